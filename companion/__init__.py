@@ -1,0 +1,1 @@
+"""The companion-computer service: perception in, offboard setpoints out, detections on zenoh."""

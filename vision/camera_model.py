@@ -1,0 +1,130 @@
+"""The pinhole camera with lens distortion, and how it is mounted on the vehicle.
+
+Optical frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel.
+Distortion is the Brown–Conrady model in OpenCV's order (k1, k2, p1, p2, k3).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.rotation import BODY_FROM_OPTICAL, matrix_from_euler
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """Intrinsics of one camera. Focal lengths and principal point in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0 or self.fx <= 0 or self.fy <= 0:
+            raise ValueError(
+                f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
+                f"fx {self.fx}, fy {self.fy}"
+            )
+        if len(self.distortion) not in (0, 4, 5):
+            raise ValueError(f"distortion must have 0, 4 or 5 coefficients, got {len(self.distortion)}")
+
+    @classmethod
+    def from_horizontal_fov(cls, width: int, height: int, fov_rad: float) -> CameraModel:
+        """Square pixels, centred, no distortion, seeing `fov_rad` from edge to edge of the width."""
+        if not 0.0 < fov_rad < math.pi:
+            raise ValueError(f"horizontal field of view must be in 0..π rad, got {fov_rad}")
+        focal = width / 2 / math.tan(fov_rad / 2)
+        return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) camera matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def scaled(self, width: int, height: int) -> CameraModel:
+        """The same camera read out at another size."""
+        sx, sy = width / self.width, height / self.height
+        return CameraModel(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.distortion,
+        )
+
+    def project(self, points_optical: NDArray[Any]) -> NDArray[np.float64]:
+        """(N, 3) points in the optical frame → (N, 2) pixels; NaN for points not in front of the camera."""
+        points = np.asarray(points_optical, np.float64).reshape(-1, 3)
+        pixels = np.full((len(points), 2), np.nan)
+        ahead = points[:, 2] > 1e-9
+        if ahead.any():
+            plane = points[ahead, :2] / points[ahead, 2:]
+            if self.distortion:
+                plane = self._distort(plane)
+            pixels[ahead] = plane * (self.fx, self.fy) + (self.cx, self.cy)
+        return pixels
+
+    def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
+        """(N, 2) pixels → (N, 3) unit vectors in the optical frame."""
+        points = np.asarray(pixels, np.float64).reshape(-1, 2)
+        if self.distortion and len(points):
+            plane = cv2.undistortPoints(
+                points.reshape(-1, 1, 2), self.matrix, np.array(self.distortion)
+            ).reshape(-1, 2)
+        else:
+            plane = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+        rays = np.column_stack([plane, np.ones(len(plane))])
+        unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return unit
+
+    def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
+        x, y = plane[:, 0], plane[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.column_stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CameraMount:
+    """Where the camera sits on the body (FRD, metres) and how it is turned from looking forward.
+
+    A negative pitch looks down. With everything zero the camera looks along the body's forward axis.
+    """
+
+    forward_m: float = 0.0
+    right_m: float = 0.0
+    down_m: float = 0.0
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    yaw_rad: float = 0.0
+
+    @property
+    def position_frd_m(self) -> NDArray[np.float64]:
+        """(3,) position of the optical centre in the body frame."""
+        return np.array([self.forward_m, self.right_m, self.down_m])
+
+    @property
+    def body_from_optical(self) -> NDArray[np.float64]:
+        """(3, 3) rotation from the optical frame to the body frame (FRD)."""
+        turned: NDArray[np.float64] = (
+            matrix_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad) @ BODY_FROM_OPTICAL
+        )
+        return turned

@@ -1,0 +1,105 @@
+"""What a detector saw in one frame: parallel arrays, validated when made, sliceable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class DetectionRecord(TypedDict):
+    """One detection as plain values, ready for JSON. `xyxy` and `center` are pixels of the frame."""
+
+    class_id: int
+    class_name: str
+    confidence: float
+    xyxy: list[float]
+    center: list[float]
+    range_m: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """N detections of one frame.
+
+    Attributes:
+        xyxy: (N, 4) float32, pixels of the frame: left, top, right, bottom.
+        confidence: (N,) float32 in 0..1.
+        class_id: (N,) int64, index into `class_names`.
+        class_names: the model's own table, id → name.
+        range_m: (N,) float32, metres along the optical axis to the object's surface, NaN where unknown.
+    """
+
+    xyxy: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    class_id: NDArray[np.int64]
+    class_names: tuple[str, ...]
+    range_m: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    def __post_init__(self) -> None:
+        count = len(self.xyxy)
+        if self.range_m.shape == (0,) and count:
+            object.__setattr__(self, "range_m", np.full(count, np.nan, np.float32))
+        if self.xyxy.shape != (count, 4):
+            raise ValueError(f"Detections.xyxy must be (N, 4), got {self.xyxy.shape}")
+        for name in ("confidence", "class_id", "range_m"):
+            shape = getattr(self, name).shape
+            if shape != (count,):
+                raise ValueError(f"Detections.{name} must be ({count},) like xyxy, got {shape}")
+        if count and not (0 <= int(self.class_id.min()) and int(self.class_id.max()) < len(self.class_names)):
+            raise ValueError(
+                f"Detections.class_id must be 0..{len(self.class_names) - 1}, got {self.class_id}"
+            )
+
+    @classmethod
+    def empty(cls, class_names: tuple[str, ...]) -> Detections:
+        """No detections, of a model with these classes."""
+        return cls(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64), class_names)
+
+    def __len__(self) -> int:
+        return len(self.xyxy)
+
+    def __iter__(self) -> Iterator[DetectionRecord]:
+        return iter(self.records())
+
+    def __getitem__(self, index: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Detections:
+        """The detections at a slice, a boolean mask or an index array."""
+        return Detections(
+            self.xyxy[index],
+            self.confidence[index],
+            self.class_id[index],
+            self.class_names,
+            self.range_m[index],
+        )
+
+    @property
+    def center(self) -> NDArray[np.float32]:
+        """(N, 2) float32, pixels: x, y of each box's middle."""
+        return ((self.xyxy[:, :2] + self.xyxy[:, 2:]) / 2).astype(np.float32)
+
+    @property
+    def names(self) -> list[str]:
+        """The class name of each detection."""
+        return [self.class_names[index] for index in self.class_id]
+
+    def of_class(self, class_name: str) -> Detections:
+        """Those of one class; none if the model does not know the class."""
+        return self[np.array([name == class_name for name in self.names], dtype=np.bool_)]
+
+    def records(self) -> list[DetectionRecord]:
+        """Plain values, rounded to what they mean (0.01 px, 0.0001, 1 mm)."""
+        centers = self.center
+        return [
+            DetectionRecord(
+                class_id=int(self.class_id[i]),
+                class_name=self.class_names[int(self.class_id[i])],
+                confidence=round(float(self.confidence[i]), 4),
+                xyxy=[round(float(value), 2) for value in self.xyxy[i]],
+                center=[round(float(value), 2) for value in centers[i]],
+                range_m=None if np.isnan(self.range_m[i]) else round(float(self.range_m[i]), 3),
+            )
+            for i in range(len(self))
+        ]

@@ -1,0 +1,45 @@
+"""One picture as it came from a source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A colour image with its capture stamp.
+
+    Attributes:
+        image: (height, width, 3) uint8, BGR, C-contiguous.
+        captured_ns: CLOCK_MONOTONIC nanoseconds (`time.monotonic_ns`) when the frame was captured, or,
+            where the source cannot tell, when its bytes arrived.
+        sequence: counts every frame the source delivered, from 0. A gap means dropped frames.
+        depth_m: (height, width) float32, metres along the optical axis, NaN where unknown; None if there is
+            no depth.
+    """
+
+    image: NDArray[np.uint8]
+    captured_ns: int
+    sequence: int
+    depth_m: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
+            raise ValueError(
+                f"Frame.image must be (height, width, 3) uint8, got {self.image.shape} {self.image.dtype}"
+            )
+        if self.depth_m is not None and self.depth_m.shape != self.image.shape[:2]:
+            raise ValueError(
+                f"Frame.depth_m must have the image's size {self.image.shape[:2]}, got {self.depth_m.shape}"
+            )
+
+    @property
+    def width(self) -> int:
+        return int(self.image.shape[1])
+
+    @property
+    def height(self) -> int:
+        return int(self.image.shape[0])

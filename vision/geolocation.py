@@ -1,0 +1,61 @@
+"""From a pixel to a direction to a place on the ground, in the world's NED frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.camera_model import CameraModel, CameraMount
+
+
+def direction_ned(
+    camera: CameraModel,
+    mount: CameraMount,
+    ned_from_body: NDArray[np.float64],
+    pixels: NDArray[Any],
+) -> NDArray[np.float64]:
+    """(N, 2) pixels → (N, 3) unit directions in NED, given the vehicle's attitude when they were captured."""
+    directions: NDArray[np.float64] = camera.rays(pixels) @ (ned_from_body @ mount.body_from_optical).T
+    return directions
+
+
+def point_at_depth(
+    camera: CameraModel,
+    mount: CameraMount,
+    ned_from_body: NDArray[np.float64],
+    pixels: NDArray[Any],
+    depth_m: NDArray[Any],
+) -> NDArray[np.float64]:
+    """(N, 3) NED offsets from the vehicle of points seen at `pixels` with a depth along the optical axis."""
+    rays = camera.rays(pixels)
+    points = rays / rays[:, 2:] * np.asarray(depth_m, np.float64).reshape(-1, 1)
+    body = points @ mount.body_from_optical.T + mount.position_frd_m
+    offsets: NDArray[np.float64] = body @ ned_from_body.T
+    return offsets
+
+
+def point_on_ground(
+    camera: CameraModel,
+    mount: CameraMount,
+    ned_from_body: NDArray[np.float64],
+    pixels: NDArray[Any],
+    height_m: float,
+    min_depression_rad: float = 0.02,
+) -> NDArray[np.float64]:
+    """(N, 3) NED offsets from the vehicle of where the pixels' rays meet level ground.
+
+    Args:
+        height_m: of the vehicle above that ground.
+        min_depression_rad: rays that point down by less than this give NaN: near the horizon a small error of
+            attitude is a large error of range.
+    """
+    directions = direction_ned(camera, mount, ned_from_body, pixels)
+    camera_offset = ned_from_body @ mount.position_frd_m
+    drop = height_m - camera_offset[2]
+    points = np.full((len(directions), 3), np.nan)
+    down = directions[:, 2] > np.sin(min_depression_rad)
+    if drop > 0.0:
+        points[down] = camera_offset + directions[down] / directions[down, 2:] * drop
+    return points
