@@ -1,0 +1,239 @@
+"""What a network is made of, as plain values: rows of (from, repeats, layer, arguments) and three multipliers.
+
+A checkpoint carries this description of itself; `yolov8_description` writes the published one for a new model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vision.yolo.layers import ACTIVATIONS
+
+# scale → depth multiple, width multiple, largest channel count before the width multiple (published table).
+YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
+    "n": (0.33, 0.25, 1024),
+    "s": (0.33, 0.50, 1024),
+    "m": (0.67, 0.75, 768),
+    "l": (1.0, 1.00, 512),
+    "x": (1.0, 1.25, 512),
+}
+_LARGEST_REPEATS = 256
+_LARGEST_ROWS = 512
+
+
+class ArchitectureError(ValueError):
+    """A description that cannot be built; the message names the row."""
+
+
+@dataclass(frozen=True, slots=True)
+class LayerRow:
+    """One layer: the rows it reads (-1 is the row before), how often it repeats, its name, its arguments."""
+
+    source: tuple[int, ...]
+    repeats: int
+    layer: str
+    arguments: tuple[Any, ...] = ()
+
+    @classmethod
+    def from_plain(cls, row: object, index: int) -> LayerRow:
+        """From `[from, repeats, layer, arguments]`; raises `ArchitectureError` naming row `index`."""
+        if not isinstance(row, list | tuple) or len(row) != 4:
+            raise ArchitectureError(
+                f"row {index} must be [from, repeats, layer, arguments], got {row!r:.200}"
+            )
+        source, repeats, layer, arguments = row
+        sources = tuple(source) if isinstance(source, list | tuple) else (source,)
+        if not sources or not all(type(value) is int for value in sources):
+            raise ArchitectureError(f"row {index}: 'from' must be row numbers, got {source!r:.200}")
+        if type(repeats) is not int or not 1 <= repeats <= _LARGEST_REPEATS:
+            raise ArchitectureError(
+                f"row {index}: repeats must be 1..{_LARGEST_REPEATS}, got {repeats!r:.200}"
+            )
+        if not isinstance(layer, str) or not isinstance(arguments, list | tuple):
+            raise ArchitectureError(f"row {index}: expected a layer's name and arguments, got {row!r:.99}")
+        return cls(sources, repeats, layer, tuple(arguments))
+
+    def to_plain(self) -> list[Any]:
+        source = self.source[0] if len(self.source) == 1 else list(self.source)
+        return [source, self.repeats, self.layer, list(self.arguments)]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelDescription:
+    """Everything needed to build a network but its weights.
+
+    Attributes:
+        class_names: id → name.
+        backbone, head: the rows, numbered on from backbone to head.
+        depth_multiple: multiplies the repeats of every row that has more than one.
+        width_multiple: multiplies channel counts, rounded up to a multiple of 8.
+        max_channels: channel counts are limited to this before the width multiple; None for no limit.
+        channels: of the input image.
+        reg_max: bins of the distribution over each box side.
+        activation: `SiLU` or `ReLU`.
+    """
+
+    class_names: tuple[str, ...]
+    backbone: tuple[LayerRow, ...]
+    head: tuple[LayerRow, ...]
+    depth_multiple: float = 1.0
+    width_multiple: float = 1.0
+    max_channels: int | None = None
+    channels: int = 3
+    reg_max: int = 16
+    activation: str = "SiLU"
+
+    def __post_init__(self) -> None:
+        if not self.class_names or not all(isinstance(name, str) for name in self.class_names):
+            raise ArchitectureError(f"a model needs the names of its classes, got {self.class_names!s:.200}")
+        for name in ("depth_multiple", "width_multiple"):
+            value = getattr(self, name)
+            if type(value) not in (int, float) or not 0 < value <= 16:
+                raise ArchitectureError(f"{name} must be a number in 0..16, got {value!r:.200}")
+        limits = {"channels": 64, "reg_max": 256, "max_channels": None}
+        for name, largest in limits.items():
+            value = getattr(self, name)
+            if name == "max_channels" and value is None:
+                continue
+            if type(value) is not int or value < 1 or (largest is not None and value > largest):
+                raise ArchitectureError(f"{name} must be a whole number from 1, got {value!r:.200}")
+        if self.activation not in ACTIVATIONS:
+            raise ArchitectureError(
+                f"unknown activation {self.activation!r:.200}; known are {', '.join(ACTIVATIONS)}"
+            )
+        if not 1 <= len(self.rows) <= _LARGEST_ROWS:
+            raise ArchitectureError(f"a network needs 1..{_LARGEST_ROWS} rows, got {len(self.rows)}")
+
+    @property
+    def rows(self) -> tuple[LayerRow, ...]:
+        """The rows of backbone and head, in the order in which the network runs them."""
+        return self.backbone + self.head
+
+    def to_plain(self) -> dict[str, Any]:
+        """The description as plain dicts, lists, strings and numbers; `from_plain` reads it back."""
+        return {
+            "nc": len(self.class_names),
+            "names": list(self.class_names),
+            "depth_multiple": self.depth_multiple,
+            "width_multiple": self.width_multiple,
+            "max_channels": self.max_channels,
+            "channels": self.channels,
+            "reg_max": self.reg_max,
+            "activation": self.activation,
+            "backbone": [row.to_plain() for row in self.backbone],
+            "head": [row.to_plain() for row in self.head],
+        }
+
+    @classmethod
+    def from_plain(
+        cls, plain: Mapping[Any, Any], class_names: Sequence[str] | None = None
+    ) -> ModelDescription:
+        """Read a model table: our own (`to_plain`) or one with a `scales` table and a `scale` letter in it.
+
+        `class_names` overrides the table's `names`. Raises `ArchitectureError`.
+        """
+        if plain.get("end2end"):
+            raise ArchitectureError("an end-to-end head (without NMS) is not YOLOv8; use a YOLOv8 model")
+        names = plain.get("names") if class_names is None else class_names
+        if isinstance(names, str) or not isinstance(names, Sequence):
+            raise ArchitectureError(f"a model needs a list of class names, got {names!r:.200}")
+        depth, width, max_channels = _multiples(plain)
+        backbone, head = plain.get("backbone"), plain.get("head")
+        if not isinstance(backbone, list | tuple) or not isinstance(head, list | tuple):
+            raise ArchitectureError("a description needs the lists `backbone` and `head`")
+        return cls(
+            class_names=tuple(names),
+            backbone=tuple(LayerRow.from_plain(row, index) for index, row in enumerate(backbone)),
+            head=tuple(LayerRow.from_plain(row, index) for index, row in enumerate(head, len(backbone))),
+            depth_multiple=depth,
+            width_multiple=width,
+            max_channels=max_channels,
+            channels=_first(plain, ("channels", "ch"), 3),
+            reg_max=_first(plain, ("reg_max",), 16),
+            activation=_activation_name(_first(plain, ("activation",), "SiLU")),
+        )
+
+
+def yolov8_description(scale: str | tuple[float, float, int], class_names: Sequence[str]) -> ModelDescription:
+    """The published YOLOv8 network.
+
+    Args:
+        scale: `n`, `s`, `m`, `l`, `x`, or (depth multiple, width multiple, largest channel count).
+        class_names: id → name.
+    """
+    if isinstance(scale, str):
+        if scale not in YOLOV8_SCALES:
+            raise ArchitectureError(f"unknown scale {scale!r}; known are {', '.join(YOLOV8_SCALES)}")
+        scale = YOLOV8_SCALES[scale]
+    depth, width, max_channels = scale
+    before = (-1,)
+
+    def down(channels: int) -> LayerRow:
+        return LayerRow(before, 1, "Conv", (channels, 3, 2))
+
+    upsample = LayerRow(before, 1, "nn.Upsample", (None, 2, "nearest"))
+    backbone = (
+        down(64),
+        down(128),
+        LayerRow(before, 3, "C2f", (128, True)),
+        down(256),
+        LayerRow(before, 6, "C2f", (256, True)),
+        down(512),
+        LayerRow(before, 6, "C2f", (512, True)),
+        down(1024),
+        LayerRow(before, 3, "C2f", (1024, True)),
+        LayerRow(before, 1, "SPPF", (1024, 5)),
+    )
+    head = (
+        upsample,
+        LayerRow((-1, 6), 1, "Concat", (1,)),
+        LayerRow(before, 3, "C2f", (512,)),
+        upsample,
+        LayerRow((-1, 4), 1, "Concat", (1,)),
+        LayerRow(before, 3, "C2f", (256,)),
+        down(256),
+        LayerRow((-1, 12), 1, "Concat", (1,)),
+        LayerRow(before, 3, "C2f", (512,)),
+        down(512),
+        LayerRow((-1, 9), 1, "Concat", (1,)),
+        LayerRow(before, 3, "C2f", (1024,)),
+        LayerRow((15, 18, 21), 1, "Detect", ("nc",)),
+    )
+    return ModelDescription(tuple(class_names), backbone, head, depth, width, max_channels)
+
+
+def _first(plain: Mapping[Any, Any], keys: Sequence[str], default: Any) -> Any:
+    for key in keys:
+        if plain.get(key) is not None:
+            return plain[key]
+    return default
+
+
+def _activation_name(value: Any) -> Any:
+    """`nn.SiLU()`, `torch.nn.SiLU` and `SiLU` name the same activation."""
+    if not isinstance(value, str):
+        return value
+    return value.removesuffix("()").removeprefix("torch.").removeprefix("nn.")
+
+
+def _multiples(plain: Mapping[Any, Any]) -> tuple[float, float, int | None]:
+    """(depth multiple, width multiple, largest channel count) of a model table."""
+    scales = plain.get("scales")
+    if not scales:
+        return (
+            _first(plain, ("depth_multiple",), 1.0),
+            _first(plain, ("width_multiple",), 1.0),
+            plain.get("max_channels"),
+        )
+    if not isinstance(scales, Mapping):
+        raise ArchitectureError(f"`scales` must be a table, got {scales!r:.200}")
+    scale = _first(plain, ("scale",), next(iter(scales)))
+    if not isinstance(scale, str) or scale not in scales:
+        raise ArchitectureError(f"scale {scale!r:.100} is not in the table {', '.join(map(str, scales))}")
+    row = scales[scale]
+    if not isinstance(row, list | tuple) or len(row) != 3:
+        raise ArchitectureError(f"scale {scale!r} must be [depth, width, max_channels], got {row!r:.200}")
+    depth, width, max_channels = row
+    return depth, width, max_channels
