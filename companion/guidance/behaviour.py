@@ -1,0 +1,89 @@
+"""The contract of a behaviour: what it needs, and four hooks. A behaviour never touches the link."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import StrEnum
+
+from companion.guidance.target import Target
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, VehicleState
+
+
+class Requirement(StrEnum):
+    """What a behaviour cannot do without. A missing one is a refusal that names it."""
+
+    POSITION = "position"  # fresh local position and attitude
+    IN_AIR = "in_air"
+    ON_GROUND = "on_ground"
+    PERCEPTION = "perception"  # a perception worker that delivers
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """Everything a behaviour may look at in one update.
+
+    Attributes:
+        now_ns: CLOCK_MONOTONIC nanoseconds.
+        state: the vehicle.
+        targets: what is seen now, in the level world frame; empty when nothing is or when it is too old.
+        perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
+        perception_fresh: that age is within the declared maximum.
+        sent: what the envelope let through of the last setpoint; None before the first.
+    """
+
+    now_ns: int
+    state: VehicleState
+    targets: tuple[Target, ...] = ()
+    perception_age_s: float | None = None
+    perception_fresh: bool = False
+    sent: Setpoint | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A behaviour has ended."""
+
+    success: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRequest:
+    """Let the autopilot fly one of its own modes (take-off, land, return, hold) until further notice.
+
+    `altitude_m` is for FlightMode.TAKEOFF: height above home. `arm` asks to arm first (only take-off does).
+    """
+
+    mode: FlightMode
+    altitude_m: float | None = None
+    arm: bool = False
+
+
+# What an update may answer: a setpoint to fly, a mode of the autopilot's own, or the end.
+Step = Setpoint | ModeRequest | Outcome
+
+
+class Behaviour(ABC):
+    """One way of flying. `name` is its word in the command grammar."""
+
+    name: str
+    requirements: frozenset[Requirement] = frozenset()
+    # Classes that perception must know for this behaviour to make sense.
+    class_names: tuple[str, ...] = ()
+
+    def on_activate(self, situation: Situation) -> None:  # noqa: B027  (a hook that may be left out)
+        """Called once, before the first update."""
+
+    @abstractmethod
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        """Called at the guidance rate. `dt_s` is the time since the last update (0 at the first)."""
+
+    def on_deactivate(self) -> None:  # noqa: B027  (a hook that may be left out)
+        """Called once, when it ended or was replaced."""
+
+    @property
+    def status(self) -> str:
+        """A few words on what it is doing now, for people."""
+        return self.name

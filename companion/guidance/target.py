@@ -1,0 +1,43 @@
+"""A target: a detection turned into a direction and, where possible, a place in the level world frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from companion.vehicle.state import Vector3
+
+
+class RangeSource(StrEnum):
+    """Where a target's range comes from."""
+
+    DEPTH = "depth"
+    GROUND_PLANE = "ground_plane"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One seen object.
+
+    Attributes:
+        class_name, confidence: as the detector says.
+        captured_ns: CLOCK_MONOTONIC stamp of the frame.
+        bearing_rad: direction of the box's centre, clockwise from north, -π..π (attitude removed).
+        elevation_rad: above the horizon, positive up.
+        range_m: horizontal distance from the vehicle to the object's nearest surface; NaN when unknown.
+        range_source: where that comes from.
+        position_ned_m: of that nearest point, local NED; None when the range is unknown.
+        box_xyxy: pixels, as detected.
+    """
+
+    class_name: str
+    confidence: float
+    captured_ns: int
+    bearing_rad: float
+    elevation_rad: float
+    range_m: float = math.nan
+    range_source: RangeSource = RangeSource.NONE
+    position_ned_m: Vector3 | None = None
+    box_xyxy: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)

@@ -1,0 +1,107 @@
+"""A setpoint: where to be or how to move, in local NED, and until when that is meant.
+
+The two shapes that leave this house are the ones PX4 takes in frame MAV_FRAME_LOCAL_NED of
+SET_POSITION_TARGET_LOCAL_NED (MAVLink common, 84): a position or a velocity, each with a yaw or a yaw rate.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from companion.vehicle.state import Vector3
+
+# POSITION_TARGET_TYPEMASK
+IGNORE_POSITION = 0b0000_0000_0111
+IGNORE_VELOCITY = 0b0000_0011_1000
+IGNORE_ACCELERATION = 0b0001_1100_0000
+IGNORE_YAW = 0b0100_0000_0000
+IGNORE_YAW_RATE = 0b1000_0000_0000
+
+# How long a setpoint counts unless its maker says otherwise: a quarter of PX4's default COM_OF_LOSS_T.
+DEFAULT_LIFETIME_S = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """Exactly one of position and velocity; at most one of yaw and yaw rate (none: keep the heading).
+
+    Attributes:
+        deadline_ns: CLOCK_MONOTONIC nanoseconds after which this must not be sent any more.
+        position_ned_m: metres, local NED.
+        velocity_ned_mps: metres a second, local NED.
+        yaw_rad: heading, clockwise from north.
+        yaw_rate_radps: clockwise seen from above.
+
+    Raises:
+        ValueError: the shape is none of the above, or a value is not finite.
+    """
+
+    deadline_ns: int
+    position_ned_m: Vector3 | None = None
+    velocity_ned_mps: Vector3 | None = None
+    yaw_rad: float | None = None
+    yaw_rate_radps: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.position_ned_m is None) == (self.velocity_ned_mps is None):
+            raise ValueError("a setpoint is a position or a velocity: give exactly one of them")
+        if self.yaw_rad is not None and self.yaw_rate_radps is not None:
+            raise ValueError("a setpoint has a yaw or a yaw rate, not both")
+        values = [*(self.position_ned_m or ()), *(self.velocity_ned_mps or ())]
+        values += [value for value in (self.yaw_rad, self.yaw_rate_radps) if value is not None]
+        if not all(math.isfinite(value) for value in values):
+            raise ValueError(f"every value of a setpoint must be finite, got {values}")
+
+    @classmethod
+    def velocity(
+        cls,
+        velocity_ned_mps: Vector3,
+        now_ns: int,
+        *,
+        yaw_rad: float | None = None,
+        yaw_rate_radps: float | None = None,
+        lifetime_s: float = DEFAULT_LIFETIME_S,
+    ) -> Setpoint:
+        """Move with this velocity, for `lifetime_s` from now."""
+        return cls(
+            now_ns + round(lifetime_s * 1e9),
+            velocity_ned_mps=velocity_ned_mps,
+            yaw_rad=yaw_rad,
+            yaw_rate_radps=yaw_rate_radps,
+        )
+
+    @classmethod
+    def position(
+        cls,
+        position_ned_m: Vector3,
+        now_ns: int,
+        *,
+        yaw_rad: float | None = None,
+        lifetime_s: float = DEFAULT_LIFETIME_S,
+    ) -> Setpoint:
+        """Go to and stay at this position."""
+        return cls(now_ns + round(lifetime_s * 1e9), position_ned_m=position_ned_m, yaw_rad=yaw_rad)
+
+    @classmethod
+    def brake(cls, now_ns: int, lifetime_s: float = DEFAULT_LIFETIME_S) -> Setpoint:
+        """Stand still where you are and stop turning."""
+        return cls.velocity((0.0, 0.0, 0.0), now_ns, yaw_rate_radps=0.0, lifetime_s=lifetime_s)
+
+    @property
+    def type_mask(self) -> int:
+        """POSITION_TARGET_TYPEMASK: the bits of what is to be ignored."""
+        mask = IGNORE_ACCELERATION
+        mask |= IGNORE_POSITION if self.position_ned_m is None else 0
+        mask |= IGNORE_VELOCITY if self.velocity_ned_mps is None else 0
+        mask |= IGNORE_YAW if self.yaw_rad is None else 0
+        mask |= IGNORE_YAW_RATE if self.yaw_rate_radps is None else 0
+        return mask
+
+    def expired(self, now_ns: int) -> bool:
+        """The deadline has passed."""
+        return now_ns > self.deadline_ns
+
+    def with_velocity(self, velocity_ned_mps: Vector3) -> Setpoint:
+        """The same with another velocity (of a velocity setpoint)."""
+        return replace(self, velocity_ned_mps=velocity_ned_mps)

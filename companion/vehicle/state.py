@@ -1,0 +1,112 @@
+"""What is known of the vehicle at one moment. World frame: local NED. Body frame: FRD."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+# A quadrotor that has not told anything for this long is not where we think it is.
+TELEMETRY_MAX_AGE_S = 0.5
+# HEARTBEAT comes once a second; three missing is the usual sign of a lost link.
+HEARTBEAT_MAX_AGE_S = 3.0
+
+
+class FlightMode(StrEnum):
+    """Flight modes, named as PX4 names them."""
+
+    UNKNOWN = "unknown"
+    MANUAL = "manual"
+    ALTITUDE = "altitude"
+    POSITION = "position"
+    ACRO = "acro"
+    STABILIZED = "stabilized"
+    OFFBOARD = "offboard"
+    READY = "ready"
+    TAKEOFF = "takeoff"
+    HOLD = "hold"
+    MISSION = "mission"
+    RETURN = "return"
+    LAND = "land"
+    FOLLOW = "follow"
+    PRECISION_LAND = "precision_land"
+
+
+class LandedState(StrEnum):
+    """MAV_LANDED_STATE of EXTENDED_SYS_STATE."""
+
+    UNKNOWN = "unknown"
+    ON_GROUND = "on_ground"
+    IN_AIR = "in_air"
+    TAKING_OFF = "taking_off"
+    LANDING = "landing"
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """A snapshot. Every group of values has the stamp of its newest message (CLOCK_MONOTONIC ns, 0: never).
+
+    Attributes:
+        position_ned_m: metres from the local origin, north, east, down.
+        velocity_ned_mps: metres a second, north, east, down.
+        attitude: (w, x, y, z), turns body FRD into NED.
+        angular_velocity_frd_radps: body rates.
+        latitude_deg, longitude_deg, altitude_amsl_m: global position, NaN when unknown.
+        home_altitude_amsl_m, home_position_ned_m: of the home position; None until known.
+        battery_fraction: 0..1, None when unknown.
+        ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
+        failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
+    """
+
+    heartbeat_ns: int = 0
+    attitude_ns: int = 0
+    position_ns: int = 0
+    landed_ns: int = 0
+    armed: bool = False
+    mode: FlightMode = FlightMode.UNKNOWN
+    landed: LandedState = LandedState.UNKNOWN
+    ready_to_arm: bool = False
+    failsafe: bool = False
+    position_ned_m: Vector3 | None = None
+    velocity_ned_mps: Vector3 | None = None
+    attitude: Quaternion | None = None
+    angular_velocity_frd_radps: Vector3 | None = None
+    latitude_deg: float = math.nan
+    longitude_deg: float = math.nan
+    altitude_amsl_m: float = math.nan
+    home_altitude_amsl_m: float | None = None
+    home_position_ned_m: Vector3 | None = None
+    battery_fraction: float | None = None
+
+    @property
+    def yaw_rad(self) -> float | None:
+        """Heading, clockwise from north, -π..π."""
+        if self.attitude is None:
+            return None
+        w, x, y, z = self.attitude
+        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    @property
+    def altitude_m(self) -> float | None:
+        """Height above home (above the local origin while home is unknown), metres, up positive."""
+        if self.position_ned_m is None:
+            return None
+        home_down = self.home_position_ned_m[2] if self.home_position_ned_m else 0.0
+        return home_down - self.position_ned_m[2]
+
+    def connected(self, now_ns: int) -> bool:
+        """A heartbeat came within `HEARTBEAT_MAX_AGE_S`."""
+        return self.heartbeat_ns > 0 and now_ns - self.heartbeat_ns <= HEARTBEAT_MAX_AGE_S * 1e9
+
+    def position_fresh(self, now_ns: int) -> bool:
+        """Position and attitude are known and no older than `TELEMETRY_MAX_AGE_S`."""
+        limit_ns = TELEMETRY_MAX_AGE_S * 1e9
+        return (
+            self.position_ned_m is not None
+            and self.attitude is not None
+            and now_ns - self.position_ns <= limit_ns
+            and now_ns - self.attitude_ns <= limit_ns
+        )

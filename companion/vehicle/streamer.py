@@ -1,0 +1,120 @@
+"""The dead-man: sends the newest setpoint at a steady rate while, and only while, it is fresh.
+
+Fresh → the setpoint. Expired → a braking setpoint for `brake_s`. Then silence, so that the autopilot's own
+loss-of-offboard failsafe acts (PX4: COM_OF_LOSS_T, COM_OBL_RC_ACT). The streamer lives in the same loop as
+everything else: when that loop hangs or the process is stopped, nothing is sent and the failsafe acts too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from enum import StrEnum
+
+from companion.vehicle.setpoint import Setpoint
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_RATE_HZ = 50.0
+DEFAULT_BRAKE_S = 0.5
+
+
+class StreamState(StrEnum):
+    """What the streamer is doing."""
+
+    SILENT = "silent"  # nothing was submitted, or command was given up
+    FRESH = "fresh"  # sending the newest setpoint
+    BRAKING = "braking"  # the newest setpoint expired; sending a brake
+    EXPIRED = "expired"  # braking time is over; nothing is sent until a fresh setpoint comes
+
+
+class Streamer:
+    """Sends setpoints through `send`, one a tick.
+
+    `tick(now_ns)` is the whole logic and is pure of clocks; `run()` calls it at `rate_hz`.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[Setpoint], None],
+        *,
+        rate_hz: float = DEFAULT_RATE_HZ,
+        brake_s: float = DEFAULT_BRAKE_S,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        if not rate_hz > 2.0:
+            raise ValueError(f"PX4 needs setpoints faster than 2 Hz, got rate_hz={rate_hz}")
+        self._send = send
+        self._period_ns = round(1e9 / rate_hz)
+        self._brake_ns = round(brake_s * 1e9)
+        self._clock_ns = clock_ns
+        self._newest: Setpoint | None = None
+        self._state = StreamState.SILENT
+        self._sent: Setpoint | None = None
+        self._sent_ns: int | None = None
+        self.sent_count = 0
+
+    @property
+    def state(self) -> StreamState:
+        """What the last tick did."""
+        return self._state
+
+    @property
+    def last_sent(self) -> Setpoint | None:
+        """The setpoint that last left; None before the first."""
+        return self._sent
+
+    @property
+    def last_sent_ns(self) -> int | None:
+        """When it left."""
+        return self._sent_ns
+
+    def submit(self, setpoint: Setpoint) -> None:
+        """The newest setpoint; it replaces the one before."""
+        self._newest = setpoint
+
+    def stop(self) -> None:
+        """Give up command: forget the setpoint and send nothing more."""
+        self._newest = None
+        self._enter(StreamState.SILENT)
+
+    def tick(self, now_ns: int) -> None:
+        """Send what is due at `now_ns`."""
+        newest = self._newest
+        if newest is None:
+            return
+        if not newest.expired(now_ns):
+            self._enter(StreamState.FRESH)
+            self._put(newest, now_ns)
+        elif now_ns - newest.deadline_ns <= self._brake_ns:
+            self._enter(StreamState.BRAKING)
+            self._put(Setpoint.brake(now_ns), now_ns)
+        else:
+            self._enter(StreamState.EXPIRED)
+
+    async def run(self) -> None:
+        """Tick at the rate until cancelled. Missed ticks are skipped, never sent in a burst."""
+        due_ns = self._clock_ns()
+        while True:
+            self.tick(self._clock_ns())
+            due_ns += self._period_ns
+            late_ns = self._clock_ns() - due_ns
+            if late_ns > 0:
+                due_ns += (late_ns // self._period_ns + 1) * self._period_ns
+            await asyncio.sleep((due_ns - self._clock_ns()) / 1e9)
+
+    def _put(self, setpoint: Setpoint, now_ns: int) -> None:
+        self._send(setpoint)
+        self._sent, self._sent_ns = setpoint, now_ns
+        self.sent_count += 1
+
+    def _enter(self, state: StreamState) -> None:
+        if state is self._state:
+            return
+        if state is StreamState.BRAKING:
+            logger.warning("setpoint expired: braking")
+        elif state is StreamState.EXPIRED:
+            logger.error("no fresh setpoint: sending stopped, the autopilot's failsafe takes over")
+        self._state = state
