@@ -78,7 +78,7 @@ class YoloModel(nn.Module):
     def decode(self, maps: Sequence[Tensor]) -> Tensor:
         """Raw maps → (B, N, 4 + classes): xyxy in pixels of the network's input, then scores in 0..1."""
         flat = torch.cat([level.flatten(2) for level in maps], dim=2).transpose(1, 2)
-        sides, logits = torch.split(flat, (4 * self.reg_max, len(self.class_names)), dim=2)
+        sides, logits = torch.split(flat, [4 * self.reg_max, len(self.class_names)], dim=2)
         centres, strides = anchor_points(maps, self.strides)
         boxes = decode_boxes(self.detect.dfl(sides), centres, strides)
         return torch.cat((boxes, logits.sigmoid()), dim=2)
@@ -168,6 +168,8 @@ class _Made:
 
 
 def _scaled_channels(count: int, description: ModelDescription) -> int:
+    if count in description.unscaled_channels:
+        return count
     limited = count if description.max_channels is None else min(count, description.max_channels)
     return max(8, math.ceil(limited * description.width_multiple / 8) * 8)
 

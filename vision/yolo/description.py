@@ -1,6 +1,6 @@
-"""What a network is made of, as plain values: rows of (from, repeats, layer, arguments) and three multipliers.
+"""What a network is made of: rows of (from, repeats, layer, arguments) and three multipliers.
 
-A checkpoint carries this description of itself; `yolov8_description` writes the published one for a new model.
+A checkpoint carries this description of itself; `yolov8_description` writes the published one.
 """
 
 from __future__ import annotations
@@ -73,6 +73,8 @@ class ModelDescription:
         channels: of the input image.
         reg_max: bins of the distribution over each box side.
         activation: `SiLU` or `ReLU`.
+        unscaled_channels: channel counts that the width multiple leaves alone. (Ultralytics' networks do not
+            scale a row whose channel count equals the number of classes.)
     """
 
     class_names: tuple[str, ...]
@@ -84,6 +86,7 @@ class ModelDescription:
     channels: int = 3
     reg_max: int = 16
     activation: str = "SiLU"
+    unscaled_channels: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.class_names or not all(isinstance(name, str) for name in self.class_names):
@@ -99,7 +102,11 @@ class ModelDescription:
                 continue
             if type(value) is not int or value < 1 or (largest is not None and value > largest):
                 raise ArchitectureError(f"{name} must be a whole number from 1, got {value!r:.200}")
-        if self.activation not in ACTIVATIONS:
+        if not all(type(count) is int for count in self.unscaled_channels):
+            raise ArchitectureError(
+                f"unscaled_channels must be whole numbers, got {self.unscaled_channels!r:.99}"
+            )
+        if not isinstance(self.activation, str) or self.activation not in ACTIVATIONS:
             raise ArchitectureError(
                 f"unknown activation {self.activation!r:.200}; known are {', '.join(ACTIVATIONS)}"
             )
@@ -122,6 +129,7 @@ class ModelDescription:
             "channels": self.channels,
             "reg_max": self.reg_max,
             "activation": self.activation,
+            "unscaled_channels": list(self.unscaled_channels),
             "backbone": [row.to_plain() for row in self.backbone],
             "head": [row.to_plain() for row in self.head],
         }
@@ -140,9 +148,7 @@ class ModelDescription:
         if isinstance(names, str) or not isinstance(names, Sequence):
             raise ArchitectureError(f"a model needs a list of class names, got {names!r:.200}")
         depth, width, max_channels = _multiples(plain)
-        backbone, head = plain.get("backbone"), plain.get("head")
-        if not isinstance(backbone, list | tuple) or not isinstance(head, list | tuple):
-            raise ArchitectureError("a description needs the lists `backbone` and `head`")
+        backbone, head = _list(plain, "backbone"), _list(plain, "head")
         return cls(
             class_names=tuple(names),
             backbone=tuple(LayerRow.from_plain(row, index) for index, row in enumerate(backbone)),
@@ -153,6 +159,7 @@ class ModelDescription:
             channels=_first(plain, ("channels", "ch"), 3),
             reg_max=_first(plain, ("reg_max",), 16),
             activation=_activation_name(_first(plain, ("activation",), "SiLU")),
+            unscaled_channels=tuple(_list(plain, "unscaled_channels")),
         )
 
 
@@ -209,6 +216,13 @@ def _first(plain: Mapping[Any, Any], keys: Sequence[str], default: Any) -> Any:
         if plain.get(key) is not None:
             return plain[key]
     return default
+
+
+def _list(plain: Mapping[Any, Any], key: str) -> Sequence[Any]:
+    value = plain.get(key, ())
+    if not isinstance(value, list | tuple):
+        raise ArchitectureError(f"`{key}` must be a list, got {value!r:.200}")
+    return value
 
 
 def _activation_name(value: Any) -> Any:

@@ -1,0 +1,285 @@
+"""Checkpoints: our own format, and the ordinary Ultralytics `.pt`, both read without running them.
+
+Our own is a dictionary that `torch.load(weights_only=True)` reads too:
+`{"format", "description", "state_dict" (float16), "metadata"}`.
+An Ultralytics checkpoint is a pickled `DetectionModel`; its description, class names and tensors are taken
+from the inert records that `torch_archive` makes of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vision.yolo.architecture import STRIDES, ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError
+from vision.yolo.torch_archive import read_archive
+
+__all__ = [
+    "FORMAT",
+    "CheckpointError",
+    "LoadedModel",
+    "UnsafeCheckpointError",
+    "load_checkpoint",
+    "save_checkpoint",
+]
+
+FORMAT = "mavlink-companion.yolo.v1"
+_DETECTION_MODEL = "ultralytics.nn.tasks.DetectionModel"
+_DEEPEST = 16
+_MOST_NODES = 200_000
+_LONGEST_TEXT = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedModel:
+    """A checkpoint that was read.
+
+    Attributes:
+        model: float32, on the CPU, in evaluation mode, batch normalisation not folded.
+        class_names: id → name.
+        description: what it was built from.
+        metadata: plain values: licence, origin, score, whatever the file tells.
+    """
+
+    model: YoloModel
+    class_names: tuple[str, ...]
+    description: ModelDescription
+    metadata: dict[str, Any]
+
+
+def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str, Any]) -> None:
+    """Write `model` at `path`, weights as float16 (those beyond its range as float32), in one step.
+
+    Args:
+        metadata: plain values only (dicts, lists, texts, numbers, booleans, None), else `TypeError`.
+    """
+    path = Path(path)
+    try:
+        plain_metadata = _plain(dict(metadata))
+    except CheckpointError as error:
+        raise TypeError(f"metadata must be plain values: {error}") from None
+    content = {
+        "format": FORMAT,
+        "description": model.description.to_plain(),
+        "state_dict": {name: _compact(tensor) for name, tensor in model.state_dict().items()},
+        "metadata": plain_metadata,
+    }
+    # A reader, or the next start after a power cut, sees the old file or the new one.
+    partial = path.with_name(f"{path.name}.partial")
+    torch.save(content, partial)
+    os.replace(partial, path)
+
+
+def load_checkpoint(path: str | Path) -> LoadedModel:
+    """Read our own checkpoint or an Ultralytics YOLOv8 detection checkpoint.
+
+    Raises:
+        UnsafeCheckpointError: the file asks for code to be run, named in the message.
+        CheckpointError: missing, damaged, of another kind, or weights that do not fit the description.
+    """
+    content = read_archive(path)
+    try:
+        return _interpret(content)
+    except (CheckpointError, ArchitectureError) as error:
+        kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
+        raise kind(f"{path}: {error}") from None
+
+
+def _interpret(content: Any) -> LoadedModel:
+    if not isinstance(content, dict):
+        raise CheckpointError("not a detection checkpoint: expected a dictionary with a model in it")
+    if "format" in content:
+        return _interpret_own(content)
+    # The averaged weights, where training kept them, are the better ones.
+    record = content["model"] if content.get("ema") is None and "model" in content else content.get("ema")
+    if not isinstance(record, Inert):
+        raise CheckpointError(
+            "holds no model: expected our own format, or Ultralytics' with the model under 'ema' or 'model'"
+        )
+    return _interpret_ultralytics(record, content)
+
+
+def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
+    if content["format"] != FORMAT:
+        raise CheckpointError(f"has format {content['format']!r:.100}, this version reads {FORMAT!r}")
+    description = ModelDescription.from_plain(_plain_dictionary(content, "description"))
+    weights = content.get("state_dict")
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise CheckpointError("has no state_dict of tensors")
+    model = _with_weights(description, weights)
+    return LoadedModel(model, description.class_names, description, _plain_dictionary(content, "metadata"))
+
+
+def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedModel:
+    if record.name != _DETECTION_MODEL:
+        raise CheckpointError(f"holds a {record.name.rpartition('.')[2]}; only detection models can be used")
+    table = _plain_dictionary(record.state, "yaml")
+    modules = dict(_modules(record))
+    description = ModelDescription.from_plain(table, _class_names(record, table))
+    description = _as_trained(description, table, modules)
+    weights = dict(_weights(modules))
+    model = _with_weights(description, weights)
+    for name, module in model.named_modules():
+        trained = modules.get(name)
+        if isinstance(module, nn.BatchNorm2d) and trained is not None:
+            epsilon = trained.state.get("eps", module.eps)
+            if type(epsilon) is not float or not 0 < epsilon < 1:
+                raise CheckpointError(f"{name} has the epsilon {epsilon!r:.100}, expected a small number")
+            module.eps = epsilon
+    metadata = {"origin": f"Ultralytics {_note(content, 'version')}".strip()}
+    for key, source in (("licence", "license"), ("date", "date")):
+        if _note(content, source):
+            metadata[key] = _note(content, source)
+    return LoadedModel(model, description.class_names, description, metadata)
+
+
+def _note(content: dict[Any, Any], key: str) -> str:
+    value = content.get(key)
+    return value[:200] if isinstance(value, str) else ""
+
+
+def _class_names(record: Inert, table: dict[Any, Any]) -> list[str]:
+    names = _plain(record.state.get("names"))
+    if isinstance(names, dict):
+        if sorted(map(str, names)) != sorted(map(str, range(len(names)))):
+            raise CheckpointError("its class names are not numbered from 0")
+        names = [names[index] if index in names else names[str(index)] for index in range(len(names))]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise CheckpointError("has no class names")
+    if table.get("nc") != len(names):
+        raise CheckpointError(f"names {len(names)} classes, its network has {table.get('nc')!r:.100}")
+    return names
+
+
+def _as_trained(
+    description: ModelDescription, table: dict[Any, Any], modules: dict[str, Inert]
+) -> ModelDescription:
+    """What the pickled layers know and the table may not say: activation, bins, unscaled channel counts."""
+    heads = [module for module in modules.values() if module.name.endswith(".head.Detect")]
+    for head in heads:
+        stride = head.state.get("stride")
+        if isinstance(stride, Tensor) and stride.flatten().tolist() != list(STRIDES):
+            raise CheckpointError(f"its head has strides {stride.flatten().tolist()!r:.100}, not {STRIDES}")
+        bins = head.state.get("reg_max", description.reg_max)
+        description = dataclasses.replace(description, reg_max=bins)
+    activations = {
+        module.name.rpartition(".")[2]
+        for name, module in modules.items()
+        if name.endswith(".act") and ".activation." in module.name
+    }
+    if len(activations) > 1:
+        raise CheckpointError(f"mixes the activations {', '.join(sorted(activations))}")
+    for activation in activations:
+        description = dataclasses.replace(description, activation=activation)
+    return dataclasses.replace(description, unscaled_channels=(len(description.class_names),))
+
+
+def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
+    """Every module below `record` with its dotted name."""
+    waiting = [("", record, 0)]
+    seen = 0
+    while waiting:
+        name, module, depth = waiting.pop()
+        seen += 1
+        if depth > _DEEPEST or seen > _MOST_NODES:
+            raise CheckpointError("its modules contain each other")
+        yield name, module
+        children = module.state.get("_modules", {})
+        if not isinstance(children, dict):
+            raise CheckpointError(f"the modules of {name or 'the model'} are not a dictionary")
+        for key, child in children.items():
+            if isinstance(child, Inert):
+                waiting.append((f"{name}.{key}" if name else str(key), child, depth + 1))
+            elif child is not None:
+                raise CheckpointError(f"{name}.{key} is not a module")
+
+
+def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
+    for name, module in modules.items():
+        passing = module.state.get("_non_persistent_buffers_set", frozenset())
+        for kind in ("_parameters", "_buffers"):
+            tensors = module.state.get(kind, {})
+            if not isinstance(tensors, dict):
+                raise CheckpointError(f"{name}'s {kind} are not a dictionary")
+            for key, tensor in tensors.items():
+                if tensor is None or (isinstance(passing, frozenset) and key in passing):
+                    continue
+                if not isinstance(tensor, Tensor):
+                    raise CheckpointError(f"{name}.{key} is not a tensor")
+                yield f"{name}.{key}", tensor
+
+
+def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
+    """The described network with exactly these weights; every name of either side accounted for."""
+    # Shapes only: a description that promises more than the file holds must not cost memory.
+    with torch.device("meta"):
+        model = YoloModel(description)
+        if not any(name.endswith(".bn.weight") for name in weights):
+            model.fuse()
+    expected = model.state_dict()
+    missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
+    if missing or unknown:
+        raise CheckpointError(
+            f"its weights do not fit its description: {len(missing)} missing ({', '.join(missing[:3])}), "
+            f"{len(unknown)} unknown ({', '.join(map(str, unknown[:3]))})"
+        )
+    for name, tensor in weights.items():
+        if tensor.shape != expected[name].shape:
+            raise CheckpointError(
+                f"{name} should have the shape {tuple(expected[name].shape)}, it has {tuple(tensor.shape)}"
+            )
+        if tensor.is_floating_point() != expected[name].is_floating_point():
+            raise CheckpointError(f"{name} should be {expected[name].dtype}, it is {tensor.dtype}")
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise CheckpointError(f"{name} has numbers that are not finite")
+    model.load_state_dict(
+        {name: tensor.to(expected[name].dtype, copy=True).contiguous() for name, tensor in weights.items()},
+        strict=True,
+        assign=True,
+    )
+    return model.eval()
+
+
+def _compact(tensor: Tensor) -> Tensor:
+    tensor = tensor.detach().cpu()
+    if not tensor.is_floating_point():
+        return tensor.clone()
+    half = tensor.half()
+    return half if bool(half.isfinite().all()) else tensor.float().clone()
+
+
+def _plain_dictionary(content: Mapping[Any, Any], key: str) -> dict[Any, Any]:
+    value = _plain(content.get(key))
+    if not isinstance(value, dict):
+        raise CheckpointError(f"has no {key}: expected a table")
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """A bounded copy of containers and scalars, so that nothing later is led around a maze of references."""
+    left = _MOST_NODES
+
+    def copy(value: Any, depth: int) -> Any:
+        nonlocal left
+        left -= 1
+        if depth > _DEEPEST or left < 0:
+            raise CheckpointError("its description is too deep or too long")
+        if isinstance(value, str) and len(value) > _LONGEST_TEXT:
+            raise CheckpointError(f"has a text of {len(value)} characters in its description")
+        if value is None or type(value) in (bool, int, float, str):
+            return value
+        if isinstance(value, dict):
+            return {copy(key, depth + 1): copy(item, depth + 1) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [copy(item, depth + 1) for item in value]
+        raise CheckpointError(f"has a {type(value).__name__} where a plain value belongs")
+
+    return copy(value, 0)

@@ -1,0 +1,279 @@
+"""A reader of pickles that cannot run anything: the part of the pickle machine that `torch.save` writes.
+
+Python's own unpickler imports what a file names and calls it. This one knows tokens only: a global is looked
+up in the caller's table of admitted names, "calling" it makes an `Inert` record or asks the table's own
+function, and setting state fills a record's dictionary. No import, no attribute of a real object, no class of
+the file's choosing. The opcodes are those of pickle protocol 2 (PEP 307); any other is refused.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be read; one line that says which, why, and what to do."""
+
+
+class UnsafeCheckpointError(CheckpointError):
+    """A checkpoint that asks for code to be run; the message names what it asked for."""
+
+
+@dataclass(slots=True, eq=False)
+class Inert:
+    """What stands in for an object of class `name`: its constructor's arguments and its attributes."""
+
+    name: str
+    arguments: tuple[Any, ...] = ()
+    state: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Admitted:
+    """A global that the file may name. `make` answers a call with these arguments.
+
+    Without `make` a call, or an instance, is an `Inert` of this name.
+    """
+
+    name: str
+    make: Callable[[tuple[Any, ...]], Any] | None = None
+
+    def call(self, arguments: tuple[Any, ...]) -> Any:
+        return Inert(self.name, arguments) if self.make is None else self.make(arguments)
+
+
+_MARK = object()
+_SCALARS = (str, int, float, bool, type(None))
+
+
+def unpickle(
+    data: bytes, admitted: Mapping[str, Admitted], persistent: Callable[[tuple[Any, ...]], Any]
+) -> Any:
+    """The value that `data` describes.
+
+    Args:
+        data: a pickle of protocol 2.
+        admitted: `module.name` → what it stands for.
+        persistent: answers a persistent id (for torch: a storage).
+
+    Raises:
+        UnsafeCheckpointError: a global that is not admitted; the message names it.
+        CheckpointError: not such a pickle.
+    """
+    return _Machine(data, admitted, persistent).run()
+
+
+class _Machine:
+    def __init__(
+        self, data: bytes, admitted: Mapping[str, Admitted], persistent: Callable[[tuple[Any, ...]], Any]
+    ) -> None:
+        self._data = data
+        self._position = 0
+        self._admitted = admitted
+        self._persistent = persistent
+        self._stack: list[Any] = []
+        # A dictionary, not a list: the file chooses the numbers, and a huge one must not cost memory.
+        self._memo: dict[int, Any] = {}
+
+    def run(self) -> Any:
+        if self._take(2) != b"\x80\x02":
+            raise CheckpointError("its pickle is not of protocol 2, which torch.save writes")
+        while (opcode := self._take(1)) != b".":
+            handler = _HANDLERS.get(opcode)
+            if handler is None:
+                raise CheckpointError(f"its pickle has opcode {opcode!r}, which torch.save does not write")
+            handler(self)
+        value = self._pop()
+        if self._stack:
+            raise CheckpointError("its pickle ends with values left over")
+        return value
+
+    def _take(self, count: int) -> bytes:
+        chunk = self._data[self._position : self._position + count]
+        if len(chunk) != count:
+            raise CheckpointError("its pickle ends in the middle")
+        self._position += count
+        return chunk
+
+    def _unsigned(self, count: int) -> int:
+        return int.from_bytes(self._take(count), "little")
+
+    def _line(self) -> str:
+        end = self._data.find(b"\n", self._position)
+        if end < 0 or end - self._position > 1000:
+            raise CheckpointError("its pickle has a global without a name")
+        line = self._take(end - self._position)
+        self._position += 1
+        return _text(line)
+
+    def _pop(self) -> Any:
+        if not self._stack or self._stack[-1] is _MARK:
+            raise CheckpointError("its pickle takes a value that is not there")
+        return self._stack.pop()
+
+    def _pop_to_mark(self) -> list[Any]:
+        values: list[Any] = []
+        while True:
+            if not self._stack:
+                raise CheckpointError("its pickle has no mark where one is needed")
+            value = self._stack.pop()
+            if value is _MARK:
+                values.reverse()
+                return values
+            values.append(value)
+
+    def _push(self, value: Any) -> None:
+        self._stack.append(value)
+
+    def _top(self, kind: type) -> Any:
+        if not self._stack or not isinstance(self._stack[-1], kind):
+            raise CheckpointError(f"its pickle fills a {kind.__name__} that is not there")
+        return self._stack[-1]
+
+    def proto(self) -> None:
+        raise CheckpointError("its pickle declares its protocol twice")
+
+    def mark(self) -> None:
+        self._push(_MARK)
+
+    def integer(self) -> None:
+        self._push(struct.unpack("<i", self._take(4))[0])
+
+    def long(self) -> None:
+        self._push(int.from_bytes(self._take(self._unsigned(1)), "little", signed=True))
+
+    def real(self) -> None:
+        self._push(struct.unpack(">d", self._take(8))[0])
+
+    def text(self) -> None:
+        self._push(_text(self._take(self._unsigned(4))))
+
+    def tuple_to_mark(self) -> None:
+        self._push(tuple(self._pop_to_mark()))
+
+    def tuple_of(self, count: int) -> None:
+        values = [self._pop() for _ in range(count)]
+        self._push(tuple(reversed(values)))
+
+    def append(self) -> None:
+        value = self._pop()
+        self._top(list).append(value)
+
+    def appends(self) -> None:
+        values = self._pop_to_mark()
+        self._top(list).extend(values)
+
+    def set_item(self) -> None:
+        value, key = self._pop(), self._pop()
+        self._fill([key, value])
+
+    def set_items(self) -> None:
+        self._fill(self._pop_to_mark())
+
+    def _fill(self, values: list[Any]) -> None:
+        target = self._top(dict)
+        if len(values) % 2:
+            raise CheckpointError("its pickle has a dictionary key without a value")
+        for key, value in zip(values[::2], values[1::2], strict=True):
+            # Hashing a nested tuple can be made to take for ever; no checkpoint needs one as a key.
+            if not isinstance(key, _SCALARS):
+                raise CheckpointError(f"its pickle has a dictionary key of type {type(key).__name__}")
+            target[key] = value
+
+    def put(self, width: int) -> None:
+        index = self._unsigned(width)
+        if not self._stack or self._stack[-1] is _MARK:
+            raise CheckpointError("its pickle remembers a value that is not there")
+        self._memo[index] = self._stack[-1]
+
+    def get(self, width: int) -> None:
+        index = self._unsigned(width)
+        if index not in self._memo:
+            raise CheckpointError(f"its pickle asks for value {index}, which it never stored")
+        self._push(self._memo[index])
+
+    def global_name(self) -> None:
+        name = f"{self._line()}.{self._line()}"
+        if name not in self._admitted:
+            raise UnsafeCheckpointError(
+                f"its pickle asks for {name!r:.200}, which is not part of a detection checkpoint; "
+                "nothing was run. Do not use this file, or save the model again from a source you trust"
+            )
+        self._push(self._admitted[name])
+
+    def reduce(self) -> None:
+        arguments, function = self._pop(), self._pop()
+        if not isinstance(function, Admitted) or not isinstance(arguments, tuple):
+            raise UnsafeCheckpointError(f"its pickle calls a {type(function).__name__}; nothing was run")
+        self._push(function.call(arguments))
+
+    def new_object(self) -> None:
+        arguments, kind = self._pop(), self._pop()
+        if not isinstance(kind, Admitted) or kind.make is not None or not isinstance(arguments, tuple):
+            name = kind.name if isinstance(kind, Admitted) else type(kind).__name__
+            raise UnsafeCheckpointError(f"its pickle makes an instance of {name}; nothing was run")
+        self._push(Inert(kind.name, arguments))
+
+    def build(self) -> None:
+        state = self._pop()
+        target = self._stack[-1] if self._stack else None
+        if isinstance(target, dict):
+            return  # An ordered dictionary's own attributes (torch: layer versions) carry no weights.
+        if not isinstance(target, Inert):
+            raise UnsafeCheckpointError(
+                f"its pickle sets attributes of a {type(target).__name__}; nothing was run"
+            )
+        if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
+            raise CheckpointError(f"its pickle gives {target.name} a state that is not a dictionary")
+        target.state.update(state)
+
+    def persistent_id(self) -> None:
+        identity = self._pop()
+        if not isinstance(identity, tuple):
+            raise CheckpointError("its pickle names a storage by something else than a tuple")
+        self._push(self._persistent(identity))
+
+
+def _text(data: bytes) -> str:
+    try:
+        return data.decode("utf-8", "surrogatepass")
+    except UnicodeDecodeError:
+        raise CheckpointError("its pickle holds a text that is not UTF-8") from None
+
+
+_HANDLERS: dict[bytes, Callable[[_Machine], None]] = {
+    b"\x80": _Machine.proto,
+    b"(": _Machine.mark,
+    b"N": lambda machine: machine._push(None),
+    b"\x88": lambda machine: machine._push(True),
+    b"\x89": lambda machine: machine._push(False),
+    b"K": lambda machine: machine._push(machine._unsigned(1)),
+    b"M": lambda machine: machine._push(machine._unsigned(2)),
+    b"J": _Machine.integer,
+    b"\x8a": _Machine.long,
+    b"G": _Machine.real,
+    b"X": _Machine.text,
+    b")": lambda machine: machine._push(()),
+    b"t": _Machine.tuple_to_mark,
+    b"\x85": lambda machine: machine.tuple_of(1),
+    b"\x86": lambda machine: machine.tuple_of(2),
+    b"\x87": lambda machine: machine.tuple_of(3),
+    b"]": lambda machine: machine._push([]),
+    b"a": _Machine.append,
+    b"e": _Machine.appends,
+    b"}": lambda machine: machine._push({}),
+    b"s": _Machine.set_item,
+    b"u": _Machine.set_items,
+    b"q": lambda machine: machine.put(1),
+    b"r": lambda machine: machine.put(4),
+    b"h": lambda machine: machine.get(1),
+    b"j": lambda machine: machine.get(4),
+    b"c": _Machine.global_name,
+    b"R": _Machine.reduce,
+    b"\x81": _Machine.new_object,
+    b"b": _Machine.build,
+    b"Q": _Machine.persistent_id,
+}

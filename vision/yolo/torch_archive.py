@@ -1,0 +1,292 @@
+"""The zip archive that `torch.save` writes, read without running anything in it.
+
+`data.pkl` describes the value; each storage is a member `data/<key>` of raw little-endian numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vision.yolo.safe_pickle import Admitted, CheckpointError, UnsafeCheckpointError, unpickle
+
+_STORAGES: dict[str, torch.dtype] = {
+    "torch.DoubleStorage": torch.float64,
+    "torch.FloatStorage": torch.float32,
+    "torch.HalfStorage": torch.float16,
+    "torch.BFloat16Storage": torch.bfloat16,
+    "torch.LongStorage": torch.int64,
+    "torch.IntStorage": torch.int32,
+    "torch.ShortStorage": torch.int16,
+    "torch.CharStorage": torch.int8,
+    "torch.ByteStorage": torch.uint8,
+    "torch.BoolStorage": torch.bool,
+}
+
+# Layers and values that detection checkpoints hold. Each becomes an inert record; that a name stands here
+# lets the file be read, so that the builder can name the layer it does not know.
+_INERT = (
+    *(
+        f"torch.nn.modules.{name}"
+        for name in (
+            "activation.GELU",
+            "activation.Hardswish",
+            "activation.LeakyReLU",
+            "activation.ReLU",
+            "activation.ReLU6",
+            "activation.SiLU",
+            "activation.Sigmoid",
+            "batchnorm.BatchNorm2d",
+            "container.ModuleList",
+            "container.Sequential",
+            "conv.Conv2d",
+            "conv.ConvTranspose2d",
+            "dropout.Dropout",
+            "linear.Identity",
+            "linear.Linear",
+            "module.Module",
+            "pooling.AdaptiveAvgPool2d",
+            "pooling.MaxPool2d",
+            "upsampling.Upsample",
+        )
+    ),
+    *(
+        f"ultralytics.nn.modules.{name}"
+        for name in (
+            "block.Attention",
+            "block.Bottleneck",
+            "block.C2PSA",
+            "block.C2f",
+            "block.C3",
+            "block.C3k",
+            "block.C3k2",
+            "block.DFL",
+            "block.PSABlock",
+            "block.Proto",
+            "block.SPPF",
+            "conv.Concat",
+            "conv.Conv",
+            "conv.DWConv",
+            "head.Classify",
+            "head.Detect",
+            "head.OBB",
+            "head.Pose",
+            "head.Segment",
+        )
+    ),
+    "ultralytics.nn.tasks.ClassificationModel",
+    "ultralytics.nn.tasks.DetectionModel",
+    "ultralytics.nn.tasks.OBBModel",
+    "ultralytics.nn.tasks.PoseModel",
+    "ultralytics.nn.tasks.SegmentationModel",
+    "ultralytics.utils.IterableSimpleNamespace",
+    "ultralytics.yolo.utils.IterableSimpleNamespace",
+    "numpy.core.multiarray.scalar",
+    "numpy._core.multiarray.scalar",
+    "numpy.dtype",
+    "pathlib.PosixPath",
+    "pathlib.PurePosixPath",
+    "pathlib.WindowsPath",
+    "_codecs.encode",
+    "torch.device",
+)
+_LARGEST_PICKLE_BYTES = 64 << 20
+_MOST_MEMBERS = 100_000
+_MOST_DIMENSIONS = 8
+# Views may share a storage (a state dictionary beside its model), but not without end.
+_MOST_VIEWS_PER_ELEMENT = 4
+
+
+def read_archive(path: str | Path) -> Any:
+    """The value that was saved at `path`: containers, scalars, CPU tensors, `Inert` records for the rest.
+
+    Raises:
+        UnsafeCheckpointError: the file asks for something that is not admitted, by name.
+        CheckpointError: missing, empty, truncated, not an archive of `torch.save`. One line naming the file.
+    """
+    path = Path(path)
+    try:
+        return _read(path)
+    except CheckpointError as error:
+        raise type(error)(f"{path}: {error}") from None
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such file; give the path of a .pt checkpoint") from None
+    except IsADirectoryError:
+        raise CheckpointError(f"{path}: is a folder; give the path of a .pt checkpoint") from None
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _read(path: Path) -> Any:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if size == 0:
+            raise CheckpointError("the file is empty; copy or download it again")
+        if file.read(2) != b"PK":
+            raise CheckpointError(
+                "not a checkpoint: expected the zip archive that torch.save writes (torch 1.6 or newer)"
+            )
+        file.seek(0)
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return _Archive(archive, size).value()
+        # What the zip module raises for damaged headers, encryption, unknown compression and bad names.
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            struct.error,
+            NotImplementedError,
+            EOFError,
+            KeyError,
+            RuntimeError,
+            UnicodeError,
+            OverflowError,
+        ) as error:
+            raise CheckpointError(
+                f"the archive is truncated or damaged ({error}); copy or download it again"
+            ) from None
+
+
+class _Archive:
+    """One open archive; storages are read when the pickle names them."""
+
+    def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
+        self._archive = archive
+        members = archive.infolist()
+        if len(members) > _MOST_MEMBERS:
+            raise CheckpointError(f"the archive has {len(members)} members, a checkpoint far fewer")
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise CheckpointError("the archive is compressed, torch.save never does; save the model again")
+        if sum(member.file_size for member in members) > size:
+            raise CheckpointError("the archive's members are larger than the file; it is not a checkpoint")
+        self._members = {member.filename: member for member in members}
+        if len(self._members) != len(members):
+            raise CheckpointError("the archive has two members of one name; it is not a checkpoint")
+        pickles = [name for name in self._members if PurePosixPath(name).name == "data.pkl"]
+        if len(pickles) != 1:
+            raise CheckpointError(f"the archive has {len(pickles)} data.pkl, a checkpoint has one")
+        self._root = pickles[0].removesuffix("data.pkl")
+        if any(name.startswith(f"{self._root}code/") for name in self._members):
+            raise CheckpointError(
+                "the file is a TorchScript program, not a checkpoint; give the .pt of training"
+            )
+        order = self._members.get(f"{self._root}byteorder")
+        if order is not None and self._bytes(order, 16) != b"little":
+            raise CheckpointError("its numbers are big-endian; save it on a little-endian machine")
+        self._storages: dict[str, Tensor] = {}
+        self._views_left = _MOST_VIEWS_PER_ELEMENT * size
+
+    def value(self) -> Any:
+        data = self._bytes(self._members[f"{self._root}data.pkl"], _LARGEST_PICKLE_BYTES)
+        return unpickle(data, self._admitted(), self._storage)
+
+    def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
+        if largest is not None and member.file_size > largest:
+            raise CheckpointError(
+                f"{member.filename} has {member.file_size} bytes, at most {largest} make sense"
+            )
+        return self._archive.read(member)
+
+    def _admitted(self) -> dict[str, Admitted]:
+        calls = {
+            "torch._utils._rebuild_tensor_v2": self._tensor,
+            "torch._utils._rebuild_parameter": _parameter,
+            "torch._utils._rebuild_parameter_with_state": _parameter,
+            "torch.Size": _size,
+            "collections.OrderedDict": _dictionary,
+            "__builtin__.set": _set,
+            "builtins.set": _set,
+        }
+        return (
+            {name: Admitted(name) for name in (*_INERT, *_STORAGES)}
+            | {name: Admitted(name, make) for name, make in calls.items()}
+        )  # fmt: skip
+
+    def _storage(self, identity: tuple[Any, ...]) -> Tensor:
+        """('storage', type, key, location, number of elements) → those elements, flat."""
+        if len(identity) != 5 or identity[0] != "storage":
+            raise CheckpointError("its pickle refers to something else than a storage")
+        _, kind, key, _, count = identity
+        dtype = _STORAGES.get(kind.name) if isinstance(kind, Admitted) else None
+        if dtype is None or not isinstance(key, str) or type(count) is not int or count < 0:
+            raise CheckpointError("its pickle refers to a storage in an unknown way")
+        stored = self._storages.get(key)
+        if stored is None:
+            member = self._members.get(f"{self._root}data/{key}")
+            if member is None:
+                raise CheckpointError(f"storage {key!r:.100} is missing from the archive")
+            if member.file_size != count * dtype.itemsize:
+                raise CheckpointError(
+                    f"storage {key!r:.100} should have {count} numbers of {dtype.itemsize} bytes, "
+                    f"it has {member.file_size} bytes"
+                )
+            data = bytearray(self._bytes(member))
+            stored = torch.frombuffer(data, dtype=dtype) if count else torch.empty(0, dtype=dtype)
+            self._storages[key] = stored
+        if stored.dtype != dtype or stored.numel() != count:
+            raise CheckpointError(f"storage {key!r:.100} is described in two ways")
+        return stored
+
+    def _tensor(self, arguments: tuple[Any, ...]) -> Tensor:
+        """(storage, offset, size, stride, …) → that view of the storage, its bounds checked."""
+        if len(arguments) < 4:
+            raise CheckpointError("its pickle has a tensor without a shape")
+        storage, offset, size, stride = arguments[:4]
+        shape_is_sound = (
+            isinstance(storage, Tensor)
+            and storage.dim() == 1
+            and type(offset) is int
+            and _are_counts(size)
+            and _are_counts(stride)
+            and len(size) == len(stride) <= _MOST_DIMENSIONS
+            and offset >= 0
+        )
+        if not shape_is_sound:
+            raise CheckpointError("its pickle has a tensor of an impossible shape")
+        count = math.prod(size)
+        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if count else -1
+        if last >= storage.numel() or count > storage.numel():
+            raise CheckpointError(
+                f"its pickle has a tensor of size {size} that is larger than its storage ({storage.numel()})"
+            )
+        self._views_left -= count
+        if self._views_left < 0:
+            raise CheckpointError("its tensors repeat the same numbers too often; it is not a checkpoint")
+        return storage.as_strided(size, stride, offset) if count else storage.new_empty(size)
+
+
+def _are_counts(values: object) -> bool:
+    return isinstance(values, tuple) and all(type(value) is int and 0 <= value < 1 << 40 for value in values)
+
+
+def _parameter(arguments: tuple[Any, ...]) -> Tensor:
+    tensor = arguments[0] if arguments else None
+    if not isinstance(tensor, Tensor):
+        raise CheckpointError("its pickle has a parameter without a tensor")
+    return tensor
+
+
+def _size(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    if len(arguments) != 1 or not isinstance(arguments[0], list | tuple):
+        raise CheckpointError("its pickle has a size without numbers")
+    return tuple(arguments[0])
+
+
+def _dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
+    if arguments:
+        raise UnsafeCheckpointError("its pickle fills an ordered dictionary by a call; nothing was run")
+    return {}
+
+
+def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
+    values = arguments[0] if len(arguments) == 1 else None
+    if not isinstance(values, list) or not all(isinstance(value, str | int | float) for value in values):
+        raise CheckpointError("its pickle has a set of something else than names and numbers")
+    return frozenset(values)
