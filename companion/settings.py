@@ -1,0 +1,294 @@
+"""Everything that can be set: one frozen value, a section for each part of the service.
+
+Every key is declared once, with its default, its range and one line of help; the file's comments, the flags,
+the checks and their messages (`config.py`) all come from that declaration.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+
+from vision.camera_model import CameraModel, CameraMount
+from vision.sources.source import SourceSettings
+
+# What `vision.detector` calls the bundled model. Named here too, as importing that module would load torch.
+DEFAULT_MODEL = "default"
+
+
+class Section(BaseModel):
+    """One table of the file. Values are never changed and never guessed from another type."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+# One word of a zenoh key expression: no `/`, and none of its wildcards and separators `* $ ? # @`.
+KeyWord = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+VehicleUrl = Annotated[
+    str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
+]
+ZenohEndpoint = Annotated[
+    str,
+    StringConstraints(pattern=r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$"),
+]
+
+# What a pattern means, in words, for a person whose value did not match it.
+PATTERN_MEANINGS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
+    r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
+        "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
+    ),
+    r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$": (
+        "a zenoh endpoint such as tcp/192.168.1.5:7447"
+    ),
+}
+
+
+class VehicleSection(Section):
+    """The autopilot, and what the vehicle is called."""
+
+    url: VehicleUrl = "udpin://127.0.0.1:14540"
+    """where the autopilot is: udpin:// (listen), udpout:// or tcp://HOST:PORT, or serial:///dev/ttyAMA0:921600"""
+    driver: Literal["mavsdk", "pymavlink"] = "mavsdk"
+    """the library that speaks MAVLink"""
+    system_id: Annotated[int, Field(ge=1, le=255)] = 1
+    """the autopilot's MAVLink system id"""
+    name: KeyWord = "vehicle1"
+    """what the vehicle is called in zenoh's keys: companion/NAME/detections"""
+    connect_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    """how long to wait for the autopilot's first heartbeat, seconds"""
+
+
+class SourceSection(Section):
+    """Where frames come from."""
+
+    uri: Annotated[str, Field(min_length=1)] = "/dev/video0"
+    """a video file, a folder of images, /dev/video0, a FIFO or - (standard input), rtsp://, http:// or udp://"""
+    width: Annotated[int | None, Field(ge=16, le=16384)] = None
+    """of a frame, pixels; asked of a camera, and needed for raw frames from a pipe"""
+    height: Annotated[int | None, Field(ge=16, le=16384)] = None
+    """of a frame, pixels, as width"""
+    rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
+    """frames a second; asked of a camera, and the pace of images and raw files"""
+    pixel_format: str | None = None
+    """a camera's four letters (MJPG, YUYV), or what a pipe carries: bgr24, rgb24, gray8, y4m, mjpeg"""
+    loop: bool = False
+    """begin a file or folder again when it ends"""
+    realtime: bool = True
+    """play a file or folder at its own pace, as a camera would; false: every frame, as fast as can be"""
+    every_frame: bool | None = None
+    """pipes only: true: every frame, and the writer waits; false: the newest; unset: true for a regular file"""
+    open_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
+    """how long the first frame may take at start, seconds"""
+    read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
+    """a live source that is silent for so long is opened again, seconds"""
+
+    @model_validator(mode="after")
+    def _can_be_opened(self) -> Self:
+        self.opening()
+        return self
+
+    def opening(self) -> SourceSettings:
+        """The same, as `vision.sources.open_source` takes it. Raises ValueError for a bad pixel format."""
+        return SourceSettings(**self.model_dump(exclude={"uri"}))
+
+
+class CameraSection(Section):
+    """The lens, and how the camera is mounted. Body frame: forward, right, down."""
+
+    horizontal_fov_deg: Annotated[float, Field(gt=1, lt=179)] = 80.0
+    """field of view from the left edge to the right, degrees; unused when fx_px is set"""
+    mount_forward_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """the camera's place ahead of the autopilot, metres"""
+    mount_right_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """the camera's place to the right of the autopilot, metres"""
+    mount_down_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """the camera's place below the autopilot, metres"""
+    mount_roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """the camera's roll on the body, degrees"""
+    mount_pitch_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
+    """the camera's pitch on the body, degrees; negative looks down"""
+    mount_yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """the camera's yaw on the body, degrees clockwise"""
+    fx_px: Annotated[float | None, Field(gt=0)] = None
+    """calibrated focal length along x, pixels; with it fy_px, cx_px, cy_px and calibrated_* are needed"""
+    fy_px: Annotated[float | None, Field(gt=0)] = None
+    """calibrated focal length along y, pixels"""
+    cx_px: float | None = None
+    """calibrated principal point, pixels from the left"""
+    cy_px: float | None = None
+    """calibrated principal point, pixels from the top"""
+    calibrated_width: Annotated[int | None, Field(ge=16, le=16384)] = None
+    """width of the pictures that calibrated the camera, pixels"""
+    calibrated_height: Annotated[int | None, Field(ge=16, le=16384)] = None
+    """height of the pictures that calibrated the camera, pixels"""
+    distortion: tuple[float, ...] = ()
+    """k1, k2, p1, p2, k3 in OpenCV's order: none, four or five numbers"""
+
+    @model_validator(mode="after")
+    def _calibration_is_whole(self) -> Self:
+        calibration = {
+            name: getattr(self, name)
+            for name in ("fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height")
+        }
+        missing = [name for name, value in calibration.items() if value is None]
+        if missing and len(missing) < len(calibration):
+            raise ValueError(f"a calibration needs all of {', '.join(calibration)}; {missing[0]} is not set")
+        if len(self.distortion) not in (0, 4, 5):
+            raise ValueError(f"distortion must have 0, 4 or 5 numbers, got {len(self.distortion)}")
+        return self
+
+    def model(self, width: int, height: int) -> CameraModel:
+        """The camera's model for frames of this size, pixels."""
+        if (
+            self.fx_px is None
+            or self.fy_px is None
+            or self.cx_px is None
+            or self.cy_px is None
+            or self.calibrated_width is None
+            or self.calibrated_height is None
+        ):
+            fov_rad = math.radians(self.horizontal_fov_deg)
+            ideal = CameraModel.from_horizontal_fov(width, height, fov_rad)
+            return CameraModel(width, height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, self.distortion)
+        calibrated = CameraModel(
+            self.calibrated_width,
+            self.calibrated_height,
+            self.fx_px,
+            self.fy_px,
+            self.cx_px,
+            self.cy_px,
+            self.distortion,
+        )
+        return calibrated.scaled(width, height)
+
+    def mount(self) -> CameraMount:
+        """How the camera sits on the body."""
+        return CameraMount(
+            self.mount_forward_m,
+            self.mount_right_m,
+            self.mount_down_m,
+            math.radians(self.mount_roll_deg),
+            math.radians(self.mount_pitch_deg),
+            math.radians(self.mount_yaw_deg),
+        )
+
+
+class DetectorSection(Section):
+    """What looks for objects in the frames."""
+
+    enabled: bool = True
+    """false: frames are read and nothing is looked for"""
+    model: Annotated[str, Field(min_length=1)] = DEFAULT_MODEL
+    """a YOLOv8 checkpoint (.pt); default: the model of this package, which knows drawn scenes"""
+    classes: tuple[str | int, ...] = ()
+    """only these classes, by name or id; none: all that the model knows"""
+    confidence: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """the smallest confidence kept"""
+    iou: Annotated[float, Field(ge=0, le=1)] = 0.7
+    """boxes of one class that overlap by more than this are one object"""
+    image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
+    """the frame's longer side as the network sees it, pixels"""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
+    threads: Annotated[int | None, Field(ge=1, le=256)] = None
+    """processor threads of the network; unset: as many as torch takes by itself"""
+    every: Annotated[int, Field(ge=1, le=1000)] = 1
+    """look at every N-th frame only"""
+
+
+class GuidanceSection(Section):
+    """How the vehicle may be moved, and when what we know is too old to move by."""
+
+    rate_hz: Annotated[float, Field(ge=5, le=200)] = 20.0
+    """how often a behaviour is asked where to go, times a second"""
+    max_horizontal_speed_mps: Annotated[float, Field(gt=0, le=30)] = 5.0
+    """largest horizontal speed asked for, metres a second"""
+    max_climb_mps: Annotated[float, Field(gt=0, le=10)] = 2.0
+    """largest climb rate asked for, metres a second"""
+    max_descent_mps: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """largest descent rate asked for, metres a second"""
+    max_yaw_rate_radps: Annotated[float, Field(gt=0, le=6)] = 1.0
+    """largest turn rate asked for, radians a second"""
+    max_acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 2.0
+    """largest change of the velocity asked for, metres a second squared"""
+    min_altitude_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    """never asks to fly lower than this above home (landing is the autopilot's own), metres"""
+    max_altitude_m: Annotated[float, Field(gt=0, le=5000)] = 50.0
+    """never asks to fly higher than this above home, metres"""
+    max_distance_m: Annotated[float, Field(gt=0, le=100000)] = 200.0
+    """never asks to fly farther than this from home, metres"""
+    setpoint_rate_hz: Annotated[float, Field(ge=5, le=250)] = 50.0
+    """setpoints a second on the link; PX4 needs more than 2"""
+    setpoint_lifetime_s: Annotated[float, Field(ge=0.02, le=2)] = 0.3
+    """a setpoint older than this is not sent any more, seconds"""
+    brake_s: Annotated[float, Field(ge=0, le=5)] = 0.5
+    """after that a brake is sent for so long, then nothing, and the autopilot's failsafe acts; seconds"""
+    perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
+    """detections older than this do not steer, seconds from capture"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.min_altitude_m >= self.max_altitude_m:
+            raise ValueError(
+                f"min_altitude_m must be below max_altitude_m, got {self.min_altitude_m:g} "
+                f"and {self.max_altitude_m:g}"
+            )
+        if self.setpoint_lifetime_s <= 1 / self.rate_hz:
+            raise ValueError(
+                f"setpoint_lifetime_s must be longer than one period of rate_hz ({1 / self.rate_hz:.3g} s), "
+                f"got {self.setpoint_lifetime_s:g}: each setpoint would expire before the next"
+            )
+        return self
+
+
+class ZenohSection(Section):
+    """The network on which detections are published and commands are taken."""
+
+    mode: Literal["peer", "client"] = "peer"
+    """peer: talks to others directly; client: through the router at `connect`"""
+    connect: tuple[ZenohEndpoint, ...] = ()
+    """endpoints to connect to, e.g. tcp/192.168.1.5:7447; retried until they answer"""
+    listen: tuple[ZenohEndpoint, ...] = ("tcp/127.0.0.1:7447",)
+    """endpoints to listen on (peer only); tcp/0.0.0.0:7447 lets the whole network in"""
+    multicast_scouting: bool = False
+    """find other peers on the local network by multicast"""
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Self:
+        if self.mode == "client" and not self.connect and not self.multicast_scouting:
+            raise ValueError("a client needs an endpoint in connect, or multicast_scouting = true")
+        return self
+
+
+class RecordingSection(Section):
+    """What is kept on disk."""
+
+    video: str | None = None
+    """an .mp4 file to write the annotated video to; unset: none"""
+    rate_hz: Annotated[float, Field(gt=0, le=240)] = 20.0
+    """frames a second of that video"""
+
+
+class LogSection(Section):
+    """What is said on standard error."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    """the least severe lines that are printed"""
+
+
+class Settings(Section):
+    """Everything that can be set."""
+
+    vehicle: VehicleSection = VehicleSection()
+    source: SourceSection = SourceSection()
+    camera: CameraSection = CameraSection()
+    detector: DetectorSection = DetectorSection()
+    guidance: GuidanceSection = GuidanceSection()
+    zenoh: ZenohSection = ZenohSection()
+    recording: RecordingSection = RecordingSection()
+    log: LogSection = LogSection()
