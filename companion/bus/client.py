@@ -1,0 +1,88 @@
+"""The other side of the bus, for the command line and for tests: send a command, listen to topics."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import zenoh
+
+from companion.bus.session import zenoh_config
+from companion.bus.topics import ROOT, command_key
+from companion.settings import ZenohSection
+
+
+class NoAnswerError(TimeoutError):
+    """No service answered. The message is one line for a person."""
+
+
+def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> ZenohSection:
+    """How to reach the service that has these settings: as a peer that connects to where it listens."""
+    endpoints = connect or settings.connect or settings.listen
+    return ZenohSection(
+        mode="peer",
+        connect=tuple(endpoint.replace("0.0.0.0", "127.0.0.1") for endpoint in endpoints),
+        listen=(),
+        multicast_scouting=settings.multicast_scouting,
+    )
+
+
+@contextmanager
+def open_client(settings: ZenohSection, *, timeout_s: float = 5.0) -> Iterator[zenoh.Session]:
+    """A session connected to somebody.
+
+    Raises:
+        NoAnswerError: nobody was there within `timeout_s`.
+    """
+    session = zenoh.open(zenoh_config(settings))
+    try:
+        deadline = time.monotonic() + timeout_s
+        while not (list(session.info.routers_zid()) or list(session.info.peers_zid())):
+            if time.monotonic() > deadline:
+                where = ", ".join(settings.connect) or "the local network"
+                raise NoAnswerError(
+                    f"no zenoh node answers at {where}: is `companion run` running? "
+                    "(--connect names another place)"
+                )
+            time.sleep(0.02)
+        yield session
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def send_command(
+    session: zenoh.Session, vehicle: str, text: str, *, timeout_s: float = 120.0
+) -> dict[str, Any]:
+    """Send one command and wait for its outcome: {"success": bool, "reason": str, ...}.
+
+    Raises:
+        NoAnswerError: no service for this vehicle, or it did not end in `timeout_s`.
+    """
+    # The queryable's declaration may still be on its way just after connecting.
+    deadline = time.monotonic() + min(3.0, timeout_s)
+    while True:
+        for reply in session.get(command_key(vehicle), payload=text, timeout=timeout_s):
+            if reply.ok is not None:
+                answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
+                return answer
+        if time.monotonic() > deadline:
+            raise NoAnswerError(
+                f"no service answered for vehicle {vehicle!r} on {command_key(vehicle)}: "
+                f"wrong vehicle.name, or it did not end within {timeout_s:g} s"
+            )
+        time.sleep(0.05)
+
+
+def listen(
+    session: zenoh.Session, key: str, on_message: Callable[[str, str], None]
+) -> zenoh.Subscriber[None]:
+    """Call back, on a thread of zenoh's, with (key, text) of every message on `key` (wildcards allowed)."""
+    full = key if key.startswith(f"{ROOT}/") else f"{ROOT}/*/{key}"
+
+    def receive(sample: zenoh.Sample) -> None:
+        on_message(str(sample.key_expr), sample.payload.to_string())
+
+    return session.declare_subscriber(full, receive)

@@ -1,0 +1,210 @@
+"""The service's zenoh session: publishes the topics, takes commands, says when the router is gone.
+
+zenoh calls back on threads of its own; whatever comes in hops into the asyncio loop. A publication never
+waits: `DROP` where the network is slow. While the session is not open yet, what is published is counted as
+unsent, not queued: old detections are of no use to anybody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from typing import Any
+
+import zenoh
+
+from companion.bus.topics import TOPICS, Topic, command_key
+from companion.settings import ZenohSection
+
+logger = logging.getLogger(__name__)
+
+CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
+
+_RETRY_MIN_S, _RETRY_MAX_S = 0.5, 5.0
+_WATCH_PERIOD_S = 0.25
+
+
+class BusError(ConnectionError):
+    """The zenoh session cannot be opened at all (a busy port, a bad endpoint)."""
+
+
+def zenoh_config(settings: ZenohSection) -> zenoh.Config:
+    """zenoh's own configuration for these settings."""
+    config = zenoh.Config()
+    values = {
+        "mode": settings.mode,
+        "connect/endpoints": list(settings.connect),
+        "listen/endpoints": list(settings.listen) if settings.mode == "peer" else [],
+        "scouting/multicast/enabled": settings.multicast_scouting,
+        "timestamping/enabled": True,
+    }
+    if settings.mode == "peer":
+        # A peer starts without its router and goes on looking for it.
+        values["connect/exit_on_failure"] = False
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Bus:
+    """One vehicle's publications and its command queryable.
+
+    Args:
+        on_event: called with (level, text) when the network is lost or found.
+        on_command: answers a command's text with a JSON-able reply; called in the loop, one task each.
+    """
+
+    def __init__(
+        self,
+        settings: ZenohSection,
+        vehicle: str,
+        *,
+        on_event: Callable[[str, str], None],
+        on_command: CommandHandler,
+    ) -> None:
+        self._settings = settings
+        self._vehicle = vehicle
+        self._on_event = on_event
+        self._on_command = on_command
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._connected = False
+        self._token: zenoh.LivelinessToken | None = None
+        self._queryable: zenoh.Queryable[None] | None = None
+        self.published: dict[str, int] = {topic.name: 0 for topic in TOPICS}
+        self.unsent = 0
+
+    @property
+    def open(self) -> bool:
+        """The session is there and publications go out."""
+        return self._session is not None
+
+    @property
+    def connected(self) -> bool:
+        """Every endpoint in `connect` was asked for none, or at least one other node is connected."""
+        return self.open and (self._connected or not self._settings.connect)
+
+    async def start(self) -> None:
+        """Open the session: at once as a peer, as soon as the router answers as a client.
+
+        Raises:
+            BusError: a peer cannot listen where it should.
+        """
+        self._loop = asyncio.get_running_loop()
+        if self._settings.mode == "peer":
+            try:
+                self._adopt(await asyncio.to_thread(zenoh.open, zenoh_config(self._settings)))
+            except zenoh.ZError as error:
+                endpoints = ", ".join(self._settings.listen)
+                raise BusError(
+                    f"zenoh cannot listen on {endpoints}: {_first_line(error)}. "
+                    "Is a router or another service there? Then set zenoh.connect to it and zenoh.listen to none"
+                ) from error
+        self._spawn(self._watch())
+
+    async def close(self) -> None:
+        """End the session; bounded in time."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        session, self._session = self._session, None
+        self._publishers.clear()
+        if session is not None:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(asyncio.to_thread(session.close), 3.0)
+
+    def publish(self, topic: Topic, value: Any) -> None:
+        """Publish a JSON-able value, or a text as it is. Never blocks, never raises for the network."""
+        publisher = self._publishers.get(topic.name)
+        if publisher is None:
+            self.unsent += 1
+            return
+        payload = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+        try:
+            publisher.put(payload)
+        except zenoh.ZError as error:
+            self.unsent += 1
+            logger.warning("zenoh did not take a message for %s: %s", topic.name, _first_line(error))
+            return
+        self.published[topic.name] += 1
+
+    def _adopt(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._publishers = {
+            topic.name: session.declare_publisher(
+                topic.key(self._vehicle),
+                encoding=topic.encoding,
+                congestion_control=topic.congestion_control,
+                priority=topic.priority,
+                express=topic.express,
+            )
+            for topic in TOPICS
+        }
+        # Presence for free: the token goes when we go, however we go.
+        self._token = session.liveliness().declare_token(f"companion/{self._vehicle}/alive")
+        self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
+
+    def _from_zenoh_thread(self, query: zenoh.Query) -> None:
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(lambda: self._spawn(self._answer(query)))
+
+    async def _answer(self, query: zenoh.Query) -> None:
+        text = _command_text(query)
+        reply = await self._on_command(text)
+        with query:
+            query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    async def _watch(self) -> None:
+        """Open the session if it is not (client), then tell when the nodes in `connect` come and go."""
+        delay_s, told = _RETRY_MIN_S, False
+        endpoints = ", ".join(self._settings.connect)
+        while self._session is None:
+            try:
+                self._adopt(await asyncio.to_thread(zenoh.open, zenoh_config(self._settings)))
+            except zenoh.ZError:
+                if not told:
+                    self._on_event("warning", f"zenoh: nobody answers at {endpoints}; trying on")
+                    told = True
+                await asyncio.sleep(delay_s)
+                delay_s = min(2 * delay_s, _RETRY_MAX_S)
+        if not self._settings.connect:
+            return
+        while True:
+            info = self._session.info
+            connected = bool(list(info.routers_zid()) or list(info.peers_zid()))
+            if connected != self._connected or (not connected and not told):
+                self._connected, told = connected, True
+                if connected:
+                    self._on_event("info", f"zenoh: connected to {endpoints}")
+                else:
+                    self._on_event(
+                        "warning", f"zenoh: no connection to {endpoints}; nobody gets detections, trying on"
+                    )
+            await asyncio.sleep(_WATCH_PERIOD_S)
+
+    def _spawn(self, work: Any) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._finished)
+
+    def _finished(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logger.error("zenoh task failed", exc_info=error)
+
+
+def _command_text(query: zenoh.Query) -> str:
+    """The command in the query's payload, or in its parameter `text` (`…/command?text=hold`)."""
+    if query.payload is not None and len(query.payload):
+        return query.payload.to_string()
+    return str(query.parameters.get("text", ""))
+
+
+def _first_line(error: BaseException) -> str:
+    """zenoh's errors end with a place in its source; a person needs what stands before."""
+    return str(error).splitlines()[0].split(" at /")[0].strip() if str(error) else type(error).__name__

@@ -1,0 +1,86 @@
+"""The one table of what is published: key, encoding, rate, maximum age, quality of service.
+
+A topic's key is `companion/<vehicle>/<name>`. Readers that steer by a topic must refuse it past `max_age_s`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import zenoh
+
+ROOT = "companion"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One stream.
+
+    Attributes:
+        rate_hz: nominal; None where it follows the camera or happens on occasion.
+        max_age_s: past this a value says nothing of the present; None where it does not age (events).
+        encoding: of the payload.
+        priority, congestion_control, express: zenoh's quality of service. Nothing here ever blocks the sender
+            but events, which are few and must not be lost.
+    """
+
+    name: str
+    rate_hz: float | None
+    max_age_s: float | None
+    encoding: zenoh.Encoding
+    priority: zenoh.Priority
+    congestion_control: zenoh.CongestionControl
+    express: bool
+    description: str
+
+    def key(self, vehicle: str) -> str:
+        """The zenoh key of one vehicle's stream."""
+        return f"{ROOT}/{vehicle}/{self.name}"
+
+
+_JSON = zenoh.Encoding.APPLICATION_JSON
+_DROP = zenoh.CongestionControl.DROP
+_REAL_TIME = zenoh.Priority.REAL_TIME
+_DATA = zenoh.Priority.DATA
+
+DETECTIONS: Final = Topic(
+    "detections", None, 0.5, _JSON, _REAL_TIME, _DROP, True, "what one frame shows, one message a frame"
+)
+LABELS: Final = Topic(
+    "labels",
+    None,
+    0.5,
+    zenoh.Encoding.TEXT_PLAIN,
+    _DATA,
+    _DROP,
+    False,
+    "the class names of one frame, comma separated",
+)
+VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, _DROP, True, "state of the vehicle")
+SETPOINT: Final = Topic(
+    "setpoint", 10.0, 0.5, _JSON, _DATA, _DROP, True, "the setpoint asked for and the one sent"
+)
+STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, _DROP, False, "how every part of the service is")
+EVENTS: Final = Topic(
+    "events",
+    None,
+    None,
+    _JSON,
+    _DATA,
+    zenoh.CongestionControl.BLOCK,
+    False,
+    "what happened: modes, behaviours, parts lost and found",
+)
+
+TOPICS: Final = (DETECTIONS, LABELS, VEHICLE, SETPOINT, STATUS, EVENTS)
+
+# The last name of the queryable that takes a command and answers with its outcome.
+COMMAND: Final = "command"
+
+NO_OBJECTS = "no objects detected"
+
+
+def command_key(vehicle: str) -> str:
+    """The queryable that takes commands for one vehicle."""
+    return f"{ROOT}/{vehicle}/{COMMAND}"
