@@ -259,7 +259,8 @@ class _Archive:
         self._views_left -= count
         if self._views_left < 0:
             raise CheckpointError("its tensors repeat the same numbers too often; it is not a checkpoint")
-        return storage.as_strided(size, stride, offset) if count else storage.new_empty(size)
+        view: Tensor = storage.as_strided(size, stride, offset) if count else storage.new_empty(size)
+        return view
 
 
 def _are_counts(values: object) -> bool:

@@ -1,0 +1,125 @@
+"""Fitting a frame into the network's input: resized with its aspect kept, padded with grey, and the way back.
+
+The conventions (114 as padding, which side gets the odd pixel, where rounding happens) are those under which
+YOLOv8 networks are trained and published; half a pixel off costs accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+PADDING = 114
+STRIDE = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Letterbox:
+    """Where a frame lies in the network's input. All sizes in pixels.
+
+    Attributes:
+        frame_width, frame_height: the frame.
+        width, height: the network's input, multiples of the stride.
+        resized_width, resized_height: the frame inside the input.
+        left, top: of the frame inside the input.
+    """
+
+    frame_width: int
+    frame_height: int
+    width: int
+    height: int
+    resized_width: int
+    resized_height: int
+    left: int
+    top: int
+
+    def apply(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(frame_height, frame_width, 3) uint8 → (height, width, 3) uint8, the same channel order."""
+        if image.shape != (self.frame_height, self.frame_width, 3):
+            raise ValueError(
+                f"this letterbox is for ({self.frame_height}, {self.frame_width}, 3), got {image.shape}"
+            )
+        if (self.width, self.height) == (self.frame_width, self.frame_height):
+            return image
+        boxed = np.full((self.height, self.width, 3), PADDING, np.uint8)
+        inside = boxed[self.top : self.top + self.resized_height, self.left : self.left + self.resized_width]
+        if (self.resized_width, self.resized_height) == (self.frame_width, self.frame_height):
+            inside[:] = image
+        else:
+            size = (self.resized_width, self.resized_height)
+            inside[:] = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+        return boxed
+
+    def to_frame(self, xyxy: NDArray[Any]) -> NDArray[np.float32]:
+        """(N, 4) boxes in the network's input → (N, 4) float32 in the frame, clipped to it."""
+        boxes = (np.asarray(xyxy, np.float32).reshape(-1, 4) - self._corner) / self._scale
+        limits = np.array([self.frame_width, self.frame_height] * 2, np.float32)
+        clipped: NDArray[np.float32] = np.clip(boxes, 0, limits, dtype=np.float32)
+        return clipped
+
+    def to_input(self, xyxy: NDArray[Any]) -> NDArray[np.float32]:
+        """(N, 4) boxes in the frame → (N, 4) float32 in the network's input."""
+        boxes: NDArray[np.float32] = np.asarray(xyxy, np.float32).reshape(-1, 4) * self._scale + self._corner
+        return boxes
+
+    @property
+    def _scale(self) -> NDArray[np.float32]:
+        # Sizes are whole pixels, so the two axes differ by a little, and small boxes would feel it.
+        across, down = self.resized_width / self.frame_width, self.resized_height / self.frame_height
+        return np.array([across, down] * 2, np.float32)
+
+    @property
+    def _corner(self) -> NDArray[np.float32]:
+        return np.array([self.left, self.top] * 2, np.float32)
+
+
+def fit(frame_width: int, frame_height: int, image_size: int = 640, *, square: bool = False) -> Letterbox:
+    """The letterbox for frames of one size.
+
+    Args:
+        image_size: the input's longer side, a multiple of 32.
+        square: pad to image_size × image_size; else only to the next multiple of 32 (faster).
+    """
+    if frame_width < 1 or frame_height < 1:
+        raise ValueError(f"a frame needs pixels, got {frame_width}x{frame_height}")
+    if image_size < STRIDE or image_size % STRIDE:
+        raise ValueError(f"image_size must be a multiple of {STRIDE} (such as 640), got {image_size}")
+    scale = min(image_size / frame_height, image_size / frame_width)
+    # A frame a thousand times wider than high still keeps one row.
+    resized_width = max(1, round(frame_width * scale))
+    resized_height = max(1, round(frame_height * scale))
+    spare_width, spare_height = image_size - resized_width, image_size - resized_height
+    if not square:
+        spare_width, spare_height = spare_width % STRIDE, spare_height % STRIDE
+    return Letterbox(
+        frame_width=frame_width,
+        frame_height=frame_height,
+        width=resized_width + spare_width,
+        height=resized_height + spare_height,
+        resized_width=resized_width,
+        resized_height=resized_height,
+        # An odd pixel of padding goes to the right and to the bottom.
+        left=spare_width // 2,
+        top=spare_height // 2,
+    )
+
+
+def to_tensor(boxed_bgr: NDArray[np.uint8], dtype: torch.dtype = torch.float32) -> Tensor:
+    """(H, W, 3) uint8 BGR → (1, 3, H, W) RGB in 0..1, channels-last in memory."""
+    rgb = cv2.cvtColor(boxed_bgr, cv2.COLOR_BGR2RGB)
+    pixels = torch.from_numpy(rgb).permute(2, 0, 1).unsqueeze(0)
+    return pixels.to(dtype).div_(255)
+
+
+def letterbox(
+    image_bgr: NDArray[np.uint8], image_size: int = 640, *, square: bool = False
+) -> tuple[Tensor, Letterbox]:
+    """A BGR frame → ((1, 3, H, W) float32 RGB in 0..1, the transform back)."""
+    box = fit(image_bgr.shape[1], image_bgr.shape[0], image_size, square=square)
+    return to_tensor(box.apply(image_bgr)), box
