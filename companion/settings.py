@@ -81,7 +81,7 @@ class SourceSection(Section):
     realtime: bool = True
     """play a file or folder at its own pace, as a camera would; false: every frame, as fast as can be"""
     every_frame: bool | None = None
-    """pipes only: true: every frame, and the writer waits; false: the newest; unset: true for a regular file"""
+    """pipes only: true: every frame, the writer waits; false: the newest; unset: true for a regular file"""
     open_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
     """how long the first frame may take at start, seconds"""
     read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
@@ -210,13 +210,13 @@ class GuidanceSection(Section):
     """largest horizontal speed asked for, metres a second"""
     max_climb_mps: Annotated[float, Field(gt=0, le=10)] = 2.0
     """largest climb rate asked for, metres a second"""
-    max_descent_mps: Annotated[float, Field(gt=0, le=10)] = 1.0
+    max_descend_mps: Annotated[float, Field(gt=0, le=10)] = 1.0
     """largest descent rate asked for, metres a second"""
     max_yaw_rate_radps: Annotated[float, Field(gt=0, le=6)] = 1.0
     """largest turn rate asked for, radians a second"""
     max_acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 2.0
     """largest change of the velocity asked for, metres a second squared"""
-    min_altitude_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    min_altitude_m: Annotated[float, Field(gt=0, le=1000)] = 1.0
     """never asks to fly lower than this above home (landing is the autopilot's own), metres"""
     max_altitude_m: Annotated[float, Field(gt=0, le=5000)] = 50.0
     """never asks to fly higher than this above home, metres"""
