@@ -1,0 +1,90 @@
+"""A folder of images, or one image."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.sources.feed import Feed, Picture
+from vision.sources.opencv import quiet_opencv
+from vision.sources.source import EndOfStream, SourceError
+
+logger = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = frozenset(
+    (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".jp2", ".avif")
+)
+
+
+def is_image(path: Path) -> bool:
+    """Whether the name is an image's."""
+    return path.suffix.lower() in IMAGE_SUFFIXES
+
+
+def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """Sorts as people count: image2 before image10."""
+    parts = re.split(r"(\d+)", path.name.casefold())
+    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part)
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images directly in a folder, in natural order.
+
+    Raises:
+        SourceError: there are none.
+    """
+    paths = sorted((path for path in folder.iterdir() if is_image(path) and path.is_file()), key=natural_key)
+    if not paths:
+        raise SourceError(
+            f"{folder}: no images in this folder; expected names ending in "
+            f"{', '.join(sorted(IMAGE_SUFFIXES))}"
+        )
+    return paths
+
+
+def decode_image(data: bytes) -> NDArray[np.uint8] | None:
+    """(height, width, 3) BGR of an encoded image, upright as its EXIF says; None if unreadable."""
+    if not data:
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:  # a size beyond OpenCV's limits is an unreadable image, too
+        return None
+    return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
+
+
+class ImagesFeed(Feed):
+    """Images one after another. One that cannot be read is named in a warning, counted and passed over."""
+
+    def __init__(self, paths: list[Path], rate_hz: float) -> None:
+        quiet_opencv()
+        self._paths = paths
+        self._rate_hz = rate_hz
+        self._next = 0
+        self.total_frames = len(paths)
+
+    def read(self, timeout_s: float) -> Picture | None:
+        while self._next < len(self._paths):
+            index = self._next
+            self._next += 1
+            path = self._paths[index]
+            try:
+                image = decode_image(path.read_bytes())
+                reason = "not an image that OpenCV can read; is it cut short or damaged?"
+            except OSError as error:
+                image, reason = None, error.strerror or str(error)
+            if image is not None:
+                return Picture(image, media_s=index / self._rate_hz)
+            self.unreadable += 1
+            logger.warning("%s: passed over: %s", path, reason)
+        if self.unreadable == len(self._paths):
+            raise SourceError(f"{self._paths[0]}: none of the {len(self._paths)} images could be read")
+        raise EndOfStream
+
+    def close(self) -> None:
+        """Nothing is kept open."""

@@ -1,0 +1,252 @@
+"""The newest frame wins: a thread reads the source and keeps only its latest frame for whoever asks.
+
+A source that stops is opened again, with a pause that doubles up to a cap, and says so once each way.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from vision.frame import Frame
+from vision.sources.feed import Feed, FeedLost, OpenFeed, Picture
+from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
+
+logger = logging.getLogger(__name__)
+
+_POLL_S = 0.2  # how soon the reading thread notices `close` while nothing arrives
+_OPENING_GRACE_S = 1.0  # for a decoder that keeps to the same deadline, a little late
+
+
+class LatestSource(Source):
+    """A live source. Returns from its making once the first frame is there.
+
+    Args:
+        uri: the name in messages, without passwords.
+        open_feed: opens the feed, again and again.
+        settings: the time-outs and pauses.
+        reopen: whether a feed that ended or broke is opened again; if not, that ends the source.
+        paced: hold every picture back until its `media_s` has passed: a recording that stands for a camera.
+        advice: the end of the line that says it never opened: what the reader of the line can do.
+        on_close: called when the source is closed, after the last feed.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        uri: str,
+        open_feed: OpenFeed,
+        settings: SourceSettings,
+        *,
+        reopen: bool = True,
+        paced: bool = False,
+        advice: str = "",
+        on_close: Callable[[], None] | None = None,
+    ) -> None:
+        self.uri = uri
+        self._open_feed = open_feed
+        self._settings = settings
+        self._reopen = reopen
+        self._paced = paced
+        self._on_close = on_close
+        self._changed = threading.Condition()
+        self._stop = threading.Event()
+        self._slot: Frame | None = None
+        self._feed: Feed | None = None
+        self._opened = False
+        self._end: Exception | None = None
+        self._last_reason = "nothing arrived"
+        self._sequence = 0
+        self._statistics = SourceStatistics()
+        self._unreadable_before = 0
+        self._lost_since_s: float | None = None
+        self._pace_origin_s: float | None = None
+        self._thread = threading.Thread(target=self._run, name=f"source {uri}", daemon=True)
+        self._thread.start()
+        self._wait_for_first_frame(advice)
+
+    def _wait_for_first_frame(self, advice: str) -> None:
+        timeout_s = self._settings.open_timeout_s
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._opened or self._end is not None, timeout_s + _OPENING_GRACE_S
+            )
+            opened, end, reason = self._opened, self._end, self._last_reason
+        if opened:
+            return
+        self.close()
+        if isinstance(end, EndOfStream):
+            raise SourceError(f"{self.uri}: ended before its first frame{f': {end}' if str(end) else ''}")
+        if end is not None:
+            raise end
+        raise SourceError(
+            f"{self.uri}: no frame within {timeout_s:g} s: {reason}{f'; {advice}' if advice else ''}"
+        )
+
+    # --- the reader's side
+
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._slot is not None or self._end is not None or self._stop.is_set(), timeout_s
+            )
+            if self._stop.is_set():
+                raise EndOfStream
+            frame, self._slot = self._slot, None
+            if frame is not None:
+                self._count(delivered=1)
+                return frame
+            if self._end is not None:
+                raise self._end
+            return None
+
+    @property
+    def statistics(self) -> SourceStatistics:
+        with self._changed:
+            return self._statistics
+
+    def close(self) -> None:
+        with self._changed:
+            if self._stop.is_set():
+                return
+            self._stop.set()
+            feed = self._feed
+            self._changed.notify_all()
+        if feed is not None:
+            feed.interrupt()
+        # A decoder inside a network call returns at its own time-out, and must not outlive the interpreter.
+        self._thread.join(max(self._settings.open_timeout_s, self._settings.read_timeout_s) + 1.0)
+        if self._thread.is_alive():
+            logger.warning("%s: its reading thread is still busy in the driver after close", self.uri)
+        if self._on_close is not None:
+            self._on_close()
+
+    def _count(self, *, delivered: int = 0, dropped: int = 0, reopened: int = 0) -> None:
+        now = self._statistics
+        self._statistics = replace(
+            now,
+            delivered=now.delivered + delivered,
+            dropped=now.dropped + dropped,
+            reopened=now.reopened + reopened,
+        )
+
+    # --- the thread's side
+
+    def _run(self) -> None:
+        try:
+            self._read_for_ever()
+        except EndOfStream as end:
+            if str(end) and self._opened:
+                logger.warning("%s: ended after %d frames: %s", self.uri, self._sequence, end)
+            self._finish(end)
+        except (
+            Exception
+        ) as error:  # whatever it is, it belongs to the reader, not to a thread's standard error
+            self._finish(error)
+
+    def _finish(self, end: Exception) -> None:
+        with self._changed:
+            self._end = end
+            self._changed.notify_all()
+
+    def _read_for_ever(self) -> None:
+        pause_s = self._settings.retry_min_s
+        while not self._stop.is_set():
+            came_back = False
+            try:
+                self._read_one_feed()
+            except FeedLost as lost:
+                came_back = self._lost_since_s is None and self._opened
+                self._say_lost(str(lost))
+            except EndOfStream as end:
+                if not self._reopen:
+                    raise
+                came_back = self._lost_since_s is None and self._opened
+                self._say_lost(str(end) or "it ended")
+            except SourceError as error:
+                if not self._opened:
+                    raise
+                self._say_lost(str(error))
+            if came_back:
+                pause_s = self._settings.retry_min_s
+            self._stop.wait(pause_s)
+            pause_s = min(pause_s * 2, self._settings.retry_max_s)
+
+    def _say_lost(self, reason: str) -> None:
+        if self._stop.is_set():
+            return
+        if not self._reopen:
+            raise SourceError(f"{self.uri}: {reason}")
+        with self._changed:
+            self._last_reason = reason
+        if self._opened and self._lost_since_s is None:
+            self._lost_since_s = time.monotonic()
+            logger.warning("%s: lost: %s; opening it again", self.uri, reason)
+        else:
+            logger.debug("%s: not yet: %s", self.uri, reason)
+
+    def _read_one_feed(self) -> None:
+        feed = self._open_feed()
+        with self._changed:
+            self._feed = feed
+        try:
+            self._pump(feed)
+        finally:
+            with self._changed:
+                self._feed = None
+                self._unreadable_before += feed.unreadable
+            feed.close()
+
+    def _pump(self, feed: Feed) -> None:
+        settings = self._settings
+        heard_s = time.monotonic()
+        said_silent = False
+        while not self._stop.is_set():
+            picture = feed.read(_POLL_S)
+            silent_s = time.monotonic() - heard_s
+            if picture is not None:
+                if said_silent:
+                    logger.info("%s: back after %.1f s", self.uri, silent_s)
+                said_silent = False
+                self._hold_back(picture)
+                self._publish(picture, feed)
+                heard_s = time.monotonic()
+            elif silent_s > settings.read_timeout_s:
+                if feed.silence_is_loss:
+                    raise FeedLost(f"nothing came for {silent_s:.1f} s")
+                if self._opened and self._lost_since_s is None and not said_silent:
+                    logger.warning("%s: nothing came for %.1f s; waiting", self.uri, silent_s)
+                    said_silent = True
+
+    def _hold_back(self, picture: Picture) -> None:
+        if not self._paced or picture.media_s is None:
+            return
+        if self._pace_origin_s is None:
+            self._pace_origin_s = time.monotonic() - picture.media_s
+        self._stop.wait(max(self._pace_origin_s + picture.media_s - time.monotonic(), 0.0))
+
+    def _publish(self, picture: Picture, feed: Feed) -> None:
+        captured_ns = time.monotonic_ns() if picture.captured_ns is None else picture.captured_ns
+        unreadable = self._unreadable_before + feed.unreadable
+        self._sequence += picture.skipped + unreadable - self._statistics.unreadable
+        frame = Frame(picture.image, captured_ns, self._sequence, picture.depth_m)
+        self._sequence += 1
+        came_back_after_s = None
+        with self._changed:
+            if not self._opened:
+                self._opened = True
+                self.total_frames = feed.total_frames
+            elif self._lost_since_s is not None:
+                came_back_after_s = time.monotonic() - self._lost_since_s
+                self._lost_since_s = None
+                self._count(reopened=1)
+            self._count(dropped=picture.skipped + (self._slot is not None))
+            self._statistics = replace(self._statistics, unreadable=unreadable)
+            self._slot = frame
+            self._changed.notify_all()
+        if came_back_after_s is not None:
+            logger.warning("%s: back after %.1f s", self.uri, came_back_after_s)

@@ -1,0 +1,70 @@
+"""OpenCV and FFmpeg as sources use them: quiet, and with options that FFmpeg takes from the environment.
+
+Both print to standard error what this package says itself in one line. Their voices come back with
+`OPENCV_LOG_LEVEL=INFO` and `OPENCV_FFMPEG_LOGLEVEL=32`.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import cv2
+
+_AV_LOG_QUIET = "-8"  # libavutil/log.h
+_environment_lock = threading.Lock()
+
+
+def quiet_opencv() -> None:
+    """Silence OpenCV's and FFmpeg's own messages, unless the environment asks for them."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _AV_LOG_QUIET)
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+@contextmanager
+def environment(name: str, value: str) -> Iterator[None]:
+    """Set one environment variable for a while, one thread at a time."""
+    with _environment_lock:
+        before = os.environ.get(name)
+        os.environ[name] = value
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = before
+
+
+def open_ffmpeg(
+    location: str,
+    *,
+    open_timeout_s: float | None = None,
+    read_timeout_s: float | None = None,
+    options: Mapping[str, str] | None = None,
+) -> cv2.VideoCapture:
+    """A capture by FFmpeg; ask `isOpened`.
+
+    Args:
+        location: a file name or an address as FFmpeg takes it.
+        open_timeout_s, read_timeout_s: after these FFmpeg gives up; None leaves its own (30 s).
+        options: FFmpeg's format and codec options; those in OPENCV_FFMPEG_CAPTURE_OPTIONS go before them.
+    """
+    quiet_opencv()
+    parameters: list[int] = []
+    if open_timeout_s is not None:
+        parameters += [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, max(1, round(open_timeout_s * 1000))]
+    if read_timeout_s is not None:
+        parameters += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, max(1, round(read_timeout_s * 1000))]
+    if not options:
+        return cv2.VideoCapture(location, cv2.CAP_FFMPEG, parameters)
+    merged = dict(options)
+    for pair in filter(None, os.environ.get("OPENCV_FFMPEG_CAPTURE_OPTIONS", "").split("|")):
+        key, _, value = pair.partition(";")
+        merged[key] = value
+    text = "|".join(f"{key};{value}" for key, value in merged.items())
+    with environment("OPENCV_FFMPEG_CAPTURE_OPTIONS", text):
+        return cv2.VideoCapture(location, cv2.CAP_FFMPEG, parameters)

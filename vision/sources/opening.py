@@ -1,0 +1,131 @@
+"""From an address to an open source."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+from vision.sources.feed import Feed, LoopingFeed
+from vision.sources.images import ImagesFeed, images_in, is_image
+from vision.sources.latest import LatestSource
+from vision.sources.opencv import quiet_opencv
+from vision.sources.pipe import Fifo, PipeFeed, check_pipe_settings
+from vision.sources.sequential import SequentialSource
+from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
+from vision.sources.video_file import VideoFileFeed
+
+_IMAGE_RATE_HZ = 10.0  # of images standing for a camera when no rate is asked
+
+
+def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source:  # noqa: B008 - frozen
+    """Open where frames come from, and wait for the first one.
+
+    | address | source | frames |
+    |---|---|---|
+    | `street.mp4`, `file:///data/street.mp4` | a video file | every one |
+    | `photos/` | a folder of images, in natural order | every one |
+    | `photo.jpg` | one image | one |
+    | `-` | standard input: raw, YUV4MPEG2 or MJPEG | the newest; every one if it is a file or asked for |
+    | `/run/camera.fifo` | a FIFO with the same | the newest; every one if asked for |
+
+    Args:
+        uri: the address.
+        settings: see `SourceSettings`.
+
+    Raises:
+        SourceError: it cannot be opened, or gave no frame within `open_timeout_s`; one line that says why.
+    """
+    quiet_opencv()
+    if uri == "-":
+        return _open_standard_input(settings)
+    path = Path(uri.removeprefix("file://")).expanduser()
+    return _open_path(path, settings)
+
+
+def _open_path(path: Path, settings: SourceSettings) -> Source:
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file, folder or device{_nearest(path)}") from None
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be opened: {error.strerror}") from error
+    if stat.S_ISFIFO(mode):
+        return _open_fifo(path, settings)
+    if not os.access(path, os.R_OK):
+        raise SourceError(f"{path}: no permission to read it")
+    if stat.S_ISDIR(mode):
+        return _open_file(str(path), lambda: ImagesFeed(images_in(path), _image_rate_hz(settings)), settings)
+    if not stat.S_ISREG(mode):
+        raise SourceError(f"{path}: neither a file, a folder, a FIFO nor a video device")
+    if settings.pixel_format in RAW_PIXEL_FORMATS:
+        check_pipe_settings(str(path), settings)
+        return _open_file(str(path), lambda: PipeFeed(os.open(path, os.O_RDONLY), settings), settings)
+    if is_image(path):
+        return _open_file(str(path), lambda: ImagesFeed([path], _image_rate_hz(settings)), settings)
+    return _open_file(str(path), lambda: VideoFileFeed(path), settings)
+
+
+def _open_file(name: str, open_feed: Callable[[], Feed], settings: SourceSettings) -> Source:
+    def open_looping() -> Feed:
+        return LoopingFeed(open_feed)
+
+    opener = open_looping if settings.loop else open_feed
+    if settings.realtime:
+        return LatestSource(name, opener, settings, reopen=False, paced=True)
+    return SequentialSource(name, opener, settings)
+
+
+def _open_standard_input(settings: SourceSettings) -> Source:
+    name = "standard input"
+    check_pipe_settings(name, settings)
+    if os.isatty(0):
+        raise SourceError("standard input is a terminal; pipe frames into it, or name a source")
+
+    def open_feed() -> Feed:
+        return PipeFeed(os.dup(0), settings)
+
+    is_file = stat.S_ISREG(os.fstat(0).st_mode)
+    every_frame = settings.every_frame
+    if every_frame is None:
+        every_frame = is_file and not settings.realtime
+    if every_frame:
+        return SequentialSource(name, open_feed, settings)
+    return LatestSource(name, open_feed, settings, reopen=False, paced=settings.realtime)
+
+
+def _open_fifo(path: Path, settings: SourceSettings) -> Source:
+    fifo = Fifo(path, settings)
+    try:
+        if settings.every_frame:
+            return SequentialSource(str(path), fifo.open_feed, settings, on_close=fifo.close)
+        return LatestSource(
+            str(path),
+            fifo.open_feed,
+            settings,
+            paced=settings.realtime,
+            advice="start its writer",
+            on_close=fifo.close,
+        )
+    except BaseException:
+        fifo.close()
+        raise
+
+
+def _image_rate_hz(settings: SourceSettings) -> float:
+    return settings.rate_hz or _IMAGE_RATE_HZ
+
+
+def _nearest(path: Path) -> str:
+    """A hint: the names in the same folder that look alike."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f" (the folder {folder} does not exist either)"
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return ""
+    close = difflib.get_close_matches(path.name, names, n=3, cutoff=0.5)
+    return f"; did you mean {' or '.join(str(folder / name) for name in close)}?" if close else ""

@@ -1,0 +1,165 @@
+"""A pipe of bytes: standard input or a FIFO, carrying raw pixels, YUV4MPEG2 or MJPEG."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import select
+import stat
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.mjpeg import MjpegParser
+from vision.sources.raw import RawParser, StreamError, StreamParser
+from vision.sources.source import RAW_PIXEL_FORMATS, EndOfStream, SourceError, SourceSettings
+from vision.sources.y4m import MAGIC, Y4mParser
+
+logger = logging.getLogger(__name__)
+
+_PIPE_BYTES = 1 << 20  # a frame of 640x480 in one go; the kernel's own default is 64 KiB
+
+
+class PipeFeed(Feed):
+    """Pictures out of a file descriptor, which it owns.
+
+    Args:
+        descriptor: open for reading; a pipe, FIFO, socket or regular file.
+        settings: pixel_format, width, height, rate_hz.
+        end_is_loss: whether the writer's going away is a loss (a FIFO of a live source) or the end.
+    """
+
+    silence_is_loss = False  # closing a FIFO under a writer that is only slow would kill the writer
+
+    def __init__(self, descriptor: int, settings: SourceSettings, *, end_is_loss: bool = False) -> None:
+        self._descriptor = descriptor
+        self._settings = settings
+        self._end_is_loss = end_is_loss
+        self._is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
+        self._poll = select.poll()
+        self._poll.register(descriptor, select.POLLIN)
+        self._parser: StreamParser | None = _parser_of(settings)
+        self._head = b""
+        self._ready: deque[tuple[NDArray[np.uint8], int]] = deque()
+        self._delivered = 0
+        with contextlib.suppress(OSError):  # not a pipe, or above the user's limit: the default size does
+            fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+    def read(self, timeout_s: float) -> Picture | None:
+        deadline_s = time.monotonic() + timeout_s
+        while not self._ready:
+            if not self._poll.poll(max(deadline_s - time.monotonic(), 0.0) * 1000.0):
+                return None
+            data = os.read(self._descriptor, _PIPE_BYTES)
+            if not data:
+                self._end()
+            self._take(data)
+        image, captured_ns = self._ready.popleft()
+        rate_hz = self._settings.rate_hz or (self._parser.rate_hz if self._parser else None) or 30.0
+        media_s = self._delivered / rate_hz
+        self._delivered += 1
+        return Picture(image, None if self._is_file else captured_ns, media_s=media_s)
+
+    def _take(self, data: bytes) -> None:
+        captured_ns = time.monotonic_ns()
+        if self._parser is None:
+            self._head += data
+            if len(self._head) < len(MAGIC):
+                return
+            data = self._head
+        try:
+            if self._parser is None:
+                self._parser = _parser_for(data)
+            images = self._parser.push(data)
+        except StreamError as error:
+            raise FeedLost(str(error)) from error
+        self.unreadable = self._parser.unreadable
+        self._ready.extend((image, captured_ns) for image in images)
+
+    def _end(self) -> None:
+        leftover = (
+            self._parser.leftover()
+            if self._parser
+            else f"{len(self._head)} bytes, too few to know the format"
+        )
+        if self._parser is None and not self._head:
+            leftover = "no bytes at all"
+        if self._end_is_loss:
+            raise FeedLost(f"its writer has gone{f', {leftover}' if leftover else ''}")
+        raise EndOfStream(leftover)
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+
+class Fifo:
+    """A named pipe that stays open between its writers, so that no writer dies in the moment of reopening."""
+
+    def __init__(self, path: Path, settings: SourceSettings) -> None:
+        self._path = path
+        self._settings = settings
+        check_pipe_settings(str(path), settings)
+        self._keeper = _open_fifo(path)
+        self._closed = False
+
+    def open_feed(self) -> PipeFeed:
+        return PipeFeed(
+            _open_fifo(self._path), self._settings, end_is_loss=self._settings.every_frame is not True
+        )
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            os.close(self._keeper)
+
+
+def _open_fifo(path: Path) -> int:
+    # Without O_NONBLOCK the call itself would wait for a writer, for ever.
+    try:
+        return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot open this pipe: {error.strerror}") from error
+
+
+def check_pipe_settings(name: str, settings: SourceSettings) -> None:
+    """Refuse settings that no pipe can be read with.
+
+    Raises:
+        SourceError: a camera's pixel format, or raw pixels without their size.
+    """
+    pixel_format = settings.pixel_format
+    if pixel_format is not None and pixel_format not in (*RAW_PIXEL_FORMATS, "y4m", "mjpeg"):
+        raise SourceError(
+            f"{name}: a pipe carries bgr24, rgb24, gray8, y4m or mjpeg, but pixel_format is {pixel_format!r}"
+        )
+    if pixel_format in RAW_PIXEL_FORMATS and (settings.width is None or settings.height is None):
+        raise SourceError(f"{name}: {pixel_format} has no size of its own; give width and height")
+
+
+def _parser_of(settings: SourceSettings) -> StreamParser | None:
+    if settings.pixel_format in RAW_PIXEL_FORMATS:
+        assert settings.width is not None
+        assert settings.height is not None
+        return RawParser(settings.width, settings.height, settings.pixel_format)
+    if settings.pixel_format == "y4m":
+        return Y4mParser()
+    if settings.pixel_format == "mjpeg":
+        return MjpegParser()
+    return None
+
+
+def _parser_for(head: bytes) -> StreamParser:
+    if head.startswith(MAGIC):
+        return Y4mParser()
+    if head.startswith(b"\xff\xd8\xff"):
+        return MjpegParser()
+    raise StreamError(
+        f"neither YUV4MPEG2 nor JPEG (it begins with {head[:8].hex(' ')}); for raw pixels give pixel_format "
+        f"bgr24, rgb24 or gray8 with width and height"
+    )

@@ -1,0 +1,107 @@
+"""Every frame, in order: files, and pipes whose writer waits."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from vision.frame import Frame
+from vision.sources.feed import FeedLost, OpenFeed, Picture
+from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
+
+logger = logging.getLogger(__name__)
+
+
+class SequentialSource(Source):
+    """Reads a feed in the caller's own thread. The first frame is read when it is made, to know it can be."""
+
+    live = False
+
+    def __init__(
+        self,
+        uri: str,
+        open_feed: OpenFeed,
+        settings: SourceSettings,
+        *,
+        on_close: Callable[[], None] | None = None,
+    ) -> None:
+        self.uri = uri
+        self._on_close = on_close
+        try:
+            self._feed = open_feed()
+        except FeedLost as lost:
+            raise SourceError(f"{uri}: {lost}") from lost
+        self._sequence = 0
+        self._delivered = 0
+        self._dropped = 0
+        self._unreadable_seen = 0
+        self._closed = False
+        self._ended = False
+        self.total_frames = self._feed.total_frames
+        try:
+            self._first: Picture | None = self._first_picture(settings.open_timeout_s)
+        except BaseException:
+            self.close()
+            raise
+
+    def _first_picture(self, timeout_s: float) -> Picture:
+        deadline_s = time.monotonic() + timeout_s
+        try:
+            picture = self._feed.read(timeout_s)
+            while picture is None and time.monotonic() < deadline_s:
+                picture = self._feed.read(max(deadline_s - time.monotonic(), 0.0))
+        except EndOfStream as end:
+            raise SourceError(f"{self.uri}: ended before its first frame{_detail(end)}") from end
+        except FeedLost as lost:
+            raise SourceError(f"{self.uri}: {lost}") from lost
+        if picture is None:
+            raise SourceError(f"{self.uri}: no frame within {timeout_s:g} s; is its writer running?")
+        return picture
+
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        if self._closed or self._ended:
+            raise EndOfStream
+        picture = self._first
+        self._first = None
+        if picture is None:
+            try:
+                picture = self._feed.read(timeout_s)
+            except EndOfStream as end:
+                self._ended = True
+                self._say_what_is_missing(end)
+                raise
+            except FeedLost as lost:
+                self._ended = True
+                raise SourceError(f"{self.uri}: {lost}") from lost
+        if picture is None:
+            return None
+        self._sequence += picture.skipped + self._feed.unreadable - self._unreadable_seen
+        self._unreadable_seen = self._feed.unreadable
+        self._dropped += picture.skipped
+        captured_ns = time.monotonic_ns() if picture.captured_ns is None else picture.captured_ns
+        frame = Frame(picture.image, captured_ns, self._sequence, picture.depth_m)
+        self._sequence += 1
+        self._delivered += 1
+        return frame
+
+    def _say_what_is_missing(self, end: EndOfStream) -> None:
+        if detail := _detail(end):
+            logger.warning("%s: ended after %d frames%s", self.uri, self._delivered, detail)
+
+    @property
+    def statistics(self) -> SourceStatistics:
+        return SourceStatistics(
+            delivered=self._delivered, dropped=self._dropped, unreadable=self._feed.unreadable
+        )
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._feed.close()
+            if self._on_close is not None:
+                self._on_close()
+
+
+def _detail(end: EndOfStream) -> str:
+    return f": {end}" if str(end) else ""

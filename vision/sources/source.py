@@ -1,0 +1,156 @@
+"""What a source of frames is: its settings, its figures, its errors, and the contract of `read`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from vision.frame import Frame
+
+RAW_PIXEL_FORMATS = {"bgr24": 3, "rgb24": 3, "gray8": 1}
+"""Raw pixel formats of a pipe → bytes a pixel."""
+
+PIPE_PIXEL_FORMATS = (*RAW_PIXEL_FORMATS, "y4m", "mjpeg")
+
+
+class SourceError(Exception):
+    """A source that cannot be opened, or cannot go on. The text is one line that says what to do."""
+
+
+class EndOfStream(Exception):  # noqa: N818 - an end, not an error
+    """The source has given its last frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSettings:
+    """How to open and read a source. A kind of source ignores what it has no use for.
+
+    Attributes:
+        width, height: pixels. Asked of a camera; required for a raw pipe; nothing else uses them.
+        rate_hz: frames a second. Asked of a camera; the pace of images and raw files when `realtime`.
+        pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or what a pipe carries: `bgr24`, `rgb24`, `gray8`
+            (these need width and height), `y4m`, `mjpeg`. None: the driver's choice, or y4m/mjpeg recognised
+            by the pipe's first bytes.
+        loop: start a file over at its end.
+        realtime: pace a file by its own timestamps, newest frame wins: a file standing for a camera.
+        every_frame: pipes only. True: every frame in order, the writer waits for the reader, and the writer's
+            end is the end. False: newest frame wins. None: newest wins, but a regular file redirected into
+            standard input is read whole. Files give every frame unless `realtime`; cameras, networks and
+            shared memory cannot wait, so there the newest always wins.
+        open_timeout_s: how long to wait for the very first frame.
+        read_timeout_s: a live source silent for this long is lost, and is opened again.
+        retry_min_s, retry_max_s: the pause between attempts starts at the first and doubles up to the second.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    rate_hz: float | None = None
+    pixel_format: str | None = None
+    loop: bool = False
+    realtime: bool = False
+    every_frame: bool | None = None
+    open_timeout_s: float = 10.0
+    read_timeout_s: float = 5.0
+    retry_min_s: float = 0.5
+    retry_max_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if value is not None and not 1 <= value <= 32768:
+                raise ValueError(f"{name} must be 1..32768 pixels, got {value}")
+        if self.rate_hz is not None and not 0.0 < self.rate_hz <= 1000.0:
+            raise ValueError(f"rate_hz must be above 0 and at most 1000, got {self.rate_hz}")
+        for name in ("open_timeout_s", "read_timeout_s", "retry_min_s"):
+            if not 0.0 < getattr(self, name) <= 3600.0:
+                raise ValueError(f"{name} must be above 0 and at most 3600 s, got {getattr(self, name)}")
+        if not self.retry_min_s <= self.retry_max_s <= 3600.0:
+            raise ValueError(
+                f"retry_max_s must be from retry_min_s ({self.retry_min_s}) to 3600 s, got {self.retry_max_s}"
+            )
+        if self.pixel_format is not None and not (
+            self.pixel_format in PIPE_PIXEL_FORMATS or len(self.pixel_format) == 4
+        ):
+            raise ValueError(
+                f"pixel_format must be a camera's four letters (MJPG, YUYV) or one of "
+                f"{', '.join(PIPE_PIXEL_FORMATS)}, got {self.pixel_format!r}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class SourceStatistics:
+    """Counts since the source was opened.
+
+    Attributes:
+        delivered: frames that `read` returned.
+        dropped: frames that a newer one replaced before anybody read them.
+        unreadable: pictures that arrived and could not be decoded.
+        reopened: how often a lost source came back.
+    """
+
+    delivered: int = 0
+    dropped: int = 0
+    unreadable: int = 0
+    reopened: int = 0
+
+
+class Source(ABC):
+    """An open source of frames. Use it as a context manager, or iterate it to its end.
+
+    Attributes:
+        uri: where the frames come from, without passwords.
+        live: True where the newest frame wins; False where every frame is given.
+        total_frames: how many frames there will be, None where nobody knows. A video file's own claim may be
+            a little off.
+    """
+
+    uri: str
+    live: bool
+    total_frames: int | None = None
+
+    @abstractmethod
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        """The next frame.
+
+        A live source gives its newest frame, each at most once, waiting up to `timeout_s` for one; None says
+        that none came in that time (also while a lost source is being opened again: keep reading). A source
+        of every frame gives the next in order; a file never returns None, a pipe does when its writer is
+        late.
+
+        Raises:
+            EndOfStream: after the last frame, and after `close`.
+            SourceError: the source failed and will not come back.
+        """
+
+    @property
+    @abstractmethod
+    def statistics(self) -> SourceStatistics:
+        """The counts so far."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give back the device, file or socket. A second call does nothing."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Every frame until the end; a live source that recovers never ends."""
+        while True:
+            try:
+                frame = self.read()
+            except EndOfStream:
+                return
+            if frame is not None:
+                yield frame
