@@ -1,0 +1,362 @@
+"""The perception worker's keeper: starts it, reads it, and starts it again when it is dead or stuck.
+
+Nothing here waits for the worker: what it says is taken as it comes. A worker that is silent for too long is
+killed. At most `MAX_RESTARTS` restarts in `RESTART_WINDOW_S`, then the keeper gives up and says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from companion.perception_messages import (
+    Ended,
+    Heartbeat,
+    LogLine,
+    Message,
+    ProtocolError,
+    Ready,
+    Report,
+    StartFailed,
+)
+from companion.perception_process import STANDARD_INPUT, PerceptionProcess
+from companion.perception_pulse import Pulse
+from companion.perception_status import PerceptionState, PerceptionStatus
+from companion.settings import Settings
+from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__name__)
+
+__all__ = ["PerceptionKeeper", "PerceptionStartError", "PerceptionState", "PerceptionStatus"]
+
+MAX_RESTARTS = 5
+RESTART_WINDOW_S = 60.0
+STOP_S, TERMINATE_S = 5.0, 1.0
+_BACK_OFF_S = (0.2, 1.0, 2.0, 4.0, 8.0)
+_TICK_S = 0.25
+_RATE_WINDOW_S = 2.0
+
+
+class PerceptionStartError(RuntimeError):
+    """Perception cannot start as it is set up. The text is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class _End:
+    """How a worker ended. `finished`: in order, and not to be started again."""
+
+    finished: bool
+    text: str
+
+
+@dataclass(slots=True)
+class _Counts:
+    frames: int = 0
+    dropped: int = 0
+
+    def add(self, other: _Counts) -> None:
+        self.frames += other.frames
+        self.dropped += other.dropped
+
+
+class PerceptionKeeper:
+    """Keeps one perception worker running. Everything is called, and calls back, in one asyncio loop.
+
+    The loop must run in a thread that lasts: the kernel ends the worker when the thread that started it ends.
+
+    Args:
+        settings: the sections source, detector, recording and log are the worker's.
+        on_result: called with every result. Its sequence numbers go on when a worker is replaced.
+        on_event: called with a level (`info`, `warning`, `error`) and a line for people.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        on_result: Callable[[PerceptionResult], None],
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self._settings = settings
+        self._on_result = on_result
+        self._on_event = on_event
+        self._state = PerceptionState.STOPPED
+        self._task: asyncio.Task[None] | None = None
+        self._stop_asked = asyncio.Event()
+        self._process: PerceptionProcess | None = None
+        self._pulse: Pulse | None = None
+        self._ready: Ready | None = None
+        self._lines: tuple[str, ...] = ()
+        self._problem = ""
+        self._restarts = 0
+        self._deaths_s: deque[float] = deque()
+        self._lost_s: float | None = None
+        self._newest: PerceptionResult | None = None
+        self._results = 0
+        self._arrivals_s: deque[float] = deque()
+        self._before, self._now = _Counts(), _Counts()
+        self._first_sequence = 0
+
+    async def start(self) -> None:
+        """Start the worker; returns when its model is loaded and its source has given a frame.
+
+        Raises:
+            PerceptionStartError: it cannot: no such model, an unknown class, a source that does not open.
+        """
+        if self._task is not None:
+            raise RuntimeError("the perception keeper was already started")
+        self._state = PerceptionState.STARTING
+        started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._task = asyncio.create_task(self._keep(started), name="perception keeper")
+        self._task.add_done_callback(self._on_fault)
+        try:
+            await asyncio.wait({started, self._task}, return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:
+            await self.stop()
+            raise
+        if not started.done():
+            await self._task
+            raise PerceptionStartError(self._problem)
+
+    async def stop(self) -> None:
+        """End the worker: asked (it finishes the video), then terminated, then killed; in at most 7 s."""
+        task, self._task = self._task, None
+        if task is None:
+            return
+        self._stop_asked.set()
+        if self._process is not None:
+            self._process.ask_to_stop()
+        await asyncio.wait({task}, timeout=STOP_S)
+        if self._process is not None:
+            self._process.terminate()
+            await asyncio.wait({task}, timeout=TERMINATE_S)
+        if self._process is not None:
+            self._on_event(
+                "warning", f"perception process {self._process.pid} did not end when asked; killed"
+            )
+            self._process.kill()
+        await asyncio.wait({task})
+        self._state = PerceptionState.STOPPED
+
+    def send_hud(self, lines: tuple[str, ...]) -> None:
+        """Lines to draw on the recorded video from now on."""
+        self._lines = lines
+        if self._process is not None and self._settings.recording.video is not None:
+            self._process.show(lines)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """What the model knows, id → name; empty before the start and without a detector."""
+        return () if self._ready is None else self._ready.class_names
+
+    @property
+    def status(self) -> PerceptionStatus:
+        """What is known now."""
+        newest = self._newest
+        return PerceptionStatus(
+            state=self._state,
+            pid=None if self._process is None else self._process.pid,
+            restarts=self._restarts,
+            frames=self._before.frames + self._now.frames,
+            results=self._results,
+            rate_hz=self._rate_hz(),
+            newest=newest,
+            age_s=None if newest is None else (time.monotonic_ns() - newest.captured_ns) / 1e9,
+            timing_ms={} if newest is None else newest.timing_ms,
+            dropped=self._before.dropped + self._now.dropped,
+            stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
+            class_names=self.class_names,
+            problem=self._problem,
+        )
+
+    def _rate_hz(self) -> float:
+        now_s = time.monotonic()
+        while self._arrivals_s and now_s - self._arrivals_s[0] > _RATE_WINDOW_S:
+            self._arrivals_s.popleft()
+        if len(self._arrivals_s) < 2:
+            return 0.0
+        return (len(self._arrivals_s) - 1) / (now_s - self._arrivals_s[0])
+
+    def _on_fault(self, task: asyncio.Task[None]) -> None:
+        """A fault of ours, or of a callback, ended the keeper: that must not pass in silence."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._state = PerceptionState.FAILED
+            self._problem = f"{type(error).__name__}: {error}"
+            logger.error("perception's keeper failed", exc_info=error)
+            self._on_event("error", f"perception failed: {self._problem}")
+
+    # --- worker after worker
+
+    async def _keep(self, started: asyncio.Future[None]) -> None:
+        while True:
+            end = await self._run_one(started)
+            if self._stop_asked.is_set():
+                return
+            if end.finished:
+                self._state = PerceptionState.FINISHED
+                self._on_event("info", f"perception: {end.text}, after {self._before.frames} frames")
+                return
+            self._problem = end.text
+            if not started.done():
+                self._state = PerceptionState.FAILED
+                return
+            pause_s = self._after_death(end)
+            if pause_s is None:
+                self._state = PerceptionState.FAILED
+                return
+            self._state = PerceptionState.RESTARTING
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._stop_asked.wait(), pause_s)
+                return
+            self._restarts += 1
+
+    def _after_death(self, end: _End) -> float | None:
+        """Say what was lost; the seconds until the next start, None to give up."""
+        now_s = time.monotonic()
+        self._lost_s = self._lost_s or now_s
+        self._deaths_s.append(now_s)
+        while now_s - self._deaths_s[0] > RESTART_WINDOW_S:
+            self._deaths_s.popleft()
+        deaths = len(self._deaths_s)
+        source = self._settings.source
+        if source.uri == STANDARD_INPUT and source.pixel_format != "mjpeg":
+            self._on_event(
+                "error",
+                f"perception failed: {end.text}; where the next frame begins in standard input is lost "
+                "with it, so it is not started again (with pixel_format mjpeg it would be)",
+            )
+            return None
+        if deaths > MAX_RESTARTS:
+            self._on_event(
+                "error",
+                f"perception failed {deaths} times in {RESTART_WINDOW_S:g} s, the last time: {end.text}; "
+                "it is not started again",
+            )
+            return None
+        self._on_event(
+            "warning", f"perception lost: {end.text}; starting it again ({deaths} of {MAX_RESTARTS})"
+        )
+        return _BACK_OFF_S[min(deaths, len(_BACK_OFF_S)) - 1]
+
+    async def _run_one(self, started: asyncio.Future[None]) -> _End:
+        """Start one worker and stay with it until it is dead."""
+        try:
+            process = await PerceptionProcess.spawn(self._settings_of_next_worker())
+        except OSError as error:
+            return _End(False, f"the perception process cannot be started: {error}")
+        pulse = Pulse(time.monotonic(), self._settings.source.open_timeout_s)
+        reading = asyncio.create_task(self._read(process, pulse, started), name="perception reader")
+        self._process, self._pulse = process, pulse
+        try:
+            if self._stop_asked.is_set():  # while it was being started
+                process.ask_to_stop()
+            stuck = await self._until_stuck(reading, pulse)
+            told = None if stuck else reading.result()
+            # A worker that has closed its end has nothing left to do; one that is stuck never will.
+            if stuck or not await process.ends_within(TERMINATE_S):
+                process.kill()
+            died = await process.wait()
+            return stuck or told or _End(False, died)
+        finally:
+            reading.cancel()
+            process.kill()
+            self._process = self._pulse = None
+            self._before.add(self._now)
+            self._now = _Counts()
+            self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
+
+    def _settings_of_next_worker(self) -> Settings:
+        video = self._settings.recording.video
+        if video is None or self._restarts == 0:
+            return self._settings
+        # The video of the worker before is left as it is; the next part goes beside it.
+        path = Path(video)
+        part = str(path.with_name(f"{path.stem}-{self._restarts + 1}{path.suffix}"))
+        recording = self._settings.recording.model_copy(update={"video": part})
+        return self._settings.model_copy(update={"recording": recording})
+
+    async def _until_stuck(self, reading: asyncio.Task[_End | None], pulse: Pulse) -> _End | None:
+        """Wait until nothing more can be read (None), or until the worker is silent for too long."""
+        while True:
+            before_s = time.monotonic()
+            await asyncio.wait({reading}, timeout=_TICK_S)
+            if reading.done():
+                return None
+            now_s = time.monotonic()
+            if now_s - before_s > 4 * _TICK_S:
+                # We stood still ourselves; what the worker said meanwhile is still to be read.
+                pulse.forgive(now_s)
+            elif pulse.silent_s(now_s) > pulse.stuck_after_s:
+                assert self._process is not None
+                text = f"process {self._process.pid} is stuck, no message for {pulse.silent_s(now_s):.1f} s"
+                return _End(False, text)
+
+    async def _read(
+        self, process: PerceptionProcess, pulse: Pulse, started: asyncio.Future[None]
+    ) -> _End | None:
+        """Take every message; returns what the worker told of its end, None if it told nothing."""
+        while True:
+            try:
+                message = await process.read()
+            except ProtocolError as error:
+                return _End(False, str(error))
+            if message is None:
+                return None
+            pulse.heard(time.monotonic())
+            match message:
+                case Report():
+                    self._take(message)
+                    pulse.resulted()
+                case Ready():
+                    pulse.ready()
+                    self._on_ready(message, process)
+                    if not started.done():
+                        started.set_result(None)
+                case StartFailed():
+                    return _End(False, message.text)
+                case Ended():
+                    self._now.frames = message.frames
+                    return _End(message.finished, message.text)
+                case _:
+                    self._note(message)
+
+    def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
+        self._ready = ready
+        self._state = PerceptionState.RUNNING
+        if self._lines:
+            self.send_hud(self._lines)
+        if self._lost_s is not None:
+            self._on_event("info", f"perception is back after {time.monotonic() - self._lost_s:.1f} s")
+            self._lost_s = None
+            return
+        model = "no detector"
+        if ready.model is not None:
+            model = f"model {ready.model} with {len(ready.class_names)} classes in {ready.precision}"
+        self._on_event("info", f"perception sees {ready.source}, {model} (process {process.pid})")
+
+    def _take(self, report: Report) -> None:
+        result = replace(report.result, sequence=report.result.sequence + self._first_sequence)
+        self._now.frames = report.frames
+        self._now.dropped = result.dropped + report.replaced
+        self._newest = result
+        self._results += 1
+        self._arrivals_s.append(time.monotonic())
+        self._rate_hz()
+        self._on_result(result)
+
+    def _note(self, message: Message) -> None:
+        if isinstance(message, Heartbeat):
+            self._now.frames = message.frames
+        elif isinstance(message, LogLine):
+            # What a person should know is an event; the rest is only for the log. Never both.
+            if message.level >= logging.WARNING:
+                level = "error" if message.level >= logging.ERROR else "warning"
+                self._on_event(level, message.text)
+            else:
+                logging.getLogger(message.logger).log(message.level, "%s", message.text)

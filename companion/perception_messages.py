@@ -1,0 +1,164 @@
+"""What the service and the perception worker say to each other over their socket, and how it is framed.
+
+A message is one of the dataclasses below, pickled, after its length (4 bytes, big-endian). Both ends are this
+program, and nobody else holds the socket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+import socket
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from companion.settings import Settings
+from vision.pipeline import PerceptionResult
+from vision.sources import SourceStatistics
+
+_LENGTH = struct.Struct(">I")
+# Far above any message: a result is a few kilobytes. What claims to be longer is not one of ours.
+LARGEST_BYTES = 1 << 24
+
+
+# --- service → worker
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """The first message: what to do."""
+
+    settings: Settings
+
+
+@dataclass(frozen=True, slots=True)
+class Hud:
+    """Lines for the recorded video's next frames."""
+
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Finish the video and end."""
+
+
+# --- worker → service
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The model is loaded and the source has given its first frame.
+
+    `model`, and `precision`, which the network computes in, are None without a detector.
+    """
+
+    source: str
+    model: str | None
+    class_names: tuple[str, ...]
+    precision: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class StartFailed:
+    """The worker cannot do what its settings say. One line."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A result, and the counts that go with it.
+
+    Attributes:
+        replaced: results so far that a newer one replaced before they could be sent.
+    """
+
+    result: PerceptionResult
+    frames: int
+    replaced: int
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """The loop turns, though no frame comes."""
+
+    frames: int
+    statistics: SourceStatistics
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """A record of the worker's log. `level` is `logging`'s number."""
+
+    level: int
+    logger: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The last message. `finished`: the source has ended, or the service asked; else `text` says why."""
+
+    finished: bool
+    text: str
+    frames: int
+
+
+Message = Begin | Hud | Stop | Ready | StartFailed | Report | Heartbeat | LogLine | Ended
+
+
+class ProtocolError(ConnectionError):
+    """What came over the socket is not a message."""
+
+
+def packed(message: Message) -> bytes:
+    """A message as bytes, length first."""
+    body = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return _LENGTH.pack(len(body)) + body
+
+
+def receive(connection: socket.socket) -> Message | None:
+    """The next message of a blocking socket; None when the other end is closed."""
+    header = _receive_exactly(connection, _LENGTH.size)
+    if header is None:
+        return None
+    body = _receive_exactly(connection, _length(header))
+    return None if body is None else _unpacked(body)
+
+
+async def read_message(reader: asyncio.StreamReader) -> Message | None:
+    """The next message of a stream; None when the other end is closed."""
+    try:
+        header = await reader.readexactly(_LENGTH.size)
+        return _unpacked(await reader.readexactly(_length(header)))
+    except (asyncio.IncompleteReadError, ConnectionResetError):
+        return None
+
+
+def _receive_exactly(connection: socket.socket, count: int) -> bytes | None:
+    data = bytearray()
+    while len(data) < count:
+        try:
+            chunk = connection.recv(count - len(data))
+        except ConnectionResetError:
+            return None
+        if not chunk:
+            return None
+        data += chunk
+    return bytes(data)
+
+
+def _length(header: bytes) -> int:
+    length: int = _LENGTH.unpack(header)[0]
+    if length > LARGEST_BYTES:
+        raise ProtocolError(f"a message of {length} bytes is not one of ours")
+    return length
+
+
+def _unpacked(body: bytes) -> Message:
+    message: Any = pickle.loads(body)
+    if not isinstance(message, Message):
+        raise ProtocolError(f"{type(message).__name__} is not a message")
+    return message

@@ -1,0 +1,73 @@
+"""What the service knows of perception at one moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from vision.pipeline import PerceptionResult
+
+
+class PerceptionState(StrEnum):
+    """What the keeper is doing."""
+
+    STOPPED = "stopped"
+    STARTING = "starting"
+    RUNNING = "running"
+    RESTARTING = "restarting"
+    FINISHED = "finished"  # the source came to its end
+    FAILED = "failed"  # given up
+
+
+@dataclass(frozen=True, slots=True)
+class PerceptionStatus:
+    """A snapshot of perception.
+
+    Attributes:
+        pid: of the worker; None while there is none.
+        restarts: since the start.
+        frames: frames that the workers have read.
+        results: results received.
+        rate_hz: results a second, over the last two seconds.
+        newest: the newest result; None before the first.
+        age_s: of the newest result, from its capture.
+        timing_ms: stage → milliseconds of the newest result.
+        dropped: frames lost before they were looked at, and results replaced by newer ones before they left.
+        stuck_after_s: the silence after which the worker counts as stuck.
+        class_names: what the model knows; empty before the start and without a detector.
+        problem: the last thing that went wrong, empty if nothing did.
+    """
+
+    state: PerceptionState
+    pid: int | None = None
+    restarts: int = 0
+    frames: int = 0
+    results: int = 0
+    rate_hz: float = 0.0
+    newest: PerceptionResult | None = None
+    age_s: float | None = None
+    timing_ms: Mapping[str, float] = field(default_factory=dict)
+    dropped: int = 0
+    stuck_after_s: float | None = None
+    class_names: tuple[str, ...] = ()
+    problem: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain values, ready for JSON; of the newest result only its sequence number."""
+        return {
+            "state": self.state.value,
+            "pid": self.pid,
+            "restarts": self.restarts,
+            "frames": self.frames,
+            "results": self.results,
+            "rate_hz": round(self.rate_hz, 2),
+            "sequence": None if self.newest is None else self.newest.sequence,
+            "age_s": None if self.age_s is None else round(self.age_s, 3),
+            "timing_ms": {stage: round(value, 3) for stage, value in self.timing_ms.items()},
+            "dropped": self.dropped,
+            "stuck_after_s": self.stuck_after_s,
+            "class_names": list(self.class_names),
+            "problem": self.problem,
+        }

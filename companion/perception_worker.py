@@ -1,0 +1,214 @@
+"""The perception worker: the process in which frames live. `perception_process.py` starts it.
+
+It is given one end of a socket, takes its orders there, says there what it sees, and ends when the other end
+does: frames without anyone to tell are of no use, and a camera can have only one owner.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from companion.perception_messages import (
+    Begin,
+    Ended,
+    Heartbeat,
+    Hud,
+    Ready,
+    Report,
+    StartFailed,
+    Stop,
+    receive,
+)
+from companion.perception_outbox import Outbox, OutboxHandler
+from companion.settings import Settings
+from vision.pipeline import PerceptionResult, Pipeline, Recording
+from vision.sources import EndOfStream, Source, SourceError, open_source
+
+if TYPE_CHECKING:
+    from vision.detector import Detector
+
+# The loop says at least this often that it turns.
+HEARTBEAT_S = 0.25
+# How long the last messages may take to leave, and everything may take to end once the service is gone.
+FAREWELL_S = 2.0
+GRACE_S = 5.0
+# The service's loop, which steers, comes first where they share a core.
+NICENESS = 5
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+class Orders:
+    """What the service wants, taken from the socket by a thread.
+
+    Attributes:
+        stop: end now.
+        lines: for the recorded video's next frames.
+    """
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.stop = threading.Event()
+        self.lines: tuple[str, ...] = ()
+        self._connection = connection
+        self._finished = threading.Event()
+        threading.Thread(target=self._take, name="inbox", daemon=True).start()
+
+    def finished(self) -> None:
+        """The work has ended in time."""
+        self._finished.set()
+
+    def _take(self) -> None:
+        while (message := receive(self._connection)) is not None:
+            if isinstance(message, Hud):
+                self.lines = message.lines
+            elif isinstance(message, Stop):
+                self.stop.set()
+        # The service is gone. Whoever is stuck in a driver by then will not come back from there.
+        self.stop.set()
+        if not self._finished.wait(GRACE_S):
+            os._exit(1)
+
+
+@dataclass(frozen=True, slots=True)
+class Perception:
+    """Everything that was opened."""
+
+    source: Source
+    detector: Detector | None
+    recording: Recording | None
+
+
+def main(arguments: list[str]) -> int:
+    """Work until the source, the service or the order ends it.
+
+    Args:
+        arguments: the socket's descriptor and the service's process id.
+    """
+    descriptor, service_pid = (int(argument) for argument in arguments)
+    _end_with(service_pid)
+    os.nice(NICENESS)
+    connection = socket.socket(fileno=descriptor)
+    begin = receive(connection)
+    if not isinstance(begin, Begin):
+        return 1
+    orders = Orders(connection)
+    signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop.set())
+    outbox = Outbox(connection, on_lost=orders.stop.set)
+    logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[OutboxHandler(outbox)])
+    last = _work(begin.settings, orders, outbox)
+    outbox.close(last, FAREWELL_S)
+    orders.finished()
+    return 0 if isinstance(last, Ended) and last.finished else 1
+
+
+def _end_with(service_pid: int) -> None:
+    """Be told by the kernel when the service dies; and a Ctrl-C in the terminal is for the service alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != service_pid:  # it died before the kernel was asked to tell
+        os._exit(1)
+
+
+def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
+    frames = 0
+    with contextlib.ExitStack() as stack:
+        try:
+            perception = _open(settings, stack)
+        except (SourceError, ValueError, OSError) as error:  # CheckpointError is a ValueError
+            return StartFailed(_one_line(error))
+        except Exception as error:  # a fault of ours: where it happened goes to standard error
+            traceback.print_exc()
+            return StartFailed(f"perception cannot start: {type(error).__name__}: {_one_line(error)}")
+        outbox.put(_ready(settings, perception))
+        pipeline = Pipeline(
+            perception.source,
+            perception.detector,
+            every=settings.detector.every,
+            recording=perception.recording,
+        )
+        try:
+            _run(pipeline, perception, orders, outbox)
+        except EndOfStream:
+            return Ended(True, "end of stream", pipeline.frames)
+        except SourceError as error:
+            return Ended(False, _one_line(error), pipeline.frames)
+        except Exception as error:
+            traceback.print_exc()
+            return Ended(False, f"{type(error).__name__}: {_one_line(error)}", pipeline.frames)
+        frames = pipeline.frames
+    return Ended(True, "asked to stop", frames)
+
+
+def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
+    recording = None
+    if settings.recording.video is not None:
+        recording = Recording(Path(settings.recording.video), settings.recording.rate_hz)
+    detector = _load(settings) if settings.detector.enabled else None
+    source = stack.enter_context(open_source(settings.source.uri, settings.source.opening()))
+    if recording is not None:
+        # Closed before the source, which may take its time in a driver.
+        stack.callback(recording.close)
+    return Perception(source, detector, recording)
+
+
+def _load(settings: Settings) -> Detector:
+    # Only here: this import brings torch, and a worker that only records needs none.
+    from vision.detector import Detector
+
+    wanted = settings.detector
+    return Detector(
+        wanted.model,
+        classes=wanted.classes or None,
+        confidence=wanted.confidence,
+        iou=wanted.iou,
+        image_size=wanted.image_size,
+        precision=wanted.precision,
+        threads=wanted.threads,
+    )
+
+
+def _ready(settings: Settings, perception: Perception) -> Ready:
+    detector = perception.detector
+    if detector is None:
+        return Ready(perception.source.uri, None, (), None)
+    return Ready(perception.source.uri, settings.detector.model, detector.class_names, detector.precision)
+
+
+def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Outbox) -> None:
+    said_s = time.monotonic()
+
+    def deliver(result: PerceptionResult) -> None:
+        nonlocal said_s
+        outbox.put_newest(Report(result, pipeline.frames, replaced=0))
+        said_s = time.monotonic()
+
+    while not orders.stop.is_set():
+        if perception.recording is not None:
+            perception.recording.lines = orders.lines
+        pipeline.step(HEARTBEAT_S, deliver)
+        if time.monotonic() - said_s >= HEARTBEAT_S:
+            outbox.put_newest(Heartbeat(pipeline.frames, perception.source.statistics))
+            said_s = time.monotonic()
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    code = main(sys.argv[1:])
+    sys.stderr.flush()
+    # Without the interpreter's own farewell: a thread that is still in a driver would hold it up or break it.
+    os._exit(code)

@@ -1,0 +1,211 @@
+"""The perception worker's one loop: a frame, what is in it, how far that is, and the result on its way."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.depth import range_of_boxes
+from vision.detections import Detections
+from vision.frame import Frame
+from vision.sources import Source
+
+if TYPE_CHECKING:
+    from vision.video_writer import VideoWriter
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class PerceptionResult:
+    """What was seen in one frame. Small, and can be pickled.
+
+    Attributes:
+        sequence: the frame's. A gap: frames that were not looked at.
+        captured_ns: CLOCK_MONOTONIC nanoseconds of the frame's capture.
+        inferred_ns: of the moment when the detections were known.
+        width, height: the frame's size, pixels.
+        detections: in the frame's pixels, with ranges where the frame has depth.
+        timing_ms: stage → milliseconds: `preprocess`, `inference`, `postprocess`, `range`, `total` of this
+            frame, and `record` of the frame before (this one is drawn after the result has left).
+        dropped: frames lost so far, between the source and here; those left out on purpose do not count.
+    """
+
+    sequence: int
+    captured_ns: int
+    inferred_ns: int
+    width: int
+    height: int
+    detections: Detections
+    timing_ms: dict[str, float]
+    dropped: int
+
+
+class Timing(Protocol):
+    """How long the parts of one detection took, milliseconds."""
+
+    @property
+    def preprocess_ms(self) -> float: ...
+    @property
+    def inference_ms(self) -> float: ...
+    @property
+    def postprocess_ms(self) -> float: ...
+
+
+class FrameDetector(Protocol):
+    """What the pipeline needs of a detector; `vision.detector.Detector` is one."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]: ...
+    @property
+    def last_timing(self) -> Timing | None: ...
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections: ...
+
+
+class Recording:
+    """The annotated video: every frame, the newest detections drawn on it, and lines told from outside.
+
+    A recording that fails (a full disk) says so once and ends; perception goes on.
+
+    Attributes:
+        lines: text to draw on the next frames.
+        highlight: index of the detection to draw as the chosen one, or None.
+    """
+
+    def __init__(self, path: Path, rate_hz: float) -> None:
+        """Raises OSError if the file cannot be made there."""
+        self.lines: tuple[str, ...] = ()
+        self._path = path
+        self._rate_hz = rate_hz
+        self._writer: VideoWriter | None = None
+        self._size = (0, 0)
+        self._ended = False
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"cannot record to {path}: the folder {path.parent} does not exist")
+
+    def write(self, frame: Frame, detections: Detections) -> None:
+        """Draw and add one frame."""
+        if self._ended:
+            return
+        # Only here: the service shares this module for its values, and draws nothing.
+        from vision.annotate import annotate
+        from vision.video_writer import VideoWriter
+
+        drawn = annotate(frame.image, detections, lines=self.lines)
+        try:
+            if self._writer is None:
+                self._size = (frame.width, frame.height)
+                self._writer = VideoWriter(self._path, frame.width, frame.height, self._rate_hz)
+            if (frame.width, frame.height) != self._size:
+                drawn = cv2.resize(drawn, self._size).astype(np.uint8, copy=False)
+            self._writer.write(drawn, frame.captured_ns)
+        except OSError as error:
+            self._ended = True
+            logger.error("the recording to %s has ended: %s", self._path, error)
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._ended = True
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+class Pipeline:
+    """Source → detector → range → result, one frame a step.
+
+    Attributes:
+        frames: frames read so far.
+        dropped: frames lost so far between the source and here.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        detector: FrameDetector | None,
+        *,
+        every: int = 1,
+        recording: Recording | None = None,
+    ) -> None:
+        """
+        Args:
+            source: open; the caller closes it.
+            detector: None: nothing is looked for, and every result is empty.
+            every: look at every N-th frame that was read. The others are only recorded.
+            recording: the caller closes it.
+        """
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}")
+        self._source = source
+        self._detector = detector
+        self._every = every
+        self._recording = recording
+        self._newest = Detections.empty(detector.class_names if detector else ())
+        self._next_sequence: int | None = None
+        self._record_ms = 0.0
+        self.frames = 0
+        self.dropped = 0
+
+    def step(self, timeout_s: float, deliver: Callable[[PerceptionResult], None]) -> bool:
+        """Read one frame, look at it if it is its turn, hand the result to `deliver`, then record the frame.
+
+        Returns:
+            False if no frame came within `timeout_s`.
+
+        Raises:
+            EndOfStream, SourceError: as the source does.
+        """
+        frame = self._source.read(timeout_s)
+        if frame is None:
+            return False
+        if self._next_sequence is not None:
+            self.dropped += max(0, frame.sequence - self._next_sequence)
+        self._next_sequence = frame.sequence + 1
+        if self.frames % self._every == 0:
+            result = self._look(frame)
+            self._newest = result.detections
+            deliver(result)
+        self.frames += 1
+        if self._recording is not None:
+            started_ns = time.perf_counter_ns()
+            self._recording.write(frame, self._newest)
+            self._record_ms = (time.perf_counter_ns() - started_ns) / 1e6
+        return True
+
+    def _look(self, frame: Frame) -> PerceptionResult:
+        started_ns = time.perf_counter_ns()
+        timing_ms: dict[str, float] = {}
+        if self._detector is None:
+            detections = self._newest
+        else:
+            detections = self._detector.detect(frame.image)
+            timing = self._detector.last_timing
+            if timing is not None:
+                timing_ms["preprocess"] = timing.preprocess_ms
+                timing_ms["inference"] = timing.inference_ms
+                timing_ms["postprocess"] = timing.postprocess_ms
+        detected_ns = time.perf_counter_ns()
+        if frame.depth_m is not None:
+            detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
+        done_ns = time.perf_counter_ns()
+        timing_ms["range"] = (done_ns - detected_ns) / 1e6
+        timing_ms["total"] = (done_ns - started_ns) / 1e6
+        timing_ms["record"] = self._record_ms
+        return PerceptionResult(
+            sequence=frame.sequence,
+            captured_ns=frame.captured_ns,
+            inferred_ns=time.monotonic_ns(),
+            width=frame.width,
+            height=frame.height,
+            detections=detections,
+            timing_ms=timing_ms,
+            dropped=self.dropped,
+        )
