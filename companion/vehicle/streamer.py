@@ -46,7 +46,7 @@ class Streamer:
     ) -> None:
         if not rate_hz > 2.0:
             raise ValueError(f"PX4 needs setpoints faster than 2 Hz, got rate_hz={rate_hz}")
-        self._send = send
+        self.send = send
         self._period_ns = round(1e9 / rate_hz)
         self._brake_ns = round(brake_s * 1e9)
         self._clock_ns = clock_ns
@@ -106,7 +106,7 @@ class Streamer:
             await asyncio.sleep((due_ns - self._clock_ns()) / 1e9)
 
     def _put(self, setpoint: Setpoint, now_ns: int) -> None:
-        self._send(setpoint)
+        self.send(setpoint)
         self._sent, self._sent_ns = setpoint, now_ns
         self.sent_count += 1
 

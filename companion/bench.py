@@ -1,0 +1,124 @@
+"""Measurements of the parts, on this machine: the detector, and the spacing of setpoints under load."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import platform
+import resource
+import socket
+import threading
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.streamer import Streamer
+
+_WARM_UP = 10
+# SET_POSITION_TARGET_LOCAL_NED in MAVLink 2: what a setpoint weighs on the wire.
+_SETPOINT_BYTES = 65
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    """p50, p99 and the largest, rounded."""
+    array = np.asarray(values)
+    return {
+        "p50_ms": round(float(np.percentile(array, 50)), 3),
+        "p99_ms": round(float(np.percentile(array, 99)), 3),
+        "max_ms": round(float(array.max()), 3),
+    }
+
+
+def measure_detector(model: str, *, image_size: int, frames: int, threads: int | None) -> dict[str, object]:
+    """Time `Detector.detect` on 640×480 pictures of the built-in world; memory is this process's largest."""
+    from mavlink_sim.training_scenes import random_scene
+    from vision.detector import Detector
+
+    detector = Detector(model, image_size=image_size, threads=threads)
+    rng = np.random.default_rng(0)
+    pictures = [random_scene(rng, 640, 480)[0] for _ in range(8)]
+    for index in range(_WARM_UP):
+        detector.detect(pictures[index % len(pictures)])
+    total_ms, network_ms = [], []
+    for index in range(frames):
+        started = time.perf_counter()
+        detector.detect(pictures[index % len(pictures)])
+        total_ms.append((time.perf_counter() - started) * 1e3)
+        assert detector.last_timing is not None
+        network_ms.append(detector.last_timing.inference_ms)
+    figures = percentiles(total_ms)
+    return {
+        "model": model,
+        "precision": detector.precision,
+        "image_size": image_size,
+        "frames": frames,
+        **figures,
+        "network_p50_ms": round(float(np.median(network_ms)), 3),
+        "frames_per_s": round(1e3 * len(total_ms) / sum(total_ms), 1),
+        "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "machine": platform.machine(),
+    }
+
+
+def measure_setpoints(seconds: float, *, rate_hz: float, load: int) -> dict[str, object]:
+    """Spacing of the streamer's datagrams on a loopback socket, with `load` busy processes beside it.
+
+    The receiver stamps in a thread that blocks in `recv`, so its own wake-up is part of the figure.
+    """
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=_busy, daemon=True) for _ in range(load)]
+    for process in busy:
+        process.start()
+    try:
+        arrivals_ns = asyncio.run(_stream(seconds, rate_hz))
+    finally:
+        for process in busy:
+            process.kill()
+            process.join()
+    spacing_ms = np.diff(arrivals_ns) / 1e6
+    error_ms = np.abs(spacing_ms - 1e3 / rate_hz)
+    return {
+        "rate_hz": rate_hz,
+        "busy_processes": load,
+        "setpoints": len(arrivals_ns),
+        "spacing_p50_ms": round(float(np.percentile(spacing_ms, 50)), 3),
+        "error_p99_ms": round(float(np.percentile(error_ms, 99)), 3),
+        "error_max_ms": round(float(error_ms.max()), 3),
+    }
+
+
+async def _stream(seconds: float, rate_hz: float) -> list[int]:
+    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    receiver.bind(("127.0.0.1", 0))
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sender.connect(receiver.getsockname())
+    arrivals_ns: list[int] = []
+
+    def receive() -> None:
+        while receiver.recv(256):
+            arrivals_ns.append(time.monotonic_ns())
+
+    thread = threading.Thread(target=receive)
+    thread.start()
+
+    def send(_: Setpoint) -> None:
+        sender.send(bytes(_SETPOINT_BYTES))
+
+    streamer = Streamer(send, rate_hz=rate_hz)
+    streamer.submit(Setpoint.brake(time.monotonic_ns(), lifetime_s=seconds + 1))
+    task = asyncio.create_task(streamer.run())
+    await asyncio.sleep(seconds)
+    task.cancel()
+    sender.send(b"")  # an empty datagram ends the receiver
+    await asyncio.to_thread(thread.join)
+    receiver.close()
+    sender.close()
+    return arrivals_ns
+
+
+def _busy() -> None:
+    value = 0
+    while True:
+        value += 1

@@ -1,0 +1,87 @@
+"""From a frame's capture to the first setpoint that knows of it, in flight with the built-in vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import tempfile
+import time
+from pathlib import Path
+
+from companion.bench import percentiles
+from companion.demo import ALTITUDE_M
+from companion.rehearsal import (
+    RehearsalError,
+    free_port,
+    rehearsal_settings,
+    running_service,
+    simulator,
+    until_ready_to_arm,
+)
+from companion.service import Service
+from companion.vehicle.setpoint import Setpoint
+
+
+def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
+    """Fly `seek` and `approach` and time every setpoint that is the first after a new detection message.
+
+    `capture_to_setpoint` starts at the pose's stamp in the simulator; `network` is the detector's own share.
+
+    Raises:
+        RehearsalError: the vehicle did not get into the air.
+    """
+    with tempfile.TemporaryDirectory(prefix="companion-bench-") as folder:
+        return asyncio.run(_measure(Path(folder), seconds, driver))
+
+
+async def _measure(folder: Path, seconds: float, driver: str) -> dict[str, object]:
+    latency_ms: list[float] = []
+    beyond_ms: list[float] = []
+    camera = f"companion-bench-{os.getpid()}"
+    port = free_port()
+    async with simulator(port, camera, folder / "truth.jsonl", 1, folder / "simulator.log"):
+        settings = rehearsal_settings(port, camera, driver=driver)
+        service = Service(settings)
+        _measure_sent(service, latency_ms, beyond_ms)
+        async with running_service(service):
+            await until_ready_to_arm(service)
+            reply = await service.command(f"takeoff {ALTITUDE_M:g}")
+            if not reply["success"]:
+                raise RehearsalError(f"cannot measure in flight: {reply['reason']}")
+            latency_ms.clear()
+            beyond_ms.clear()
+            flight = asyncio.create_task(_look_around(service))
+            await asyncio.sleep(seconds)
+            flight.cancel()
+    if not latency_ms:
+        raise RehearsalError("no setpoint followed a detection message")
+    return {
+        "driver": driver,
+        "setpoints": len(latency_ms),
+        **{f"capture_to_setpoint_{name}": value for name, value in percentiles(latency_ms).items()},
+        **{f"beyond_network_{name}": value for name, value in percentiles(beyond_ms).items()},
+    }
+
+
+async def _look_around(service: Service) -> None:
+    await service.command("seek car")
+    await service.command("approach car distance=5")
+    await service.command("hold")
+
+
+def _measure_sent(service: Service, latency_ms: list[float], beyond_ms: list[float]) -> None:
+    """Time what the streamer puts on the wire, without changing it."""
+    send = service.driver.send_setpoint
+    seen = -1
+
+    def timed(setpoint: Setpoint) -> None:
+        nonlocal seen
+        send(setpoint)
+        newest = service.newest
+        if newest is not None and newest.sequence != seen:
+            seen = newest.sequence
+            elapsed_ms = (time.monotonic_ns() - newest.captured_ns) / 1e6
+            latency_ms.append(elapsed_ms)
+            beyond_ms.append(elapsed_ms - newest.timing_ms["total"])
+
+    service.streamer.send = timed

@@ -1,0 +1,184 @@
+"""The whole way in one command: the built-in vehicle, its camera, our weights, and a flight to a car.
+
+The simulator and the perception worker are processes of their own, the detections are counted by a zenoh
+subscriber that knows nothing of the service, and what is claimed is measured from the simulator's truth.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.bus.client import client_settings, listen, open_client
+from companion.bus.topics import DETECTIONS
+from companion.rehearsal import free_port, rehearsal_settings, running_service, simulator, until_ready_to_arm
+from companion.service import Event, Service
+
+STOP_DISTANCE_M = 5.0
+# Arrival counts when the simulator agrees with it to within this.
+RANGE_TOLERANCE_M = 1.0
+ALTITUDE_M = 4.0
+VIDEO_NAME = "flight.webm"
+
+# What is flown, in the service's own grammar. The range is taken at the end of the hold, when all is still.
+STEPS = (
+    f"takeoff {ALTITUDE_M:g}",
+    "seek car",
+    f"approach car distance={STOP_DISTANCE_M:g}",
+    "hold duration=3",
+)
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What happened. Ranges and landing are the simulator's truth, not our own estimate."""
+
+    success: bool
+    found: bool
+    reached: bool
+    final_range_m: float | None
+    landed: bool
+    frames: int
+    detections_published: int
+    detections_received: int
+    seed: int
+    duration_s: float
+    video: str
+    failure: str | None
+
+
+def run_demo(output: Path, *, seed: int, limit_s: float, say: Say) -> Summary:
+    """Fly it. Leaves `flight.webm`, `summary.json`, `events.jsonl` and `truth.jsonl` in `output`.
+
+    Raises:
+        RehearsalError: the simulator did not start, or its vehicle never became ready.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    truth_path = output / "truth.jsonl"
+    truth_path.unlink(missing_ok=True)
+    started = time.monotonic()
+    flight = asyncio.run(_fly(output, truth_path, seed=seed, limit_s=limit_s, say=say))
+    final_range_m = _range_at(truth_path, flight.reached_ns) if flight.reached_ns else None
+    reached = final_range_m is not None and abs(final_range_m - STOP_DISTANCE_M) <= RANGE_TOLERANCE_M
+    landed = flight.ended and _landed(truth_path)
+    failure = flight.failure
+    if failure is None and not reached:
+        failure = f"stopped at {final_range_m} m of the car, not at {STOP_DISTANCE_M:g} m"
+    if failure is None and not landed:
+        failure = "the vehicle is not on the ground and disarmed"
+    summary = Summary(
+        success=failure is None and flight.found and reached and landed and flight.received > 0,
+        found=flight.found,
+        reached=reached,
+        final_range_m=None if final_range_m is None else round(final_range_m, 2),
+        landed=landed,
+        frames=flight.frames,
+        detections_published=flight.published,
+        detections_received=flight.received,
+        seed=seed,
+        duration_s=round(time.monotonic() - started, 1),
+        video=VIDEO_NAME,
+        failure=failure,
+    )
+    (output / "summary.json").write_text(json.dumps(asdict(summary), indent=2) + "\n")
+    return summary
+
+
+@dataclass(slots=True)
+class _Flight:
+    """What is gathered while flying."""
+
+    found: bool = False
+    reached_ns: int | None = None
+    ended: bool = False
+    frames: int = 0
+    published: int = 0
+    received: int = 0
+    failure: str | None = None
+
+
+async def _fly(output: Path, truth_path: Path, *, seed: int, limit_s: float, say: Say) -> _Flight:
+    flight = _Flight()
+    camera = f"companion-demo-{os.getpid()}"
+    port = free_port()
+    async with simulator(port, camera, truth_path, seed, output / "simulator.log"):
+        say("the vehicle and its camera are running")
+        settings = rehearsal_settings(port, camera, video=output / VIDEO_NAME)
+        with (output / "events.jsonl").open("w") as events:
+
+            def on_event(event: Event) -> None:
+                events.write(json.dumps(asdict(event)) + "\n")
+                say(event.text)
+
+            service = Service(settings, on_event=on_event)
+            try:
+                async with asyncio.timeout(limit_s), running_service(service):
+                    await _watched_mission(service, flight)
+            except TimeoutError:
+                flight.failure = flight.failure or f"not finished in {limit_s:g} s"
+            finally:
+                flight.published = service.bus.published[DETECTIONS.name]
+                flight.frames = service.perception.status.frames
+    return flight
+
+
+async def _watched_mission(service: Service, flight: _Flight) -> None:
+    """The mission, while a zenoh subscriber of its own counts the detection messages."""
+
+    def count(_key: str, text: str) -> None:
+        json.loads(text)
+        flight.received += 1
+
+    with open_client(client_settings(service.settings.zenoh)) as session:
+        subscriber = listen(session, DETECTIONS.name, count)
+        try:
+            await _mission(service, flight)
+        finally:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+async def _mission(service: Service, flight: _Flight) -> None:
+    """The steps; the first that fails ends it, and the vehicle comes home all the same."""
+    await until_ready_to_arm(service)
+    for step in STEPS:
+        reply = await service.command(step)
+        if not reply["success"]:
+            flight.failure = f"{step}: {reply['reason']}"
+            break
+        flight.found = flight.found or step.startswith("seek")
+        if step.startswith("hold"):
+            flight.reached_ns = time.monotonic_ns()
+    if service.driver.state.armed:
+        reply = await service.command("rtl")
+        if not reply["success"]:
+            flight.failure = flight.failure or f"rtl: {reply['reason']}"
+    flight.ended = not service.driver.state.armed
+
+
+def _range_at(truth_path: Path, stamp_ns: int) -> float | None:
+    """The true range to the nearest car at a moment."""
+    rows = _rows(truth_path)
+    if not rows:
+        return None
+    row = min(rows, key=lambda row: abs(row["stamp_ns"] - stamp_ns))
+    ranges = [item["range_m"] for item in row["objects"] if item["class_name"] == "car"]
+    return min(ranges) if ranges else None
+
+
+def _landed(truth_path: Path) -> bool:
+    rows = _rows(truth_path)
+    return bool(rows) and not rows[-1]["armed"] and rows[-1]["landed"] == "on_ground"
+
+
+def _rows(truth_path: Path) -> list[dict[str, Any]]:
+    lines = truth_path.read_text().splitlines() if truth_path.exists() else []
+    # The simulator may have been ended in the middle of its last line.
+    return [json.loads(line) for line in lines if line.endswith("}")]

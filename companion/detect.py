@@ -1,0 +1,131 @@
+"""`companion detect`: every frame of a source through the detector, one line a frame."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from vision.annotate import annotate
+from vision.detections import Detections
+from vision.detector import Detector
+from vision.frame import Frame
+from vision.sources import Source
+
+logger = logging.getLogger(__name__)
+
+
+def detect_source(
+    source: Source,
+    detector: Detector,
+    *,
+    every: int = 1,
+    limit: int | None = None,
+    save: Path | None = None,
+    as_json: bool = False,
+    write: Callable[[str], None],
+) -> int:
+    """Detect in every `every`-th frame, at most `limit` of them.
+
+    Args:
+        save: folder for `<sequence>.jpg` (the input) and `<sequence>_detections.jpg` (annotated).
+        as_json: one JSON object a frame instead of a readable line.
+        write: takes each line.
+
+    Returns:
+        How many frames were looked at.
+
+    Raises:
+        OSError: a picture cannot be written.
+    """
+    if save is not None:
+        save.mkdir(parents=True, exist_ok=True)
+    looked_at = 0
+    with _progress(source, every, limit) as advance:
+        for index, frame in enumerate(source):
+            if index % every:
+                continue
+            detections = detector.detect(frame.image)
+            write(_line(frame, detections, detector, as_json))
+            if save is not None:
+                _save(save, frame, detections)
+            looked_at += 1
+            advance()
+            if looked_at == limit:
+                break
+    statistics = source.statistics
+    if statistics.dropped or statistics.unreadable:
+        logger.warning("%d frames dropped, %d unreadable", statistics.dropped, statistics.unreadable)
+    return looked_at
+
+
+def _line(frame: Frame, detections: Detections, detector: Detector, as_json: bool) -> str:
+    timing = detector.last_timing
+    assert timing is not None
+    if not as_json:
+        seen = ", ".join(
+            f"{record['class_name']} {record['confidence']:.2f}" for record in detections.records()
+        )
+        return f"{frame.sequence:6d}  {timing.total_ms:6.1f} ms  {seen or 'no objects detected'}"
+    message: dict[str, Any] = {
+        "sequence": frame.sequence,
+        "captured_ns": frame.captured_ns,
+        "width": frame.width,
+        "height": frame.height,
+        "inference_ms": round(timing.inference_ms, 2),
+        "detections": [
+            {key: value for key, value in record.items() if key != "range_m"}
+            for record in detections.records()
+        ],
+    }
+    return json.dumps(message)
+
+
+def _save(folder: Path, frame: Frame, detections: Detections) -> None:
+    _write_image(folder / f"{frame.sequence:06d}.jpg", frame.image)
+    _write_image(folder / f"{frame.sequence:06d}_detections.jpg", annotate(frame.image, detections))
+
+
+def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"cannot write {path}: is the disk full, or the folder not ours to write?")
+
+
+def _progress(source: Source, every: int, limit: int | None) -> AbstractContextManager[Callable[[], None]]:
+    """A bar on standard error for sources with an end, where somebody looks."""
+    if source.total_frames is None or not sys.stderr.isatty():
+        return nullcontext(lambda: None)
+    frames = -(-source.total_frames // every)
+    return _Bar(frames if limit is None else min(frames, limit))
+
+
+class _Bar:
+    """A progress bar as a context that gives what advances it."""
+
+    def __init__(self, total: int) -> None:
+        self._progress = Progress(
+            TextColumn("detecting"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._task = self._progress.add_task("detecting", total=total)
+
+    def __enter__(self) -> Callable[[], None]:
+        self._progress.start()
+        return lambda: self._progress.advance(self._task)
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()

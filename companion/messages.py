@@ -1,0 +1,84 @@
+"""What goes out on the bus, as plain JSON-able values. Stamps are CLOCK_MONOTONIC nanoseconds of this host.
+
+These shapes are the public contract with subscribers (`docs/messages.md`): fields are added, never changed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from companion.bus.topics import NO_OBJECTS
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import VehicleState
+from vision.pipeline import PerceptionResult
+
+
+def detections_message(result: PerceptionResult, vehicle: str, published_ns: int) -> dict[str, Any]:
+    """One frame's detections, with the three stamps: captured, inferred, published."""
+    return {
+        "vehicle": vehicle,
+        "sequence": result.sequence,
+        "captured_ns": result.captured_ns,
+        "inferred_ns": result.inferred_ns,
+        "published_ns": published_ns,
+        "width": result.width,
+        "height": result.height,
+        "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
+        "dropped": result.dropped,
+        "detections": result.detections.records(),
+    }
+
+
+def labels_message(result: PerceptionResult) -> str:
+    """The class names of one frame, comma separated, in the detections' order."""
+    return ", ".join(result.detections.names) or NO_OBJECTS
+
+
+def vehicle_message(state: VehicleState, now_ns: int) -> dict[str, Any]:
+    """The vehicle's state. Metres, metres a second, radians; NED and, for `attitude_wxyz`, FRD to NED."""
+    return {
+        "stamp_ns": now_ns,
+        "connected": state.connected(now_ns),
+        "heartbeat_age_s": _age_s(state.heartbeat_ns, now_ns),
+        "position_age_s": _age_s(state.position_ns, now_ns),
+        "armed": state.armed,
+        "mode": state.mode.value,
+        "landed": state.landed.value,
+        "failsafe": state.failsafe,
+        "position_ned_m": _rounded(state.position_ned_m),
+        "velocity_ned_mps": _rounded(state.velocity_ned_mps),
+        "attitude_wxyz": _rounded(state.attitude, 5),
+        "yaw_rad": None if state.yaw_rad is None else round(state.yaw_rad, 4),
+        "altitude_m": None if state.altitude_m is None else round(state.altitude_m, 3),
+        "latitude_deg": _finite(state.latitude_deg),
+        "longitude_deg": _finite(state.longitude_deg),
+        "altitude_amsl_m": _finite(state.altitude_amsl_m),
+        "battery_fraction": state.battery_fraction,
+    }
+
+
+def setpoint_message(setpoint: Setpoint | None) -> dict[str, Any] | None:
+    """A setpoint, or None where there is none."""
+    if setpoint is None:
+        return None
+    return {
+        "position_ned_m": _rounded(setpoint.position_ned_m),
+        "velocity_ned_mps": _rounded(setpoint.velocity_ned_mps),
+        "yaw_rad": _finite(setpoint.yaw_rad),
+        "yaw_rate_radps": _finite(setpoint.yaw_rate_radps),
+        "deadline_ns": setpoint.deadline_ns,
+    }
+
+
+def _age_s(stamp_ns: int, now_ns: int) -> float | None:
+    return round((now_ns - stamp_ns) / 1e9, 3) if stamp_ns else None
+
+
+def _rounded(values: tuple[float, ...] | None, digits: int = 3) -> list[float] | None:
+    return None if values is None else [round(value, digits) for value in values]
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON has no NaN."""
+    return value if value is not None and math.isfinite(value) else None

@@ -1,0 +1,145 @@
+"""The service with the built-in vehicle, both on loopback: for the demonstration and for measuring."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from companion.config import load_settings
+from companion.service import Service
+from companion.settings import Settings
+
+_SIMULATOR_START_S = 20.0
+_ARMABLE_S = 20.0
+
+
+class RehearsalError(RuntimeError):
+    """The built-in vehicle is not to be had. The message is one line for a person."""
+
+
+@asynccontextmanager
+async def simulator(
+    port: int, camera: str, truth_path: Path, seed: int, log_path: Path
+) -> AsyncIterator[asyncio.subprocess.Process]:
+    """`mavlink-sim` as a process of its own, sending to `port`; what it says goes to `log_path`.
+
+    Raises:
+        RehearsalError: it did not start.
+    """
+    arguments = [
+        "--onboard-port",
+        str(port),
+        "--onboard-bind",
+        "0",
+        "--gcs-port",
+        str(free_port()),
+        "--gcs-bind",
+        "0",
+    ]
+    arguments += ["--camera", camera, "--truth", str(truth_path), "--seed", str(seed)]
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "mavlink_sim", *arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert process.stdout is not None
+    lines: list[str] = []
+    copying: asyncio.Task[None] | None = None
+    try:
+        await _until_ready(process.stdout, lines)
+        copying = asyncio.create_task(_copy(process.stdout, lines))
+        yield process
+    finally:
+        if process.returncode is None:
+            process.terminate()
+        await process.wait()
+        if copying is not None:
+            await copying
+        log_path.write_text("".join(lines))  # noqa: ASYNC240 - the loop has nothing else to do any more
+
+
+async def _until_ready(stream: asyncio.StreamReader, lines: list[str]) -> None:
+    try:
+        async with asyncio.timeout(_SIMULATOR_START_S):
+            while line := await stream.readline():
+                lines.append(line.decode())
+                if lines[-1].startswith("ready"):
+                    return
+    except TimeoutError as error:
+        raise RehearsalError(f"the simulator was not ready in {_SIMULATOR_START_S:g} s") from error
+    raise RehearsalError(f"the simulator did not start: {''.join(lines[-3:]).strip()}")
+
+
+async def _copy(stream: asyncio.StreamReader, lines: list[str]) -> None:
+    while line := await stream.readline():
+        lines.append(line.decode())
+
+
+def rehearsal_settings(
+    port: int, camera: str, *, video: Path | None = None, driver: str = "mavsdk"
+) -> Settings:
+    """Settings for the built-in vehicle and its camera, whatever is configured on this machine."""
+    from mavlink_sim.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
+
+    fov_deg = math.degrees(2 * math.atan(DEFAULT_CAMERA.width / 2 / DEFAULT_CAMERA.fx))
+    overrides = {
+        "vehicle.url": f"udpin://127.0.0.1:{port}",
+        "vehicle.driver": driver,
+        "source.uri": f"shm://{camera}",
+        "camera.horizontal_fov_deg": f"{fov_deg:.6f}",
+        "camera.mount_pitch_deg": f"{math.degrees(DEFAULT_MOUNT.pitch_rad):.6f}",
+        "camera.mount_forward_m": str(DEFAULT_MOUNT.forward_m),
+        "camera.mount_right_m": str(DEFAULT_MOUNT.right_m),
+        "camera.mount_down_m": str(DEFAULT_MOUNT.down_m),
+        "detector.threads": "1",
+        "zenoh.listen": f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",
+    }
+    if video is not None:
+        overrides["recording.video"] = str(video)
+    return load_settings(Path(os.devnull), overrides, environment={})
+
+
+@asynccontextmanager
+async def running_service(service: Service) -> AsyncIterator[None]:
+    """The service, ready; stopped at the end. What fails in it is raised here.
+
+    Raises:
+        LinkError, PerceptionStartError, BusError: as `Service.run`.
+    """
+    ready = asyncio.Event()
+    running = asyncio.create_task(service.run(ready.set))
+    waiting = asyncio.create_task(ready.wait())
+    try:
+        await asyncio.wait({running, waiting}, return_when=asyncio.FIRST_COMPLETED)
+        if running.done():
+            running.result()
+        yield
+    finally:
+        waiting.cancel()
+        service.stop()
+        await running
+
+
+async def until_ready_to_arm(service: Service) -> None:
+    """Wait for the autopilot's pre-arm checks. Raises RehearsalError if they do not pass."""
+    armable = asyncio.Event()
+    unsubscribe = service.driver.subscribe(lambda state: armable.set() if state.ready_to_arm else None)
+    try:
+        async with asyncio.timeout(_ARMABLE_S):
+            await armable.wait()
+    except TimeoutError as error:
+        raise RehearsalError(f"the vehicle was not ready to arm in {_ARMABLE_S:g} s") from error
+    finally:
+        unsubscribe()
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    """A port of loopback that nobody holds now."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

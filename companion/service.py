@@ -1,0 +1,359 @@
+"""The service put together: link, perception, guidance, streamer, bus; what is lost is said, and found again.
+
+Everything here runs in one asyncio loop and nothing in it is heavy. The heartbeat and systemd's watchdog are
+fed from the guidance loop, so whoever watches them watches the loop that steers.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from companion.bus import topics
+from companion.bus.session import Bus
+from companion.guidance import grammar
+from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
+from companion.guidance.registry import behaviour_for
+from companion.guidance.target import Target
+from companion.guidance.targets import StateHistory, targets_from_detections
+from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
+from companion.operator.console import run_console, terminal_is_free
+from companion.perception import PerceptionKeeper, PerceptionState
+from companion.settings import Settings
+from companion.systemd_notify import SystemdNotifier
+from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
+from companion.vehicle.drivers import open_driver
+from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.streamer import Streamer, StreamState
+from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__name__)
+
+_HEARTBEAT_PERIOD_S = 1.0
+_HUD_PERIOD_S = 0.2
+_EVENTS_KEPT = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something a person should know. `level` is info, warning or error."""
+
+    stamp_ns: int
+    level: str
+    text: str
+
+
+class Service:
+    """One vehicle's companion.
+
+    Attributes:
+        ready: everything is up, and commands are taken.
+        newest: what was last seen.
+
+    Args:
+        settings: all of them.
+        on_event: called in the loop with every event, besides the log and the bus.
+        console: take commands from the terminal as well.
+    """
+
+    def __init__(
+        self, settings: Settings, *, on_event: Callable[[Event], None] | None = None, console: bool = False
+    ) -> None:
+        self.settings = settings
+        self._on_event = on_event
+        self._console = console
+        self.events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
+        guidance = settings.guidance
+        self.driver: Driver = open_driver(
+            settings.vehicle.driver, settings.vehicle.url, system_id=settings.vehicle.system_id
+        )
+        self.streamer = Streamer(
+            self.driver.send_setpoint, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s
+        )
+        self.pilot = Pilot(
+            self.driver, self.streamer, Envelope(_limits(settings)), on_event=self._pilot_event
+        )
+        self.perception = PerceptionKeeper(settings, on_result=self._result, on_event=self._event)
+        self.bus = Bus(settings.zenoh, settings.vehicle.name, on_event=self._event, on_command=self.command)
+        self.ready = False
+        self.newest: PerceptionResult | None = None
+        self._notifier = SystemdNotifier()
+        self._history = StateHistory()
+        self._targets: tuple[Target, ...] = ()
+        self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
+        self._started_ns = time.monotonic_ns()
+        self._linked = False
+        self._stop = asyncio.Event()
+
+    async def run(self, ready: Callable[[], None] | None = None) -> None:
+        """Start everything, call `ready`, and work until `stop()`; then let the autopilot hold and end.
+
+        Raises:
+            LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
+        """
+        unsubscribe = self.driver.subscribe(self._history.add)
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            await self._start()
+            loops = [self._guide(), self.streamer.run(), self._tell_vehicle(), self._tell_status()]
+            if self._console and terminal_is_free(self.settings.source.uri):
+                loops.append(run_console(self.command, self.stop, grammar.describe()))
+            tasks = [asyncio.create_task(loop) for loop in loops]
+            self._notifier.ready("flying" if self.driver.state.armed else "ready")
+            self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")
+            self.ready = True
+            if ready is not None:
+                ready()
+            await self._until_stopped(tasks)
+            await self._leave()
+        finally:
+            self._notifier.stopping()
+            unsubscribe()
+            self.streamer.stop()
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.gather(self.perception.stop(), self.bus.close(), self.driver.close())
+            self._notifier.close()
+
+    def stop(self) -> None:
+        """End `run()`. In flight under our command, the autopilot is asked to hold first."""
+        self._stop.set()
+
+    async def command(self, text: str) -> dict[str, Any]:
+        """Do what a command says; the reply tells how it ended: success, reason.
+
+        A command without an end of its own (`hold`, `orbit` with no laps) is answered when it is under way.
+        """
+        try:
+            command = grammar.parse(text, self.perception.status.class_names or None)
+        except grammar.GrammarError as error:
+            return {"command": text, "success": False, "reason": str(error)}
+        self._event("info", f"command: {command}")
+        outcome = await self._outcome_of(command)
+        self._event("info" if outcome.success else "warning", f"{command}: {outcome.reason}")
+        return {"command": str(command), **asdict(outcome)}
+
+    async def _outcome_of(self, command: grammar.Command) -> Outcome:
+        behaviour = behaviour_for(command)
+        ended = self.pilot.command(behaviour)
+        if not command.endless:
+            return await asyncio.shield(ended)
+        under_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._awaited = (behaviour, under_way)
+        await asyncio.wait({ended, under_way}, return_when=asyncio.FIRST_COMPLETED)
+        return ended.result() if ended.done() else Outcome(True, "under way")
+
+    def _answer_under_way(self) -> None:
+        """A command without an end counts as done when the vehicle flies it."""
+        if self._awaited is None:
+            return
+        behaviour, under_way = self._awaited
+        flown = self.driver.state.mode is FlightMode.OFFBOARD and self.streamer.state is StreamState.FRESH
+        if self.pilot.behaviour is behaviour and flown and not under_way.done():
+            under_way.set_result(None)
+
+    async def _start(self) -> None:
+        starts = [
+            asyncio.create_task(self.bus.start()),
+            asyncio.create_task(self.driver.connect(self.settings.vehicle.connect_timeout_s)),
+            asyncio.create_task(self.perception.start()),
+        ]
+        try:
+            done, _ = await asyncio.wait(starts, return_when=asyncio.FIRST_EXCEPTION)
+            for task in done:
+                task.result()
+        finally:
+            for task in starts:
+                task.cancel()
+            await asyncio.gather(*starts, return_exceptions=True)
+
+    async def _until_stopped(self, tasks: list[asyncio.Task[None]]) -> None:
+        """Until `stop()`, or until a loop fails: one that steers must not die unseen."""
+        stopped = asyncio.create_task(self._stop.wait())
+        waiting: set[asyncio.Task[Any]] = {stopped, *tasks}
+        try:
+            while not stopped.done():
+                done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()  # the console may end (end of file); a failure is raised here
+        finally:
+            stopped.cancel()
+
+    async def _leave(self) -> None:
+        """Hand the vehicle to the autopilot's own hold, if we had it."""
+        if not self.pilot.in_command or self.driver.state.mode is not FlightMode.OFFBOARD:
+            return
+        try:
+            await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
+        except CommandRefusedError as error:
+            self._event("error", f"leaving: {error}; the autopilot's offboard-loss failsafe takes over")
+
+    async def _guide(self) -> None:
+        """The loop that steers; the heartbeat, the watchdog and the video's text go with it."""
+        period_s = 1 / self.settings.guidance.rate_hz
+        due_s = next_heartbeat_s = next_hud_s = time.monotonic()
+        while True:
+            now_ns = time.monotonic_ns()
+            self._watch_link(now_ns)
+            self.pilot.update(self._situation(now_ns))
+            self._answer_under_way()
+            now_s = now_ns / 1e9
+            if now_s >= next_heartbeat_s:
+                next_heartbeat_s = now_s + _HEARTBEAT_PERIOD_S
+                self.driver.send_heartbeat(
+                    SystemStatus.ACTIVE if self._healthy(now_ns) else SystemStatus.CRITICAL
+                )
+                self._notifier.alive()
+            if now_s >= next_hud_s:
+                next_hud_s = now_s + _HUD_PERIOD_S
+                self.perception.send_hud(self._hud())
+            due_s = max(due_s + period_s, time.monotonic())
+            await asyncio.sleep(due_s - time.monotonic())
+
+    async def _tell_vehicle(self) -> None:
+        period_s = 1 / (topics.VEHICLE.rate_hz or 10.0)
+        while True:
+            now_ns = time.monotonic_ns()
+            self.bus.publish(topics.VEHICLE, vehicle_message(self.driver.state, now_ns))
+            if self.pilot.in_command:
+                self.bus.publish(
+                    topics.SETPOINT,
+                    {
+                        "stamp_ns": now_ns,
+                        "asked": setpoint_message(self.pilot.asked),
+                        "sent": setpoint_message(self.streamer.last_sent),
+                        "sent_ns": self.streamer.last_sent_ns,
+                        "stream": self.streamer.state.value,
+                        "limited_by": list(self.pilot.limited_by),
+                    },
+                )
+            await asyncio.sleep(period_s)
+
+    async def _tell_status(self) -> None:
+        while True:
+            status = self.status()
+            self.bus.publish(topics.STATUS, status)
+            self._notifier.status(f"{status['vehicle']['mode']}, {status['pilot']['behaviour']}")
+            await asyncio.sleep(1 / (topics.STATUS.rate_hz or 1.0))
+
+    def status(self) -> dict[str, Any]:
+        """How every part is, as published on `status`."""
+        now_ns = time.monotonic_ns()
+        state = self.driver.state
+        return {
+            "stamp_ns": now_ns,
+            "uptime_s": round((now_ns - self._started_ns) / 1e9, 1),
+            "healthy": self._healthy(now_ns),
+            "vehicle": {
+                "connected": state.connected(now_ns),
+                "mode": state.mode.value,
+                "armed": state.armed,
+                "failsafe": state.failsafe,
+            },
+            "pilot": {
+                "in_command": self.pilot.in_command,
+                "behaviour": self.pilot.status,
+                "stream": self.streamer.state.value,
+                "setpoints_sent": self.streamer.sent_count,
+            },
+            "perception": self.perception.status.as_dict(),
+            "bus": {
+                "connected": self.bus.connected,
+                "published": dict(self.bus.published),
+                "unsent": self.bus.unsent,
+            },
+        }
+
+    def _situation(self, now_ns: int) -> Situation:
+        age_s = None if self.newest is None else (now_ns - self.newest.captured_ns) / 1e9
+        fresh = age_s is not None and age_s <= self.settings.guidance.perception_max_age_s
+        return Situation(
+            now_ns,
+            self.driver.state,
+            self._targets if fresh else (),
+            age_s,
+            fresh,
+            self.streamer.last_sent,
+        )
+
+    def _healthy(self, now_ns: int) -> bool:
+        seeing = (
+            not self.settings.detector.enabled
+            or self.perception.status.state is PerceptionState.FINISHED
+            or (
+                self.newest is not None
+                and (now_ns - self.newest.captured_ns) / 1e9
+                <= max(1.0, self.settings.guidance.perception_max_age_s)
+            )
+        )
+        return seeing and self.driver.state.connected(now_ns)
+
+    def _watch_link(self, now_ns: int) -> None:
+        linked = self.driver.state.connected(now_ns)
+        if linked != self._linked:
+            self._linked = linked
+            if linked:
+                self._event("info", "the autopilot is heard")
+            else:
+                self._event("error", "the autopilot is not heard any more")
+
+    def _result(self, result: PerceptionResult) -> None:
+        self.newest = result
+        name = self.settings.vehicle.name
+        self.bus.publish(topics.DETECTIONS, detections_message(result, name, time.monotonic_ns()))
+        self.bus.publish(topics.LABELS, labels_message(result))
+        self._targets = targets_from_detections(
+            result.detections.records(),
+            result.captured_ns,
+            self.settings.camera.model(result.width, result.height),
+            self.settings.camera.mount(),
+            self._history,
+        )
+
+    def _hud(self) -> tuple[str, ...]:
+        state: VehicleState = self.driver.state
+        altitude = "-" if state.altitude_m is None else f"{state.altitude_m:.1f} m"
+        speed = state.velocity_ned_mps
+        horizontal = "-" if speed is None else f"{(speed[0] ** 2 + speed[1] ** 2) ** 0.5:.1f} m/s"
+        return (
+            f"{state.mode.value}  {'armed' if state.armed else 'disarmed'}",
+            self.pilot.status,
+            f"height {altitude}  speed {horizontal}",
+        )
+
+    def _pilot_event(self, event: PilotEvent) -> None:
+        lost = event.kind is PilotEventKind.LOST
+        # What is refused or ended is told with the command's own outcome.
+        if event.kind not in (PilotEventKind.REFUSED, PilotEventKind.ENDED, PilotEventKind.STARTED):
+            self._event("warning" if lost else "info", event.message)
+
+    def _event(self, level: str, text: str) -> None:
+        event = Event(time.monotonic_ns(), level, text)
+        self.events.append(event)
+        logger.log(getattr(logging, level.upper()), "%s", text)
+        self.bus.publish(topics.EVENTS, asdict(event))
+        if self._on_event is not None:
+            self._on_event(event)
+
+
+def _limits(settings: Settings) -> Limits:
+    """The envelope's limits, from the settings of the same names."""
+    guidance = settings.guidance
+    return Limits(
+        max_horizontal_speed_mps=guidance.max_horizontal_speed_mps,
+        max_climb_mps=guidance.max_climb_mps,
+        max_descend_mps=guidance.max_descend_mps,
+        max_yaw_rate_radps=guidance.max_yaw_rate_radps,
+        max_acceleration_mps2=guidance.max_acceleration_mps2,
+        min_altitude_m=guidance.min_altitude_m,
+        max_altitude_m=guidance.max_altitude_m,
+        max_distance_m=guidance.max_distance_m,
+    )

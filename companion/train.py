@@ -1,0 +1,128 @@
+"""`companion train`: the bundled detector, made again from nothing but this repository.
+
+The recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.training_scenes`) decide the weights; nothing
+is downloaded.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mavlink_sim.training_scenes import CLASS_NAMES, random_scene
+from vision.yolo.checkpoint import save_checkpoint
+from vision.yolo.evaluation import evaluate
+from vision.yolo.metrics import Score
+from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE
+from vision.yolo.training import Progress as TrainingProgress
+from vision.yolo.training import TrainedModel, TrainingSettings, train
+
+LICENCE = "Apache-2.0"
+
+
+def train_default(
+    output: Path,
+    *,
+    seed: int | None = None,
+    steps: int | None = None,
+    time_limit_s: float | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
+    resume: bool = False,
+    held_out: int = 400,
+) -> Score:
+    """Train by the recipe (with what is given here changed), judge, and write `output` and its `.json`.
+
+    The state of training is kept beside it as `<output>.training`, for `resume`.
+
+    Raises:
+        FileNotFoundError: `resume` without a state. ValueError: the state is of another recipe.
+    """
+    output.parent.mkdir(parents=True, exist_ok=True)
+    changes: dict[str, Any] = {
+        "seed": seed,
+        "time_limit_s": time_limit_s,
+        "workers": workers,
+        "threads": threads,
+    }
+    settings = replace(DEFAULT_RECIPE, **{key: value for key, value in changes.items() if value is not None})
+    if tuple(settings.class_names) != tuple(CLASS_NAMES):
+        raise ValueError(f"the recipe knows {settings.class_names}, the scenes draw {CLASS_NAMES}")
+    if steps is not None:
+        settings = settings.with_steps(steps)
+    with _Shown() as shown:
+        trained = train(
+            settings,
+            random_scene,
+            shown,
+            checkpoint=output.with_suffix(output.suffix + ".training"),
+            resume=resume,
+        )
+    return judge_and_save(output, trained, settings, held_out)
+
+
+def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettings, held_out: int) -> Score:
+    """Score a model on held-out scenes and write it, fp16, with licence, score and settings."""
+    width, height = HELD_OUT_SIZE
+    score = evaluate(trained.model, random_scene, HELD_OUT_SEED, held_out, width, height)
+    metadata = {
+        "licence": LICENCE,
+        "trained_on": "scenes drawn by mavlink_sim.training_scenes",
+        "steps_done": trained.steps_done,
+        "score": {
+            "map50": round(score.map50, 4),
+            "map50_95": round(score.map50_95, 4),
+            "per_class": json.loads(json.dumps(score.per_class, default=asdict)),
+            "held_out_scenes": held_out,
+            "held_out_seed": HELD_OUT_SEED,
+            "held_out_size": [width, height],
+        },
+        "settings": json.loads(json.dumps(asdict(settings))),
+    }
+    save_checkpoint(output, trained.model, metadata=metadata)
+    output.with_suffix(".json").write_text(json.dumps(metadata, indent=2) + "\n")
+    return score
+
+
+class _Shown:
+    """Progress on standard error: a bar for a person, a line now and then for a log."""
+
+    _LINE_EVERY = 100
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            self._bar = Progress(
+                TextColumn("training"),
+                BarColumn(),
+                TextColumn("{task.fields[losses]}"),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+            )
+        self._task = self._bar.add_task("training", total=None, losses="") if self._bar else None
+
+    def __call__(self, progress: TrainingProgress) -> None:
+        losses = (
+            f"step {progress.step}/{progress.steps} box {progress.box_loss:.3f} "
+            f"class {progress.class_loss:.3f} distribution {progress.distribution_loss:.3f} "
+            f"{progress.images_per_s:.1f} images/s"
+        )
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, total=progress.steps, completed=progress.step, losses=losses)
+        elif progress.step % self._LINE_EVERY == 0 or progress.step == progress.steps:
+            print(f"{losses}, {progress.remaining_s / 60:.1f} min left", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> _Shown:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
