@@ -1,0 +1,227 @@
+"""Training from drawn scenes: it learns, it repeats itself, it goes on where it stopped."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vision.yolo.augmentation import NO_AUGMENTATION, Augmentation, augment
+from vision.yolo.evaluation import evaluate
+from vision.yolo.scene_batches import SceneKey, collate, draw_scene
+from vision.yolo.training import Progress, Stage, TrainingSettings, load_average, train
+
+COLOURS = ((40, 40, 220), (60, 200, 60))
+
+
+def rectangles(rng, width, height):
+    """Two rectangles of two classes on noise, in their own halves so that none hides another."""
+    image = rng.integers(90, 130, (height, width, 3), dtype=np.uint8)
+    boxes, ids = [], []
+    for half in range(2):
+        class_id = int(rng.integers(2))
+        size = rng.integers(width // 6, width // 3, 2)
+        left = int(rng.integers(0, width // 2 - size[0])) + half * width // 2
+        top = int(rng.integers(0, height - size[1]))
+        right, bottom = left + int(size[0]), top + int(size[1])
+        cv2.rectangle(image, (left, top), (right - 1, bottom - 1), COLOURS[class_id], -1)
+        boxes.append([left, top, right, bottom])
+        ids.append(class_id)
+    return image, np.array(boxes, np.float32), np.array(ids, np.int64)
+
+
+def one_of_eight(rng, width, height):
+    """One of eight fixed pictures."""
+    return rectangles(np.random.default_rng(int(rng.integers(8))), width, height)
+
+
+def nothing(_rng, width, height):
+    return np.zeros((height, width, 3), np.uint8), np.zeros((0, 4), np.float32), np.zeros(0, np.int64)
+
+
+SMALL = TrainingSettings(
+    class_names=("red", "green"),
+    stages=(Stage(96, 96, 8, 4),),
+    width_multiple=0.0625,
+    max_channels=256,
+    augmentation=NO_AUGMENTATION,
+    warmup_steps=2,
+    workers=0,
+)
+
+
+def weights(trained):
+    return torch.cat([value.flatten().float() for value in trained.model.state_dict().values()])
+
+
+def silent(_progress):
+    pass
+
+
+def test_a_tiny_model_overfits_eight_pictures():
+    settings = replace(
+        SMALL, stages=(Stage(96, 96, 8, 180),), warmup_steps=10, learning_rate=6e-3, average_decay=0.95
+    )
+    seen: list[Progress] = []
+    trained = train(settings, one_of_eight, seen.append)
+    score = evaluate(trained.model, one_of_eight, seed=0, count=24, width=96, height=96)
+    assert score.map50 > 0.9
+    assert set(score.per_class) == {"red", "green"}
+    assert [progress.step for progress in seen] == list(range(1, 181))
+    assert seen[-1].remaining_s == 0
+
+
+def test_the_same_seed_gives_the_same_weights_whatever_the_number_of_workers():
+    assert torch.equal(
+        weights(train(SMALL, rectangles, silent)),
+        weights(train(replace(SMALL, workers=2), rectangles, silent)),
+    )
+
+
+def test_another_seed_gives_other_weights():
+    assert not torch.equal(
+        weights(train(SMALL, rectangles, silent)), weights(train(replace(SMALL, seed=1), rectangles, silent))
+    )
+
+
+def test_training_resumed_from_a_checkpoint_ends_with_the_weights_of_an_uninterrupted_run(tmp_path: Path):
+    whole = train(SMALL, rectangles, silent)
+    kept = tmp_path / "state.pt"
+    cut = train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
+    assert cut.steps_done == 1
+    resumed = train(SMALL, rectangles, silent, checkpoint=kept, resume=True)
+    assert resumed.steps_done == 4
+    assert torch.equal(weights(whole), weights(resumed))
+    assert torch.equal(weights(load_average(kept, SMALL)), weights(resumed))
+
+
+def test_resuming_another_network_is_refused(tmp_path: Path):
+    kept = tmp_path / "state.pt"
+    train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
+    with pytest.raises(ValueError, match=r"is of the network .* the settings ask for"):
+        train(replace(SMALL, width_multiple=0.125), rectangles, silent, checkpoint=kept, resume=True)
+
+
+def test_resuming_without_a_checkpoint_says_which_file_is_missing(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match=r"missing\.pt"):
+        train(SMALL, rectangles, silent, checkpoint=tmp_path / "missing.pt", resume=True)
+
+
+def test_pictures_without_any_object_can_be_trained_on():
+    assert torch.isfinite(
+        weights(train(replace(SMALL, stages=(Stage(64, 64, 2, 2),)), nothing, silent))
+    ).all()
+
+
+def test_stages_of_different_sizes_follow_each_other():
+    seen: list[Progress] = []
+    train(replace(SMALL, stages=(Stage(64, 64, 2, 2), Stage(96, 64, 1, 1))), rectangles, seen.append)
+    assert [(p.step, p.steps) for p in seen] == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_the_rate_warms_up_stays_and_falls():
+    settings = replace(
+        SMALL, stages=(Stage(64, 64, 1, 100),), warmup_steps=10, decay_steps=20, final_rate=0.1
+    )
+    rates = [settings.rate_at(step) / settings.learning_rate for step in range(101)]
+    assert rates[0] == pytest.approx(0.1)
+    assert rates[9:81] == pytest.approx([1.0] * 72)
+    assert all(later < earlier for earlier, later in itertools.pairwise(rates[80:]))
+    assert rates[100] == pytest.approx(0.1)
+
+
+def test_prolonging_the_constant_stretch_leaves_the_earlier_rates_alone():
+    settings = replace(SMALL, stages=(Stage(64, 64, 1, 100),), warmup_steps=10, decay_steps=20)
+    longer = replace(settings, stages=(Stage(64, 64, 1, 300),))
+    assert [settings.rate_at(step) for step in range(80)] == [longer.rate_at(step) for step in range(80)]
+
+
+def test_a_compressed_course_keeps_its_stages():
+    settings = replace(SMALL, stages=(Stage(64, 64, 1, 90), Stage(96, 96, 1, 10)), decay_steps=20)
+    short = settings.with_steps(10)
+    assert [stage.steps for stage in short.stages] == [9, 1]
+    assert short.decay_steps == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        pytest.param({"stages": ()}, "at least one stage", id="no stage"),
+        pytest.param({"learning_rate": 0.0}, "learning rate above 0", id="no rate"),
+        pytest.param({"average_decay": 1.0}, "average_decay must be in", id="an average that never moves"),
+    ],
+)
+def test_impossible_settings_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SMALL, **change)
+
+
+def test_a_picture_size_the_network_cannot_halve_five_times_is_refused():
+    with pytest.raises(ValueError, match="multiples of 32 pixels, got 100x64"):
+        Stage(100, 64, 1, 1)
+
+
+def wrong_size(rng, width, height):
+    return rectangles(rng, width + 1, height)
+
+
+def unknown_class(rng, width, height):
+    image, boxes, ids = rectangles(rng, width, height)
+    return image, boxes, ids + 5
+
+
+def label_short(rng, width, height):
+    image, boxes, ids = rectangles(rng, width, height)
+    return image, boxes, ids[:1]
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        pytest.param(wrong_size, "the source gave", id="size"),
+        pytest.param(unknown_class, r"class ids must be 0\.\.1", id="class"),
+        pytest.param(label_short, "2 boxes but 1 class ids", id="labels"),
+    ],
+)
+def test_a_source_that_gives_no_proper_scene_is_named(source, message):
+    with pytest.raises(ValueError, match=message):
+        train(SMALL, source, silent)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_augmented_boxes_still_hold_their_objects(seed):
+    limits = Augmentation(mirror=0.5, zoom_probability=1.0, hue=0, saturation=0, brightness=0)
+    image = np.full((96, 128, 3), 114, np.uint8)
+    image[30:60, 40:90] = (0, 0, 255)
+    boxes, ids = np.array([[40, 30, 90, 60]], np.float32), np.zeros(1, np.int64)
+    changed, moved, kept = augment(np.random.default_rng(seed), (image, boxes, ids), limits)
+    assert changed.shape == image.shape
+    rows, columns = np.nonzero(changed[:, :, 2].astype(int) - changed[:, :, 0] > 120)
+    if len(kept):
+        assert moved[0] == pytest.approx(
+            [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], abs=1.6
+        )
+
+
+def test_the_same_key_draws_the_same_picture():
+    key = SceneKey(3, 4, 5, 96, 64)
+    first, second = (draw_scene(rectangles, key, 2, Augmentation()) for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    other = draw_scene(rectangles, SceneKey(3, 4, 6, 96, 64), 2, Augmentation())
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_a_batch_pads_its_labels_and_turns_colours_to_rgb():
+    full = draw_scene(rectangles, SceneKey(0, 0, 0, 64, 64), 2)
+    empty = nothing(None, 64, 64)
+    images, truth = collate([full, empty])
+    assert images.shape == (2, 64, 64, 3)
+    assert np.array_equal(images[0].numpy(), full[0][:, :, ::-1])
+    assert truth.present.tolist() == [[True, True], [False, False]]

@@ -1,0 +1,109 @@
+"""Changing a training picture without changing what it shows: mirror, zoom and shift, colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+PADDING_GREY = 114
+"""The grey a letterbox pads with, so that training has seen such borders."""
+
+LabelledImage = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]
+"""Image (height, width, 3) uint8 BGR; boxes (N, 4) float32 pixels xyxy; class ids (N,) int64."""
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How far a picture may be changed. Fractions are of the original value.
+
+    Attributes:
+        mirror: probability of a left–right mirror.
+        zoom_probability: probability of a zoom with a shift; otherwise the geometry stays.
+        zoom_min: smallest zoom; below 1 the picture gets grey borders.
+        zoom_max: largest zoom.
+        hue: largest shift of the hue, as a fraction of the colour circle.
+        saturation: largest relative change of the saturation.
+        brightness: largest relative change of the brightness.
+        visible_fraction: an object of which less than this stays in the picture is no longer labelled.
+    """
+
+    mirror: float = 0.5
+    zoom_probability: float = 0.5
+    zoom_min: float = 0.75
+    zoom_max: float = 1.4
+    hue: float = 0.015
+    saturation: float = 0.4
+    brightness: float = 0.25
+    visible_fraction: float = 0.35
+
+
+NO_AUGMENTATION = Augmentation(mirror=0, zoom_probability=0, hue=0, saturation=0, brightness=0)
+
+
+def augment(rng: np.random.Generator, scene: LabelledImage, limits: Augmentation) -> LabelledImage:
+    """A changed copy of the same size. The same `rng` state gives the same change."""
+    image, boxes, class_ids = scene
+    if rng.random() < limits.mirror:
+        image, boxes = mirrored(image, boxes)
+    if rng.random() < limits.zoom_probability:
+        image, boxes, class_ids = _zoomed(rng, image, boxes, class_ids, limits)
+    if limits.hue or limits.saturation or limits.brightness:
+        image = _recoloured(rng, image, limits)
+    return np.ascontiguousarray(image), boxes, class_ids
+
+
+def mirrored(
+    image: NDArray[np.uint8], boxes: NDArray[np.float32]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Left and right exchanged. Box edges are continuous coordinates: 0 is the left edge, width the right."""
+    width = image.shape[1]
+    turned = boxes.copy()
+    turned[:, 0], turned[:, 2] = width - boxes[:, 2], width - boxes[:, 0]
+    return image[:, ::-1], turned
+
+
+def _zoomed(
+    rng: np.random.Generator,
+    image: NDArray[np.uint8],
+    boxes: NDArray[np.float32],
+    class_ids: NDArray[np.int64],
+    limits: Augmentation,
+) -> LabelledImage:
+    height, width = image.shape[:2]
+    zoom = float(np.exp(rng.uniform(np.log(limits.zoom_min), np.log(limits.zoom_max))))
+    # Zoomed in, the window lies anywhere in the picture; zoomed out, the picture anywhere in the window.
+    shift = rng.random(2) * ((1 - zoom) * width, (1 - zoom) * height)
+    # warpAffine counts from pixel centres, boxes from pixel edges: half a pixel each way.
+    centre_shift = shift + 0.5 * zoom - 0.5
+    matrix = np.array([[zoom, 0, centre_shift[0]], [0, zoom, centre_shift[1]]])
+    warped = cv2.warpAffine(
+        np.ascontiguousarray(image),
+        matrix,
+        (width, height),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(PADDING_GREY, PADDING_GREY, PADDING_GREY),
+    )
+    moved = boxes * zoom + np.tile(shift, 2)
+    clipped = np.clip(moved, 0, (width, height, width, height)).astype(np.float32)
+    area = (moved[:, 2:] - moved[:, :2]).prod(1)
+    left = (clipped[:, 2:] - clipped[:, :2]).prod(1)
+    kept = left >= limits.visible_fraction * np.maximum(area, 1e-9)
+    return warped.astype(np.uint8, copy=False), clipped[kept], class_ids[kept]
+
+
+def _recoloured(
+    rng: np.random.Generator, image: NDArray[np.uint8], limits: Augmentation
+) -> NDArray[np.uint8]:
+    hue, saturation, brightness = rng.uniform(-1, 1, 3) * (limits.hue, limits.saturation, limits.brightness)
+    levels = np.arange(256)
+    # OpenCV's 8-bit hue is half degrees, 0..179.
+    hue_table = ((levels + hue * 180) % 180).astype(np.uint8)
+    saturation_table = np.clip(levels * (1 + saturation), 0, 255).astype(np.uint8)
+    brightness_table = np.clip(levels * (1 + brightness), 0, 255).astype(np.uint8)
+    table = np.stack([hue_table, saturation_table, brightness_table], -1)[None]
+    coloured = cv2.LUT(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2HSV), table)
+    return cv2.cvtColor(coloured, cv2.COLOR_HSV2BGR).astype(np.uint8, copy=False)

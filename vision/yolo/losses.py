@@ -1,0 +1,183 @@
+"""The three losses of the YOLOv8 head.
+
+Boxes: CIoU (Zheng et al., AAAI 2020, "Distance-IoU Loss") and the distribution focal loss over distance bins
+(Li et al., NeurIPS 2020, "Generalized Focal Loss"). Classes: binary cross-entropy against task-aligned soft
+targets (`vision.yolo.assigner`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from vision.yolo.assigner import assign_task_aligned
+
+BINS = 16
+"""Distance bins per side of a box; bin k stands for k strides."""
+
+BOX_GAIN = 7.5
+CLASS_GAIN = 0.5
+DISTRIBUTION_GAIN = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectionLoss:
+    """The weighted sum to minimise, and its weighted parts for the log.
+
+    Attributes:
+        total: scalar with gradient, the mean per image.
+        box: scalar, CIoU part, detached.
+        classes: scalar, classification part, detached.
+        distribution: scalar, distribution focal part, detached.
+        foreground: how many cells were given an object, per image on average.
+    """
+
+    total: Tensor
+    box: float
+    classes: float
+    distribution: float
+    foreground: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """The objects of B images, padded to the most any of them has.
+
+    Attributes:
+        boxes: (B, M, 4) float32, pixels xyxy of the network's input.
+        classes: (B, M) int64.
+        present: (B, M) bool, false for padding.
+    """
+
+    boxes: Tensor
+    classes: Tensor
+    present: Tensor
+
+
+def ciou(first: Tensor, second: Tensor) -> Tensor:
+    """Complete IoU of paired boxes: (..., 4) and (..., 4) pixels xyxy → (...) in -1.5..1.
+
+    IoU, less the squared centre distance over the enclosing box's squared diagonal, less the weighted
+    difference of aspect ratios. The weight has no gradient, as in the paper.
+    """
+    tiny = 1e-7
+    size_first = (first[..., 2:] - first[..., :2]).clamp(min=0)
+    size_second = (second[..., 2:] - second[..., :2]).clamp(min=0)
+    inner = torch.minimum(first[..., 2:], second[..., 2:]) - torch.maximum(first[..., :2], second[..., :2])
+    intersection = inner.clamp(min=0).prod(-1)
+    union = size_first.prod(-1) + size_second.prod(-1) - intersection
+    iou = intersection / (union + tiny)
+
+    outer = torch.maximum(first[..., 2:], second[..., 2:]) - torch.minimum(first[..., :2], second[..., :2])
+    diagonal = outer.square().sum(-1) + tiny
+    apart = (first[..., :2] + first[..., 2:] - second[..., :2] - second[..., 2:]).square().sum(-1) / 4
+
+    angle_first = torch.atan2(size_first[..., 0], size_first[..., 1] + tiny)
+    angle_second = torch.atan2(size_second[..., 0], size_second[..., 1] + tiny)
+    aspect = (4 / math.pi**2) * (angle_first - angle_second).square()
+    with torch.no_grad():
+        weight = aspect / (1 - iou + aspect + tiny)
+    return iou - apart / diagonal - weight * aspect
+
+
+def distribution_focal_loss(logits: Tensor, distances: Tensor) -> Tensor:
+    """Cross-entropy against the two bins around each true distance, in proportion to their nearness.
+
+    Args:
+        logits: (N, 4, BINS) raw bins of each side.
+        distances: (N, 4) true distances in strides; clipped into the bins' range.
+
+    Returns:
+        (N,) the mean over the four sides.
+    """
+    bins = logits.shape[-1]
+    clipped = distances.clamp(0, bins - 1 - 0.01)
+    lower = clipped.floor()
+    toward_upper = clipped - lower
+    log_probability = logits.log_softmax(-1)
+    index = lower.long()[..., None]
+    at_lower = log_probability.gather(-1, index)[..., 0]
+    at_upper = log_probability.gather(-1, index + 1)[..., 0]
+    return -(at_lower * (1 - toward_upper) + at_upper * toward_upper).mean(-1)
+
+
+def cell_grid(
+    shapes: Sequence[tuple[int, int]], strides: Sequence[float], device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Centres (A, 2) in pixels and strides (A,) of all cells: level after level, row by row."""
+    centres, sizes = [], []
+    for (height, width), stride in zip(shapes, strides, strict=True):
+        rows = (torch.arange(height, device=device, dtype=torch.float32) + 0.5) * stride
+        columns = (torch.arange(width, device=device, dtype=torch.float32) + 0.5) * stride
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        centres.append(torch.stack([x, y], -1).reshape(-1, 2))
+        sizes.append(torch.full((height * width,), float(stride), device=device))
+    return torch.cat(centres), torch.cat(sizes)
+
+
+def detection_loss(maps: Sequence[Tensor], strides: Sequence[float], truth: Truth) -> DetectionLoss:
+    """The loss of one batch.
+
+    Args:
+        maps: raw head outputs, one per stride, (B, 4 · BINS + classes, H, W): first the bins of left, top,
+            right and bottom, then the class logits.
+        strides: pixels per cell of each map.
+        truth: the objects of the B images.
+
+    Raises:
+        ValueError: a map has no room for class logits.
+    """
+    channels = maps[0].shape[1]
+    if channels <= 4 * BINS:
+        raise ValueError(f"head maps must have {4 * BINS} + classes channels, got {channels}")
+    centres, cell_sizes = cell_grid([(m.shape[2], m.shape[3]) for m in maps], strides, maps[0].device)
+    flat = torch.cat([m.flatten(2) for m in maps], 2).transpose(1, 2)
+    bin_logits = flat[..., : 4 * BINS].reshape(*flat.shape[:2], 4, BINS)
+    class_logits = flat[..., 4 * BINS :]
+
+    with torch.no_grad():
+        predicted = _boxes_from_bins(bin_logits, centres, cell_sizes[:, None])
+        target = assign_task_aligned(
+            class_logits.sigmoid(),
+            predicted,
+            centres,
+            truth.boxes,
+            truth.classes,
+            truth.present,
+            smallest_cell=float(min(strides)),
+        )
+    # The soft targets' sum is the batch's amount of evidence; below one object it must not blow losses up.
+    evidence = target.class_scores.sum().clamp(min=1.0)
+    classes = (
+        F.binary_cross_entropy_with_logits(class_logits, target.class_scores, reduction="sum") / evidence
+    )
+
+    image, cell = target.foreground.nonzero(as_tuple=True)
+    weight = target.class_scores[image, cell].sum(-1)
+    chosen = bin_logits[image, cell]
+    middle, size = centres[cell], cell_sizes[cell][:, None]
+    true_boxes = target.boxes[image, cell]
+    box = ((1 - ciou(_boxes_from_bins(chosen, middle, size), true_boxes)) * weight).sum() / evidence
+    distances = torch.cat([middle - true_boxes[:, :2], true_boxes[:, 2:] - middle], -1) / size
+    distribution = (distribution_focal_loss(chosen, distances) * weight).sum() / evidence
+
+    box, classes, distribution = BOX_GAIN * box, CLASS_GAIN * classes, DISTRIBUTION_GAIN * distribution
+    return DetectionLoss(
+        box + classes + distribution,
+        float(box.detach()),
+        float(classes.detach()),
+        float(distribution.detach()),
+        len(image) / max(len(flat), 1),
+    )
+
+
+def _boxes_from_bins(bin_logits: Tensor, centres: Tensor, cell_sizes: Tensor) -> Tensor:
+    """(..., 4, BINS) → (..., 4) pixels xyxy: each side's distance is its distribution's mean."""
+    steps = torch.arange(bin_logits.shape[-1], dtype=bin_logits.dtype, device=bin_logits.device)
+    distances = (bin_logits.softmax(-1) * steps).sum(-1) * cell_sizes
+    return torch.cat([centres - distances[..., :2], centres + distances[..., 2:]], -1)

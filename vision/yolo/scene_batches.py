@@ -1,0 +1,127 @@
+"""Scenes drawn on the fly, in batches, the same whatever the number of workers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from vision.yolo.augmentation import Augmentation, LabelledImage, augment
+from vision.yolo.losses import Truth
+
+SceneSource = Callable[[np.random.Generator, int, int], LabelledImage]
+"""`(rng, width, height) → (image (height, width, 3) uint8 BGR, boxes (N, 4) pixels xyxy, class ids (N,))`.
+
+All randomness must come from `rng`. With workers it must be picklable: a function of a module, or a
+`functools.partial` of one.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneKey:
+    """Names one training picture; its random numbers follow from `(seed, step, index)` alone."""
+
+    seed: int
+    step: int
+    index: int
+    width: int
+    height: int
+
+
+def draw_scene(
+    scenes: SceneSource, key: SceneKey, class_count: int, augmentation: Augmentation | None = None
+) -> LabelledImage:
+    """Draw, check and augment the picture a key names.
+
+    Raises:
+        ValueError: the source gave an image of another size or type, or labels that do not fit together.
+    """
+    rng = np.random.default_rng([key.seed, key.step, key.index])
+    image, boxes, class_ids = scenes(rng, key.width, key.height)
+    if image.shape != (key.height, key.width, 3) or image.dtype != np.uint8:
+        raise ValueError(
+            f"a scene must be ({key.height}, {key.width}, 3) uint8, "
+            f"the source gave {image.shape} {image.dtype}"
+        )
+    boxes = np.asarray(boxes, np.float32).reshape(-1, 4)
+    class_ids = np.asarray(class_ids, np.int64).reshape(-1)
+    if len(boxes) != len(class_ids):
+        raise ValueError(f"a scene has {len(boxes)} boxes but {len(class_ids)} class ids")
+    if len(class_ids) and not (0 <= class_ids.min() and class_ids.max() < class_count):
+        raise ValueError(f"class ids must be 0..{class_count - 1}, the source gave {np.unique(class_ids)}")
+    return (
+        (image, boxes, class_ids)
+        if augmentation is None
+        else augment(rng, (image, boxes, class_ids), augmentation)
+    )
+
+
+def collate(scenes: Sequence[LabelledImage]) -> tuple[Tensor, Truth]:
+    """Images → (B, H, W, 3) uint8 RGB, boxes and classes padded to the fullest image."""
+    images = torch.from_numpy(np.stack([image[:, :, ::-1] for image, _, _ in scenes]))
+    most = max(len(class_ids) for _, _, class_ids in scenes)
+    boxes = torch.zeros(len(scenes), most, 4)
+    classes = torch.zeros(len(scenes), most, dtype=torch.int64)
+    present = torch.zeros(len(scenes), most, dtype=torch.bool)
+    for row, (_, scene_boxes, class_ids) in enumerate(scenes):
+        count = len(class_ids)
+        boxes[row, :count] = torch.from_numpy(scene_boxes)
+        classes[row, :count] = torch.from_numpy(class_ids)
+        present[row, :count] = True
+    return images, Truth(boxes, classes, present)
+
+
+def network_input(images: Tensor) -> Tensor:
+    """(B, H, W, 3) uint8 RGB → (B, 3, H, W) float32 in 0..1, channels last in memory."""
+    return images.permute(0, 3, 1, 2).float().div_(255.0)
+
+
+class _Scenes(Dataset[LabelledImage]):
+    """Map-style data set whose index is a `SceneKey`."""
+
+    def __init__(self, scenes: SceneSource, class_count: int, augmentation: Augmentation) -> None:
+        self.scenes, self.class_count, self.augmentation = scenes, class_count, augmentation
+
+    def __getitem__(self, key: SceneKey) -> LabelledImage:
+        return draw_scene(self.scenes, key, self.class_count, self.augmentation)
+
+
+def _single_threaded(_worker: int) -> None:
+    cv2.setNumThreads(1)
+
+
+def scene_batches(
+    scenes: SceneSource,
+    plan: Sequence[Sequence[SceneKey]],
+    *,
+    class_count: int,
+    augmentation: Augmentation,
+    workers: int,
+) -> Iterator[tuple[Tensor, Truth]]:
+    """The batches of a plan, in its order: (B, H, W, 3) uint8 RGB and their truth.
+
+    Args:
+        scenes: draws the pictures.
+        plan: the keys of each batch; within a batch all of one size.
+        class_count: how many classes ids may name.
+        augmentation: applied after drawing, from the same random numbers.
+        workers: processes that draw ahead; 0 draws in this one.
+    """
+    if not plan:
+        return
+    loader = DataLoader(
+        _Scenes(scenes, class_count, augmentation),
+        batch_sampler=[list(keys) for keys in plan],
+        num_workers=workers,
+        collate_fn=collate,
+        worker_init_fn=_single_threaded,
+        # A forked child of a process with busy native threads may inherit a locked mutex.
+        multiprocessing_context="spawn" if workers else None,
+        prefetch_factor=4 if workers else None,
+    )
+    yield from loader

@@ -1,0 +1,404 @@
+"""Training a YOLOv8 from drawn scenes: the loop, its settings, and its checkpoints for going on later."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from vision.yolo.architecture import YoloModel, build
+from vision.yolo.augmentation import Augmentation
+from vision.yolo.description import yolov8_description
+from vision.yolo.losses import DetectionLoss, detection_loss
+from vision.yolo.scene_batches import SceneKey, SceneSource, network_input, scene_batches
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A stretch of training at one picture size. Width and height in pixels, multiples of 32."""
+
+    width: int
+    height: int
+    batch_size: int
+    steps: int
+
+    def __post_init__(self) -> None:
+        if self.width % 32 or self.height % 32 or self.width <= 0 or self.height <= 0:
+            raise ValueError(
+                f"training pictures must be multiples of 32 pixels, got {self.width}x{self.height}"
+            )
+        if self.batch_size < 1 or self.steps < 1:
+            raise ValueError(f"a stage needs a batch size and steps of 1 or more, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSettings:
+    """Everything that decides the weights. Same settings, same scenes, same machine: same weights.
+
+    Attributes:
+        class_names: id → name, as the scene source numbers them.
+        stages: run one after the other; the learning rate's course spans them all.
+        depth_multiple, width_multiple, max_channels: the network's scale (`yolov8_description`).
+        optimiser: AdamW, or SGD with Nesterov momentum.
+        learning_rate: the highest, reached after the warm-up.
+        weight_decay: of convolution weights; biases and normalisations have none.
+        momentum: of SGD.
+        warmup_steps: the rate rises linearly over these.
+        decay_steps: the rate falls over the last so many steps, and is constant before. None: from the end of
+            the warm-up on. A constant stretch can be prolonged without changing what went before.
+        decay: the shape of the fall.
+        final_rate: where it ends, as a fraction of `learning_rate`.
+        normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03
+            lags behind the weights in a short training.
+        gradient_limit: largest norm of the gradient, longer ones are shortened to it.
+        average_decay: of the running average of the weights, which is what is kept in the end.
+        seed: of the first weights and of every scene.
+        augmentation: of the drawn scenes.
+        threads: of torch. The order of summation, and so the last digits of the weights, depends on it.
+        workers: processes that draw scenes; they do not change the result.
+        time_limit_s: stop after so long even if steps are left; None for no limit.
+        checkpoint_every_s: how often to write the checkpoint, if one is wanted.
+    """
+
+    class_names: tuple[str, ...]
+    stages: tuple[Stage, ...]
+    depth_multiple: float = 1 / 3
+    width_multiple: float = 0.125
+    max_channels: int = 1024
+    optimiser: Literal["adamw", "sgd"] = "adamw"
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.02
+    momentum: float = 0.937
+    warmup_steps: int = 100
+    decay_steps: int | None = None
+    decay: Literal["linear", "cosine"] = "linear"
+    final_rate: float = 0.01
+    normalisation_momentum: float = 0.1
+    gradient_limit: float = 10.0
+    average_decay: float = 0.998
+    seed: int = 0
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    threads: int = 1
+    workers: int = 1
+    time_limit_s: float | None = None
+    checkpoint_every_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("training needs at least one stage")
+        if self.learning_rate <= 0 or not 0 < self.final_rate <= 1:
+            raise ValueError(
+                "training needs a learning rate above 0 and a final rate in 0..1 of it, "
+                f"got {self.learning_rate} and {self.final_rate}"
+            )
+        if not 0 <= self.average_decay < 1:
+            raise ValueError(f"average_decay must be in 0..1, got {self.average_decay}")
+
+    @property
+    def steps(self) -> int:
+        """The steps of all stages together."""
+        return sum(stage.steps for stage in self.stages)
+
+    def with_steps(self, steps: int) -> TrainingSettings:
+        """The same course compressed or stretched to about `steps` steps, at least one a stage."""
+        ratio = steps / self.steps
+        return replace(
+            self,
+            stages=tuple(replace(s, steps=max(1, round(s.steps * ratio))) for s in self.stages),
+            warmup_steps=max(1, round(self.warmup_steps * min(ratio, 1.0))),
+            decay_steps=None if self.decay_steps is None else max(1, round(self.decay_steps * ratio)),
+        )
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step, counted from 0."""
+        if step < self.warmup_steps:
+            return self.learning_rate * (step + 1) / self.warmup_steps
+        falling = self.steps - self.warmup_steps if self.decay_steps is None else self.decay_steps
+        fallen = min(max((step - (self.steps - falling)) / max(falling, 1), 0.0), 1.0)
+        if self.decay == "cosine":
+            fallen = (1 - math.cos(math.pi * fallen)) / 2
+        return self.learning_rate * (1 - fallen * (1 - self.final_rate))
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where training stands after a step (`step` of `steps` are done). Losses are of that step's batch."""
+
+    step: int
+    steps: int
+    box_loss: float
+    class_loss: float
+    distribution_loss: float
+    learning_rate: float
+    images_per_s: float
+    elapsed_s: float
+    remaining_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainedModel:
+    """The averaged weights, in evaluation mode, and what made them."""
+
+    model: YoloModel
+    settings: TrainingSettings
+    steps_done: int
+    elapsed_s: float
+
+
+def train(
+    settings: TrainingSettings,
+    scenes: SceneSource,
+    on_progress: Callable[[Progress], None],
+    *,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+) -> TrainedModel:
+    """Train from the first weights, or go on from a checkpoint, to the last step or the time limit.
+
+    Args:
+        settings: what to train and how.
+        scenes: draws the pictures; see `SceneSource`.
+        on_progress: called after every step, in this thread.
+        checkpoint: where to write the state now and then and at the end; None for nowhere.
+        resume: go on from `checkpoint`. The result is that of an uninterrupted run.
+
+    Raises:
+        FileNotFoundError: `resume` without such a file.
+        ValueError: the checkpoint is of another network, or `scenes` gives something that is no scene.
+        FloatingPointError: the loss is no longer a number.
+    """
+    started = time.monotonic()
+    torch.set_num_threads(settings.threads)
+    torch.manual_seed(settings.seed)
+    scale = (settings.depth_multiple, settings.width_multiple, settings.max_channels)
+    model = build(yolov8_description(scale, settings.class_names)).train()
+    _start_boxes_small(model)
+    for module in model.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.momentum = settings.normalisation_momentum
+    model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    average = copy.deepcopy(model).eval()
+    optimiser = _optimiser(model, settings)
+    first = 0
+    if resume:
+        if checkpoint is None:
+            raise ValueError("to go on with training, name the checkpoint")
+        first = _restore(checkpoint, settings, model, average, optimiser)
+        logger.info("training goes on from %s at step %d of %d", checkpoint, first, settings.steps)
+
+    plan = _plan(settings)[first:]
+    batches = scene_batches(
+        scenes,
+        plan,
+        class_count=len(settings.class_names),
+        augmentation=settings.augmentation,
+        workers=settings.workers,
+    )
+    step, saved, shown = first, started, 0
+    loop_started = time.monotonic()
+    for images, truth in batches:
+        rate = settings.rate_at(step)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        loss = detection_loss(model(network_input(images)), model.strides, truth)
+        if not torch.isfinite(loss.total):
+            raise FloatingPointError(
+                f"the loss of step {step} is {float(loss.total)}; lower the learning rate"
+            )
+        optimiser.zero_grad(set_to_none=True)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(model.parameters(), settings.gradient_limit)
+        optimiser.step()
+        step += 1
+        update_average(average, model, average_decay_at(step, settings.average_decay))
+
+        now = time.monotonic()
+        shown += len(images)
+        on_progress(
+            _progress(settings, step, loss, rate, shown, now - started, now - loop_started, step - first)
+        )
+        if checkpoint is not None and now - saved >= settings.checkpoint_every_s:
+            _save(checkpoint, settings, step, model, average, optimiser)
+            saved = now
+        if settings.time_limit_s is not None and now - started >= settings.time_limit_s:
+            logger.warning("training stops at its time limit after %d of %d steps", step, settings.steps)
+            break
+    if checkpoint is not None:
+        _save(checkpoint, settings, step, model, average, optimiser)
+    return TrainedModel(average.eval(), settings, step, time.monotonic() - started)
+
+
+def average_decay_at(step: int, decay: float) -> float:
+    """The averaging decay after `step` steps: short at first, so that the first weights fade soon."""
+    return min(decay, step / (step + 10))
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
+    """Move the averaged weights and normalisation statistics towards the model's: a ← d·a + (1 - d)·m."""
+    for kept, new in zip(_floats(average), _floats(model), strict=True):
+        kept.lerp_(new, 1 - decay)
+
+
+def load_average(checkpoint: Path, settings: TrainingSettings) -> TrainedModel:
+    """The averaged model of a training checkpoint, for instance while training still runs.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the checkpoint is of another network.
+    """
+    state = _read(checkpoint)
+    scale = (settings.depth_multiple, settings.width_multiple, settings.max_channels)
+    model = build(yolov8_description(scale, settings.class_names))
+    _require_same_network(state, settings, checkpoint)
+    model.load_state_dict(state["average"])
+    return TrainedModel(model.eval(), settings, int(state["step"]), float("nan"))
+
+
+def _floats(module: nn.Module) -> list[Tensor]:
+    return [tensor for tensor in module.state_dict().values() if tensor.is_floating_point()]
+
+
+def _start_boxes_small(model: YoloModel) -> None:
+    """Let every side's distribution fall off by bin, so that the first boxes are about four cells wide.
+
+    A flat distribution begins with boxes of 15 cells; their IoU with a small object is near zero, and with
+    β = 6 its alignment vanishes: a short training would spend its time shrinking boxes.
+    """
+    fall = -0.4 * torch.arange(model.reg_max, dtype=torch.float32)
+    with torch.no_grad():
+        for branch in model.detect.cv2:
+            last = branch[-1]  # type: ignore[index]
+            last.bias.copy_(fall.repeat(4))
+
+
+def _optimiser(model: nn.Module, settings: TrainingSettings) -> torch.optim.Optimizer:
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    groups: list[dict[str, Any]] = [
+        {"params": [p for p in trainable if p.ndim > 1], "weight_decay": settings.weight_decay},
+        {"params": [p for p in trainable if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+    if settings.optimiser == "sgd":
+        return torch.optim.SGD(groups, settings.learning_rate, momentum=settings.momentum, nesterov=True)
+    return torch.optim.AdamW(groups, settings.learning_rate, betas=(0.9, 0.99), foreach=True)
+
+
+def _plan(settings: TrainingSettings) -> list[list[SceneKey]]:
+    sizes = [stage for stage in settings.stages for _ in range(stage.steps)]
+    return [
+        [SceneKey(settings.seed, step, i, stage.width, stage.height) for i in range(stage.batch_size)]
+        for step, stage in enumerate(sizes)
+    ]
+
+
+def _progress(
+    settings: TrainingSettings,
+    step: int,
+    loss: DetectionLoss,
+    rate: float,
+    images: int,
+    elapsed_s: float,
+    loop_s: float,
+    steps_here: int,
+) -> Progress:
+    pixels = _pixels_until(settings.stages, step)
+    speed = (pixels - _pixels_until(settings.stages, step - steps_here)) / max(loop_s, 1e-9)
+    return Progress(
+        step=step,
+        steps=settings.steps,
+        box_loss=loss.box,
+        class_loss=loss.classes,
+        distribution_loss=loss.distribution,
+        learning_rate=rate,
+        images_per_s=images / max(loop_s, 1e-9),
+        elapsed_s=elapsed_s,
+        remaining_s=(_pixels_until(settings.stages, settings.steps) - pixels) / speed,
+    )
+
+
+def _pixels_until(stages: Sequence[Stage], step: int) -> int:
+    """Pixels seen in the first `step` steps: what time goes with, where stages differ in size."""
+    pixels = 0
+    for stage in stages:
+        steps = min(step, stage.steps)
+        pixels += steps * stage.batch_size * stage.width * stage.height
+        step -= steps
+    return pixels
+
+
+_CHECKPOINT_KIND = "yolo training state 1"
+
+
+def _network(settings: TrainingSettings) -> dict[str, Any]:
+    return {
+        "scale": [settings.depth_multiple, settings.width_multiple, settings.max_channels],
+        "class_names": list(settings.class_names),
+        "optimiser": settings.optimiser,
+    }
+
+
+def _save(
+    path: Path,
+    settings: TrainingSettings,
+    step: int,
+    model: nn.Module,
+    average: nn.Module,
+    optimiser: torch.optim.Optimizer,
+) -> None:
+    """Write beside the file, then rename: whoever reads sees the old state or the new one, never half."""
+    state = {
+        "kind": _CHECKPOINT_KIND,
+        "network": _network(settings),
+        "settings": asdict(settings),
+        "step": step,
+        "model": model.state_dict(),
+        "average": average.state_dict(),
+        "optimiser": optimiser.state_dict(),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    torch.save(state, part)
+    os.replace(part, path)
+    logger.info("training state of step %d written to %s", step, path)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise FileNotFoundError(f"no training checkpoint at {path}")
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(state, dict) or state.get("kind") != _CHECKPOINT_KIND:
+        raise ValueError(f"{path} is not a training checkpoint of this program ({_CHECKPOINT_KIND!r})")
+    return state
+
+
+def _require_same_network(state: dict[str, Any], settings: TrainingSettings, path: Path) -> None:
+    if state["network"] != _network(settings):
+        raise ValueError(
+            f"{path} is of the network {state['network']}, the settings ask for {_network(settings)}"
+        )
+
+
+def _restore(
+    path: Path,
+    settings: TrainingSettings,
+    model: nn.Module,
+    average: nn.Module,
+    optimiser: torch.optim.Optimizer,
+) -> int:
+    state = _read(path)
+    _require_same_network(state, settings, path)
+    model.load_state_dict(state["model"])
+    average.load_state_dict(state["average"])
+    optimiser.load_state_dict(state["optimiser"])
+    return int(state["step"])
