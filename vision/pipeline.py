@@ -169,11 +169,12 @@ class Pipeline:
         if self._next_sequence is not None:
             self.dropped += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
-        if self.frames % self._every == 0:
+        turn = self.frames % self._every == 0
+        self.frames += 1
+        if turn:
             result = self._look(frame)
             self._newest = result.detections
             deliver(result)
-        self.frames += 1
         if self._recording is not None:
             started_ns = time.perf_counter_ns()
             self._recording.write(frame, self._newest)

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import logging
+import pickle
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.detections import Detections
+from vision.frame import Frame
+from vision.pipeline import PerceptionResult, Pipeline, Recording
+from vision.sources import EndOfStream, Source, SourceSettings, SourceStatistics, open_source
+
+WIDTH, HEIGHT = 96, 64
+
+
+@dataclass(frozen=True)
+class Timing:
+    preprocess_ms: float = 1.0
+    inference_ms: float = 2.0
+    postprocess_ms: float = 3.0
+
+
+class BrightSpot:
+    """A detector of the brightest square: real enough to tell frames apart."""
+
+    class_names = ("spot",)
+    last_timing = Timing()
+
+    def detect(self, image_bgr: np.ndarray, /) -> Detections:
+        rows, columns = np.nonzero(image_bgr.max(axis=2) > 200)
+        if len(rows) == 0:
+            return Detections.empty(self.class_names)
+        box = np.array([[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], np.float32)
+        return Detections(box, np.ones(1, np.float32), np.zeros(1, np.int64), self.class_names)
+
+
+class Frames(Source):
+    """A source of given frames; None stands for a time in which none came."""
+
+    uri = "frames"
+    live = True
+
+    def __init__(self, *frames: Frame | None) -> None:
+        self._frames = list(frames)
+
+    def read(self, timeout_s: float = 1.0) -> Frame | None:
+        if not self._frames:
+            raise EndOfStream
+        return self._frames.pop(0)
+
+    @property
+    def statistics(self) -> SourceStatistics:
+        return SourceStatistics()
+
+    def close(self) -> None:
+        self._frames.clear()
+
+
+def frame_of(sequence: int, *, spot_x: int = 40, depth_m: float | None = None) -> Frame:
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[20:36, spot_x : spot_x + 16] = 255
+    depth = None
+    if depth_m is not None:
+        depth = np.full((HEIGHT, WIDTH), 50.0, np.float32)
+        depth[20:36, spot_x : spot_x + 16] = depth_m
+    return Frame(image, time.monotonic_ns(), sequence, depth)
+
+
+def run(pipeline: Pipeline) -> list[PerceptionResult]:
+    results: list[PerceptionResult] = []
+    while True:
+        try:
+            pipeline.step(0.1, results.append)
+        except EndOfStream:
+            return results
+
+
+def test_every_frame_of_a_folder_gives_a_result_with_its_own_stamps(tmp_path: Path) -> None:
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), frame_of(0, spot_x=number * 10).image)
+    with open_source(str(tmp_path), SourceSettings()) as source:
+        results = run(Pipeline(source, BrightSpot()))
+    assert [result.sequence for result in results] == [0, 1, 2, 3]
+    assert [result.detections.xyxy[0, 0] for result in results] == [0, 10, 20, 30]
+    assert all(result.captured_ns < result.inferred_ns for result in results)
+    assert {(result.width, result.height, result.dropped) for result in results} == {(WIDTH, HEIGHT, 0)}
+
+
+def test_the_time_of_every_stage_is_told() -> None:
+    (result,) = run(Pipeline(Frames(frame_of(0)), BrightSpot()))
+    assert result.timing_ms["preprocess"] == 1.0
+    assert result.timing_ms["inference"] == 2.0
+    assert result.timing_ms["postprocess"] == 3.0
+    assert result.timing_ms["total"] >= result.timing_ms["range"] >= 0
+    assert result.timing_ms["record"] == 0
+
+
+def test_depth_gives_every_detection_its_range() -> None:
+    near, none = run(Pipeline(Frames(frame_of(0, depth_m=6.5), frame_of(1)), BrightSpot()))
+    assert near.detections.range_m == pytest.approx([6.5])
+    assert np.isnan(none.detections.range_m).all()
+
+
+def test_only_every_nth_frame_is_looked_at() -> None:
+    pipeline = Pipeline(Frames(*(frame_of(number) for number in range(7))), BrightSpot(), every=3)
+    assert [result.sequence for result in run(pipeline)] == [0, 3, 6]
+    assert pipeline.frames == 7
+    assert pipeline.dropped == 0
+
+
+def test_frames_that_the_source_lost_are_counted() -> None:
+    pipeline = Pipeline(Frames(frame_of(5), frame_of(6), frame_of(10)), BrightSpot())
+    assert [result.dropped for result in run(pipeline)] == [0, 0, 3]
+
+
+def test_a_time_without_a_frame_is_told_and_is_no_end() -> None:
+    results: list[PerceptionResult] = []
+    pipeline = Pipeline(Frames(None, frame_of(0)), BrightSpot())
+    assert pipeline.step(0.1, results.append) is False
+    assert pipeline.step(0.1, results.append) is True
+    assert len(results) == 1
+
+
+def test_without_a_detector_every_result_is_empty() -> None:
+    (result,) = run(Pipeline(Frames(frame_of(0, depth_m=4.0)), None))
+    assert len(result.detections) == 0
+    assert "inference" not in result.timing_ms
+
+
+def test_a_result_is_small_and_survives_pickling() -> None:
+    (result,) = run(Pipeline(Frames(frame_of(3, depth_m=4.0)), BrightSpot()))
+    data = pickle.dumps(result)
+    assert len(data) < 4096
+    copy = pickle.loads(data)
+    assert copy.detections.records() == result.detections.records()
+    assert (copy.sequence, copy.captured_ns, copy.timing_ms) == (3, result.captured_ns, result.timing_ms)
+
+
+def test_every_must_be_a_count() -> None:
+    with pytest.raises(ValueError, match="every must be at least 1, got 0"):
+        Pipeline(Frames(), BrightSpot(), every=0)
+
+
+def played(path: Path) -> list[np.ndarray]:
+    with open_source(str(path), SourceSettings()) as source:
+        return [frame.image for frame in source]
+
+
+def test_the_recording_shows_every_frame_also_those_that_were_not_looked_at(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mp4"
+    frames = [
+        Frame(frame.image, 10**9 + number * 50_000_000, number)
+        for number, frame in enumerate(frame_of(0) for _ in range(6))
+    ]
+    recording = Recording(path, 20.0)
+    recording.lines = ("hold", "height 5.0 m")
+    run(Pipeline(Frames(*frames), BrightSpot(), every=2, recording=recording))
+    recording.close()
+    images = played(path)
+    assert len(images) == 6
+    assert images[0].shape == (HEIGHT, WIDTH, 3)
+
+
+def test_a_frame_of_another_size_goes_on_in_the_size_of_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mp4"
+    other = Frame(np.zeros((32, 48, 3), np.uint8), 10**9 + 50_000_000, 1)
+    recording = Recording(path, 20.0)
+    run(Pipeline(Frames(Frame(frame_of(0).image, 10**9, 0), other), BrightSpot(), recording=recording))
+    recording.close()
+    assert {image.shape for image in played(path)} == {(HEIGHT, WIDTH, 3)}
+
+
+def test_a_recording_that_cannot_be_made_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="does not exist"):
+        Recording(tmp_path / "no" / "flight.mp4", 20.0)
+
+
+def test_a_recording_that_fails_says_so_once_and_perception_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "flight.mp4"
+    path.mkdir()  # nothing can be written there
+    with caplog.at_level(logging.ERROR):
+        results = run(
+            Pipeline(Frames(*(frame_of(n) for n in range(3))), BrightSpot(), recording=Recording(path, 20.0))
+        )
+    assert len(results) == 3
+    assert sum(str(path) in record.getMessage() for record in caplog.records) == 1
