@@ -20,10 +20,13 @@ class NoAnswerError(TimeoutError):
 
 
 def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> ZenohSection:
-    """How to reach the service that has these settings: as a peer that connects to where it listens."""
+    """How to reach the service that has these settings: as a client of its router, or of itself.
+
+    A client, as two peers of one router do not see each other (zenoh routes between peers only if told to).
+    """
     endpoints = connect or settings.connect or settings.listen
     return ZenohSection(
-        mode="peer",
+        mode="client",
         connect=tuple(endpoint.replace("0.0.0.0", "127.0.0.1") for endpoint in endpoints),
         listen=(),
         multicast_scouting=settings.multicast_scouting,
@@ -37,20 +40,25 @@ def open_client(settings: ZenohSection, *, timeout_s: float = 5.0) -> Iterator[z
     Raises:
         NoAnswerError: nobody was there within `timeout_s`.
     """
-    session = zenoh.open(zenoh_config(settings))
+    session = _open(settings, time.monotonic() + timeout_s)
     try:
-        deadline = time.monotonic() + timeout_s
-        while not (list(session.info.routers_zid()) or list(session.info.peers_zid())):
+        yield session
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
+    while True:
+        try:
+            return zenoh.open(zenoh_config(settings))
+        except zenoh.ZError as error:
             if time.monotonic() > deadline:
                 where = ", ".join(settings.connect) or "the local network"
                 raise NoAnswerError(
                     f"no zenoh node answers at {where}: is `companion run` running? "
                     "(--connect names another place)"
-                )
-            time.sleep(0.02)
-        yield session
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
+                ) from error
+        time.sleep(0.1)
 
 
 def send_command(

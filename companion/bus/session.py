@@ -103,7 +103,7 @@ class Bus:
                 endpoints = ", ".join(self._settings.listen)
                 raise BusError(
                     f"zenoh cannot listen on {endpoints}: {_first_line(error)}. "
-                    "Is a router or another service there? Then set zenoh.connect to it and zenoh.listen to none"
+                    "Is a router or another service there? Set zenoh.connect to it and zenoh.listen to none"
                 ) from error
         self._spawn(self._watch())
 

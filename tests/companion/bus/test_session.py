@@ -1,0 +1,161 @@
+"""The service's zenoh session, with real sessions over loopback."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing
+import queue
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any
+
+import pytest
+import zenoh
+
+from companion.bus import topics
+from companion.bus.client import NoAnswerError, client_settings, listen, open_client, send_command
+from companion.bus.session import Bus, BusError
+from companion.settings import ZenohSection
+
+WAIT_S = 20.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(WAIT_S):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+class Events(list[tuple[str, str]]):
+    def __call__(self, level: str, text: str) -> None:
+        self.append((level, text))
+
+    def has(self, text: str) -> bool:
+        return any(text in line for _, line in self)
+
+
+async def refuse(text: str) -> dict[str, Any]:
+    return {"success": False, "reason": f"no {text}"}
+
+
+def _route(port: int, ready: Connection) -> None:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config):
+        ready.send(True)
+        ready.recv()
+
+
+@contextmanager
+def router(port: int) -> Iterator[multiprocessing.process.BaseProcess]:
+    """A zenoh router in a process of its own, which can be killed."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_route, args=(port, theirs), daemon=True)
+    process.start()
+    try:
+        assert ours.poll(WAIT_S), "the router did not start"
+        ours.recv()
+        yield process
+    finally:
+        process.kill()
+        process.join()
+        ours.close()
+
+
+async def test_a_subscriber_receives_what_is_published_and_a_command_is_answered() -> None:
+    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port()}",))
+    bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
+    await bus.start()
+    received: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+    try:
+
+        def other_side() -> tuple[tuple[str, str], dict[str, Any]]:
+            with open_client(client_settings(settings)) as session:
+                listen(session, "labels", lambda key, text: received.put((key, text)))
+                reply = send_command(session, "alpha", "dance")
+                return received.get(timeout=WAIT_S), reply
+
+        answer = asyncio.create_task(asyncio.to_thread(other_side))
+        while not answer.done():
+            bus.publish(topics.LABELS, "car, person")
+            await asyncio.sleep(0.02)
+        message, reply = await answer
+    finally:
+        await bus.close()
+    assert message == ("companion/alpha/labels", "car, person")
+    assert reply == {"success": False, "reason": "no dance"}
+    assert bus.published["labels"] > 0
+
+
+async def test_a_busy_port_is_one_clear_line() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        bus = Bus(ZenohSection(listen=(endpoint,)), "alpha", on_event=Events(), on_command=refuse)
+        with pytest.raises(BusError, match=endpoint) as error:
+            await bus.start()
+        await bus.close()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+async def test_a_router_that_is_killed_is_missed_and_found_again(mode: str) -> None:
+    port = free_port()
+    events = Events()
+    settings = ZenohSection(mode=mode, connect=(f"tcp/127.0.0.1:{port}",), listen=())
+    bus = Bus(settings, "alpha", on_event=events, on_command=refuse)
+    await bus.start()
+    try:
+        await until(lambda: bool(events))
+        assert not bus.connected
+        bus.publish(topics.LABELS, "car")  # nobody is there: neither blocks nor raises
+        with router(port) as process:
+            await until(lambda: bus.connected)
+            process.kill()
+            await until(lambda: not bus.connected)
+            assert events.has("no connection")
+        events.clear()
+        with router(port):
+            await until(lambda: events.has("connected to"))
+            with open_client(client_settings(settings)) as session:
+                reply = await asyncio.to_thread(send_command, session, "alpha", "dance")
+            assert reply["reason"] == "no dance"
+    finally:
+        await bus.close()
+
+
+async def test_what_is_published_before_the_session_is_open_is_counted() -> None:
+    settings = ZenohSection(mode="client", connect=(f"tcp/127.0.0.1:{free_port()}",))
+    bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
+    bus.publish(topics.LABELS, "car")
+    assert bus.unsent == 1
+    assert bus.published["labels"] == 0
+
+
+def test_a_client_without_a_service_says_so_in_one_line() -> None:
+    settings = ZenohSection(connect=(f"tcp/127.0.0.1:{free_port()}",), listen=())
+    with (
+        pytest.raises(NoAnswerError, match="is `companion run` running"),
+        open_client(settings, timeout_s=0.5),
+    ):
+        pass
+
+
+def test_every_topic_has_a_key_of_its_own_and_none_blocks_the_sender_but_events() -> None:
+    keys = {topic.key("v") for topic in topics.TOPICS}
+    assert len(keys) == len(topics.TOPICS)
+    blocking = {t.name for t in topics.TOPICS if t.congestion_control == zenoh.CongestionControl.BLOCK}
+    assert blocking == {"events"}

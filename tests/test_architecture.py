@@ -1,0 +1,126 @@
+"""The house's one rule: imports run downwards only. `docs/architecture.md` draws the same picture."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+# Each room of `companion` and its floor; a room may import from lower floors alone.
+FLOORS = {
+    "settings": 0,
+    "systemd_notify": 0,
+    "config": 1,
+    "vehicle": 1,
+    "bus": 1,
+    "perception": 1,
+    "guidance": 2,
+    "cli_flags": 2,
+    "messages": 2,
+    "operator": 3,
+    "service": 4,
+    "rehearsal": 5,
+    "demo": 6,
+    "detect": 6,
+    "train": 6,
+    "bench": 6,
+    "cli": 7,
+}
+SIMULATOR_MAY_IMPORT = {
+    "vision.camera_model",
+    "vision.frame",
+    "vision.geolocation",
+    "vision.rotation",
+    "vision.shared_frame",
+}
+MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench"}
+
+
+def modules() -> dict[str, Path]:
+    """Dotted name → file, of everything that is installed."""
+    found = {}
+    for package in ("companion", "vision", "mavlink_sim"):
+        for path in (ROOT / package).rglob("*.py"):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports_of(name: str, path: Path, *, only_top: bool = False) -> set[str]:
+    """Our own modules that a module imports (inside functions too, unless `only_top`)."""
+    tree = ast.parse(path.read_text())
+    known = modules()
+    found: set[str] = set()
+    nodes = _top_level(tree) if only_top else list(ast.walk(tree))
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{name} imports relatively; write the whole name"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+    return {module for module in found if module in known and module != name}
+
+
+def _top_level(tree: ast.Module) -> list[ast.stmt]:
+    """Statements that run at import; `if TYPE_CHECKING:` does not."""
+    return [node for node in tree.body if not isinstance(node, ast.If)]
+
+
+def room(module: str) -> str:
+    """`companion.guidance.pilot` → guidance; `companion.perception_worker` → perception."""
+    name = module.split(".")[1]
+    return name if name in FLOORS else name.split("_")[0]
+
+
+def test_vision_imports_nothing_of_the_others() -> None:
+    for name, path in modules().items():
+        if name.startswith("vision"):
+            strangers = {m for m in imports_of(name, path) if not m.startswith("vision")}
+            assert not strangers, f"{name} imports {strangers}"
+
+
+def test_the_simulator_imports_only_geometry_and_frames_of_vision() -> None:
+    for name, path in modules().items():
+        if name.startswith("mavlink_sim"):
+            strangers = {m for m in imports_of(name, path) if not m.startswith("mavlink_sim")}
+            assert strangers <= SIMULATOR_MAY_IMPORT | {"vision"}, f"{name} imports {strangers}"
+
+
+def test_only_rehearsal_training_and_benchmarks_know_the_simulator() -> None:
+    for name, path in modules().items():
+        if name.startswith("companion.") and any(m.startswith("mavlink_sim") for m in imports_of(name, path)):
+            assert room(name) in MAY_IMPORT_SIMULATOR, f"{name} imports the simulator"
+
+
+def test_rooms_of_the_companion_import_downwards_only() -> None:
+    for name, path in modules().items():
+        if not name.startswith("companion."):
+            continue
+        here = room(name)
+        assert here in FLOORS, f"{name}: a new room; give it a floor here and in docs/architecture.md"
+        for other in imports_of(name, path):
+            if not other.startswith("companion.") or room(other) == here:
+                continue
+            assert FLOORS[room(other)] < FLOORS[here], f"{name} imports upwards: {other}"
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    graph = {name: imports_of(name, path, only_top=True) for name, path in modules().items()}
+    finished: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        if name in trail:
+            pytest.fail(" → ".join([*trail[trail.index(name) :], name]))
+        if name in finished:
+            return
+        for other in graph[name]:
+            # A package's own __init__ may gather its modules.
+            if not name.startswith(f"{other}."):
+                visit(other, (*trail, name))
+        finished.add(name)
+
+    for name in graph:
+        visit(name, ())
