@@ -1,0 +1,171 @@
+"""Fly to an object of a class and stop before it: visual servoing on its filtered place."""
+
+from __future__ import annotations
+
+import math
+
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.motion import (
+    correction,
+    ground_speed,
+    position_and_yaw,
+    stay_at,
+    stopping_speed,
+)
+from companion.guidance.target import Target
+from companion.guidance.track import ObjectTrack
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+from vision.rotation import wrap_angle
+
+# Well under the envelope's acceleration, so that a vehicle that answers late still stops in time.
+DECELERATION_MPS2 = 0.7
+# Away from an object that is too near: slowly, the camera does not look backwards.
+MAX_RETREAT_MPS = 1.0
+ARRIVAL_TOLERANCE_M = 0.3
+ARRIVAL_SPEED_MPS = 0.3
+ARRIVAL_S = 1.0
+# Detectors miss single frames; this long without the object and the vehicle brakes.
+LOST_AFTER_S = 1.0
+# Nearer than this the bearing to the object's nearest point swings too much to be followed.
+MIN_YAW_RANGE_M = 1.0
+BASE_TIMEOUT_S = 45.0
+
+
+class ApproachBehaviour(Behaviour):
+    """Keeps its height, turns its nose to the object and stops `distance_m` before its nearest surface.
+
+    It begins with the object of the class nearest to the nose and stays with that one. Lost, it brakes and
+    looks for `lost_timeout_s` before it gives up.
+    """
+
+    name = "approach"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+
+    def __init__(
+        self,
+        class_name: str,
+        *,
+        distance_m: float = 5.0,
+        speed_mps: float = 2.0,
+        confidence: float = 0.3,
+        lost_timeout_s: float = 5.0,
+    ) -> None:
+        self.class_names = (class_name,)
+        self._class_name = class_name
+        self._distance_m, self._speed_mps = distance_m, speed_mps
+        self._confidence = confidence
+        self._lost_timeout_s = lost_timeout_s
+        self._track: ObjectTrack | None = None
+        self._down_m = 0.0
+        self._seen_ns = 0
+        self._until_ns: float = math.inf
+        self._started_ns = 0
+        self._bearing_rad: float | None = None
+        self._wait_place: Vector3 | None = None
+        self._arrived_since_ns: int | None = None
+        self._range_m = math.nan
+
+    def on_activate(self, situation: Situation) -> None:
+        position, _ = position_and_yaw(situation.state)
+        self._down_m = position[2]
+        self._started_ns = self._seen_ns = situation.now_ns
+        self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
+        self._track = self._bearing_rad = self._wait_place = self._arrived_since_ns = None
+        self._range_m = math.nan
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        now_ns, state = situation.now_ns, situation.state
+        position, yaw_rad = position_and_yaw(state)
+        self._observe(situation, position, yaw_rad)
+        track = self._track
+        unseen_s = (now_ns - self._seen_ns) / 1e9
+        if track is not None:
+            north, east, _ = track.position_ned_m
+            self._range_m = math.hypot(north - position[0], east - position[1])
+        if now_ns > self._until_ns:
+            away = f"still {self._range_m:.1f} m away" if track else "its range never became known"
+            took_s = (now_ns - self._started_ns) / 1e9
+            return Outcome(False, f"did not reach the {self._class_name} in {took_s:.0f} s: {away}")
+        if track is None or unseen_s > LOST_AFTER_S or not situation.perception_fresh:
+            return self._wait(situation, position, unseen_s)
+        self._wait_place = None
+
+        bearing = math.atan2(east - position[1], north - position[0])
+        if self._range_m > MIN_YAW_RANGE_M or self._bearing_rad is None:
+            self._bearing_rad = bearing
+        error_m = self._range_m - self._distance_m
+        if self._arrived(error_m, ground_speed(state), now_ns):
+            return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m")
+        top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
+        speed = stopping_speed(error_m, top, DECELERATION_MPS2)
+        # Towards what the camera does not look at yet, only as fast as the nose comes round.
+        speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
+        velocity = (
+            speed * math.cos(bearing),
+            speed * math.sin(bearing),
+            correction(self._down_m - position[2]),
+        )
+        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
+
+    @property
+    def status(self) -> str:
+        if self._track is None:
+            return f"looking for the {self._class_name}"
+        if self._wait_place is not None:
+            return f"lost the {self._class_name}, waiting"
+        return f"{self._class_name} {self._range_m:.1f} m away"
+
+    def _observe(self, situation: Situation, position: Vector3, yaw_rad: float) -> None:
+        fitting = [
+            target
+            for target in situation.targets
+            if target.class_name == self._class_name and target.confidence >= self._confidence
+        ]
+        if self._track is not None:
+            if self._track.update(fitting, position):
+                self._seen_ns = self._track.captured_ns
+            return
+        if not fitting:
+            return
+        chosen = min(fitting, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
+        if chosen.position_ned_m is None:
+            # Turned to, it may come fully into the picture, and its range with it.
+            self._bearing_rad = chosen.bearing_rad
+            return
+        self._begin(chosen, position, situation.now_ns)
+
+    def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
+        self._track = ObjectTrack(target, position)
+        self._seen_ns = target.captured_ns
+        way_m = abs(target.range_m - self._distance_m)
+        self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * way_m / self._speed_mps) * 1e9
+
+    def _arrived(self, error_m: float, speed_mps: float, now_ns: int) -> bool:
+        if abs(error_m) > ARRIVAL_TOLERANCE_M or speed_mps > ARRIVAL_SPEED_MPS:
+            self._arrived_since_ns = None
+            return False
+        if self._arrived_since_ns is None:
+            self._arrived_since_ns = now_ns
+        return now_ns - self._arrived_since_ns >= ARRIVAL_S * 1e9
+
+    def _wait(self, situation: Situation, position: Vector3, unseen_s: float) -> Step:
+        """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""
+        self._arrived_since_ns = None
+        if unseen_s > self._lost_timeout_s:
+            if not situation.perception_fresh:
+                why = "nothing comes from the detector"
+            elif self._track is None:
+                why = "it was never seen with a known range"
+            else:
+                why = f"last seen {self._range_m:.1f} m away"
+            return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
+        if self._wait_place is None and ground_speed(situation.state) < ARRIVAL_SPEED_MPS:
+            self._wait_place = (position[0], position[1], self._down_m)
+        if self._wait_place is None:
+            velocity = (0.0, 0.0, correction(self._down_m - position[2]))
+        else:
+            velocity = stay_at(self._wait_place, position)
+        if self._bearing_rad is None:
+            return Setpoint.velocity(velocity, situation.now_ns, yaw_rate_radps=0.0)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=self._bearing_rad)

@@ -1,0 +1,105 @@
+"""Whose vehicle it is: tells our own mode changes from a pilot's.
+
+What we asked for is known, but not when it shows: a HEARTBEAT comes once a second, a request takes its time,
+and the autopilot moves on by itself (take-off ends in hold, landing ends disarmed). Every mode that none of
+this explains was chosen by someone else, and someone else always wins.
+"""
+
+from __future__ import annotations
+
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+
+# A heartbeat's period and some: so long may the vehicle show an old mode after it acknowledged a new one.
+SHOW_DELAY_S = 2.0
+# PX4 ends a take-off inside NAV_MC_ALT_RAD (0.8 m); heights measured in two ways differ by some more. A hold
+# that appears lower than this below the wanted height was asked for by a pilot.
+TAKEOFF_SHORT_M = 1.3
+GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN)
+
+
+class Authority:
+    """Follows the modes of one vehicle while we are in command of it."""
+
+    def __init__(self) -> None:
+        self._mode: FlightMode | None = None
+        self._leaving: set[FlightMode] = set()
+        self._leaving_until_ns: float = 0
+        self._takeoff_altitude_m = 0.0
+        self._was_armed = False
+        self._failsafe_before = False
+
+    @property
+    def mode(self) -> FlightMode | None:
+        """The mode we last asked for; None while we are not in command."""
+        return self._mode
+
+    def take(self, state: VehicleState) -> None:
+        """We take command of a vehicle as it is now."""
+        self._mode = state.mode
+        self._leaving = set()
+        self._leaving_until_ns = 0
+        self._takeoff_altitude_m = state.altitude_m or 0.0
+        self._was_armed = state.armed
+        self._failsafe_before = state.failsafe
+
+    def release(self) -> None:
+        """We are not in command any more; nothing is compared."""
+        self._mode = None
+
+    def request(self, mode: FlightMode, state: VehicleState, altitude_m: float | None = None) -> None:
+        """We ask for a mode: until `settled`, what it was before may still be shown."""
+        self._leaving |= {state.mode}
+        if self._mode is not None:
+            self._leaving |= {self._mode}
+        if mode is FlightMode.TAKEOFF:
+            self._leaving |= {FlightMode.HOLD}
+            self._takeoff_altitude_m = altitude_m if altitude_m is not None else 0.0
+        self._mode = mode
+        self._leaving_until_ns = float("inf")
+
+    def settled(self, now_ns: int) -> None:
+        """The request is done; the old mode may still show for a heartbeat, if the new one never showed."""
+        self._leaving_until_ns = now_ns + SHOW_DELAY_S * 1e9
+
+    def refused(self, mode: FlightMode) -> None:
+        """The request came to nothing: the mode from before is ours again."""
+        self._mode = mode
+        self._leaving = set()
+
+    def lost(self, state: VehicleState, now_ns: int, *, flying_by_setpoint: bool) -> str | None:
+        """Why we are not in command any more; None while we are."""
+        if self._mode is None:
+            return None
+        if not state.connected(now_ns):
+            silent_s = (now_ns - state.heartbeat_ns) / 1e9
+            return f"the link to the autopilot is lost: no heartbeat for {silent_s:.1f} s"
+        explained = self._explained(state, now_ns)
+        self._failsafe_before &= state.failsafe
+        if state.failsafe and not self._failsafe_before and (flying_by_setpoint or not explained):
+            return f"autopilot failsafe: {_shown(state.mode)}"
+        if not explained:
+            return f"the pilot took over: {_shown(state.mode)}"
+        self._was_armed |= state.armed
+        if self._was_armed and not state.armed and self._mode not in GOING_DOWN:
+            return "the vehicle was disarmed"
+        return None
+
+    def _explained(self, state: VehicleState, now_ns: int) -> bool:
+        if state.mode is self._mode:
+            # Shown while the request is still under way, an old mode may flicker; after it, no more.
+            if self._leaving_until_ns != float("inf"):
+                self._leaving = set()
+            return True
+        if state.mode in self._leaving and now_ns <= self._leaving_until_ns:
+            return True
+        if self._mode in GOING_DOWN and (not state.armed or state.landed is LandedState.ON_GROUND):
+            # Landed and disarmed, PX4 shows the mode that was chosen before the landing.
+            return True
+        if FlightMode.TAKEOFF in (self._mode, *self._leaving) and state.mode is FlightMode.HOLD:
+            short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)
+            return short_m <= TAKEOFF_SHORT_M
+        return False
+
+
+def _shown(mode: FlightMode) -> str:
+    return f"{mode.value.replace('_', ' ')} mode"

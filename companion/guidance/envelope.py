@@ -1,0 +1,232 @@
+"""The limits that no behaviour can leave: the last thing a setpoint passes before it is sent.
+
+The envelope only ever takes away. A velocity that leaves it is never faster than the one that came, neither
+over ground nor upwards or downwards; braking is never delayed. A setpoint inside every limit passes as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3, VehicleState
+from vision.rotation import wrap_angle
+
+# PX4 flies towards a position with about this much speed for each metre that is missing (MPC_XY_P 0.95,
+# MPC_Z_P 1.0), so a position limit/gain ahead is flown to with no more than the limit.
+POSITION_GAIN_PER_S = 1.0
+# A loop that stood still must not earn itself a jump.
+LONGEST_STEP_S = 0.2
+# Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
+FENCE_BRAKING = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the vehicle may be asked for.
+
+    Attributes:
+        max_horizontal_speed_mps: over ground.
+        max_climb_mps, max_descend_mps: upwards, downwards.
+        max_yaw_rate_radps: either way.
+        max_acceleration_mps2: at which a commanded velocity may grow or turn.
+        min_altitude_m, max_altitude_m: band above home.
+        max_distance_m: horizontally from home.
+
+    Raises:
+        ValueError: a limit is not finite and positive, or the band of altitudes is empty.
+    """
+
+    max_horizontal_speed_mps: float = 5.0
+    max_climb_mps: float = 2.0
+    max_descend_mps: float = 1.0
+    max_yaw_rate_radps: float = 1.0
+    max_acceleration_mps2: float = 2.0
+    min_altitude_m: float = 1.0
+    max_altitude_m: float = 50.0
+    max_distance_m: float = 200.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{field.name} must be a finite number above 0, got {value}")
+        if self.min_altitude_m >= self.max_altitude_m:
+            raise ValueError(
+                f"min_altitude_m must be below max_altitude_m, got {self.min_altitude_m} "
+                f"and {self.max_altitude_m}"
+            )
+
+
+class Limited(NamedTuple):
+    """What the envelope let through, and a few words for every limit that acted."""
+
+    sent: Setpoint
+    reasons: tuple[str, ...]
+
+
+class Envelope:
+    """Applies `limits` to a stream of setpoints. It remembers the last one, for acceleration and yaw rate."""
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self.limits = limits or Limits()
+        self._velocity: Vector3 | None = None
+        self._yaw_rad: float | None = None
+
+    def reset(self) -> None:
+        """Forget the last setpoint: the next one starts from how the vehicle really moves."""
+        self._velocity = self._yaw_rad = None
+
+    def apply(self, setpoint: Setpoint, state: VehicleState, now_ns: int, dt_s: float) -> Limited:
+        """What may be sent of a setpoint.
+
+        Args:
+            setpoint: as the behaviour asked for it.
+            state: for where the vehicle is, how it moves, and where home is.
+            now_ns: CLOCK_MONOTONIC nanoseconds.
+            dt_s: since the last call; more than 0.2 s counts as that.
+
+        Without a known position a position setpoint cannot be judged: a brake takes its place.
+        """
+        dt_s = max(0.0, min(dt_s, LONGEST_STEP_S))
+        reasons: list[str] = []
+        if setpoint.position_ned_m is not None and state.position_ned_m is None:
+            self.reset()
+            return Limited(Setpoint.brake(now_ns), ("position unknown",))
+        sent = setpoint
+        if setpoint.velocity_ned_mps is not None:
+            velocity = self._limit_velocity(setpoint.velocity_ned_mps, state, dt_s, reasons)
+            self._velocity = velocity
+            if velocity != setpoint.velocity_ned_mps:
+                sent = replace(sent, velocity_ned_mps=velocity)
+        elif setpoint.position_ned_m is not None and state.position_ned_m is not None:
+            place = self._limit_position(setpoint.position_ned_m, state.position_ned_m, state, reasons)
+            self._velocity = None
+            if place != setpoint.position_ned_m:
+                sent = replace(sent, position_ned_m=place)
+        return Limited(self._limit_yaw(sent, state, dt_s, reasons), tuple(reasons))
+
+    def _limit_velocity(
+        self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]
+    ) -> Vector3:
+        limits = self.limits
+        velocity = _shorten(asked, limits.max_horizontal_speed_mps)
+        if velocity != asked:
+            reasons.append(f"horizontal speed limited to {limits.max_horizontal_speed_mps:g} m/s")
+        north, east, down = velocity
+        vertical = max(-limits.max_climb_mps, min(limits.max_descend_mps, down))
+        if vertical != down:
+            which, limit = (
+                ("climb", limits.max_climb_mps) if down < 0 else ("descent", limits.max_descend_mps)
+            )
+            reasons.append(f"{which} limited to {limit:g} m/s")
+        velocity = self._slew((north, east, vertical), state, dt_s, reasons)
+        # Last, so that no slew delays what a fence takes away.
+        return self._slow_at_fences(velocity, state, reasons)
+
+    def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
+        """Take away what would carry the vehicle over a fence: √(2·a·s) of speed for s of way left."""
+        limits, altitude_m = self.limits, state.altitude_m
+        if state.position_ned_m is None or altitude_m is None:
+            return velocity
+        north, east, down = velocity
+        if down < -self._towards_fence(limits.max_altitude_m - altitude_m):
+            down = -self._towards_fence(limits.max_altitude_m - altitude_m)
+            reasons.append(f"altitude limited to {limits.max_altitude_m:g} m")
+        elif down > self._towards_fence(altitude_m - limits.min_altitude_m):
+            down = self._towards_fence(altitude_m - limits.min_altitude_m)
+            reasons.append(f"altitude kept above {limits.min_altitude_m:g} m")
+        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
+        distance_m = math.hypot(*away)
+        if distance_m > 0.0:
+            outward = (away[0] / distance_m, away[1] / distance_m)
+            leaving = north * outward[0] + east * outward[1]
+            excess = leaving - self._towards_fence(limits.max_distance_m - distance_m)
+            if leaving > 0.0 and excess > 1e-9:
+                north, east = north - outward[0] * excess, east - outward[1] * excess
+                reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
+        return (north, east, down)
+
+    def _towards_fence(self, left_m: float) -> float:
+        return math.sqrt(2.0 * FENCE_BRAKING * self.limits.max_acceleration_mps2 * max(0.0, left_m))
+
+    def _slew(self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]) -> Vector3:
+        """Let the velocity change by the greatest acceleration, without ever being more than asked for."""
+        previous = self._velocity or state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        step = (asked[0] - previous[0], asked[1] - previous[1], asked[2] - previous[2])
+        size, allowed = math.hypot(*step), self.limits.max_acceleration_mps2 * dt_s
+        if size <= allowed + 1e-9:
+            return asked
+        part = allowed / size
+        north, east, down = (p + s * part for p, s in zip(previous, step, strict=True))
+        north, east, _ = _shorten((north, east, 0.0), math.hypot(asked[0], asked[1]))
+        down = max(min(asked[2], 0.0), min(max(asked[2], 0.0), down))
+        if (north, east, down) != asked and math.dist((north, east, down), asked) > 1e-9:
+            reasons.append(f"acceleration limited to {self.limits.max_acceleration_mps2:g} m/s²")
+            return (north, east, down)
+        return asked
+
+    def _limit_position(
+        self, asked: Vector3, here: Vector3, state: VehicleState, reasons: list[str]
+    ) -> Vector3:
+        limits = self.limits
+        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        down = max(home[2] - limits.max_altitude_m, min(home[2] - limits.min_altitude_m, asked[2]))
+        if down != asked[2]:
+            reasons.append(f"altitude kept within {limits.min_altitude_m:g} to {limits.max_altitude_m:g} m")
+        away = _shorten((asked[0] - home[0], asked[1] - home[1], 0.0), limits.max_distance_m)
+        place = (home[0] + away[0], home[1] + away[1], down)
+        if math.dist(place[:2], asked[:2]) > 1e-9:
+            reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
+        else:
+            place = (asked[0], asked[1], down)
+
+        offset = (place[0] - here[0], place[1] - here[1], 0.0)
+        carrot = _shorten(offset, limits.max_horizontal_speed_mps / POSITION_GAIN_PER_S)
+        if carrot != offset:
+            place = (here[0] + carrot[0], here[1] + carrot[1], place[2])
+            reasons.append(f"horizontal speed limited to {limits.max_horizontal_speed_mps:g} m/s")
+        highest = here[2] - limits.max_climb_mps / POSITION_GAIN_PER_S
+        lowest = here[2] + limits.max_descend_mps / POSITION_GAIN_PER_S
+        if place[2] < highest:
+            place = (place[0], place[1], highest)
+            reasons.append(f"climb limited to {limits.max_climb_mps:g} m/s")
+        elif place[2] > lowest:
+            place = (place[0], place[1], lowest)
+            reasons.append(f"descent limited to {limits.max_descend_mps:g} m/s")
+        return place
+
+    def _limit_yaw(
+        self, setpoint: Setpoint, state: VehicleState, dt_s: float, reasons: list[str]
+    ) -> Setpoint:
+        """Limit a yaw rate, or the rate at which a wanted heading runs ahead of the last one."""
+        limit = self.limits.max_yaw_rate_radps
+        if setpoint.yaw_rate_radps is not None:
+            self._yaw_rad = None
+            rate = max(-limit, min(limit, setpoint.yaw_rate_radps))
+            if rate == setpoint.yaw_rate_radps:
+                return setpoint
+            reasons.append(f"yaw rate limited to {limit:g} rad/s")
+            return replace(setpoint, yaw_rate_radps=rate)
+        previous = self._yaw_rad if self._yaw_rad is not None else state.yaw_rad
+        self._yaw_rad = setpoint.yaw_rad
+        if setpoint.yaw_rad is None or previous is None:
+            return setpoint
+        turn = wrap_angle(setpoint.yaw_rad - previous)
+        if abs(turn) <= limit * dt_s + 1e-9:
+            return setpoint
+        self._yaw_rad = wrap_angle(previous + math.copysign(limit * dt_s, turn))
+        reasons.append(f"yaw rate limited to {limit:g} rad/s")
+        return replace(setpoint, yaw_rad=self._yaw_rad)
+
+
+def _shorten(vector: Vector3, longest: float) -> Vector3:
+    """The same direction over ground, no longer than `longest`; down as it was."""
+    length = math.hypot(vector[0], vector[1])
+    if length <= longest * (1.0 + 1e-12):
+        return vector
+    scale = longest / length
+    return (vector[0] * scale, vector[1] * scale, vector[2])

@@ -1,0 +1,67 @@
+"""The autopilot's own ways down: land here, or return and land."""
+
+from __future__ import annotations
+
+import math
+
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+
+# MPC_LAND_SPEED is 0.7 m/s by default; landing detection and PX4's delay to disarm (COM_DISARM_LAND) come on
+# top.
+SLOWEST_DESCENT_MPS = 0.4
+GROUND_TIMEOUT_S = 30.0
+# RTL climbs to RTL_RETURN_ALT (30 m) first, then cruises at 5 m/s; both taken generously.
+RETURN_ALTITUDE_M = 60.0
+SLOWEST_RETURN_MPS = 1.5
+
+
+class LandBehaviour(Behaviour):
+    """Lands where it is, and ends when the autopilot has disarmed."""
+
+    name = "land"
+    requirements: frozenset[Requirement] = frozenset()
+    mode = FlightMode.LAND
+    did = "landed"
+
+    def __init__(self) -> None:
+        self._until_ns: float = 0
+        self._landed = LandedState.UNKNOWN
+
+    def on_activate(self, situation: Situation) -> None:
+        self._until_ns = situation.now_ns + self.timeout_s(situation.state) * 1e9
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        state = situation.state
+        self._landed = state.landed
+        if not state.armed and state.landed is LandedState.ON_GROUND:
+            return Outcome(True, f"{self.did} and disarmed")
+        if situation.now_ns > self._until_ns:
+            armed = "armed" if state.armed else "disarmed"
+            return Outcome(
+                False, f"{self.name} timed out: {state.landed.value.replace('_', ' ')} and {armed}"
+            )
+        return ModeRequest(self.mode)
+
+    def timeout_s(self, state: VehicleState) -> float:
+        """How long it may take from this state, seconds."""
+        return GROUND_TIMEOUT_S + max(0.0, state.altitude_m or 0.0) / SLOWEST_DESCENT_MPS
+
+    @property
+    def status(self) -> str:
+        return "on the ground" if self._landed is LandedState.ON_GROUND else f"{self.mode.value} mode"
+
+
+class ReturnBehaviour(LandBehaviour):
+    """Returns to home, lands there, and ends when the autopilot has disarmed."""
+
+    name = "rtl"
+    mode = FlightMode.RETURN
+    did = "returned, landed"
+
+    def timeout_s(self, state: VehicleState) -> float:
+        north, east, _ = state.position_ned_m or (0.0, 0.0, 0.0)
+        home_north, home_east, _ = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        away_m = math.hypot(north - home_north, east - home_east)
+        climbed_m = max(RETURN_ALTITUDE_M, state.altitude_m or 0.0)
+        return GROUND_TIMEOUT_S + away_m / SLOWEST_RETURN_MPS + 2.0 * climbed_m / SLOWEST_DESCENT_MPS

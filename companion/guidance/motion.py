@@ -1,0 +1,52 @@
+"""Small laws of motion that several behaviours share. Local NED, metres, seconds."""
+
+from __future__ import annotations
+
+import math
+
+from companion.vehicle.state import Vector3, VehicleState
+
+# Answer of a velocity command to an error of position, 1/s: about PX4's own MPC_XY_P and MPC_Z_P.
+POSITION_GAIN = 0.9
+# Corrections of drift are slow on purpose.
+MAX_CORRECTION_MPS = 0.8
+
+
+def position_and_yaw(state: VehicleState) -> tuple[Vector3, float]:
+    """Both, of a state that has them. Raises RuntimeError where a requirement was not checked."""
+    position, yaw_rad = state.position_ned_m, state.yaw_rad
+    if position is None or yaw_rad is None:
+        raise RuntimeError("position or attitude is unknown: the behaviour must require POSITION")
+    return position, yaw_rad
+
+
+def ground_speed(state: VehicleState) -> float:
+    """Horizontal speed, m/s; 0 while the velocity is unknown."""
+    north, east, _ = state.velocity_ned_mps or (0.0, 0.0, 0.0)
+    return math.hypot(north, east)
+
+
+def correction(error_m: float, limit_mps: float = MAX_CORRECTION_MPS) -> float:
+    """Speed that takes an error of position away."""
+    return max(-limit_mps, min(limit_mps, POSITION_GAIN * error_m))
+
+
+def stay_at(place: Vector3, position: Vector3) -> Vector3:
+    """Velocity that keeps the vehicle at a place (for setpoints that also carry a yaw rate)."""
+    north, east = place[0] - position[0], place[1] - position[1]
+    distance = math.hypot(north, east)
+    speed = correction(distance)
+    scale = speed / distance if distance > 1e-6 else 0.0
+    return (north * scale, east * scale, correction(place[2] - position[2]))
+
+
+def stopping_speed(error_m: float, top_speed_mps: float, deceleration_mps2: float) -> float:
+    """Signed speed towards a stop `error_m` ahead: full speed, then √(2·a·s), then proportional."""
+    distance = abs(error_m)
+    speed = min(top_speed_mps, math.sqrt(2.0 * deceleration_mps2 * distance), POSITION_GAIN * distance)
+    return math.copysign(speed, error_m)
+
+
+def in_degrees(bearing_rad: float) -> int:
+    """A bearing as people write it: 0..359."""
+    return round(math.degrees(bearing_rad)) % 360

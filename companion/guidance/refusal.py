@@ -1,0 +1,62 @@
+"""What a behaviour cannot do without, checked before it begins: a refusal names what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.vehicle.state import LandedState
+
+AIRBORNE = (LandedState.IN_AIR, LandedState.TAKING_OFF, LandedState.LANDING)
+
+
+def refusal(
+    behaviour: Behaviour, situation: Situation | None, class_names: Sequence[str] | None
+) -> str | None:
+    """Why this behaviour cannot begin now, in one line; None: it can.
+
+    Args:
+        situation: the newest; None before there is one.
+        class_names: what the detector knows; None: not known, not checked.
+    """
+    if situation is None:
+        return "the vehicle's state is not known yet"
+    state, now_ns = situation.state, situation.now_ns
+    if not state.connected(now_ns):
+        return "there is no link to the autopilot"
+    missing = []
+    for requirement in sorted(behaviour.requirements):
+        match requirement:
+            case Requirement.POSITION if not state.position_fresh(now_ns):
+                missing.append(f"position ({_position_age(situation)})")
+            case Requirement.IN_AIR if not (state.armed and state.landed in AIRBORNE):
+                missing.append(f"to be in the air ({_where(situation)})")
+            case Requirement.ON_GROUND if state.landed is not LandedState.ON_GROUND:
+                missing.append(f"to be on the ground ({_where(situation)})")
+            case Requirement.PERCEPTION if not situation.perception_fresh:
+                missing.append(f"perception ({_perception_age(situation)})")
+    if class_names is not None:
+        unknown = [name for name in behaviour.class_names if name not in class_names]
+        if unknown:
+            missing.append(f"a detector that knows {', '.join(unknown)}")
+    return f"{behaviour.name} needs {' and '.join(missing)}" if missing else None
+
+
+def _where(situation: Situation) -> str:
+    armed = "armed" if situation.state.armed else "disarmed"
+    landed = situation.state.landed.value.replace("_", " ")
+    return f"{armed}, {'not known where' if landed == 'unknown' else landed}"
+
+
+def _position_age(situation: Situation) -> str:
+    state = situation.state
+    if state.position_ned_m is None or state.attitude is None:
+        return "none came yet"
+    oldest_ns = min(state.position_ns, state.attitude_ns)
+    return f"{(situation.now_ns - oldest_ns) / 1e9:.1f} s old"
+
+
+def _perception_age(situation: Situation) -> str:
+    if situation.perception_age_s is None:
+        return "nothing came from the detector yet"
+    return f"its newest frame is {situation.perception_age_s:.1f} s old"

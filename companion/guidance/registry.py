@@ -1,0 +1,48 @@
+"""From a command of the grammar to the behaviour that flies it."""
+
+from __future__ import annotations
+
+from companion.guidance import grammar
+from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.behaviour import Behaviour
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.seek import SeekBehaviour
+from companion.guidance.stop import StopBehaviour
+from companion.guidance.takeoff import TakeoffBehaviour
+
+
+def behaviour_for(command: grammar.Command) -> Behaviour:
+    """A new behaviour, ready for the pilot. Raises TypeError for a command no behaviour is written for."""
+    match command:
+        case grammar.Takeoff(altitude_m):
+            return TakeoffBehaviour(altitude_m)
+        case grammar.Land():
+            return LandBehaviour()
+        case grammar.Rtl():
+            return ReturnBehaviour()
+        case grammar.Stop():
+            return StopBehaviour()
+        case grammar.Hold(duration_s):
+            return HoldBehaviour(duration_s)
+        case grammar.Orbit(class_name, radius_m, speed_mps, laps, direction):
+            clockwise = direction == "clockwise"
+            return OrbitBehaviour(radius_m, speed_mps, laps, clockwise=clockwise, class_name=class_name)
+        case grammar.Seek(class_name, laps, rate_radps, confidence, direction):
+            return SeekBehaviour(
+                class_name,
+                laps=laps,
+                rate_radps=rate_radps,
+                confidence=confidence,
+                clockwise=direction == "clockwise",
+            )
+        case grammar.Approach(class_name, distance_m, speed_mps, confidence, lost_timeout_s):
+            return ApproachBehaviour(
+                class_name,
+                distance_m=distance_m,
+                speed_mps=speed_mps,
+                confidence=confidence,
+                lost_timeout_s=lost_timeout_s,
+            )
+    raise TypeError(f"no behaviour is written for {type(command).__name__}")

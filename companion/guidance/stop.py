@@ -1,0 +1,31 @@
+"""Give the vehicle back to the autopilot: its own hold mode, and nothing of ours any more."""
+
+from __future__ import annotations
+
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation, Step
+from companion.vehicle.state import FlightMode
+
+TIMEOUT_S = 5.0
+
+
+class StopBehaviour(Behaviour):
+    """Asks for HOLD and ends when the autopilot shows it."""
+
+    name = "stop"
+
+    def __init__(self) -> None:
+        self._until_ns: float = 0
+        self._asked = False
+
+    def on_activate(self, situation: Situation) -> None:
+        self._until_ns = situation.now_ns + TIMEOUT_S * 1e9
+        self._asked = False
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        mode = situation.state.mode
+        if self._asked and mode is FlightMode.HOLD:
+            return Outcome(True, "stopped: the autopilot holds")
+        if situation.now_ns > self._until_ns:
+            return Outcome(False, f"hold mode was not reached in {TIMEOUT_S:g} s: {mode.value} mode")
+        self._asked = True
+        return ModeRequest(FlightMode.HOLD)

@@ -1,0 +1,183 @@
+"""From detections to targets: boxes in a picture become directions and places in local NED.
+
+A frame is some tens of milliseconds old when its detections arrive, and the vehicle has turned since: the
+attitude and the position used here are those of the moment of capture, interpolated from a short history.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.guidance.target import RangeSource, Target
+from companion.vehicle.state import Quaternion, Vector3, VehicleState
+from vision.camera_model import CameraModel, CameraMount
+from vision.detections import DetectionRecord
+from vision.geolocation import direction_ned, point_at_depth, point_on_ground
+from vision.rotation import matrix_from_quaternion
+
+HISTORY_S = 3.0
+# Beyond the ends of the history the nearest sample is taken for this long; a quadrotor turns 10° in it.
+MAX_OUTSIDE_S = 0.2
+# A box that touches the picture's lower edge (pixels) hides where its object stands.
+EDGE_PX = 2.0
+# One degree of attitude error at this depression is half the range.
+MIN_DEPRESSION_RAD = math.radians(2.0)
+# Below this height the ground plane says nothing about range.
+MIN_HEIGHT_M = 0.3
+
+
+class HistoryError(LookupError):
+    """The history does not reach to the asked moment. The message says by how much."""
+
+
+class Pose(NamedTuple):
+    """Where the vehicle was.
+
+    Attributes:
+        ned_from_body: (3, 3) float64 rotation from body FRD to NED.
+        position_ned_m: local NED, metres.
+        height_m: above home; taken as the height above flat ground.
+    """
+
+    ned_from_body: NDArray[np.float64]
+    position_ned_m: Vector3
+    height_m: float
+
+
+class StateHistory:
+    """The attitudes and positions of the last few seconds, each at its own stamp (CLOCK_MONOTONIC ns)."""
+
+    def __init__(self, duration_s: float = HISTORY_S) -> None:
+        self._duration_ns = round(duration_s * 1e9)
+        self._attitudes: deque[tuple[int, Quaternion]] = deque()
+        self._positions: deque[tuple[int, tuple[float, float, float, float]]] = deque()
+
+    def add(self, state: VehicleState) -> None:
+        """Remember what is new in a snapshot; older or repeated stamps are passed over."""
+        if state.attitude is not None and _newer(self._attitudes, state.attitude_ns):
+            self._attitudes.append((state.attitude_ns, state.attitude))
+            self._forget(self._attitudes)
+        position, height_m = state.position_ned_m, state.altitude_m
+        if position is not None and height_m is not None and _newer(self._positions, state.position_ns):
+            self._positions.append((state.position_ns, (*position, height_m)))
+            self._forget(self._positions)
+
+    def at(self, stamp_ns: int) -> Pose:
+        """The pose at a moment: attitude by slerp, position linearly between the samples around it.
+
+        Raises:
+            HistoryError: nothing is known yet, or the moment lies outside by more than `MAX_OUTSIDE_S`.
+        """
+        first, second, fraction = _around(self._attitudes, stamp_ns, "attitude")
+        quaternion = slerp(first, second, fraction)
+        before, after, fraction = _around(self._positions, stamp_ns, "position")
+        north, east, down, height = (a + (b - a) * fraction for a, b in zip(before, after, strict=True))
+        return Pose(matrix_from_quaternion(quaternion), (north, east, down), height)
+
+    def _forget(self, samples: deque[tuple[int, Quaternion]]) -> None:
+        oldest_ns = samples[-1][0] - self._duration_ns
+        while samples[0][0] < oldest_ns:
+            samples.popleft()
+
+
+def targets_from_detections(
+    detections: Sequence[DetectionRecord],
+    captured_ns: int,
+    camera: CameraModel,
+    mount: CameraMount,
+    history: StateHistory,
+) -> tuple[Target, ...]:
+    """The targets of one frame, in the order of its detections.
+
+    Range comes from the detection's depth where it has one (`range_m`, along the optical axis, at the box's
+    centre), else from where the ray through the middle of the box's lower edge meets the ground. The ground
+    is taken as flat and level with home. There is no range if the box touches the picture's lower edge, or
+    the ray points less than 2° down.
+
+    Raises:
+        HistoryError: the vehicle's pose at `captured_ns` is not known.
+    """
+    pose = history.at(captured_ns)
+    return tuple(_target(detection, captured_ns, camera, mount, pose) for detection in detections)
+
+
+def _target(
+    detection: DetectionRecord, captured_ns: int, camera: CameraModel, mount: CameraMount, pose: Pose
+) -> Target:
+    left, top, right, bottom = detection["xyxy"]
+    centre = np.array([[(left + right) / 2, (top + bottom) / 2]])
+    direction = direction_ned(camera, mount, pose.ned_from_body, centre)[0]
+    source, offset = RangeSource.NONE, np.full(3, np.nan)
+    depth_m = detection["range_m"]
+    if depth_m is not None and math.isfinite(depth_m) and depth_m > 0.0:
+        source = RangeSource.DEPTH
+        offset = point_at_depth(camera, mount, pose.ned_from_body, centre, np.array([depth_m]))[0]
+    elif bottom < camera.height - 1 - EDGE_PX and pose.height_m > MIN_HEIGHT_M:
+        foot = np.array([[(left + right) / 2, bottom]])
+        offset = point_on_ground(camera, mount, pose.ned_from_body, foot, pose.height_m, MIN_DEPRESSION_RAD)[
+            0
+        ]
+        if np.isfinite(offset).all():
+            source = RangeSource.GROUND_PLANE
+    known = source is not RangeSource.NONE
+    north, east, down = (
+        float(origin + away) for origin, away in zip(pose.position_ned_m, offset, strict=True)
+    )
+    return Target(
+        class_name=detection["class_name"],
+        confidence=detection["confidence"],
+        captured_ns=captured_ns,
+        bearing_rad=math.atan2(direction[1], direction[0]),
+        elevation_rad=math.asin(max(-1.0, min(1.0, -float(direction[2])))),
+        range_m=math.hypot(offset[0], offset[1]) if known else math.nan,
+        range_source=source,
+        position_ned_m=(north, east, down) if known else None,
+        box_xyxy=(left, top, right, bottom),
+    )
+
+
+def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
+    """Between two attitudes along the shorter way (Shoemake 1985). Quaternions are (w, x, y, z)."""
+    a, b = (np.array(q) / math.sqrt(sum(v * v for v in q)) for q in (first, second))
+    cosine = float(a @ b)
+    if cosine < 0.0:
+        b, cosine = -b, -cosine
+    if cosine > 0.9995:
+        mixed = a + (b - a) * fraction
+    else:
+        angle = math.acos(cosine)
+        mixed = a * math.sin((1.0 - fraction) * angle) + b * math.sin(fraction * angle)
+    w, x, y, z = (float(value) for value in mixed / np.linalg.norm(mixed))
+    return (w, x, y, z)
+
+
+def _newer(samples: deque[tuple[int, Quaternion]], stamp_ns: int) -> bool:
+    return not samples or stamp_ns > samples[-1][0]
+
+
+def _around(
+    samples: deque[tuple[int, Quaternion]], stamp_ns: int, what: str
+) -> tuple[Quaternion, Quaternion, float]:
+    """The samples before and after a moment and how far between them it is; the nearest beyond the ends."""
+    if not samples:
+        raise HistoryError(f"no {what} of the vehicle is known yet")
+    outside_s = max(samples[0][0] - stamp_ns, stamp_ns - samples[-1][0]) / 1e9
+    if outside_s > MAX_OUTSIDE_S:
+        side = "older than the oldest" if stamp_ns < samples[0][0] else "newer than the newest"
+        raise HistoryError(
+            f"the frame is {outside_s:.2f} s {side} {what} of the vehicle, allowed are {MAX_OUTSIDE_S:g} s"
+        )
+    index = bisect_right(samples, stamp_ns, key=lambda sample: sample[0])
+    if index == 0:
+        return samples[0][1], samples[0][1], 0.0
+    if index == len(samples):
+        return samples[-1][1], samples[-1][1], 0.0
+    (before_ns, before), (after_ns, after) = samples[index - 1], samples[index]
+    return before, after, (stamp_ns - before_ns) / (after_ns - before_ns)
