@@ -1,0 +1,125 @@
+"""Average precision on cases whose answer is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vision.yolo.metrics import ImageResult, average_precision, box_iou, score_detections
+
+NAMES = ("car", "boat")
+SQUARE = (0.0, 0.0, 10.0, 10.0)
+FAR = (50.0, 50.0, 60.0, 60.0)
+
+
+def result(found=(), true=()):
+    """found: (box, confidence, class); true: (box, class)."""
+    return ImageResult(
+        np.array([f[0] for f in found], np.float32).reshape(-1, 4),
+        np.array([f[1] for f in found], np.float32),
+        np.array([f[2] for f in found], np.int64),
+        np.array([t[0] for t in true], np.float32).reshape(-1, 4),
+        np.array([t[1] for t in true], np.int64),
+    )
+
+
+def test_finding_everything_exactly_scores_one():
+    score = score_detections([result([(SQUARE, 0.9, 0), (FAR, 0.8, 1)], [(SQUARE, 0), (FAR, 1)])], NAMES)
+    assert score.map50 == pytest.approx(1)
+    assert score.map50_95 == pytest.approx(1)
+    assert score.per_class["boat"].objects == 1
+    assert score.images == 1
+
+
+def test_a_missed_object_costs_the_recall_points_beyond():
+    score = score_detections([result([(SQUARE, 0.9, 0)], [(SQUARE, 0), (FAR, 0)])], NAMES)
+    assert score.map50 == pytest.approx(51 / 101)
+
+
+def test_a_more_confident_false_alarm_halves_the_precision():
+    score = score_detections([result([(FAR, 0.9, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)])], NAMES)
+    assert score.map50 == pytest.approx(0.5)
+
+
+def test_a_less_confident_false_alarm_costs_nothing():
+    score = score_detections([result([(FAR, 0.1, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)])], NAMES)
+    assert score.map50 == pytest.approx(1)
+
+
+def test_the_second_box_on_one_object_is_a_false_alarm():
+    score = score_detections(
+        [result([(SQUARE, 0.9, 0), (SQUARE, 0.8, 0), (FAR, 0.7, 0)], [(SQUARE, 0), (FAR, 0)])], NAMES
+    )
+    assert score.map50 == pytest.approx((51 + 50 * 2 / 3) / 101)
+
+
+def test_a_box_of_iou_0_72_counts_at_the_five_lower_thresholds():
+    loose = (0.0, 0.0, 10.0, 7.2)
+    score = score_detections([result([(loose, 0.9, 0)], [(SQUARE, 0)])], NAMES)
+    assert score.map50 == pytest.approx(1)
+    assert score.map50_95 == pytest.approx(0.5)
+
+
+def test_classes_do_not_find_each_other_and_absent_classes_do_not_count():
+    score = score_detections([result([(SQUARE, 0.9, 1)], [(SQUARE, 0)])], NAMES)
+    assert score.map50 == 0
+    assert math.isnan(score.per_class["boat"].ap50)
+
+
+def test_an_object_is_not_found_by_a_box_in_another_image():
+    score = score_detections([result([(SQUARE, 0.9, 0)]), result((), [(SQUARE, 0)])], NAMES)
+    assert score.map50 == 0
+
+
+def test_only_the_hundred_most_confident_boxes_of_an_image_count():
+    noise = [(FAR, 0.9, 0)] * 100
+    assert score_detections([result([*noise, (SQUARE, 0.1, 0)], [(SQUARE, 0)])], NAMES).map50 == 0
+
+
+def test_no_images_give_no_score():
+    assert math.isnan(score_detections([], NAMES).map50)
+
+
+def test_a_class_id_the_model_does_not_know_is_refused():
+    with pytest.raises(ValueError, match=r"class ids must be 0\.\.1, got 0\.\.7"):
+        score_detections([result([(SQUARE, 0.5, 7)], [(SQUARE, 0)])], NAMES)
+
+
+def test_precision_without_true_objects_is_not_defined():
+    with pytest.raises(ValueError, match="at least one true object"):
+        average_precision(np.zeros(0, np.float32), np.zeros(0, bool), 0)
+
+
+def test_iou_of_half_overlapping_boxes_is_a_third():
+    iou = box_iou(np.array([[0, 0, 2, 2]], np.float32), np.array([[1, 0, 3, 2]], np.float32))
+    assert iou.tolist() == [[pytest.approx(1 / 3)]]
+
+
+def plain_average_precision(confidences, right, objects):
+    """The definition, written out: at each recall the best precision at that recall or more."""
+    order = sorted(range(len(right)), key=lambda i: -confidences[i])
+    curve, found = [], 0
+    for rank, index in enumerate(order, 1):
+        found += right[index]
+        curve.append((found / objects, found / rank))
+    points = [max((p for r, p in curve if r >= k / 100 - 1e-12), default=0) for k in range(101)]
+    return sum(points) / 101
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 10**6), st.booleans()), max_size=30, unique_by=lambda p: p[0]),
+    st.integers(0, 5),
+)
+def test_average_precision_agrees_with_its_definition(pairs, missed):
+    confidences = np.array([p[0] / 10**6 for p in pairs], np.float32)
+    right = np.array([p[1] for p in pairs], bool)
+    objects = int(right.sum()) + missed
+    if objects == 0:
+        return
+    assert average_precision(confidences, right, objects) == pytest.approx(
+        plain_average_precision(confidences.tolist(), right.tolist(), objects), abs=1e-6
+    )
