@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 from companion.bench import percentiles
-from companion.demo import ALTITUDE_M
 from companion.rehearsal import (
+    ALTITUDE_M,
     RehearsalError,
     free_port,
     rehearsal_settings,

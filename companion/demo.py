@@ -17,13 +17,19 @@ from typing import Any
 
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
-from companion.rehearsal import free_port, rehearsal_settings, running_service, simulator, until_ready_to_arm
+from companion.rehearsal import (
+    ALTITUDE_M,
+    free_port,
+    rehearsal_settings,
+    running_service,
+    simulator,
+    until_ready_to_arm,
+)
 from companion.service import Event, Service
 
 STOP_DISTANCE_M = 5.0
 # Arrival counts when the simulator agrees with it to within this.
 RANGE_TOLERANCE_M = 1.0
-ALTITUDE_M = 4.0
 VIDEO_NAME = "flight.webm"
 
 # What is flown, in the service's own grammar. The range is taken at the end of the hold, when all is still.

@@ -16,6 +16,9 @@ from companion.config import load_settings
 from companion.service import Service
 from companion.settings import Settings
 
+# High enough to see far, low enough that a car at 5 m is in the picture.
+ALTITUDE_M = 4.0
+
 _SIMULATOR_START_S = 20.0
 _ARMABLE_S = 20.0
 

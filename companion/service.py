@@ -144,11 +144,12 @@ class Service:
     async def _outcome_of(self, command: grammar.Command) -> Outcome:
         behaviour = behaviour_for(command)
         ended = self.pilot.command(behaviour)
-        if not command.endless:
+        if not _endless(command):
             return await asyncio.shield(ended)
         under_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._awaited = (behaviour, under_way)
-        await asyncio.wait({ended, under_way}, return_when=asyncio.FIRST_COMPLETED)
+        waited: set[asyncio.Future[Any]] = {ended, under_way}
+        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
         return ended.result() if ended.done() else Outcome(True, "under way")
 
     def _answer_under_way(self) -> None:
@@ -342,6 +343,16 @@ class Service:
         self.bus.publish(topics.EVENTS, asdict(event))
         if self._on_event is not None:
             self._on_event(event)
+
+
+def _endless(command: grammar.Command) -> bool:
+    """It goes on until another command comes."""
+    match command:
+        case grammar.Hold(duration_s=duration_s):
+            return duration_s == 0.0
+        case grammar.Orbit(laps=laps):
+            return laps == 0.0
+    return False
 
 
 def _limits(settings: Settings) -> Limits:

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 # Each room of `companion` and its floor; a room may import from lower floors alone.
 FLOORS = {
     "settings": 0,
+    "standard_input": 0,
     "systemd_notify": 0,
     "config": 1,
     "vehicle": 1,

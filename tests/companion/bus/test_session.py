@@ -146,7 +146,7 @@ async def test_what_is_published_before_the_session_is_open_is_counted() -> None
 
 
 def test_a_client_without_a_service_says_so_in_one_line() -> None:
-    settings = ZenohSection(connect=(f"tcp/127.0.0.1:{free_port()}",), listen=())
+    settings = client_settings(ZenohSection(listen=(f"tcp/127.0.0.1:{free_port()}",)))
     with (
         pytest.raises(NoAnswerError, match="is `companion run` running"),
         open_client(settings, timeout_s=0.5),
