@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -25,10 +26,11 @@ from companion.perception_messages import (
     Report,
     StartFailed,
 )
-from companion.perception_process import STANDARD_INPUT, PerceptionProcess
+from companion.perception_process import PerceptionProcess
 from companion.perception_pulse import Pulse
 from companion.perception_status import PerceptionState, PerceptionStatus
 from companion.settings import Settings
+from companion.standard_input import STANDARD_INPUT, StandardInput
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -91,6 +93,7 @@ class PerceptionKeeper:
         self._stop_asked = asyncio.Event()
         self._process: PerceptionProcess | None = None
         self._pulse: Pulse | None = None
+        self._input: StandardInput | None = None
         self._ready: Ready | None = None
         self._lines: tuple[str, ...] = ()
         self._problem = ""
@@ -142,6 +145,8 @@ class PerceptionKeeper:
             )
             self._process.kill()
         await asyncio.wait({task})
+        if self._input is not None:
+            self._input.close()
         self._state = PerceptionState.STOPPED
 
     def send_hud(self, lines: tuple[str, ...]) -> None:
@@ -224,14 +229,6 @@ class PerceptionKeeper:
         while now_s - self._deaths_s[0] > RESTART_WINDOW_S:
             self._deaths_s.popleft()
         deaths = len(self._deaths_s)
-        source = self._settings.source
-        if source.uri == STANDARD_INPUT and source.pixel_format != "mjpeg":
-            self._on_event(
-                "error",
-                f"perception failed: {end.text}; where the next frame begins in standard input is lost "
-                "with it, so it is not started again (with pixel_format mjpeg it would be)",
-            )
-            return None
         if deaths > MAX_RESTARTS:
             self._on_event(
                 "error",
@@ -247,7 +244,7 @@ class PerceptionKeeper:
     async def _run_one(self, started: asyncio.Future[None]) -> _End:
         """Start one worker and stay with it until it is dead."""
         try:
-            process = await PerceptionProcess.spawn(self._settings_of_next_worker())
+            process = await self._spawn()
         except OSError as error:
             return _End(False, f"the perception process cannot be started: {error}")
         pulse = Pulse(time.monotonic(), self._settings.source.open_timeout_s)
@@ -270,6 +267,19 @@ class PerceptionKeeper:
             self._before.add(self._now)
             self._now = _Counts()
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
+
+    async def _spawn(self) -> PerceptionProcess:
+        settings = self._settings_of_next_worker()
+        if settings.source.uri != STANDARD_INPUT:
+            return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL)
+        if self._input is None:
+            self._input = StandardInput(settings.source)
+        descriptor = self._input.for_worker()
+        try:
+            return await PerceptionProcess.spawn(settings, descriptor)
+        finally:
+            # The worker's copy must be the only one, or its death would not be seen.
+            os.close(descriptor)
 
     def _settings_of_next_worker(self) -> Settings:
         video = self._settings.recording.video

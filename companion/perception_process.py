@@ -17,7 +17,6 @@ from companion.settings import Settings
 _SEND_BUFFER_BYTES = 16384
 # Above this much that the worker has not taken (it is stopped, or busy) no more lines for the video go there.
 _UNREAD_BYTES = 65536
-STANDARD_INPUT = "-"
 
 
 class PerceptionProcess:
@@ -34,9 +33,14 @@ class PerceptionProcess:
         self._writer = writer
 
     @classmethod
-    async def spawn(cls, settings: Settings) -> Self:
-        """Start a fresh interpreter with nothing of this one but the search path, and standard input if it
-        is the source. Raises OSError.
+    async def spawn(cls, settings: Settings, standard_input: int) -> Self:
+        """Start a fresh interpreter that has nothing of this one but the search path.
+
+        Args:
+            standard_input: the descriptor that becomes the worker's, or `subprocess.DEVNULL`.
+
+        Raises:
+            OSError: no more processes or descriptors.
         """
         ours, theirs = socket.socketpair()
         with theirs:
@@ -50,7 +54,7 @@ class PerceptionProcess:
                     str(theirs.fileno()),
                     str(os.getpid()),
                     pass_fds=(theirs.fileno(),),
-                    stdin=None if settings.source.uri == STANDARD_INPUT else asyncio.subprocess.DEVNULL,
+                    stdin=standard_input,
                     stdout=2,  # standard output is the service's own
                     env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
                     # A Ctrl-C in the terminal is for the service, which then asks the worker to end.

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -341,13 +342,14 @@ RAW = (
     "source.pixel_format=bgr24",
     "source.width=64",
     "source.height=48",
+    "source.realtime=no",
     "detector.enabled=no",
 )
 
 
 def test_frames_come_from_the_services_own_standard_input() -> None:
     ours, theirs = os.pipe()
-    with service(ours, *RAW, "source.realtime=no", "source.every_frame=yes") as process:
+    with service(ours, *RAW, "source.every_frame=yes") as process:
         os.close(ours)
         with open(theirs, "wb") as writer:
             for number in range(20):
@@ -358,5 +360,32 @@ def test_frames_come_from_the_services_own_standard_input() -> None:
 def test_a_file_as_standard_input_is_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "frames.bgr"
     path.write_bytes(bytes(64 * 48 * 3 * 7))
-    with path.open("rb") as file, service(file.fileno(), *RAW, "source.realtime=no") as process:
+    with path.open("rb") as file, service(file.fileno(), *RAW) as process:
         assert wait_for_line(process, "state") == "state finished 7"
+
+
+def test_a_killed_worker_does_not_cost_the_place_in_standard_input() -> None:
+    ours, theirs = os.pipe()
+    with service(ours, *RAW) as process:
+        os.close(ours)
+        with open(theirs, "wb") as writer:
+            stop = threading.Event()
+
+            def write() -> None:
+                while not stop.is_set():
+                    writer.write(bytes(64 * 48 * 3))
+                    writer.flush()
+                    time.sleep(0.005)
+
+            writing = threading.Thread(target=write)
+            writing.start()
+            try:
+                pid = int(wait_for_line(process, "pid").split()[1])
+                wait_for_line(process, "result")
+                os.kill(pid, signal.SIGKILL)
+                wait_for_line(process, "event perception is back")
+                wait_for_line(process, "result")
+            finally:
+                stop.set()
+                writing.join()
+        assert wait_for_line(process, "state").startswith("state finished")

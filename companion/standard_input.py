@@ -1,0 +1,226 @@
+"""Standard input as a source that outlives its reader: frames go on whole, to one worker after another.
+
+What a dead worker had read of a pipe is gone with it, and in a stream of raw pixels nobody can tell where the
+next frame begins. So the service keeps the pipe. A thread moves the bytes on into a pipe of the worker's own
+(`splice(2)`: the kernel moves pages, nothing is copied here) and always knows where in a frame it is. The
+next worker gets the stream's header, if it has one, and then the next whole frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import select
+import stat
+import threading
+from typing import NamedTuple
+
+from companion.settings import SourceSection
+from vision.sources.raw import StreamError
+from vision.sources.source import RAW_PIXEL_FORMATS
+from vision.sources.y4m import MAGIC, parse_y4m_header
+
+logger = logging.getLogger(__name__)
+
+STANDARD_INPUT = "-"
+_CHUNK_BYTES = 1 << 20
+_LONGEST_LINE = 4096
+
+
+class _Framing(NamedTuple):
+    """How the stream is made of frames.
+
+    Attributes:
+        header: what every reader needs before its first frame.
+        frame_bytes: of one frame; None where frames tell their own beginning, as MJPEG's do.
+        has_lines: every frame comes after a line of its own.
+        taken: what was read of the first frame while finding this out.
+    """
+
+    header: bytes = b""
+    frame_bytes: int | None = None
+    has_lines: bool = False
+    taken: bytes = b""
+
+
+class _End(Exception):  # noqa: N818 - an end, not an error
+    """The writer of standard input has closed it."""
+
+
+class StandardInput:
+    """The service's standard input, for its workers. Call `for_worker` before each start.
+
+    Args:
+        source: says what the pipe carries.
+        descriptor: readable; stays open.
+    """
+
+    def __init__(self, source: SourceSection, descriptor: int = 0) -> None:
+        """Raises OSError if the descriptor is not open."""
+        self._source = source
+        self._descriptor = descriptor
+        mode = os.fstat(descriptor).st_mode
+        self._is_stream = stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)
+        self._file_begins = os.lseek(descriptor, 0, os.SEEK_CUR) if stat.S_ISREG(mode) else None
+        self._changed = threading.Condition()
+        self._waiting_writer: int | None = None
+        self._closed = False
+        self._thread: threading.Thread | None = None
+
+    def for_worker(self) -> int:
+        """A descriptor to be the next worker's standard input. The caller closes it."""
+        if not self._is_stream:
+            if self._file_begins is not None:
+                # Every worker reads a file from where it began, as it does a file that has a name.
+                os.lseek(self._descriptor, self._file_begins, os.SEEK_SET)
+            return os.dup(self._descriptor)
+        reader, writer = os.pipe()
+        with self._changed:
+            if self._waiting_writer is not None:
+                os.close(self._waiting_writer)
+            self._waiting_writer = writer
+            if self._closed:
+                self._close_waiting_writer()
+            self._changed.notify()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="standard input", daemon=True)
+            self._thread.start()
+        return reader
+
+    def close(self) -> None:
+        """No more workers will come. The thread ends when it next has something to hand on."""
+        with self._changed:
+            self._closed = True
+            self._close_waiting_writer()
+            self._changed.notify()
+
+    # --- the thread
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):  # above the user's limit: the default size does
+            fcntl.fcntl(self._descriptor, fcntl.F_SETPIPE_SZ, _CHUNK_BYTES)
+        writer: int | None = None
+        try:
+            framing = self._recognise()
+            line = framing.taken
+            while True:
+                if writer is None:
+                    writer = self._next_writer(framing.header)
+                    if writer is None:
+                        return
+                if framing.has_lines:
+                    line = self._line()
+                handed_on = self._hand_on(line, framing.frame_bytes, writer)
+                line = b""
+                if not handed_on:
+                    os.close(writer)
+                    writer = None
+        except _End:
+            logger.debug("standard input has ended")
+        except OSError as error:
+            logger.error("standard input cannot be read: %s", error.strerror)
+        finally:
+            if writer is not None:
+                os.close(writer)
+            self.close()
+
+    def _recognise(self) -> _Framing:
+        source = self._source
+        if source.pixel_format in RAW_PIXEL_FORMATS and source.width and source.height:
+            return _Framing(frame_bytes=source.width * source.height * RAW_PIXEL_FORMATS[source.pixel_format])
+        if source.pixel_format not in (None, "y4m"):
+            return _Framing()
+        beginning = b""
+        while len(beginning) < len(MAGIC):
+            beginning += self._read(len(MAGIC) - len(beginning))
+        if beginning != MAGIC:
+            return _Framing(taken=beginning)
+        header = beginning + self._line()
+        try:
+            return _Framing(header, parse_y4m_header(header.rstrip(b"\n")).frame_bytes, has_lines=True)
+        except StreamError:  # the worker meets it too, and tells it
+            return _Framing(taken=header)
+
+    def _next_writer(self, header: bytes) -> int | None:
+        """Wait for the next worker's pipe; None when no more will come."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting_writer is not None or self._closed)
+                writer, self._waiting_writer = self._waiting_writer, None
+            if writer is None or _written(writer, header):
+                return writer
+            os.close(writer)
+
+    def _hand_on(self, line: bytes, frame_bytes: int | None, writer: int) -> bool:
+        """Move one frame. False if the worker has died; the rest of its frame is passed over then."""
+        alive = _written(writer, line)
+        remaining = 0 if frame_bytes is None else frame_bytes
+        try:
+            if alive and frame_bytes is None:
+                self._move(writer, _CHUNK_BYTES)
+            while alive and remaining > 0:
+                remaining -= self._move(writer, remaining)
+        except BrokenPipeError:
+            alive = False
+        while remaining > 0:
+            remaining -= len(self._read(min(remaining, _CHUNK_BYTES)))
+        return alive
+
+    def _line(self) -> bytes:
+        line = b""
+        while not line.endswith(b"\n") and len(line) < _LONGEST_LINE:
+            line += self._read(1)
+        return line
+
+    def _read(self, count: int) -> bytes:
+        while True:
+            try:
+                data = os.read(self._descriptor, count)
+            except BlockingIOError:
+                self._wait_readable()
+                continue
+            if not data:
+                raise _End
+            return data
+
+    def _move(self, writer: int, count: int) -> int:
+        """Move at most `count` bytes; how many."""
+        while True:
+            try:
+                moved = os.splice(self._descriptor, writer, min(count, _CHUNK_BYTES))
+            except BlockingIOError:
+                self._wait_readable()
+                continue
+            except OSError as error:
+                if error.errno != errno.EINVAL:
+                    raise
+                data = self._read(min(count, _CHUNK_BYTES))  # a socket of a kind that cannot be spliced
+                if not _written(writer, data):
+                    raise BrokenPipeError from None
+                return len(data)
+            if moved == 0:
+                raise _End
+            return moved
+
+    def _wait_readable(self) -> None:
+        poll = select.poll()
+        poll.register(self._descriptor, select.POLLIN)
+        poll.poll()
+
+    def _close_waiting_writer(self) -> None:
+        if self._waiting_writer is not None:
+            os.close(self._waiting_writer)
+            self._waiting_writer = None
+
+
+def _written(writer: int, data: bytes) -> bool:
+    """Write all of it; False if nobody reads that pipe any more."""
+    try:
+        while data:
+            data = data[os.write(writer, data) :]
+    except BrokenPipeError:
+        return False
+    return True
