@@ -12,9 +12,9 @@ ROOT = Path(__file__).parent.parent
 # Each room of `companion` and its floor; a room may import from lower floors alone.
 FLOORS = {
     "settings": 0,
-    "standard_input": 0,
     "systemd_notify": 0,
     "config": 1,
+    "standard_input": 1,
     "vehicle": 1,
     "bus": 1,
     "perception": 1,

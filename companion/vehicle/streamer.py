@@ -3,6 +3,9 @@
 Fresh → the setpoint. Expired → a braking setpoint for `brake_s`. Then silence, so that the autopilot's own
 loss-of-offboard failsafe acts (PX4: COM_OF_LOSS_T, COM_OBL_RC_ACT). The streamer lives in the same loop as
 everything else: when that loop hangs or the process is stopped, nothing is sent and the failsafe acts too.
+
+Silence is final: PX4 goes back to OFFBOARD by itself when setpoints return, so after a silence as long as its
+failsafe may take, whatever caused it, nothing is sent until `stop()` and a new beginning.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_RATE_HZ = 50.0
 DEFAULT_BRAKE_S = 0.5
+# A gap longer than this in a running stream is a silence. PX4 allows 1 s (COM_OF_LOSS_T); a gap of 0.8 s did
+# nothing to a real one.
+SILENCE_S = 0.8
 
 
 class StreamState(StrEnum):
@@ -27,7 +33,7 @@ class StreamState(StrEnum):
     SILENT = "silent"  # nothing was submitted, or command was given up
     FRESH = "fresh"  # sending the newest setpoint
     BRAKING = "braking"  # the newest setpoint expired; sending a brake
-    EXPIRED = "expired"  # braking time is over; nothing is sent until a fresh setpoint comes
+    EXPIRED = "expired"  # there was a silence; nothing is sent until `stop()`
 
 
 class Streamer:
@@ -72,8 +78,9 @@ class Streamer:
         return self._sent_ns
 
     def submit(self, setpoint: Setpoint) -> None:
-        """The newest setpoint; it replaces the one before."""
-        self._newest = setpoint
+        """The newest setpoint; it replaces the one before. Not taken after a silence."""
+        if self._state is not StreamState.EXPIRED:
+            self._newest = setpoint
 
     def stop(self) -> None:
         """Give up command: forget the setpoint and send nothing more."""
@@ -83,9 +90,11 @@ class Streamer:
     def tick(self, now_ns: int) -> None:
         """Send what is due at `now_ns`."""
         newest = self._newest
-        if newest is None:
+        if newest is None or self._state is StreamState.EXPIRED:
             return
-        if not newest.expired(now_ns):
+        if self._was_silent(now_ns):
+            self._enter(StreamState.EXPIRED)
+        elif not newest.expired(now_ns):
             self._enter(StreamState.FRESH)
             self._put(newest, now_ns)
         elif now_ns - newest.deadline_ns <= self._brake_ns:
@@ -104,6 +113,11 @@ class Streamer:
             if late_ns > 0:
                 due_ns += (late_ns // self._period_ns + 1) * self._period_ns
             await asyncio.sleep((due_ns - self._clock_ns()) / 1e9)
+
+    def _was_silent(self, now_ns: int) -> bool:
+        """The stream was running and then nothing left for too long: this loop did not go round."""
+        running = self._state in (StreamState.FRESH, StreamState.BRAKING)
+        return running and self._sent_ns is not None and now_ns - self._sent_ns > SILENCE_S * 1e9
 
     def _put(self, setpoint: Setpoint, now_ns: int) -> None:
         self.send(setpoint)
