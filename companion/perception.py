@@ -113,7 +113,7 @@ class PerceptionKeeper:
             PerceptionStartError: it cannot: no such model, an unknown class, a source that does not open.
         """
         if self._task is not None:
-            raise RuntimeError("the perception keeper was already started")
+            raise RuntimeError("a perception keeper is started once; make another")
         self._state = PerceptionState.STARTING
         started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._task = asyncio.create_task(self._keep(started), name="perception keeper")
@@ -129,8 +129,8 @@ class PerceptionKeeper:
 
     async def stop(self) -> None:
         """End the worker: asked (it finishes the video), then terminated, then killed; in at most 7 s."""
-        task, self._task = self._task, None
-        if task is None:
+        task = self._task
+        if task is None or self._stop_asked.is_set():
             return
         self._stop_asked.set()
         if self._process is not None:

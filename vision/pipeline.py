@@ -149,7 +149,7 @@ class Pipeline:
         self._every = every
         self._recording = recording
         self._newest = Detections.empty(detector.class_names if detector else ())
-        self._next_sequence: int | None = None
+        self._next_sequence = 0
         self._record_ms = 0.0
         self.frames = 0
         self.dropped = 0
@@ -166,8 +166,7 @@ class Pipeline:
         frame = self._source.read(timeout_s)
         if frame is None:
             return False
-        if self._next_sequence is not None:
-            self.dropped += max(0, frame.sequence - self._next_sequence)
+        self.dropped += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
         turn = self.frames % self._every == 0
         self.frames += 1

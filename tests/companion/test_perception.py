@@ -389,3 +389,14 @@ def test_a_killed_worker_does_not_cost_the_place_in_standard_input() -> None:
                 stop.set()
                 writing.join()
         assert wait_for_line(process, "state").startswith("state finished")
+
+
+async def test_a_keeper_is_stopped_as_often_as_one_likes_and_started_once(photos: Path) -> None:
+    keeper = PerceptionKeeper(settings_of(photos), on_result=lambda _: None, on_event=lambda *_: None)
+    await keeper.stop()
+    await keeper.start()
+    await keeper.stop()
+    await keeper.stop()
+    assert keeper.status.state is PerceptionState.STOPPED
+    with pytest.raises(RuntimeError, match="started once"):
+        await keeper.start()

@@ -114,8 +114,8 @@ def test_only_every_nth_frame_is_looked_at() -> None:
 
 
 def test_frames_that_the_source_lost_are_counted() -> None:
-    pipeline = Pipeline(Frames(frame_of(5), frame_of(6), frame_of(10)), BrightSpot())
-    assert [result.dropped for result in run(pipeline)] == [0, 0, 3]
+    pipeline = Pipeline(Frames(frame_of(1), frame_of(2), frame_of(6)), BrightSpot())
+    assert [result.dropped for result in run(pipeline)] == [1, 1, 4]
 
 
 def test_a_time_without_a_frame_is_told_and_is_no_end() -> None:
