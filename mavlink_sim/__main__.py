@@ -1,0 +1,6 @@
+"""`python -m mavlink_sim` is `mavlink-sim`."""
+
+from mavlink_sim.cli import main
+
+if __name__ == "__main__":
+    main()

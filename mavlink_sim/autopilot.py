@@ -1,0 +1,427 @@
+"""PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, automatic disarming.
+
+`update` runs once a physics step. Whatever PX4 would tell a ground station is queued in `texts`.
+Times are seconds since boot. Names in capitals are PX4's parameters.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavlink_sim import flight
+from mavlink_sim.control import NAN, Demand, PositionController, TrajectorySetpoint
+from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
+
+CRITICAL = 2  # MAV_SEVERITY_CRITICAL
+INFO = 6  # MAV_SEVERITY_INFO
+
+ACCEPTED = 0  # MAV_RESULT
+TEMPORARILY_REJECTED = 1
+
+# Measured: an armed vehicle that does not take off is disarmed 11.2 s after arming with COM_DISARM_PRFLT = 10.
+PREFLIGHT_DISARM_MARGIN_S = 1.2
+# PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
+LAND_DETECTION_S = 1.5
+TAKEOFF_DETECTION_HEIGHT_M = 0.12
+IDLE_THRUST_MPS2 = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """One status text, with the event (identifier, log levels, arguments) that says the same, if PX4 has one."""
+
+    severity: int
+    text: str
+    event: tuple[int, int, bytes] | None = None
+
+
+# Event identifiers, log levels and arguments as a PX4 v1.17 emitted them in a recorded flight.
+ARMED_EVENT = (0x0190CAF3, 0x66, b"\x04")
+TAKEOFF_EVENT = (0x01414569, 0x66, b"")
+LANDING_EVENT = (0x0132B2DE, 0x66, b"")
+LANDED_EVENT = (0x019638AC, 0x66, b"")
+DISARMED_EVENT = 0x01F46777
+ARMING_DENIED_EVENT = (0x0102089D, 0x62, b"")
+DEFAULT_ALTITUDE_EVENT = 0x013B2FC7
+
+GimbalCommand = tuple[int, int, tuple[float, float, float, float, float, float, float]]
+# What a landing PX4 sends to look after a gimbal: (seconds after the landing began, command, confirmation, values).
+_TAKE_CONTROL = (1.0, 1.0, -1.0, -1.0, 0.0, 0.0, 0.0)
+GIMBAL_COMMANDS: tuple[tuple[float, GimbalCommand], ...] = (
+    (0.24, (1001, 0, _TAKE_CONTROL)),
+    (0.24, (1000, 0, (NAN, NAN, NAN, NAN, 2.0, 0.0, 0.0))),
+    (0.24, (1001, 0, (-3.0, -3.0, -1.0, -1.0, 0.0, 0.0, 0.0))),
+    (1.26, (1001, 1, _TAKE_CONTROL)),
+    (1.77, (1001, 2, _TAKE_CONTROL)),
+    (2.29, (1001, 3, _TAKE_CONTROL)),
+)
+
+
+class Autopilot:
+    """The decisions of one vehicle. `now_s` is the time since boot, advanced by `update`."""
+
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        *,
+        ready_after_s: float,
+        on_event: Callable[[str], None],
+    ) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._ready_after_s = ready_after_s
+        self._on_event = on_event
+        self.controller = PositionController(parameters)
+        self.controller.reset(airframe.yaw_rad)
+        self.now_s = 0.0
+        self.armed = False
+        self.mode = Mode.HOLD
+        self.intended_mode = Mode.HOLD
+        self.failsafe = False
+        self.landed = True
+        self.pilot_has_sticks = False  # a remote control is connected, so POSCTL and the like can be flown
+        self.home: Vector = airframe.position
+        self.texts: deque[Text] = deque()
+        self.gimbal_commands: deque[GimbalCommand] = deque()
+        self.demand = Demand(0.0, 0.0, 0.0, 0.0)
+        self._gimbal_schedule: deque[tuple[float, GimbalCommand]] = deque()
+        self._takeoff_height_m: float | None = None
+        self.task: flight.Task | None = None
+        self._mode_after_disarming = Mode.HOLD
+        self._last_setpoint_s = -math.inf
+        self._armed_since_s = 0.0
+        self._landed_since_s = 0.0
+        self._contact_since_s: float | None = None
+        self._lifting_since_s: float | None = None
+        self._has_flown = False
+
+    # ---- what others read -------------------------------------------------------------------------------
+
+    @property
+    def has_setpoints(self) -> bool:
+        """The offboard stream is alive (COM_OF_LOSS_T)."""
+        return self.now_s - self._last_setpoint_s <= self._parameters.number("COM_OF_LOSS_T")
+
+    @property
+    def sensors_ready(self) -> bool:
+        return self.now_s >= self._ready_after_s
+
+    @property
+    def can_arm(self) -> bool:
+        """PX4's prearm check of the current mode (SYS_STATUS' bit MAV_SYS_STATUS_PREARM_CHECK)."""
+        return (
+            self.sensors_ready
+            and self.mode not in MODES_PREVENTING_ARMING
+            and self.mode is not Mode.MISSION
+            and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
+            and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
+        )
+
+    @property
+    def system_status(self) -> SystemState:
+        if self.failsafe and self.armed:
+            return SystemState.CRITICAL
+        if self.armed:
+            return SystemState.ACTIVE
+        return SystemState.STANDBY if self.can_arm else SystemState.UNINIT
+
+    @property
+    def base_mode(self) -> int:
+        return base_mode(self.mode, self.armed, self.has_setpoints)
+
+    @property
+    def landed_state(self) -> LandedState:
+        if self.landed:
+            return LandedState.ON_GROUND
+        if self.mode is Mode.TAKEOFF:
+            return LandedState.TAKEOFF
+        if self.task is not None and self.task.landing:
+            return LandedState.LANDING
+        return LandedState.IN_AIR
+
+    # ---- what a client asks for -------------------------------------------------------------------------
+
+    def arm(self) -> int:
+        """MAV_RESULT of an arming request."""
+        if self.armed:
+            return ACCEPTED
+        if not self.can_arm:
+            if not self.sensors_ready:
+                self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
+            self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
+            return TEMPORARILY_REJECTED
+        self.armed = True
+        self._has_flown = False
+        self._armed_since_s = self.now_s
+        self._lifting_since_s = None
+        self.home = self._airframe.position
+        self._say(INFO, "Armed by external command\t", ARMED_EVENT)
+        self._on_event("armed")
+        self._start_task()
+        return ACCEPTED
+
+    def disarm(self, force: bool = False) -> int:
+        """MAV_RESULT of a disarming request; `force` stops the motors in the air too."""
+        if not self.armed:
+            return ACCEPTED
+        if not self.landed and not force:
+            self._say(CRITICAL, "Disarming denied: not landed\t")
+            return TEMPORARILY_REJECTED
+        self._disarm("Disarmed by external command\t", "by command")
+        return ACCEPTED
+
+    def set_mode(self, mode: Mode, tell: bool = False) -> int:
+        """MAV_RESULT of a request for a mode; `tell` it by a text if it is refused (requests from component 190)."""
+        if self.armed and not self.can_run(mode):
+            if tell:
+                self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
+            return TEMPORARILY_REJECTED
+        self._intend(mode)
+        return ACCEPTED
+
+    def can_run(self, mode: Mode) -> bool:
+        """Whether an armed vehicle may fly in this mode now."""
+        if mode is Mode.OFFBOARD:
+            return self.has_setpoints
+        if mode in MANUAL_MODES:
+            return self.pilot_has_sticks
+        return mode is not Mode.MISSION  # there is never a mission on board
+
+    def takeoff(self, altitude_m: float | None) -> int:
+        """Mode TAKEOFF to a height above home (None: MIS_TAKEOFF_ALT). It never arms."""
+        if altitude_m is None:
+            altitude_m = self._parameters.number("MIS_TAKEOFF_ALT")
+            self._say(
+                INFO,
+                f"Using default takeoff altitude: {altitude_m:.1f} m\t",
+                (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
+            )
+        self._takeoff_height_m = altitude_m
+        self._intend(Mode.TAKEOFF)
+        return ACCEPTED
+
+    def land(self) -> int:
+        self._say(INFO, "Landing at current position\t", LANDING_EVENT)
+        self._intend(Mode.LAND)
+        return ACCEPTED
+
+    def return_home(self) -> int:
+        self._say(INFO, "Returning to launch\t")
+        self._intend(Mode.RTL)
+        return ACCEPTED
+
+    def reposition(self, goal: Vector, yaw_rad: float) -> int:
+        """Fly to a local NED position and hold there; NaN components stay as they are."""
+        self._intend(Mode.HOLD)
+        if self.armed and not self.landed:
+            here = flight.Trajectory(self._airframe, self._parameters).stopping_point()
+            x, y, z = (
+                wanted if math.isfinite(wanted) else own for wanted, own in zip(goal, here, strict=True)
+            )
+            self.task = flight.Hold(self._airframe, self._parameters, (x, y, z), yaw_rad)
+        return ACCEPTED
+
+    def offboard_setpoint(self, setpoint: TrajectorySetpoint) -> None:
+        """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
+        self._last_setpoint_s = self.now_s
+        if self.mode is Mode.OFFBOARD and isinstance(self.task, flight.Offboard):
+            self.task.setpoint = setpoint
+
+    # ---- one step ---------------------------------------------------------------------------------------
+
+    def update(self, dt_s: float) -> None:
+        """Check failsafes and detectors, run the flight task, move the airframe."""
+        self.now_s += dt_s
+        self._check_offboard()
+        while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
+            self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
+        airframe = self._airframe
+        if not self.armed:
+            self._idle(dt_s, 0.0)
+            if not self.landed and airframe.on_ground:
+                self._has_landed()
+            return
+        task = self.task
+        assert task is not None
+        setpoint = task.update(dt_s)
+        if self._on_ground_and_idle(setpoint):
+            self._idle(dt_s, IDLE_THRUST_MPS2)
+        else:
+            demand = self.demand = self.controller.update(
+                dt_s,
+                setpoint,
+                airframe.position,
+                airframe.velocity,
+                airframe.acceleration,
+                airframe.yaw_rad,
+                self._climb_limit(),
+            )
+            airframe.step(dt_s, demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, demand.yaw_rate_radps)
+        self._detect_landing(setpoint)
+        self._disarm_automatically()
+        if self.armed and task is self.task and task.finished and self.mode is Mode.TAKEOFF:
+            goal = task.goal
+            self._intend(Mode.HOLD)
+            self.task = flight.Hold(airframe, self._parameters, goal)
+
+    def _idle(self, dt_s: float, thrust_mps2: float) -> None:
+        airframe = self._airframe
+        self.controller.reset(airframe.yaw_rad)
+        self.demand = Demand(thrust_mps2, 0.0, 0.0, 0.0)
+        airframe.step(dt_s, thrust_mps2, 0.0, 0.0, 0.0)
+
+    def _spooling(self) -> bool:
+        spool = self._parameters.number("COM_SPOOLUP_TIME")
+        return self.now_s - self._armed_since_s < spool
+
+    def _on_ground_and_idle(self, setpoint: TrajectorySetpoint) -> bool:
+        """Landed with a setpoint that does not ask to climb. Also starts the take-off ramp's clock."""
+        if not self.landed:
+            return False
+        airframe = self._airframe
+        rise = setpoint.velocity[2] < -0.05
+        if setpoint.position[2] == setpoint.position[2]:
+            rise = rise or setpoint.position[2] < airframe.position[2] - 0.1
+        if setpoint.acceleration[2] == setpoint.acceleration[2]:
+            rise = rise or setpoint.acceleration[2] < -0.3
+        if isinstance(self.task, flight.Takeoff):
+            rise = True
+        elif isinstance(self.task, flight.Hold | flight.Land | flight.Return):
+            rise = False
+        if not rise or self._spooling():
+            self._lifting_since_s = None
+            return True
+        if self._lifting_since_s is None:
+            self._lifting_since_s = self.now_s
+        return False
+
+    def _climb_limit(self) -> float:
+        """PX4's take-off ramp: MPC_TKO_RAMP_T from nothing to MPC_TKO_SPEED, then free."""
+        if self._lifting_since_s is None:
+            return math.inf
+        progress = (self.now_s - self._lifting_since_s) / max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)
+        if progress >= 1.0:
+            self._lifting_since_s = None if not self.landed else self._lifting_since_s
+            return math.inf if not self.landed else self._parameters.number("MPC_TKO_SPEED")
+        return self._parameters.number("MPC_TKO_SPEED") * max(0.1, progress)
+
+    def _detect_landing(self, setpoint: TrajectorySetpoint) -> None:
+        airframe = self._airframe
+        if self.landed:
+            if -airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
+                self.landed = False
+                self._has_flown = True
+                self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
+                self._on_event("takeoff")
+            return
+        sinking = self.controller.velocity[2] > 0.05 or airframe.thrust_mps2 < 0.5 * GRAVITY_MPS2
+        if not airframe.on_ground or not sinking:
+            self._contact_since_s = None
+            return
+        if self._contact_since_s is None:
+            self._contact_since_s = self.now_s
+        elif self.now_s - self._contact_since_s >= LAND_DETECTION_S:
+            self._has_landed()
+
+    def _has_landed(self) -> None:
+        self._contact_since_s = None
+        self.landed = True
+        self._landed_since_s = self.now_s
+        self._say(INFO, "Landing detected\t", LANDED_EVENT)
+        self._on_event("landed")
+
+    def _disarm_automatically(self) -> None:
+        if not self.landed:
+            return
+        if self._has_flown:
+            delay = self._parameters.number("COM_DISARM_LAND")
+            if delay >= 0.0 and self.now_s - self._landed_since_s >= delay:
+                self._disarm("Disarmed by landing\t", "after landing")
+        else:
+            delay = self._parameters.number("COM_DISARM_PRFLT")
+            if delay > 0.0 and self.now_s - self._armed_since_s >= delay + PREFLIGHT_DISARM_MARGIN_S:
+                self._disarm("Disarmed by auto preflight disarming\t", "no takeoff")
+
+    def _check_offboard(self) -> None:
+        """Loss of the setpoint stream, and its return, while OFFBOARD is what the user wants."""
+        if self.intended_mode is not Mode.OFFBOARD or not self.armed:
+            return
+        if self.failsafe and self.has_setpoints:
+            self.failsafe = False
+            self._on_event("offboard setpoints are back")
+            self._enter(Mode.OFFBOARD)
+        elif not self.failsafe and not self.has_setpoints:
+            self.failsafe = True
+            fallback = self._offboard_loss_mode()
+            self._say(CRITICAL, "Failsafe activated\t")
+            self._on_event(f"failsafe: offboard setpoints lost, {fallback.name}")
+            self._enter(fallback)
+
+    def _offboard_loss_mode(self) -> Mode:
+        """COM_OBL_RC_ACT; its manual modes need a remote control, else NAV_RCL_ACT decides."""
+        action = int(self._parameters.number("COM_OBL_RC_ACT"))
+        with_sticks = {0: Mode.POSCTL, 1: Mode.ALTCTL, 2: Mode.MANUAL}
+        if action in with_sticks:
+            if self.pilot_has_sticks:
+                return with_sticks[action]
+            action = int(self._parameters.number("NAV_RCL_ACT"))
+            return {1: Mode.HOLD, 3: Mode.LAND}.get(action, Mode.RTL)
+        return {4: Mode.LAND, 5: Mode.HOLD}.get(action, Mode.RTL)
+
+    # ---- transitions ------------------------------------------------------------------------------------
+
+    def _intend(self, mode: Mode) -> None:
+        self.intended_mode = mode
+        if mode not in MODES_PREVENTING_ARMING:
+            self._mode_after_disarming = mode
+        self.failsafe = False
+        self._enter(mode)
+
+    def _enter(self, mode: Mode) -> None:
+        if mode is not self.mode:
+            self._on_event(f"mode {mode.name}")
+        self.mode = mode
+        if not self.armed:
+            return
+        self._start_task()
+        self._gimbal_schedule.clear()
+        if mode in (Mode.LAND, Mode.RTL) and not self.landed:
+            self._gimbal_schedule.extend((self.now_s + delay, command) for delay, command in GIMBAL_COMMANDS)
+
+    def _start_task(self) -> None:
+        airframe, parameters = self._airframe, self._parameters
+        if self.mode is Mode.OFFBOARD:
+            if not isinstance(self.task, flight.Offboard):
+                self.task = flight.Offboard()
+        elif self.mode is Mode.TAKEOFF:
+            self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
+        elif self.mode in (Mode.LAND, Mode.PRECLAND):
+            self.task = flight.Land(airframe, parameters)
+        elif self.mode is Mode.RTL:
+            self.task = flight.Return(airframe, parameters, self.home)
+        else:
+            self.task = flight.Hold(airframe, parameters)
+
+    def _takeoff_height(self) -> float:
+        height = self._takeoff_height_m
+        return self._parameters.number("MIS_TAKEOFF_ALT") if height is None else height
+
+    def _disarm(self, text: str, reason: str) -> None:
+        self.armed = False
+        self.failsafe = False
+        self.task = None
+        self._takeoff_height_m = None
+        self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))
+        self._on_event(f"disarmed ({reason})")
+        self.intended_mode = self._mode_after_disarming
+        self._enter(self.intended_mode)
+
+    def _say(self, severity: int, text: str, event: tuple[int, int, bytes] | None = None) -> None:
+        self.texts.append(Text(severity, text, event))

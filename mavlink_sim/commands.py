@@ -1,0 +1,194 @@
+"""COMMAND_LONG and COMMAND_INT: which commands the vehicle knows, and the MAV_RESULT that PX4 gives for each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.autopilot import ACCEPTED, CRITICAL, TEMPORARILY_REJECTED, Text
+from mavlink_sim.modes import CUSTOM_MODE_ENABLED, mode_of
+from mavlink_sim.telemetry import MESSAGE_IDS, geographic, local
+
+if TYPE_CHECKING:
+    from mavlink_sim.vehicle import Link, Vehicle
+
+DENIED = 2  # MAV_RESULT
+UNSUPPORTED = 3
+FAILED = 4
+
+FORCE_DISARM = 21196.0
+GROUND_STATION_COMPONENT = 190  # MAV_COMP_ID_MISSIONPLANNER
+
+NAV_RETURN_TO_LAUNCH = 20
+NAV_LAND = 21
+NAV_TAKEOFF = 22
+DO_SET_MODE = 176
+DO_REPOSITION = 192
+ARM_DISARM = 400
+GET_MESSAGE_INTERVAL = 510
+SET_MESSAGE_INTERVAL = 511
+REQUEST_MESSAGE = 512
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command with its seven parameters: latitude and longitude (5, 6) in degrees, altitude (7) AMSL metres."""
+
+    identifier: int
+    parameters: tuple[float, float, float, float, float, float, float]
+    source_system: int
+    source_component: int
+
+
+def command_of(message: Any) -> Command:
+    """The command of a COMMAND_LONG or COMMAND_INT message."""
+    if message.get_type() == "COMMAND_INT":
+        # INT32_MAX means "not given", as NaN does in COMMAND_LONG
+        place = [value / 1e7 if abs(value) < 2**31 - 1 else math.nan for value in (message.x, message.y)]
+        tail = (place[0], place[1], message.z)
+    else:
+        tail = (message.param5, message.param6, message.param7)
+    head = (message.param1, message.param2, message.param3, message.param4)
+    return Command(int(message.command), head + tail, message.get_srcSystem(), message.get_srcComponent())
+
+
+def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+    """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
+    if command.identifier == 0:
+        return None
+    handler = _HANDLERS.get(command.identifier)
+    return UNSUPPORTED if handler is None else handler(vehicle, link, command)
+
+
+def _arm(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if command.parameters[0] == 1.0:
+        return vehicle.autopilot.arm()
+    if command.parameters[0] == 0.0:
+        return vehicle.autopilot.disarm(force=command.parameters[1] == FORCE_DISARM)
+    return UNSUPPORTED
+
+
+def set_mode(vehicle: Vehicle, base: float, main: float, sub: float, source_component: int) -> int:
+    """Commander's answer to DO_SET_MODE and to the older SET_MODE message."""
+    autopilot = vehicle.autopilot
+    values = (base, main, sub)
+    if not all(math.isfinite(value) for value in values) or not int(base) & CUSTOM_MODE_ENABLED:
+        return TEMPORARILY_REJECTED
+    mode = mode_of(int(main), int(sub))
+    if mode is None:
+        autopilot.texts.append(Text(CRITICAL, "Unsupported main mode\t"))
+        return TEMPORARILY_REJECTED
+    return autopilot.set_mode(mode, tell=source_component == GROUND_STATION_COMPONENT)
+
+
+def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
+    base, main, sub = command.parameters[:3]
+    return set_mode(vehicle, base, main, sub, command.source_component)
+
+
+def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
+    altitude = command.parameters[6]
+    if not math.isfinite(altitude):
+        return vehicle.autopilot.takeoff(None)
+    home_altitude = geographic(vehicle.autopilot.home)[2]
+    return vehicle.autopilot.takeoff(altitude - home_altitude)
+
+
+def _land(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return vehicle.autopilot.land()
+
+
+def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return vehicle.autopilot.return_home()
+
+
+def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if not int(command.parameters[1]) & 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
+        return UNSUPPORTED
+    yaw = command.parameters[3]
+    latitude, longitude, altitude = command.parameters[4:7]
+    if abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        return DENIED
+    return vehicle.autopilot.reposition(local(latitude, longitude, altitude), yaw)
+
+
+def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return ACCEPTED
+
+
+def _deny(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return DENIED
+
+
+def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if command.parameters[0] == 1.0:
+        vehicle.autopilot.home = vehicle.airframe.position
+        return ACCEPTED
+    place = command.parameters[4:7]
+    if all(math.isfinite(value) for value in place):
+        vehicle.autopilot.home = local(*place)
+    return ACCEPTED
+
+
+def _flight_termination(vehicle: Vehicle, link: Link, command: Command) -> int:
+    # CBRK_FLIGHTTERM is engaged on this vehicle: a termination is accepted and has no effect
+    return ACCEPTED if command.parameters[0] > 0.5 else DENIED
+
+
+def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
+    name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
+    if name is None or not vehicle.send_built(link, name):
+        return DENIED
+    return ACCEPTED
+
+
+def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if command.parameters[0] != 1.0:
+        return DENIED
+    vehicle.send_built(link, "AUTOPILOT_VERSION")
+    return ACCEPTED
+
+
+def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+    name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
+    interval = command.parameters[1]
+    if name is None or name == "HEARTBEAT" or not link.has_stream(name) or not math.isfinite(interval):
+        return FAILED
+    link.streams.set_interval(name, round(interval), vehicle.boot_us)
+    return ACCEPTED
+
+
+def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+    identifier = _identifier(command.parameters[0])
+    vehicle.send_interval(link, identifier, MESSAGE_IDS.get(identifier))
+    return ACCEPTED
+
+
+def _identifier(value: float) -> int:
+    return round(value) if math.isfinite(value) else -1
+
+
+_HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
+    NAV_RETURN_TO_LAUNCH: _return_to_launch,
+    NAV_LAND: _land,
+    NAV_TAKEOFF: _takeoff,
+    DO_SET_MODE: _do_set_mode,
+    178: _accept,  # DO_CHANGE_SPEED
+    179: _set_home,  # DO_SET_HOME
+    185: _flight_termination,  # DO_FLIGHTTERMINATION
+    DO_REPOSITION: _reposition,
+    245: _accept,  # PREFLIGHT_STORAGE
+    300: _deny,  # MISSION_START: there is no mission
+    ARM_DISARM: _arm,
+    401: _accept,  # COMPONENT_ARM_DISARM's neighbour RUN_PREARM_CHECKS
+    GET_MESSAGE_INTERVAL: _get_message_interval,
+    SET_MESSAGE_INTERVAL: _set_message_interval,
+    REQUEST_MESSAGE: _request_message,
+    519: _accept,  # REQUEST_PROTOCOL_VERSION: PX4 answers with a message no client decodes any more
+    520: _request_capabilities,  # REQUEST_AUTOPILOT_CAPABILITIES
+}
+
+# Flown by Commander a moment later, after the receiver's own answer (see `Vehicle.handle`).
+ANSWERED_TWICE = frozenset({DO_SET_MODE})

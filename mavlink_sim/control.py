@@ -1,0 +1,166 @@
+"""PX4's multirotor position control: position P, velocity PID, then thrust and tilt (`PositionControl.cpp`'s law).
+
+All vectors NED. A NaN axis is not controlled by that stage, as in PX4's trajectory setpoint.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2, Vector
+
+NAN = math.nan
+NOTHING: Vector = (NAN, NAN, NAN)
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectorySetpoint:
+    """What a flight task asks of the controller; NaN means "not controlled". NED, metres, seconds, radians."""
+
+    position: Vector = NOTHING
+    velocity: Vector = NOTHING
+    acceleration: Vector = NOTHING
+    yaw_rad: float = NAN
+    yaw_rate_radps: float = NAN
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What the airframe is asked for."""
+
+    thrust_mps2: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rate_radps: float
+
+
+class PositionController:
+    """The cascade with its integrator. `position`, `velocity`, `acceleration` hold the last inner setpoints."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._revision = -1
+        self._integral = [0.0, 0.0, 0.0]
+        self.position: Vector = NOTHING
+        self.velocity: Vector = NOTHING
+        self.acceleration: Vector = NOTHING
+        self.yaw_rad = 0.0
+        self.yaw_rate_radps = 0.0
+        self._load()
+
+    def _load(self) -> None:
+        value = self._parameters.number
+        self._revision = self._parameters.revision
+        self._position_p = (value("MPC_XY_P"), value("MPC_XY_P"), value("MPC_Z_P"))
+        self._velocity_p = (value("MPC_XY_VEL_P_ACC"), value("MPC_XY_VEL_P_ACC"), value("MPC_Z_VEL_P_ACC"))
+        self._velocity_i = (value("MPC_XY_VEL_I_ACC"), value("MPC_XY_VEL_I_ACC"), value("MPC_Z_VEL_I_ACC"))
+        self._velocity_d = (value("MPC_XY_VEL_D_ACC"), value("MPC_XY_VEL_D_ACC"), value("MPC_Z_VEL_D_ACC"))
+        self._max_xy = value("MPC_XY_VEL_MAX")
+        self._max_up = value("MPC_Z_VEL_MAX_UP")
+        self._max_down = value("MPC_Z_VEL_MAX_DN")
+        self._max_tilt_tan = math.tan(math.radians(value("MPC_TILTMAX_AIR")))
+        self._yaw_p = value("MC_YAW_P")
+
+    def reset(self, yaw_rad: float) -> None:
+        """Forget the integrator and hold this yaw (on the ground)."""
+        self._integral = [0.0, 0.0, 0.0]
+        self.position = self.velocity = NOTHING
+        self.acceleration = (0.0, 0.0, 100.0)  # PX4's "idle thrust" setpoint on the ground
+        self.yaw_rad = yaw_rad
+        self.yaw_rate_radps = 0.0
+
+    def update(
+        self,
+        dt_s: float,
+        setpoint: TrajectorySetpoint,
+        position: Vector,
+        velocity: Vector,
+        acceleration: Vector,
+        yaw_rad: float,
+        max_up_mps: float = math.inf,
+    ) -> Demand:
+        """One control step. `max_up_mps` further limits the climb (the take-off ramp)."""
+        if self._revision != self._parameters.revision:
+            self._load()
+        velocity_setpoint = self._velocity_setpoint(setpoint, position, max_up_mps)
+        demanded = [0.0, 0.0, 0.0]
+        error = [0.0, 0.0, 0.0]
+        for axis in range(3):
+            wanted = velocity_setpoint[axis]
+            forward = setpoint.acceleration[axis]
+            if wanted == wanted:
+                error[axis] = wanted - velocity[axis]
+                demanded[axis] = (
+                    self._velocity_p[axis] * error[axis]
+                    + self._integral[axis]
+                    - self._velocity_d[axis] * acceleration[axis]
+                )
+            if forward == forward:
+                demanded[axis] += forward
+        thrust, achieved_x, achieved_y, achieved_z = self._allocate(demanded[0], demanded[1], demanded[2])
+        self._integrate(dt_s, error, demanded, (achieved_x, achieved_y, achieved_z))
+        self.position = setpoint.position
+        self.velocity = velocity_setpoint
+        self.acceleration = (demanded[0], demanded[1], demanded[2])
+        roll, pitch = _tilt(achieved_x, achieved_y, yaw_rad)
+        return Demand(thrust, roll, pitch, self._yaw_rate(setpoint, yaw_rad, dt_s))
+
+    def _velocity_setpoint(self, setpoint: TrajectorySetpoint, position: Vector, max_up_mps: float) -> Vector:
+        values = [NAN, NAN, NAN]
+        for axis in range(3):
+            target, feed_forward = setpoint.position[axis], setpoint.velocity[axis]
+            if target == target:
+                values[axis] = self._position_p[axis] * (target - position[axis])
+                if feed_forward == feed_forward:
+                    values[axis] += feed_forward
+            else:
+                values[axis] = feed_forward
+        x, y, z = values
+        if x == x and y == y:
+            speed = math.hypot(x, y)
+            if speed > self._max_xy:
+                x, y = x * self._max_xy / speed, y * self._max_xy / speed
+        if z == z:
+            z = min(max(z, -min(self._max_up, max_up_mps)), self._max_down)
+        return (x, y, z)
+
+    def _allocate(self, ax: float, ay: float, az: float) -> tuple[float, float, float, float]:
+        """Collective thrust, and the acceleration that tilt and thrust limits leave of the demand."""
+        lift = min(max(GRAVITY_MPS2 - az, 0.12 * MAX_THRUST_MPS2), 0.97 * MAX_THRUST_MPS2)
+        sideways = math.hypot(ax, ay)
+        # horizontal demand is met relative to hover (MPC_ACC_DECOUPLE): tilt as if flying level
+        limit = GRAVITY_MPS2 * self._max_tilt_tan
+        scale = limit / sideways if sideways > limit else 1.0
+        ax, ay = ax * scale, ay * scale
+        cosine = GRAVITY_MPS2 / math.sqrt(GRAVITY_MPS2 * GRAVITY_MPS2 + ax * ax + ay * ay)
+        thrust = min(lift / cosine, MAX_THRUST_MPS2)
+        return thrust, ax, ay, GRAVITY_MPS2 - thrust * cosine
+
+    def _integrate(self, dt_s: float, error: list[float], demanded: list[float], achieved: Vector) -> None:
+        for axis in range(3):
+            # back-calculation (PX4: arw gain 2/P): a saturated demand must not wind the integrator up
+            excess = (demanded[axis] - achieved[axis]) * 2.0 / self._velocity_p[axis]
+            change = self._velocity_i[axis] * (error[axis] - excess) * dt_s
+            self._integral[axis] = min(max(self._integral[axis] + change, -GRAVITY_MPS2), GRAVITY_MPS2)
+
+    def _yaw_rate(self, setpoint: TrajectorySetpoint, yaw_rad: float, dt_s: float) -> float:
+        rate = setpoint.yaw_rate_radps if setpoint.yaw_rate_radps == setpoint.yaw_rate_radps else 0.0
+        self.yaw_rate_radps = rate
+        if setpoint.yaw_rad == setpoint.yaw_rad:
+            self.yaw_rad = math.remainder(setpoint.yaw_rad, math.tau)
+        elif rate != 0.0:
+            self.yaw_rad = yaw_rad
+            return rate
+        return rate + self._yaw_p * math.remainder(self.yaw_rad - yaw_rad, math.tau)
+
+
+def _tilt(ax: float, ay: float, yaw_rad: float) -> tuple[float, float]:
+    """(roll, pitch) that point the thrust so that it accelerates by (ax, ay) while carrying the weight."""
+    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+    forward = cosine * ax + sine * ay
+    right = -sine * ax + cosine * ay
+    pitch = math.atan2(-forward, GRAVITY_MPS2)
+    roll = math.atan2(right * math.cos(pitch), GRAVITY_MPS2)
+    return roll, pitch

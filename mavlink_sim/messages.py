@@ -1,0 +1,105 @@
+"""The MAVLink dialect the vehicle speaks: pymavlink's `development`, and PX4's messages that it lacks.
+
+PX4 is built with MAVLink's development dialect. pymavlink's copy of it has CURRENT_MODE (436) and AVAILABLE_MODES (435)
+but not LINK_NODE_STATUS, TIME_ESTIMATE_TO_TARGET, EVENT and CURRENT_EVENT_SEQUENCE; those are defined here from the
+public XML definitions. A client whose dialect lacks one of them sees it as UNKNOWN_<id>, as it does with PX4.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from pymavlink.dialects.v20 import development as dialect
+
+__all__ = [
+    "Outgoing",
+    "current_event_sequence",
+    "dialect",
+    "event",
+    "link_node_status",
+    "parser",
+    "time_estimate_to_target",
+]
+
+_NODE_STATUS = struct.Struct("<QIIIIIHHHBB")
+_TIME_ESTIMATE = struct.Struct("<5i")
+_EVENT = struct.Struct("<IIHBBB40s")
+_EVENT_SEQUENCE = struct.Struct("<HB")
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A message on its way out of the vehicle, with the component it comes from (a forwarded one has another)."""
+
+    message: Any
+    system: int
+    component: int
+
+
+class _PackedMessage(dialect.MAVLink_message):  # type: ignore[misc]
+    """A message given as its packed payload."""
+
+    def __init__(self, identifier: int, name: str, crc_extra: int, packed: bytes, **fields: Any) -> None:
+        super().__init__(identifier, name)
+        self._fieldnames = list(fields)
+        self._crc_extra = crc_extra
+        self._packed = packed
+        for field, value in fields.items():
+            setattr(self, field, value)
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        packed: bytes = self._pack(mav, self._crc_extra, self._packed, force_mavlink1=force_mavlink1)
+        return packed
+
+
+def link_node_status(timestamp_ms: int, sent: int, received: int, lost: int) -> Any:
+    """LINK_NODE_STATUS (8): counters of one link."""
+    packed = _NODE_STATUS.pack(timestamp_ms, 0, 0, sent, received, lost, 0, 0, 0, 0, 0)
+    return _PackedMessage(
+        8,
+        "LINK_NODE_STATUS",
+        117,
+        packed,
+        timestamp=timestamp_ms,
+        messages_sent=sent,
+        messages_received=received,
+        messages_lost=lost,
+    )
+
+
+def time_estimate_to_target(safe_return_s: int, land_s: int) -> Any:
+    """TIME_ESTIMATE_TO_TARGET (380), seconds; -1 where unknown."""
+    packed = _TIME_ESTIMATE.pack(safe_return_s, land_s, -1, -1, -1)
+    return _PackedMessage(380, "TIME_ESTIMATE_TO_TARGET", 232, packed, safe_return=safe_return_s, land=land_s)
+
+
+def event(identifier: int, boot_ms: int, sequence: int, log_levels: int, arguments: bytes = b"") -> Any:
+    """EVENT (410) of the events interface, to everyone."""
+    packed = _EVENT.pack(identifier, boot_ms, sequence, 0, 0, log_levels, arguments)
+    return _PackedMessage(
+        410,
+        "EVENT",
+        160,
+        packed,
+        id=identifier,
+        event_time_boot_ms=boot_ms,
+        sequence=sequence,
+        log_levels=log_levels,
+        arguments=arguments,
+    )
+
+
+def current_event_sequence(sequence: int) -> Any:
+    """CURRENT_EVENT_SEQUENCE (411): the newest event's number."""
+    return _PackedMessage(
+        411, "CURRENT_EVENT_SEQUENCE", 106, _EVENT_SEQUENCE.pack(sequence, 0), sequence=sequence, flags=0
+    )
+
+
+def parser(system: int = 1, component: int = 1) -> Any:
+    """A pymavlink codec: reads a stream of bytes without raising on garbage, packs with its own sequence numbers."""
+    codec = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+    codec.robust_parsing = True
+    return codec

@@ -1,0 +1,123 @@
+"""PX4's flight modes: how HEARTBEAT and CURRENT_MODE encode them, and how DO_SET_MODE names them.
+
+The custom mode is `main << 16 | sub << 24` (PX4's `px4_custom_mode.h`); the base mode's bits are MAV_MODE_FLAG.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum
+
+CUSTOM_MODE_ENABLED = 1
+GUIDED_ENABLED = 8
+AUTO_ENABLED = 4
+STABILIZE_ENABLED = 16
+MANUAL_INPUT_ENABLED = 64
+SAFETY_ARMED = 128
+
+
+class LandedState(IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+class SystemState(IntEnum):
+    """The part of MAV_STATE that PX4 reports."""
+
+    UNINIT = 0
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+
+
+class Mode(Enum):
+    """A flight mode; the value is (main mode, sub mode) of PX4's custom mode."""
+
+    MANUAL = (1, 0)
+    ALTCTL = (2, 0)
+    POSCTL = (3, 0)
+    POSITION_SLOW = (3, 2)
+    TAKEOFF = (4, 2)
+    HOLD = (4, 3)
+    MISSION = (4, 4)
+    RTL = (4, 5)
+    LAND = (4, 6)
+    FOLLOW = (4, 8)
+    PRECLAND = (4, 9)
+    ACRO = (5, 0)
+    OFFBOARD = (6, 0)
+    STABILIZED = (7, 0)
+
+    @property
+    def custom_mode(self) -> int:
+        main, sub = self.value
+        return int(main << 16 | sub << 24)
+
+    @property
+    def title(self) -> str:
+        """PX4's name of the mode in its status texts."""
+        return _TITLES[self]
+
+    @property
+    def standard_mode(self) -> int:
+        """MAV_STANDARD_MODE of the mode, 0 where there is none."""
+        return _STANDARD_MODES.get(self, 0)
+
+
+_TITLES = {
+    Mode.MANUAL: "Manual",
+    Mode.ALTCTL: "Altitude",
+    Mode.POSCTL: "Position",
+    Mode.POSITION_SLOW: "Position Slow",
+    Mode.TAKEOFF: "Takeoff",
+    Mode.HOLD: "Hold",
+    Mode.MISSION: "Mission",
+    Mode.RTL: "Return",
+    Mode.LAND: "Land",
+    Mode.FOLLOW: "Follow Target",
+    Mode.PRECLAND: "Precision Land",
+    Mode.ACRO: "Acro",
+    Mode.OFFBOARD: "Offboard",
+    Mode.STABILIZED: "Stabilized",
+}
+_STANDARD_MODES = {
+    Mode.POSCTL: 1,
+    Mode.ALTCTL: 4,
+    Mode.RTL: 5,
+    Mode.MISSION: 6,
+    Mode.LAND: 7,
+    Mode.TAKEOFF: 8,
+}
+
+MANUAL_MODES = frozenset(
+    {Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.POSITION_SLOW, Mode.ACRO, Mode.STABILIZED}
+)
+# Modes a vehicle can never be armed in; after disarming, the mode chosen before one of these comes back.
+MODES_PREVENTING_ARMING = frozenset({Mode.RTL, Mode.LAND, Mode.PRECLAND})
+
+_BY_CUSTOM = {mode.value: mode for mode in Mode}
+# PX4 shows an orbit request as the position mode it falls back to.
+_BY_CUSTOM[(3, 1)] = Mode.POSCTL
+
+
+def mode_of(main: int, sub: int) -> Mode | None:
+    """The mode that DO_SET_MODE's parameters 2 and 3 name; None where PX4 refuses them (AUTO.READY, RATTITUDE…)."""
+    return _BY_CUSTOM.get((main, sub if main in (3, 4) else 0))
+
+
+def base_mode(mode: Mode, armed: bool, has_setpoints: bool) -> int:
+    """HEARTBEAT.base_mode. `has_setpoints`: an OFFBOARD setpoint stream is present (it matters in OFFBOARD alone)."""
+    if mode is Mode.OFFBOARD:
+        flags = STABILIZE_ENABLED if has_setpoints else 0
+    elif mode is Mode.ACRO:
+        flags = MANUAL_INPUT_ENABLED
+    elif mode in MANUAL_MODES:
+        flags = MANUAL_INPUT_ENABLED | STABILIZE_ENABLED
+    elif mode is Mode.FOLLOW:
+        flags = STABILIZE_ENABLED
+    else:
+        flags = AUTO_ENABLED | GUIDED_ENABLED | STABILIZE_ENABLED
+    return CUSTOM_MODE_ENABLED | flags | (SAFETY_ARMED if armed else 0)

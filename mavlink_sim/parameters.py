@@ -1,0 +1,134 @@
+"""The vehicle's parameters: PX4's names, types and values, with integers sent bytewise in the float field.
+
+`parameters.txt` beside this file is the selection this vehicle has, one `NAME TYPE VALUE` a line.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from importlib import resources
+
+INT32 = 6  # MAV_PARAM_TYPE_INT32
+REAL32 = 9  # MAV_PARAM_TYPE_REAL32
+UINT32 = 5  # MAV_PARAM_TYPE_UINT32, of _HASH_CHECK alone
+HASH_CHECK = "_HASH_CHECK"
+HASH_CHECK_INDEX = 65535
+_TYPES = {"INT32": INT32, "REAL32": REAL32}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter; `kind` is its MAV_PARAM_TYPE."""
+
+    name: str
+    kind: int
+    value: int | float
+
+    @property
+    def wire_value(self) -> float:
+        """The value as PARAM_VALUE.param_value carries it: an integer's bytes read as a float."""
+        if self.kind == INT32:
+            return float(struct.unpack("<f", struct.pack("<i", int(self.value)))[0])
+        return float(self.value)
+
+
+class UnknownParameterError(KeyError):
+    """No parameter of that name."""
+
+
+def decode_wire_value(kind: int, wire_value: float) -> int | float:
+    """The number in PARAM_SET.param_value: bytewise for INT32."""
+    if kind == INT32:
+        return int(struct.unpack("<i", struct.pack("<f", wire_value))[0])
+    return float(wire_value)
+
+
+def default_parameters() -> list[Parameter]:
+    """The selection in `parameters.txt`, in alphabetical order."""
+    text = resources.files("mavlink_sim").joinpath("parameters.txt").read_text(encoding="utf-8")
+    found = []
+    for line in text.splitlines():
+        if line and not line.startswith("#"):
+            name, kind, value = line.split()
+            number = int(value) if kind == "INT32" else _single(float(value))
+            found.append(Parameter(name, _TYPES[kind], number))
+    return sorted(found, key=lambda parameter: parameter.name)
+
+
+class Parameters:
+    """The parameter set of one vehicle, in alphabetical order. `revision` grows with every change."""
+
+    def __init__(self, values: Mapping[str, float] | None = None) -> None:
+        """Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be."""
+        self._parameters = {parameter.name: parameter for parameter in default_parameters()}
+        self._names = list(self._parameters)
+        self.revision = 0
+        for name, value in (values or {}).items():
+            self.set(name, value)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self._parameters.values())
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._parameters
+
+    def __getitem__(self, name: str) -> Parameter:
+        try:
+            return self._parameters[name]
+        except KeyError:
+            raise UnknownParameterError(
+                f"this vehicle has no parameter {name!r}; PARAM_REQUEST_LIST names all {len(self)}"
+            ) from None
+
+    def number(self, name: str) -> float:
+        return self[name].value
+
+    def at(self, index: int) -> Parameter | None:
+        """The parameter at an index of the list, None outside it."""
+        return self._parameters[self._names[index]] if 0 <= index < len(self._names) else None
+
+    def index(self, name: str) -> int:
+        return self._names.index(name)
+
+    def set(self, name: str, value: float) -> Parameter:
+        """Set a value; PX4 checks no range. Raises UnknownParameterError, ValueError for a fraction in an INT32."""
+        parameter = self[name]
+        if not math.isfinite(value):
+            raise ValueError(f"parameter {name} needs a finite number, got {value}")
+        if parameter.kind == INT32:
+            if value != int(value) or not -(2**31) <= value < 2**31:
+                raise ValueError(f"parameter {name} is an INT32, got {value}; give a whole number")
+            value = int(value)
+        else:
+            value = _single(float(value))
+        changed = replace(parameter, value=value)
+        self._parameters[name] = changed
+        self.revision += 1
+        return changed
+
+    def hash(self) -> int:
+        """PX4's _HASH_CHECK: CRC-32 (no inversions) over every name and value in order, as in `param_hash_check`."""
+        crc = 0xFFFFFFFF
+        for parameter in self:
+            packed = struct.pack("<i" if parameter.kind == INT32 else "<f", parameter.value)
+            crc = zlib.crc32(parameter.name.encode() + packed, crc)
+        return crc ^ 0xFFFFFFFF
+
+    def hash_wire_value(self) -> float:
+        """The hash as PARAM_VALUE carries it: its bytes read as a float."""
+        return float(struct.unpack("<f", struct.pack("<I", self.hash()))[0])
+
+
+def _single(value: float) -> float:
+    """The nearest float32, which is what the vehicle stores."""
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    except OverflowError:
+        raise ValueError(f"{value} does not fit a 32-bit float") from None

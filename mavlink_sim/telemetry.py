@@ -1,0 +1,585 @@
+"""The message streams: what each message says of the vehicle, and how often each kind of link gets it.
+
+Rates in `ONBOARD_RATES_HZ` are those measured on a PX4's onboard link, `GCS_RATES_HZ` on its ground-station link.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
+from mavlink_sim.physics import MAX_THRUST_MPS2
+from vision.rotation import quaternion_from_euler
+
+if TYPE_CHECKING:
+    from mavlink_sim.vehicle import Vehicle
+
+ONBOARD_RATES_HZ: dict[str, float] = {
+    "HEARTBEAT": 1.0,
+    "ATTITUDE": 98.5,
+    "ATTITUDE_QUATERNION": 49.0,
+    "GLOBAL_POSITION_INT": 49.0,
+    "HIGHRES_IMU": 49.0,
+    "LOCAL_POSITION_NED": 29.5,
+    "ODOMETRY": 29.5,
+    "TIMESYNC": 9.85,
+    "ALTITUDE": 9.85,
+    "DISTANCE_SENSOR": 9.85,
+    "ATTITUDE_TARGET": 9.85,
+    "POSITION_TARGET_LOCAL_NED": 9.85,
+    "POSITION_TARGET_GLOBAL_INT": 9.85,
+    "SERVO_OUTPUT_RAW": 9.85,
+    "VFR_HUD": 9.85,
+    "GPS_RAW_INT": 7.9,
+    "EXTENDED_SYS_STATE": 4.95,
+    "SYS_STATUS": 4.95,
+    "ESTIMATOR_STATUS": 1.0,
+    "OPEN_DRONE_ID_LOCATION": 1.0,
+    "OPEN_DRONE_ID_SYSTEM": 1.0,
+    "PING": 1.0,
+    "SCALED_PRESSURE": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "LINK_NODE_STATUS": 1.0,
+    "MISSION_CURRENT": 1.0,
+    "BATTERY_STATUS": 0.5,
+    "CURRENT_MODE": 0.5,
+    "HOME_POSITION": 0.5,
+    "VIBRATION": 0.5,
+    "TIME_ESTIMATE_TO_TARGET": 0.5,
+    "CURRENT_EVENT_SEQUENCE": 0.3,
+    "GPS_GLOBAL_ORIGIN": 0.0,  # on change alone
+}
+GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
+    "HEARTBEAT": 1.0,
+    "ATTITUDE": 49.0,
+    "ATTITUDE_QUATERNION": 49.0,
+    "ATTITUDE_TARGET": 49.0,
+    "GLOBAL_POSITION_INT": 49.0,
+    "LOCAL_POSITION_NED": 49.0,
+    "POSITION_TARGET_LOCAL_NED": 49.0,
+    "SERVO_OUTPUT_RAW": 49.0,
+    "GPS_RAW_INT": 5.0,
+    "ALTITUDE": 1.0,
+    "EXTENDED_SYS_STATE": 1.0,
+    "ESTIMATOR_STATUS": 0.5,
+    "POSITION_TARGET_GLOBAL_INT": 1.0,
+    "SCALED_PRESSURE": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "SYS_STATUS": 1.0,
+    "VFR_HUD": 1.0,
+    "MISSION_CURRENT": 1.0,
+    "OPEN_DRONE_ID_LOCATION": 1.0,
+    "OPEN_DRONE_ID_SYSTEM": 1.0,
+    "LINK_NODE_STATUS": 1.0,
+    "BATTERY_STATUS": 0.5,
+    "CURRENT_MODE": 0.5,
+    "HOME_POSITION": 0.5,
+    "TIME_ESTIMATE_TO_TARGET": 0.5,
+    "DISTANCE_SENSOR": 0.5,
+    "CURRENT_EVENT_SEQUENCE": 0.3,
+    "PING": 0.1,
+    "VIBRATION": 0.1,
+}
+
+PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
+# (present, enabled, health) of SYS_STATUS as recorded from PX4's SIH quadrotor, before and after its estimator started
+SENSORS_STARTING = (0x402F, 0x1402F, 0x320883F)
+SENSORS_READY = (0x402F, 0x1402F, 0x320C83F)
+
+HOME_LATITUDE_DEG = 47.397743225  # SIH_LOC_LAT0
+HOME_LONGITUDE_DEG = 8.545594215
+HOME_ALTITUDE_M = 489.4  # SIH_LOC_H0, above mean sea level
+EARTH_RADIUS_M = 6371000.0
+_METRES_PER_DEGREE = math.radians(1.0) * EARTH_RADIUS_M
+_LONGITUDE_SCALE = math.cos(math.radians(HOME_LATITUDE_DEG))
+
+# PX4 clears these with every message it cannot fill.
+_U16_UNKNOWN = 65535
+_NAN = math.nan
+
+
+def geographic(position: tuple[float, float, float]) -> tuple[float, float, float]:
+    """(latitude °, longitude °, altitude AMSL m) of a local NED position."""
+    north, east, down = position
+    return (
+        HOME_LATITUDE_DEG + north / _METRES_PER_DEGREE,
+        HOME_LONGITUDE_DEG + east / (_METRES_PER_DEGREE * _LONGITUDE_SCALE),
+        HOME_ALTITUDE_M - down,
+    )
+
+
+def local(latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
+    """The local NED position of a place; NaN stays NaN."""
+    return (
+        (latitude_deg - HOME_LATITUDE_DEG) * _METRES_PER_DEGREE,
+        (longitude_deg - HOME_LONGITUDE_DEG) * _METRES_PER_DEGREE * _LONGITUDE_SCALE,
+        HOME_ALTITUDE_M - altitude_m,
+    )
+
+
+def _heartbeat(vehicle: Vehicle) -> Any:
+    autopilot = vehicle.autopilot
+    return dialect.MAVLink_heartbeat_message(
+        2, 12, autopilot.base_mode, autopilot.mode.custom_mode, int(autopilot.system_status), 3
+    )
+
+
+def _attitude(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    return dialect.MAVLink_attitude_message(
+        vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates
+    )
+
+
+def _attitude_quaternion(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_attitude_quaternion_message(
+        vehicle.boot_ms, *vehicle.quaternion, *vehicle.airframe.rates, repr_offset_q=[0.0] * 4
+    )
+
+
+def _global_position_int(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    latitude, longitude, altitude = geographic(frame.position)
+    vx, vy, vz = frame.velocity
+    return dialect.MAVLink_global_position_int_message(
+        vehicle.boot_ms,
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        round(altitude * 1000),
+        round((vehicle.autopilot.home[2] - frame.position[2]) * 1000),
+        round(vx * 100),
+        round(vy * 100),
+        round(vz * 100),
+        round(math.degrees(frame.yaw_rad) % 360.0 * 100) % 36000,
+    )
+
+
+def _pressure_hpa(altitude_m: float) -> float:
+    return float(1013.25 * (1.0 - 2.25577e-5 * altitude_m) ** 5.25588)
+
+
+def _highres_imu(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    altitude = HOME_ALTITUDE_M - frame.position[2]
+    cosine, sine = math.cos(frame.yaw_rad), math.sin(frame.yaw_rad)
+    return dialect.MAVLink_highres_imu_message(
+        vehicle.boot_us,
+        *frame.specific_force,
+        *frame.rates,
+        0.21 * cosine,
+        -0.21 * sine,
+        0.43,
+        _pressure_hpa(altitude),
+        0.0,
+        altitude,
+        15.0,
+        63,
+    )
+
+
+def _local_position_ned(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    return dialect.MAVLink_local_position_ned_message(vehicle.boot_ms, *frame.position, *frame.velocity)
+
+
+_POSE_COVARIANCE = [0.041, 0, 0, 0, 0, 0, 0.041, 0, 0, 0, 0, 0.044, 0, 0, 0, 2.3e-5, 0, 0, 2.6e-5, 0, 7.3e-4]
+_VELOCITY_COVARIANCE = [0.011, 0, 0, 0, 0, 0, 0.012, 0, 0, 0, 0, 0.005, *([0] * 9)]
+
+
+def _odometry(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    return dialect.MAVLink_odometry_message(
+        vehicle.boot_us,
+        1,
+        1,
+        *frame.position,
+        list(vehicle.quaternion),
+        *frame.velocity,
+        *frame.rates,
+        _POSE_COVARIANCE,
+        _VELOCITY_COVARIANCE,
+        0,
+        8,
+        0,
+    )
+
+
+def _timesync(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_timesync_message(0, vehicle.clock_ns())
+
+
+def _altitude(vehicle: Vehicle) -> Any:
+    height = -vehicle.airframe.position[2]
+    relative = height + vehicle.autopilot.home[2]
+    return dialect.MAVLink_altitude_message(
+        vehicle.boot_us, HOME_ALTITUDE_M + height, HOME_ALTITUDE_M + height, height, relative, 0.0, height
+    )
+
+
+def _distance_sensor(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    slant = -frame.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
+    return dialect.MAVLink_distance_sensor_message(
+        vehicle.boot_ms, 0, 10000, min(round(max(slant, 0.0) * 100), 65534), 0, 0, 25, 0
+    )
+
+
+def _attitude_target(vehicle: Vehicle) -> Any:
+    demand = vehicle.autopilot.demand
+    yaw = vehicle.autopilot.controller.yaw_rad
+    q = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, yaw)
+    thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
+    return dialect.MAVLink_attitude_target_message(
+        vehicle.boot_ms, 0, list(q), 0.0, 0.0, demand.yaw_rate_radps, thrust
+    )
+
+
+def _type_mask(*groups: tuple[float, float, float]) -> int:
+    mask = 0
+    for index, value in enumerate(value for group in groups for value in group):
+        if math.isnan(value):
+            mask |= 1 << index
+    return mask
+
+
+def _position_target_local_ned(vehicle: Vehicle) -> Any:
+    inner = vehicle.autopilot.controller
+    return dialect.MAVLink_position_target_local_ned_message(
+        vehicle.boot_ms,
+        1,
+        _type_mask(inner.position, inner.velocity, inner.acceleration),
+        *inner.position,
+        *inner.velocity,
+        *inner.acceleration,
+        inner.yaw_rad,
+        inner.yaw_rate_radps,
+    )
+
+
+def _position_target_global_int(vehicle: Vehicle) -> Any:
+    task = vehicle.autopilot.task
+    if task is None or task.goal is None:
+        return None
+    latitude, longitude, altitude = geographic(task.goal)
+    inner = vehicle.autopilot.controller
+    return dialect.MAVLink_position_target_global_int_message(
+        vehicle.boot_ms,
+        5,
+        0,
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        altitude,
+        *inner.velocity,
+        *inner.acceleration,
+        inner.yaw_rad,
+        0.0,
+    )
+
+
+def _servo_output_raw(vehicle: Vehicle) -> Any:
+    power = 900
+    if vehicle.autopilot.armed:
+        power = 1000 + round(1000 * vehicle.airframe.thrust_mps2 / MAX_THRUST_MPS2)
+    rest = {f"servo{number}_raw": 900 for number in range(9, 17)}
+    return dialect.MAVLink_servo_output_raw_message(
+        vehicle.boot_us & 0xFFFFFFFF, 0, power, power, power, power, 900, 900, 900, 900, **rest
+    )
+
+
+def _vfr_hud(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    vx, vy, vz = frame.velocity
+    throttle = round(100 * frame.thrust_mps2 / MAX_THRUST_MPS2) if vehicle.autopilot.armed else 0
+    heading = round(math.degrees(frame.yaw_rad) % 360.0) % 360
+    return dialect.MAVLink_vfr_hud_message(
+        _NAN, math.hypot(vx, vy), heading, throttle, HOME_ALTITUDE_M - frame.position[2], -vz
+    )
+
+
+def _gps_raw_int(vehicle: Vehicle) -> Any:
+    latitude, longitude, altitude = geographic(vehicle.airframe.position)
+    vx, vy, _ = vehicle.airframe.velocity
+    course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
+    height_mm = round(altitude * 1000)
+    return dialect.MAVLink_gps_raw_int_message(
+        0,
+        3,
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        height_mm,
+        70,
+        110,
+        round(math.hypot(vx, vy) * 100),
+        course,
+        10,
+        height_mm,
+        900,
+        1780,
+        400,
+        0,
+        0,
+    )
+
+
+def _extended_sys_state(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_extended_sys_state_message(0, int(vehicle.autopilot.landed_state))
+
+
+def _sys_status(vehicle: Vehicle) -> Any:
+    autopilot = vehicle.autopilot
+    present, enabled, health = SENSORS_READY if autopilot.sensors_ready else SENSORS_STARTING
+    if autopilot.can_arm:
+        health |= PREARM_CHECK
+    return dialect.MAVLink_sys_status_message(
+        present,
+        enabled,
+        health,
+        120,
+        round(vehicle.battery_volts * 1000),
+        -100,
+        round(vehicle.battery_remaining * 100),
+        *([0] * 6),
+        0,
+        0,
+        1,
+    )
+
+
+def _estimator_status(vehicle: Vehicle) -> Any:
+    flags = 895 if vehicle.autopilot.sensors_ready else 164
+    return dialect.MAVLink_estimator_status_message(
+        vehicle.boot_us, flags, 0.05, 0.05, 0.002, 0.08, 0.001, _NAN, 0.28, 0.19
+    )
+
+
+def _open_drone_id_location(vehicle: Vehicle) -> Any:
+    frame = vehicle.airframe
+    latitude, longitude, altitude = geographic(frame.position)
+    vx, vy, vz = frame.velocity
+    course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
+    return dialect.MAVLink_open_drone_id_location_message(
+        0,
+        0,
+        [0] * 20,
+        1 if vehicle.autopilot.landed else 2,
+        course,
+        round(math.hypot(vx, vy) * 100),
+        max(-6200, min(6200, round(-vz * 100))),
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        altitude,
+        altitude,
+        0,
+        -frame.position[2],
+        12,
+        5,
+        0,
+        3,
+        65535.0,
+        0,
+    )
+
+
+def _open_drone_id_system(vehicle: Vehicle) -> Any:
+    latitude, longitude, altitude = geographic(vehicle.autopilot.home)
+    since_2019 = max(int(time.time()) - 1546300800, 0)  # the standard counts from 2019-01-01
+    return dialect.MAVLink_open_drone_id_system_message(
+        0,
+        0,
+        [0] * 20,
+        0,
+        0,
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        1,
+        0,
+        -1000.0,
+        -1000.0,
+        0,
+        0,
+        altitude,
+        since_2019 & 0xFFFFFFFF,
+    )
+
+
+def _ping(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_ping_message(vehicle.boot_us, vehicle.next_ping(), 0, 0)
+
+
+def _scaled_pressure(vehicle: Vehicle) -> Any:
+    altitude = HOME_ALTITUDE_M - vehicle.airframe.position[2]
+    return dialect.MAVLink_scaled_pressure_message(vehicle.boot_ms, _pressure_hpa(altitude), 0.0, 1182)
+
+
+def _system_time(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_system_time_message(time.time_ns() // 1000, vehicle.boot_ms)
+
+
+def _mission_current(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_mission_current_message(0, 65535, 1, 2)
+
+
+def _battery_status(vehicle: Vehicle) -> Any:
+    voltages = [round(vehicle.battery_volts * 1000)] + [_U16_UNKNOWN] * 9
+    remaining = round(vehicle.battery_remaining * 100)
+    return dialect.MAVLink_battery_status_message(0, 1, 1, 32767, voltages, -100, 0, -1, remaining, 0, 1)
+
+
+def _current_mode(vehicle: Vehicle) -> Any:
+    autopilot = vehicle.autopilot
+    return dialect.MAVLink_current_mode_message(
+        autopilot.mode.standard_mode, autopilot.mode.custom_mode, autopilot.intended_mode.custom_mode
+    )
+
+
+def _home_position(vehicle: Vehicle) -> Any:
+    home = vehicle.autopilot.home
+    latitude, longitude, altitude = geographic(home)
+    return dialect.MAVLink_home_position_message(
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        round(altitude * 1000),
+        *home,
+        [1.0, 0.0, 0.0, 0.0],
+        0.0,
+        0.0,
+        0.0,
+        vehicle.boot_us,
+    )
+
+
+def _vibration(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_vibration_message(vehicle.boot_us, 0.0, 0.011, 0.11, 0, 0, 0)
+
+
+def _time_estimate(vehicle: Vehicle) -> Any:
+    if vehicle.autopilot.landed:
+        return time_estimate_to_target(-1, -1)
+    home = vehicle.autopilot.home
+    position = vehicle.airframe.position
+    away = math.hypot(position[0] - home[0], position[1] - home[1])
+    value = vehicle.parameters.number
+    seconds = away / value("MPC_XY_CRUISE") + (home[2] - position[2]) / value("MPC_LAND_SPEED")
+    return time_estimate_to_target(round(seconds * value("RTL_TIME_FACTOR")), -1)
+
+
+def _current_event_sequence(vehicle: Vehicle) -> Any:
+    return current_event_sequence(vehicle.event_sequence)
+
+
+def _gps_global_origin(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_gps_global_origin_message(
+        round(HOME_LATITUDE_DEG * 1e7),
+        round(HOME_LONGITUDE_DEG * 1e7),
+        round(HOME_ALTITUDE_M * 1000),
+        vehicle.boot_us,
+    )
+
+
+def _autopilot_version(vehicle: Vehicle) -> Any:
+    return dialect.MAVLink_autopilot_version_message(
+        capabilities=59647,
+        flight_sw_version=0x01110040,
+        middleware_sw_version=0x01110040,
+        os_sw_version=0,
+        board_version=1,
+        flight_custom_version=[0, 0, 0, 253, 175, 214, 222, 89],
+        middleware_custom_version=[0, 0, 0, 253, 175, 214, 222, 89],
+        os_custom_version=[0] * 8,
+        vendor_id=0,
+        product_id=0,
+        uid=5283920058631409231,
+    )
+
+
+Builder = Callable[["Vehicle"], Any]
+
+# LINK_NODE_STATUS is built by the link itself, from its own counters.
+BUILDERS: dict[str, Builder] = {
+    "HEARTBEAT": _heartbeat,
+    "ATTITUDE": _attitude,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "GLOBAL_POSITION_INT": _global_position_int,
+    "HIGHRES_IMU": _highres_imu,
+    "LOCAL_POSITION_NED": _local_position_ned,
+    "ODOMETRY": _odometry,
+    "TIMESYNC": _timesync,
+    "ALTITUDE": _altitude,
+    "DISTANCE_SENSOR": _distance_sensor,
+    "ATTITUDE_TARGET": _attitude_target,
+    "POSITION_TARGET_LOCAL_NED": _position_target_local_ned,
+    "POSITION_TARGET_GLOBAL_INT": _position_target_global_int,
+    "SERVO_OUTPUT_RAW": _servo_output_raw,
+    "VFR_HUD": _vfr_hud,
+    "GPS_RAW_INT": _gps_raw_int,
+    "EXTENDED_SYS_STATE": _extended_sys_state,
+    "SYS_STATUS": _sys_status,
+    "ESTIMATOR_STATUS": _estimator_status,
+    "OPEN_DRONE_ID_LOCATION": _open_drone_id_location,
+    "OPEN_DRONE_ID_SYSTEM": _open_drone_id_system,
+    "PING": _ping,
+    "SCALED_PRESSURE": _scaled_pressure,
+    "SYSTEM_TIME": _system_time,
+    "MISSION_CURRENT": _mission_current,
+    "BATTERY_STATUS": _battery_status,
+    "CURRENT_MODE": _current_mode,
+    "HOME_POSITION": _home_position,
+    "VIBRATION": _vibration,
+    "TIME_ESTIMATE_TO_TARGET": _time_estimate,
+    "CURRENT_EVENT_SEQUENCE": _current_event_sequence,
+    "GPS_GLOBAL_ORIGIN": _gps_global_origin,
+}
+# Built on request alone.
+REQUESTED: dict[str, Builder] = {"AUTOPILOT_VERSION": _autopilot_version}
+
+MESSAGE_IDS: dict[int, str] = {
+    identifier: message.msgname
+    for identifier, message in dialect.mavlink_map.items()
+    if message.msgname in BUILDERS or message.msgname in REQUESTED
+} | {8: "LINK_NODE_STATUS", 380: "TIME_ESTIMATE_TO_TARGET", 411: "CURRENT_EVENT_SEQUENCE"}
+
+
+class Streams:
+    """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1."""
+
+    def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0) -> None:
+        self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
+        self._interval_us = dict(self._default_us)
+        self._due_us = {
+            name: int(phase_s * 1e6) + interval
+            for name, interval in self._interval_us.items()
+            if interval > 0
+        }
+        self._next_us = min(self._due_us.values(), default=0)
+
+    def interval_us(self, name: str) -> int:
+        return self._interval_us.get(name, -1)
+
+    def set_interval(self, name: str, interval_us: int, now_us: int) -> None:
+        """-1 switches off, 0 restores the default."""
+        interval = self._default_us[name] if interval_us == 0 else max(interval_us, -1)
+        self._interval_us[name] = interval
+        if interval > 0:
+            self._due_us[name] = now_us + interval
+        else:
+            self._due_us.pop(name, None)
+        self._next_us = 0
+
+    def due(self, now_us: int) -> list[str]:
+        """The messages to send now. A stream that fell behind by more than one interval skips, it does not burst."""
+        if now_us < self._next_us:
+            return []
+        names = [name for name, due in self._due_us.items() if due <= now_us]
+        for name in names:
+            interval = self._interval_us[name]
+            following = self._due_us[name] + interval
+            self._due_us[name] = following if following > now_us else now_us + interval
+        self._next_us = min(self._due_us.values(), default=now_us + 1_000_000)
+        return names
+
+
+def _interval_us(rate_hz: float) -> int:
+    return round(1e6 / rate_hz) if rate_hz > 0.0 else -1
