@@ -1,0 +1,295 @@
+"""The link's bytes: UDP, TCP or a serial line, in the asyncio loop, without threads.
+
+A link opened once stays: a TCP peer or a serial device that goes away is opened again until `close`.
+What cannot be sent at once is dropped, never queued: an old setpoint must not arrive late.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import socket
+import termios
+import tty
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from companion.vehicle.driver import LinkError
+from companion.vehicle.link_url import LinkScheme, LinkUrl
+
+logger = logging.getLogger(__name__)
+
+# The address a datagram came from; None on a stream.
+Source = Any
+Received = Callable[[bytes, Source], None]
+
+_READ_BYTES = 65535
+_READS_A_TURN = 64  # then other work of the loop has its turn
+_REOPEN_S = 0.5
+
+
+class ByteLink(Protocol):
+    """An open link. `received(data, source)` was given when it was opened."""
+
+    datagrams: bool
+    dropped_count: int
+
+    def send(self, data: bytes) -> None:
+        """Send now or drop. Never raises and never waits."""
+
+    def answer_to(self, source: Source) -> None:
+        """Where to send from now on. Only a listening UDP link has a choice."""
+
+    async def close(self) -> None:
+        """Release everything. Never raises; can be called twice."""
+
+
+async def open_link(url: LinkUrl, received: Received) -> ByteLink:
+    """Open a link.
+
+    Raises:
+        LinkError: one line: the endpoint, what is wrong with it, what to do.
+    """
+    if url.scheme in (LinkScheme.UDP_IN, LinkScheme.UDP_OUT):
+        return await _open_udp(url, received)
+    link = _StreamLink(url, received)
+    await link.open()
+    return link
+
+
+async def _resolve(url: LinkUrl, kind: socket.SocketKind) -> tuple[int, Any]:
+    try:
+        found = await asyncio.get_running_loop().getaddrinfo(*url.address, type=kind)
+    except OSError as error:
+        raise LinkError(f"{url}: the host cannot be resolved: {error.strerror or error}") from error
+    family, _, _, _, address = found[0]
+    return family, address
+
+
+async def _open_udp(url: LinkUrl, received: Received) -> _UdpLink:
+    family, address = await _resolve(url, socket.SOCK_DGRAM)
+    endpoint = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        endpoint.setblocking(False)
+        if url.scheme is LinkScheme.UDP_IN:
+            endpoint.bind(address)
+            return _UdpLink(url, endpoint, received, peer=None)
+        return _UdpLink(url, endpoint, received, peer=address)
+    except OSError as error:
+        endpoint.close()
+        raise LinkError(_why_not_bound(url, error)) from error
+
+
+def _why_not_bound(url: LinkUrl, error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return (
+            f"{url}: UDP port {url.address[1]} is in use: another program (a MAVLink router, QGroundControl, "
+            "another companion) listens there; stop it or choose another port"
+        )
+    if error.errno == errno.EADDRNOTAVAIL:
+        return (
+            f"{url}: no interface of this computer has the address {url.address[0]}; 0.0.0.0 listens on all"
+        )
+    return f"{url}: the port cannot be opened: {error.strerror or error}"
+
+
+class _UdpLink:
+    datagrams = True
+
+    def __init__(self, url: LinkUrl, endpoint: socket.socket, received: Received, peer: Source) -> None:
+        self._url = url
+        self._socket = endpoint
+        self._received = received
+        self._peer = peer
+        self._peer_is_fixed = peer is not None
+        self._in_trouble = False
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(endpoint.fileno(), self._readable)
+        self.dropped_count = 0
+
+    def _readable(self) -> None:
+        for _ in range(_READS_A_TURN):
+            if self._socket.fileno() < 0:  # closed by whoever received
+                return
+            try:
+                data, source = self._socket.recvfrom(_READ_BYTES)
+            except BlockingIOError:
+                return
+            except OSError as error:  # an ICMP answer to what we sent: nobody listens there yet
+                logger.debug("%s: %s", self._url, error)
+                continue
+            self._received(data, source)
+
+    def send(self, data: bytes) -> None:
+        if self._peer is None or self._socket.fileno() < 0:
+            self.dropped_count += 1
+            return
+        try:
+            self._socket.sendto(data, self._peer)
+        except OSError as error:
+            self.dropped_count += 1
+            if not self._in_trouble:
+                logger.warning("%s: sending to %s fails: %s", self._url, self._peer, error.strerror or error)
+            self._in_trouble = True
+        else:
+            self._in_trouble = False
+
+    def answer_to(self, source: Source) -> None:
+        if not self._peer_is_fixed and source != self._peer:
+            if self._peer is not None:
+                logger.info("%s: the autopilot now sends from %s:%s", self._url, *source[:2])
+            self._peer = source
+
+    async def close(self) -> None:
+        if self._socket.fileno() >= 0:
+            self._loop.remove_reader(self._socket.fileno())
+            self._socket.close()
+
+
+class _StreamLink:
+    """A file descriptor that is read and written when it is ready: a TCP socket or a serial line."""
+
+    datagrams = False
+
+    def __init__(self, url: LinkUrl, received: Received) -> None:
+        self._url = url
+        self._received = received
+        self._loop = asyncio.get_running_loop()
+        self._descriptor = -1
+        self._unsent = b""  # the rest of a frame of which a part has left
+        self._reopening: asyncio.Task[None] | None = None
+        self.dropped_count = 0
+
+    async def open(self) -> None:
+        opener = _open_serial if self._url.scheme is LinkScheme.SERIAL else _open_tcp
+        self._descriptor = await opener(self._url)
+        self._unsent = b""
+        self._loop.add_reader(self._descriptor, self._readable)
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._descriptor, _READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lost(error.strerror or str(error))
+            return
+        if data:
+            self._received(data, None)
+        else:
+            self._lost("the other end closed it")
+
+    def send(self, data: bytes) -> None:
+        if self._descriptor < 0 or self._unsent:
+            self.dropped_count += 1
+            return
+        self._write(data)
+
+    def _write(self, data: bytes) -> None:
+        try:
+            written = os.write(self._descriptor, data)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            self.dropped_count += 1
+            self._lost(error.strerror or str(error))
+            return
+        if written == 0 and not self._unsent:
+            self.dropped_count += 1
+            return
+        was_waiting, self._unsent = bool(self._unsent), data[written:]
+        if self._unsent and not was_waiting:
+            self._loop.add_writer(self._descriptor, lambda: self._write(self._unsent))
+        elif was_waiting and not self._unsent:
+            self._loop.remove_writer(self._descriptor)
+
+    def answer_to(self, source: Source) -> None:
+        """A stream has one other end."""
+
+    def _lost(self, reason: str) -> None:
+        logger.error("%s: lost: %s; opening it again", self._url, reason)
+        self._release()
+        self._reopening = self._loop.create_task(self._reopen())
+
+    async def _reopen(self) -> None:
+        while self._descriptor < 0:
+            await asyncio.sleep(_REOPEN_S)
+            try:
+                await self.open()
+            except LinkError as error:
+                logger.debug("%s", error)
+        logger.info("%s: open again", self._url)
+
+    def _release(self) -> None:
+        if self._descriptor >= 0:
+            self._loop.remove_reader(self._descriptor)
+            self._loop.remove_writer(self._descriptor)
+            os.close(self._descriptor)
+        self._descriptor, self._unsent = -1, b""
+
+    async def close(self) -> None:
+        if self._reopening is not None:
+            self._reopening.cancel()
+            await asyncio.gather(self._reopening, return_exceptions=True)
+            self._reopening = None
+        self._release()
+
+
+async def _open_tcp(url: LinkUrl) -> int:
+    family, address = await _resolve(url, socket.SOCK_STREAM)
+    endpoint = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        endpoint.setblocking(False)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        await asyncio.get_running_loop().sock_connect(endpoint, address)
+        return endpoint.detach()
+    except OSError as error:
+        reason = error.strerror or error
+        raise LinkError(
+            f"{url}: cannot connect: {reason}; is a vehicle or a router listening there?"
+        ) from error
+    finally:
+        endpoint.close()  # does nothing to a detached descriptor
+
+
+async def _open_serial(url: LinkUrl) -> int:
+    device, baud = url.address
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        rates = sorted(int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit())
+        raise LinkError(f"{url}: this system has no baud rate {baud}; it has {rates}")
+    descriptor = -1
+    try:
+        descriptor = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)  # a second reader would steal bytes from us
+        tty.setraw(descriptor)
+        settings = termios.tcgetattr(descriptor)
+        settings[2] = (settings[2] | termios.CLOCAL | termios.CREAD) & ~termios.CRTSCTS
+        settings[4] = settings[5] = speed
+        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
+    except (OSError, termios.error) as error:
+        if descriptor >= 0:
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+        raise LinkError(_why_no_serial(url, error)) from error
+    return descriptor
+
+
+def _why_no_serial(url: LinkUrl, error: Exception) -> str:
+    device, _ = url.address
+    number = error.args[0] if error.args else None
+    if number == errno.ENOENT:
+        return f"{url}: there is no device {device}; is it plugged in?"
+    if number == errno.EACCES:
+        return (
+            f"{url}: no permission to open {device}; add the user to the group that owns it (often dialout)"
+        )
+    if number == errno.EBUSY:
+        return f"{url}: another program has {device} open; stop it"
+    if number == errno.ENOTTY:
+        return f"{url}: {device} is not a serial device"
+    return f"{url}: {device} cannot be opened: {error.args[1] if len(error.args) > 1 else error}"

@@ -1,0 +1,53 @@
+"""Opens the driver that was asked for."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from companion.vehicle.driver import Driver
+from companion.vehicle.link_url import parse_link_url
+
+DriverKind = Literal["mavsdk", "pymavlink"]
+
+
+def open_driver(
+    kind: DriverKind,
+    url: str,
+    *,
+    system_id: int | None = None,
+    own_system_id: int = 1,
+    own_component_id: int = 191,
+) -> Driver:
+    """A driver, not connected yet.
+
+    Args:
+        kind: which library speaks MAVLink. Both keep the same contract.
+        url: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT` or `serial:///dev/X:BAUD`.
+        system_id: the autopilot's MAVLink system id; None takes the first autopilot heard.
+        own_system_id, own_component_id: whom our messages say they are from; 191 is
+            MAV_COMP_ID_ONBOARD_COMPUTER.
+
+    Raises:
+        LinkUrlError: the url has none of these shapes (a ValueError and a LinkError).
+        ValueError: no such kind, or an id outside 1..255.
+    """
+    if kind not in get_args(DriverKind):
+        raise ValueError(f"there is no driver {kind!r}; there are: {', '.join(get_args(DriverKind))}")
+    for name, number in (("system_id", system_id), ("own_system_id", own_system_id)):
+        if number is not None and not 1 <= number <= 255:
+            raise ValueError(f"{name} must be 1..255, got {number}")
+    if not 1 <= own_component_id <= 255:
+        raise ValueError(f"own_component_id must be 1..255, got {own_component_id}")
+    link_url = parse_link_url(url)
+    # Imported here: each library takes its time to load, and one of them is enough.
+    if kind == "mavsdk":
+        from companion.vehicle.mavsdk_driver import MavsdkDriver
+
+        return MavsdkDriver(
+            link_url, system_id=system_id, own_system_id=own_system_id, own_component_id=own_component_id
+        )
+    from companion.vehicle.pymavlink_driver import PymavlinkDriver
+
+    return PymavlinkDriver(
+        link_url, system_id=system_id, own_system_id=own_system_id, own_component_id=own_component_id
+    )

@@ -1,0 +1,140 @@
+"""MAVLink frames out of any bytes, and back (https://mavlink.io/en/guide/serialization.html).
+
+Frames are cut and checked before anything decodes them, so that noise on the line costs the frames it hit
+and nothing more, and messages nobody reads are never decoded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import common as mavlink
+
+MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
+_HEADER_V1, _HEADER_V2, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
+_FLAG_SIGNED = 0x01
+LONGEST_FRAME = _HEADER_V2 + 255 + _CHECKSUM + _SIGNATURE
+
+# MAVLink common, 436, sent by PX4 >= 1.15. Not in pymavlink 2.4.50's "common".
+CURRENT_MODE_ID = 436
+CRC_EXTRA: dict[int, int] = {
+    **{message_id: message.crc_extra for message_id, message in mavlink.mavlink_map.items()},
+    CURRENT_MODE_ID: 193,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One whole frame as it came.
+
+    Attributes:
+        checked: its checksum was verified; False only for message ids we have no definition of.
+        raw: every byte, from the magic to the checksum or signature.
+        payload: as sent, so in MAVLink 2 without its trailing zeros.
+    """
+
+    message_id: int
+    system_id: int
+    component_id: int
+    sequence: int
+    checked: bool
+    raw: bytes
+    payload: bytes
+
+    def padded(self, length: int) -> bytes:
+        """The payload with the zeros that MAVLink 2 cuts off, cut to what we know of."""
+        return self.payload[:length].ljust(length, b"\0")
+
+
+class Framer:
+    """Cuts a stream of bytes into frames. Resynchronises at the next magic byte after anything broken."""
+
+    def __init__(self) -> None:
+        self._tail = b""
+        self.skipped_bytes = 0
+
+    def feed(self, data: bytes, *, datagram: bool) -> list[Frame]:
+        """The frames that `data` completes. No frame reaches from one datagram into the next."""
+        buffer = data if datagram else self._tail + data
+        frames: list[Frame] = []
+        position = 0
+        while position < len(buffer):
+            length = _frame_length(buffer, position)
+            if length is None:  # more bytes may make it a frame
+                if not datagram:
+                    break
+                length = 0
+            frame = _read_frame(buffer[position : position + length]) if length else None
+            if frame is None:
+                self.skipped_bytes += 1
+                position += 1
+                continue
+            frames.append(frame)
+            position += length
+        self._tail = b"" if datagram else buffer[position:]
+        return frames
+
+
+def pack_frame(message_id: int, payload: bytes, *, system_id: int, component_id: int, sequence: int) -> bytes:
+    """A MAVLink 2 frame, unsigned, trailing zeros of the payload cut off."""
+    payload = payload.rstrip(b"\0") or b"\0"
+    header = bytes((MAGIC_V2, len(payload), 0, 0, sequence, system_id, component_id))
+    return _with_checksum(header + message_id.to_bytes(3, "little") + payload, message_id)
+
+
+def with_sequence(frame: Frame, sequence: int) -> bytes:
+    """The same frame with another sequence number. One that is signed or cannot be checked stays as it is."""
+    signed = frame.raw[0] == MAGIC_V2 and frame.raw[2] & _FLAG_SIGNED
+    if signed or not frame.checked:
+        return frame.raw
+    at = 4 if frame.raw[0] == MAGIC_V2 else 2
+    body = frame.raw[:at] + bytes((sequence,)) + frame.raw[at + 1 : -_CHECKSUM]
+    return _with_checksum(body, frame.message_id)
+
+
+def frames_of(data: bytes) -> Iterator[Frame]:
+    """The frames of one datagram."""
+    yield from Framer().feed(data, datagram=True)
+
+
+def _frame_length(buffer: bytes, position: int) -> int | None:
+    """Length of the frame that starts here; 0: none starts here; None: not enough bytes yet."""
+    magic = buffer[position]
+    if magic not in (MAGIC_V1, MAGIC_V2):
+        return 0
+    if len(buffer) - position < 3:
+        return None
+    length = buffer[position + 1] + _CHECKSUM
+    if magic == MAGIC_V1:
+        length += _HEADER_V1
+    else:
+        flags = buffer[position + 2]
+        if flags & ~_FLAG_SIGNED:  # a receiver must drop what it does not understand
+            return 0
+        length += _HEADER_V2 + (_SIGNATURE if flags & _FLAG_SIGNED else 0)
+    return length if len(buffer) - position >= length else None
+
+
+def _read_frame(raw: bytes) -> Frame | None:
+    """The frame, or None when its checksum is wrong."""
+    if raw[0] == MAGIC_V2:
+        header, sequence, system_id, component_id = _HEADER_V2, raw[4], raw[5], raw[6]
+        message_id = int.from_bytes(raw[7:10], "little")
+    else:
+        header, sequence, system_id, component_id = _HEADER_V1, raw[2], raw[3], raw[4]
+        message_id = raw[5]
+    end = header + raw[1]
+    extra = CRC_EXTRA.get(message_id)
+    if extra is not None and _checksum(raw[1:end], extra) != raw[end : end + _CHECKSUM]:
+        return None
+    return Frame(message_id, system_id, component_id, sequence, extra is not None, raw, raw[header:end])
+
+
+def _with_checksum(body: bytes, message_id: int) -> bytes:
+    return body + _checksum(body[1:], CRC_EXTRA[message_id])
+
+
+def _checksum(body: bytes, crc_extra: int) -> bytes:
+    crc: int = mavlink.x25crc(body + bytes((crc_extra,))).crc
+    return crc.to_bytes(_CHECKSUM, "little")

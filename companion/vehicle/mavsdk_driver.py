@@ -1,0 +1,208 @@
+"""The driver on MAVSDK 4: its command and parameter protocols, its message definitions, our bytes.
+
+MAVSDK runs here on its `raw://` connection: what arrives on our link is handed to it, and what it wants to
+send is handed back and leaves from our asyncio loop. So nothing of its C++ threads reaches the vehicle by
+itself: a program that hangs is silent. Its own HEARTBEAT (once a second; MAVSDK 4.1 for Python has no way to
+turn it off) is dropped there, so the only heartbeats on the wire are those of `send_heartbeat`. Its offboard
+plugin, which repeats the last setpoint from such a thread, is not used: setpoints go one by one through
+`mavlink_direct`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import mavsdk
+from mavsdk.plugins.mavlink_direct import (
+    MavlinkDirect,
+    MavlinkDirectError,
+    MavlinkDirectResult,
+    MavlinkMessage,
+)
+from mavsdk.plugins.param import Param, ParamError, ParamResult
+
+from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
+from companion.vehicle.driver import CommandRefusedError, LinkError
+from companion.vehicle.framing import Frame, frames_of, with_sequence
+from companion.vehicle.telemetry_fold import FOLDED_MESSAGES
+
+logger = logging.getLogger(__name__)
+_library_logger = logging.getLogger("mavsdk")
+
+_T = TypeVar("_T")
+_SUBSCRIBED = sorted(FOLDED_MESSAGES - {"HEARTBEAT"} | {"COMMAND_ACK"})
+_PARAM_REASONS = {
+    ParamResult.DOES_NOT_EXIST: "there is no such parameter",
+    ParamResult.TIMEOUT: "the vehicle does not answer: no such parameter, or the link is down",
+    ParamResult.PARAM_NAME_TOO_LONG: "the name has more than 16 characters",
+    ParamResult.VALUE_OUT_OF_RANGE: "the value is out of range",
+}
+
+
+class MavsdkDriver(AutopilotDriver):
+    """See `companion.vehicle.driver.Driver`."""
+
+    _mavsdk: mavsdk.Mavsdk | None = None
+
+    async def _attach(self, timeout_s: float) -> None:
+        _log_through_python()
+        self._loop = asyncio.get_running_loop()
+        self._blocking = ThreadPoolExecutor(1, thread_name_prefix="mavsdk-driver")
+        configuration = mavsdk.Configuration.create_manual(self._own_system_id, self._own_component_id, False)
+        self._mavsdk = mavsdk.Mavsdk(configuration)
+        configuration.destroy()
+        self._mavsdk.add_any_connection_with_handle("raw://")
+        self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)
+        found: asyncio.Future[Any] = self._loop.create_future()
+        self._mavsdk.first_autopilot_async(timeout_s, lambda system: self._hop(_resolve, found, system))
+        system = await found
+        if system is None:
+            raise LinkError(f"{self.url}: MAVSDK did not find the autopilot within {timeout_s:g} s")
+        self._direct = MavlinkDirect(system)
+        for name in _SUBSCRIBED:
+            self._direct.subscribe_message(name, lambda message, _: self._hop(self._message, message))
+        self._parameters = Param(system)
+
+    async def _detach(self) -> None:
+        library, self._mavsdk = self._mavsdk, None
+        if library is None:
+            return
+        # A parameter request that is under way holds the one thread; destroying waits its turn behind it.
+        await self._loop.run_in_executor(self._blocking, library.destroy)
+        self._blocking.shutdown(wait=False)
+
+    # --- between MAVSDK's threads and our loop ------------------------------------------------------
+
+    def _hop(self, call: Callable[..., None], *arguments: object) -> None:
+        """From any thread into the loop."""
+        try:
+            self._loop.call_soon_threadsafe(call, *arguments)
+        except RuntimeError:  # the loop is closed: nobody is left to tell
+            logger.debug("%s: dropped a call of MAVSDK after the loop had closed", self.url)
+
+    def _library_sends(self, data: bytes) -> None:
+        self._hop(self._transmit_for_library, data)
+
+    def _transmit_for_library(self, data: bytes) -> None:
+        for frame in frames_of(data):
+            # Renumbered without the dropped ones, so that the vehicle does not count them as lost.
+            if frame.message_id != HEARTBEAT_ID:
+                own = frame.component_id == self._own_component_id
+                self._transmit(with_sequence(frame, self._next_sequence()) if own else frame.raw)
+
+    def _take_frames(self, frames: list[Frame]) -> None:
+        if self._mavsdk is not None:
+            self._mavsdk.pass_received_raw_bytes(b"".join(frame.raw for frame in frames))
+
+    def _message(self, message: MavlinkMessage) -> None:
+        if message.component_id == AUTOPILOT_COMPONENT and self._mavsdk is not None:
+            self._handle(message.message_name, json.loads(message.fields_json))
+
+    async def _in_thread(self, call: Callable[..., _T], *arguments: object) -> _T:
+        return await self._loop.run_in_executor(self._blocking, call, *arguments)
+
+    # --- encoding -----------------------------------------------------------------------------------
+
+    def _send_message(self, name: str, fields: dict[str, Any]) -> None:
+        if self._mavsdk is None:
+            return
+        try:
+            self._direct.send_message(self._direct_message(name, fields))
+        except MavlinkDirectError as error:
+            logger.error("%s: MAVSDK does not send %s: %s", self.url, name, error.result.name)
+
+    def _direct_message(self, name: str, fields: dict[str, Any]) -> MavlinkMessage:
+        return MavlinkMessage(
+            message_name=name,
+            system_id=self._own_system_id,
+            component_id=self._own_component_id,
+            target_system_id=self._system_id,
+            target_component_id=AUTOPILOT_COMPONENT,
+            fields_json=json.dumps(fields, allow_nan=False),
+        )
+
+    # --- commands and parameters --------------------------------------------------------------------
+
+    async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
+        fields: dict[str, Any] = {
+            "target_system": self._system_id,
+            "target_component": AUTOPILOT_COMPONENT,
+            "command": command,
+            "confirmation": 0,
+        }
+        for number, value in enumerate(parameters, start=1):
+            fields[f"param{number}"] = None if value != value else float(value)  # JSON has no NaN
+        answered: asyncio.Future[tuple[MavlinkDirectResult, MavlinkMessage]] = self._loop.create_future()
+        self._direct.send_command_async(
+            self._direct_message("COMMAND_LONG", fields),
+            lambda result, ack, _: self._hop(_resolve, answered, (result, ack)),
+        )
+        result, ack = await answered
+        if result != MavlinkDirectResult.SUCCESS:
+            raise CommandRefusedError(
+                f"the vehicle does not answer command {command} ({result.name.lower()})"
+            )
+        return int(json.loads(ack.fields_json)["result"])
+
+    async def get_parameter(self, name: str) -> float:
+        """See Driver."""
+        value = await self._read_parameter(name)
+        return float(value)
+
+    async def set_parameter(self, name: str, value: float) -> None:
+        """See Driver."""
+        before = await self._read_parameter(name)
+        if isinstance(before, int):
+            if not float(value).is_integer() or not -(2**31) <= value < 2**31:
+                raise CommandRefusedError(f"parameter {name} is an integer and cannot take {value}")
+            await self._with_parameters(name, self._parameters.set_param_int, name, int(value))
+        else:
+            await self._with_parameters(name, self._parameters.set_param_float, name, float(value))
+
+    async def _read_parameter(self, name: str) -> int | float:
+        """An int for an integer parameter, a float for a real one."""
+        if self._mavsdk is None:
+            raise CommandRefusedError(f"{self.url}: not connected, so parameter {name} cannot be reached")
+        try:
+            return float(await self._with_parameters(name, self._parameters.get_param_float, name))
+        except _WrongTypeError:
+            return int(await self._with_parameters(name, self._parameters.get_param_int, name))
+
+    async def _with_parameters(self, name: str, call: Callable[..., Any], *arguments: object) -> Any:
+        try:
+            return await self._in_thread(call, *arguments)
+        except ParamError as error:
+            if error.result in (ParamResult.WRONG_TYPE, ParamResult.TYPE_MISMATCH):
+                raise _WrongTypeError(f"parameter {name}: its type is another one") from error
+            reason = _PARAM_REASONS.get(error.result, error.result.name.lower())
+            raise CommandRefusedError(f"parameter {name}: {reason}") from error
+
+
+class _WrongTypeError(CommandRefusedError):
+    """The parameter is an integer where a real was asked for, or the other way round."""
+
+
+def _resolve(future: asyncio.Future[Any], result: object) -> None:
+    if not future.done():
+        future.set_result(result)
+
+
+def _log_through_python() -> None:
+    """MAVSDK would print to standard output, which may be somebody's JSON."""
+    levels = {
+        mavsdk.LogLevel.DEBUG: logging.DEBUG,
+        mavsdk.LogLevel.INFO: logging.DEBUG,  # its everyday remarks
+        mavsdk.LogLevel.WARN: logging.INFO,  # it also warns of what it handles
+        mavsdk.LogLevel.ERROR: logging.WARNING,
+    }
+
+    def write(level: mavsdk.LogLevel, text: str, _file: str | None, _line: int) -> bool:
+        _library_logger.log(levels[level], "%s", text)
+        return True
+
+    mavsdk.log_subscribe(write)

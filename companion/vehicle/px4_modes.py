@@ -1,0 +1,48 @@
+"""PX4's flight modes in HEARTBEAT.custom_mode and MAV_CMD_DO_SET_MODE.
+
+`custom_mode` = main mode << 16 | sub mode << 24 (PX4: src/modules/commander/px4_custom_mode.h).
+"""
+
+from __future__ import annotations
+
+from companion.vehicle.state import FlightMode
+
+_AUTO = 4
+
+# (main mode, sub mode) that PX4 shows
+_MODES: dict[tuple[int, int], FlightMode] = {
+    (1, 0): FlightMode.MANUAL,
+    (2, 0): FlightMode.ALTITUDE,
+    (3, 0): FlightMode.POSITION,
+    (3, 2): FlightMode.POSITION,  # slow
+    (5, 0): FlightMode.ACRO,
+    (6, 0): FlightMode.OFFBOARD,
+    (7, 0): FlightMode.STABILIZED,
+    (_AUTO, 1): FlightMode.READY,
+    (_AUTO, 2): FlightMode.TAKEOFF,
+    (_AUTO, 3): FlightMode.HOLD,
+    (_AUTO, 4): FlightMode.MISSION,
+    (_AUTO, 5): FlightMode.RETURN,
+    (_AUTO, 6): FlightMode.LAND,
+    (_AUTO, 8): FlightMode.FOLLOW,
+    (_AUTO, 9): FlightMode.PRECISION_LAND,
+}
+_REQUESTS = {mode: numbers for numbers, mode in reversed(_MODES.items())}
+
+
+def mode_of_custom_mode(custom_mode: int) -> FlightMode:
+    """The mode that a custom_mode shows; UNKNOWN for what has no name here."""
+    return _MODES.get(((custom_mode >> 16) & 0xFF, (custom_mode >> 24) & 0xFF), FlightMode.UNKNOWN)
+
+
+def custom_mode_of_mode(mode: FlightMode) -> int:
+    """The custom_mode PX4 shows for a mode. Raises ValueError for UNKNOWN."""
+    main, sub = request_of_mode(mode)
+    return main << 16 | sub << 24
+
+
+def request_of_mode(mode: FlightMode) -> tuple[int, int]:
+    """(main mode, sub mode), params 2 and 3 of MAV_CMD_DO_SET_MODE. Raises ValueError for UNKNOWN."""
+    if mode not in _REQUESTS:
+        raise ValueError(f"{mode!s} is not a mode that can be asked for; known: {', '.join(_REQUESTS)}")
+    return _REQUESTS[mode]

@@ -1,0 +1,220 @@
+"""The driver that speaks MAVLink by pymavlink's message definitions, on our own asyncio link."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, IN_PROGRESS, AutopilotDriver
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.framing import CURRENT_MODE_ID, Frame
+from companion.vehicle.link_url import LinkUrl
+from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, Fields
+
+logger = logging.getLogger(__name__)
+
+_PARAM_VALUE_ID, _PARAM_SET_ID = 22, 23
+# By the wire's order: the value's bytes as they are, not through a float.
+_PARAM_SET = struct.Struct("<4sBB16sB")
+_CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
+_DECODED_IDS = {
+    message_id
+    for message_id, message in mavlink.mavlink_map.items()
+    if message.msgname in FOLDED_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR"}
+} - {HEARTBEAT_ID}
+
+# Command protocol: 5 attempts half a second apart; after IN_PROGRESS no more attempts, only patience.
+_ATTEMPTS = 5
+_ATTEMPT_S = 0.5
+_PROGRESS_S = 10.0
+
+# MAV_PARAM_TYPE and the layout of its four bytes (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
+_REAL32 = 9
+_PARAM_LAYOUT = {1: "<B3x", 2: "<b3x", 3: "<H2x", 4: "<h2x", 5: "<I", 6: "<i", _REAL32: "<f"}
+_PARAM_ERRORS = {
+    1: "there is no such parameter",
+    2: "its value is out of range",
+    3: "permission denied",
+    4: "no such component",
+    5: "it is read-only",
+    6: "its type is not supported",
+    7: "its type is another one",
+    8: "reading it failed",
+}
+
+
+class PymavlinkDriver(AutopilotDriver):
+    """See `companion.vehicle.driver.Driver`."""
+
+    def __init__(
+        self, url: LinkUrl, *, system_id: int | None, own_system_id: int, own_component_id: int
+    ) -> None:
+        super().__init__(
+            url, system_id=system_id, own_system_id=own_system_id, own_component_id=own_component_id
+        )
+        self._codec = mavlink.MAVLink(None, own_system_id, own_component_id)
+
+    async def _attach(self, timeout_s: float) -> None:
+        """Nothing to wait for."""
+
+    async def _detach(self) -> None:
+        """Nothing is held."""
+
+    # --- encoding -----------------------------------------------------------------------------------
+
+    def _take_frames(self, frames: list[Frame]) -> None:
+        for frame in frames:
+            if frame.component_id != AUTOPILOT_COMPONENT:
+                continue
+            if frame.message_id == CURRENT_MODE_ID:
+                custom_mode, _ = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
+                self._handle("CURRENT_MODE", {"custom_mode": custom_mode})
+            elif frame.message_id in _DECODED_IDS:
+                try:
+                    message = self._codec.decode(bytearray(frame.raw))
+                except mavlink.MAVError as error:
+                    logger.warning("%s: message %d cannot be decoded: %s", self.url, frame.message_id, error)
+                    continue
+                fields = message.to_dict()
+                if frame.message_id == _PARAM_VALUE_ID:
+                    # An integer's bytes read as a float may be a signalling NaN, which the reading changes.
+                    fields["value_bytes"] = frame.padded(4)
+                self._handle(message.get_type(), fields)
+
+    def _send_message(self, name: str, fields: dict[str, Any]) -> None:
+        definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
+        self._codec.seq = self._next_sequence()
+        self._transmit(bytes(definition(**fields).pack(self._codec)))
+
+    # --- commands -----------------------------------------------------------------------------------
+
+    async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
+        results: asyncio.Queue[int] = asyncio.Queue()
+
+        def watch(name: str, fields: Fields) -> None:
+            if name == "COMMAND_ACK" and fields["command"] == command and self._ack_is_ours(fields):
+                results.put_nowait(fields["result"])
+
+        async with self._watching(watch):
+            for attempt in range(_ATTEMPTS):
+                self._send_command(command, parameters, attempt)
+                result = await _next_result(results, _ATTEMPT_S)
+                while result == IN_PROGRESS:
+                    result = await _next_result(results, _PROGRESS_S)
+                    if result is None:
+                        raise CommandRefusedError(
+                            f"the vehicle began command {command} and said nothing for {_PROGRESS_S:g} s"
+                        )
+                if result is not None:
+                    return result
+        raise CommandRefusedError(
+            f"the vehicle does not answer command {command} ({_ATTEMPTS} times asked, {_ATTEMPT_S:g} s apart)"
+        )
+
+    def _send_command(self, command: int, parameters: tuple[float, ...], attempt: int) -> None:
+        fields = {
+            "target_system": self._system_id or 0,
+            "target_component": AUTOPILOT_COMPONENT,
+            "command": command,
+            "confirmation": attempt,
+        }
+        values = {f"param{number}": value for number, value in enumerate(parameters, start=1)}
+        self._send_message("COMMAND_LONG", fields | values)
+
+    # --- parameters ---------------------------------------------------------------------------------
+
+    async def get_parameter(self, name: str) -> float:
+        """See Driver."""
+        value, _ = await self._read_parameter(name)
+        return value
+
+    async def set_parameter(self, name: str, value: float) -> None:
+        """See Driver."""
+        _, kind = await self._read_parameter(name)
+        wanted = _parameter_bytes(name, value, kind)
+        payload = _PARAM_SET.pack(
+            wanted, self._system_id or 0, AUTOPILOT_COMPONENT, _parameter_id(name), kind
+        )
+        echo = await self._exchange_parameter(
+            name,
+            lambda: self._transmit_payload(_PARAM_SET_ID, payload),
+            lambda fields: bool(fields["value_bytes"] == wanted),
+        )
+        if echo is None:
+            raise CommandRefusedError(f"the vehicle did not take {value} for parameter {name}")
+
+    async def _read_parameter(self, name: str) -> tuple[float, int]:
+        """Value and MAV_PARAM_TYPE."""
+        request = {
+            "target_system": self._system_id or 0,
+            "target_component": AUTOPILOT_COMPONENT,
+            "param_id": _parameter_id(name),
+            "param_index": -1,
+        }
+        fields = await self._exchange_parameter(
+            name, lambda: self._send_message("PARAM_REQUEST_READ", request), lambda _: True
+        )
+        if fields is None:
+            raise CommandRefusedError(
+                f"the vehicle does not answer for parameter {name}: no such parameter, or the link is down"
+            )
+        kind = fields["param_type"]
+        if kind not in _PARAM_LAYOUT:
+            raise CommandRefusedError(f"parameter {name} has type {kind}, which PX4 does not use")
+        return float(struct.unpack(_PARAM_LAYOUT[kind], fields["value_bytes"])[0]), kind
+
+    async def _exchange_parameter(
+        self, name: str, send: Callable[[], None], awaited: Callable[[Fields], bool]
+    ) -> Fields | None:
+        """Send until a PARAM_VALUE of that name is the awaited one; None when none came."""
+        if self._link is None:
+            raise CommandRefusedError(f"{self.url}: not connected, so parameter {name} cannot be reached")
+        answer: asyncio.Future[Fields] = asyncio.get_running_loop().create_future()
+
+        def watch(message: str, fields: Fields) -> None:
+            if answer.done() or fields.get("param_id") != name:
+                return
+            if message == "PARAM_VALUE" and awaited(fields):
+                answer.set_result(fields)
+            elif message == "PARAM_ERROR":
+                reason = _PARAM_ERRORS.get(fields["error"], f"PARAM_ERROR {fields['error']}")
+                answer.set_exception(CommandRefusedError(f"parameter {name}: {reason}"))
+
+        async with self._watching(watch):
+            for _ in range(_ATTEMPTS):
+                send()
+                await asyncio.wait([answer], timeout=_ATTEMPT_S)
+                if answer.done():
+                    return answer.result()
+        return None
+
+
+async def _next_result(results: asyncio.Queue[int], timeout_s: float) -> int | None:
+    with contextlib.suppress(TimeoutError):
+        return await asyncio.wait_for(results.get(), timeout_s)
+    return None
+
+
+def _parameter_id(name: str) -> bytes:
+    try:
+        encoded = name.encode("ascii")
+    except UnicodeEncodeError as error:
+        raise CommandRefusedError(f"{name!r} is no parameter name: it must be ASCII") from error
+    if not 1 <= len(encoded) <= 16:
+        raise CommandRefusedError(f"{name!r} is no parameter name: it must have 1 to 16 characters")
+    return encoded
+
+
+def _parameter_bytes(name: str, value: float, kind: int) -> bytes:
+    if kind != _REAL32 and not float(value).is_integer():
+        raise CommandRefusedError(f"parameter {name} is an integer and cannot take {value}")
+    try:
+        return struct.pack(_PARAM_LAYOUT[kind], value if kind == _REAL32 else int(value))
+    except (struct.error, OverflowError) as error:
+        raise CommandRefusedError(f"parameter {name} cannot hold {value}: {error}") from error

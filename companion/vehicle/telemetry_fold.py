@@ -1,0 +1,129 @@
+"""One message of the autopilot into the next snapshot of the vehicle. Pure: no link, no clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from companion.vehicle.px4_modes import mode_of_custom_mode
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+
+Fields = Mapping[str, Any]
+
+_SAFETY_ARMED = 128  # MAV_MODE_FLAG
+_STATE_CRITICAL, _STATE_EMERGENCY = 5, 6  # MAV_STATE
+_PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
+_LANDED = {
+    1: LandedState.ON_GROUND,
+    2: LandedState.IN_AIR,
+    3: LandedState.TAKING_OFF,
+    4: LandedState.LANDING,
+}
+
+
+def fold(state: VehicleState, name: str, fields: Fields, now_ns: int) -> VehicleState:
+    """The snapshot after a message.
+
+    Args:
+        name: the message's name, as in MAVLink common.
+        fields: its fields by name; a float that is not a number may be None (as JSON has it).
+        now_ns: CLOCK_MONOTONIC of its arrival.
+
+    Returns:
+        A new snapshot, or the same object when the message says nothing new of the vehicle.
+    """
+    step = _STEPS.get(name)
+    return state if step is None else step(state, fields, now_ns)
+
+
+def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    return replace(
+        state,
+        heartbeat_ns=now_ns,
+        armed=bool(fields["base_mode"] & _SAFETY_ARMED),
+        mode=mode_of_custom_mode(fields["custom_mode"]),
+        failsafe=fields["system_status"] in (_STATE_CRITICAL, _STATE_EMERGENCY),
+    )
+
+
+def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    mode = mode_of_custom_mode(fields["custom_mode"])
+    return state if mode in (state.mode, FlightMode.UNKNOWN) else replace(state, mode=mode)
+
+
+def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    landed = _LANDED.get(fields["landed_state"], LandedState.UNKNOWN)
+    return replace(state, landed_ns=now_ns, landed=landed)
+
+
+def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    w, x, y, z = (_number(fields[key]) for key in ("q1", "q2", "q3", "q4"))
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    rates = _vector(fields, "rollspeed", "pitchspeed", "yawspeed")
+    if not 0.5 < norm < 2.0 or rates is None:  # NaN also fails the comparison
+        return state
+    attitude = (w / norm, x / norm, y / norm, z / norm)
+    return replace(state, attitude_ns=now_ns, attitude=attitude, angular_velocity_frd_radps=rates)
+
+
+def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    position, velocity = _vector(fields, "x", "y", "z"), _vector(fields, "vx", "vy", "vz")
+    if position is None or velocity is None:
+        return state
+    return replace(state, position_ns=now_ns, position_ned_m=position, velocity_ned_mps=velocity)
+
+
+def _global_position_int(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    return replace(
+        state,
+        latitude_deg=fields["lat"] * 1e-7,
+        longitude_deg=fields["lon"] * 1e-7,
+        altitude_amsl_m=fields["alt"] * 1e-3,
+    )
+
+
+def _home_position(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    home = replace(state, home_altitude_amsl_m=fields["altitude"] * 1e-3)
+    local = _vector(fields, "x", "y", "z")
+    if local is not None:
+        home = replace(home, home_position_ned_m=local)
+    return state if home == state else home
+
+
+def _sys_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    ready = bool(fields["onboard_control_sensors_health"] & _PREARM_CHECK)
+    return _battery_status(replace(state, ready_to_arm=ready), fields, now_ns)
+
+
+def _battery_status(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    # Of several batteries the first speaks for the vehicle, as in SYS_STATUS.
+    if fields.get("id", 0) != 0 or fields["battery_remaining"] < 0:
+        return state
+    return replace(state, battery_fraction=min(fields["battery_remaining"] / 100.0, 1.0))
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _vector(fields: Fields, *names: str) -> tuple[float, float, float] | None:
+    """Three finite numbers, or None: an estimate that is not a number is no estimate."""
+    x, y, z = (_number(fields[name]) for name in names)
+    return (x, y, z) if math.isfinite(x) and math.isfinite(y) and math.isfinite(z) else None
+
+
+_STEPS: dict[str, Callable[[VehicleState, Fields, int], VehicleState]] = {
+    "HEARTBEAT": _heartbeat,
+    "CURRENT_MODE": _current_mode,
+    "EXTENDED_SYS_STATE": _extended_sys_state,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "LOCAL_POSITION_NED": _local_position_ned,
+    "GLOBAL_POSITION_INT": _global_position_int,
+    "HOME_POSITION": _home_position,
+    "SYS_STATUS": _sys_status,
+    "BATTERY_STATUS": _battery_status,
+}
+
+FOLDED_MESSAGES = frozenset(_STEPS)
