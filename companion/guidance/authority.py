@@ -24,6 +24,7 @@ class Authority:
         self._mode: FlightMode | None = None
         self._leaving: set[FlightMode] = set()
         self._leaving_until_ns: float = 0
+        self._dropped: dict[FlightMode, float] = {}
         self._takeoff_altitude_m = 0.0
         self._was_armed = False
         self._failsafe_before = False
@@ -38,6 +39,7 @@ class Authority:
         self._mode = state.mode
         self._leaving = set()
         self._leaving_until_ns = 0
+        self._dropped = {}
         self._takeoff_altitude_m = state.altitude_m or 0.0
         self._was_armed = state.armed
         self._failsafe_before = state.failsafe
@@ -60,6 +62,12 @@ class Authority:
     def settled(self, now_ns: int) -> None:
         """The request is done; the old mode may still show for a heartbeat, if the new one never showed."""
         self._leaving_until_ns = now_ns + SHOW_DELAY_S * 1e9
+
+    def dropped(self, now_ns: int) -> None:
+        """We do not wait for the request any more; it may still take effect, and show after the next one."""
+        if self._mode is not None:
+            self._dropped[self._mode] = now_ns + SHOW_DELAY_S * 1e9
+        self.settled(now_ns)
 
     def refused(self, mode: FlightMode) -> None:
         """The request came to nothing: the mode from before is ours again."""
@@ -91,6 +99,8 @@ class Authority:
                 self._leaving = set()
             return True
         if state.mode in self._leaving and now_ns <= self._leaving_until_ns:
+            return True
+        if now_ns <= self._dropped.get(state.mode, 0):
             return True
         if self._mode in GOING_DOWN and (not state.armed or state.landed is LandedState.ON_GROUND):
             # Landed and disarmed, PX4 shows the mode that was chosen before the landing.

@@ -50,3 +50,8 @@ def stopping_speed(error_m: float, top_speed_mps: float, deceleration_mps2: floa
 def in_degrees(bearing_rad: float) -> int:
     """A bearing as people write it: 0..359."""
     return round(math.degrees(bearing_rad)) % 360
+
+
+def laps_text(laps: float) -> str:
+    """A number of laps as people say it."""
+    return "1 lap" if laps == 1.0 else f"{laps:g} laps"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.motion import correction, in_degrees, position_and_yaw
+from companion.guidance.motion import correction, in_degrees, laps_text, position_and_yaw
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -73,7 +73,7 @@ class OrbitBehaviour(Behaviour):
             self._flown_rad += self._turn * wrap_angle(angle - self._angle_rad)
         self._angle_rad = angle
         if self._laps and self._flown_rad >= self._laps * math.tau:
-            return Outcome(True, f"{self._laps:g} laps flown at {distance:.1f} m")
+            return Outcome(True, f"{laps_text(self._laps)} flown at {distance:.1f} m")
         if self._laps and situation.now_ns > self._until_ns:
             return Outcome(
                 False, f"orbit timed out after {self._flown_rad / math.tau:.1f} of {self._laps:g} laps"

@@ -361,7 +361,7 @@ class Pilot:
             self._task.cancel()
             self._task = None
             if self._situation is not None:
-                self._authority.settled(self._situation.now_ns)
+                self._authority.dropped(self._situation.now_ns)
         if self._phase in (_Phase.REQUESTING, _Phase.DELEGATED):
             self._phase = _Phase.READY
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.motion import in_degrees, position_and_yaw, stay_at
+from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -23,6 +23,8 @@ FACING_RAD = math.radians(4.0)
 FACING_S = 0.4
 FACING_TIMEOUT_S = 12.0
 SIGHT_LOST_S = 2.0
+# Found means seen now, not a moment ago.
+SIGHT_FRESH_S = 0.7
 BLIND_TIMEOUT_S = 5.0
 # A turn may take this many times what it should, plus the looks on the way.
 SLOWEST_TURN = 3.0
@@ -87,7 +89,7 @@ class SeekBehaviour(Behaviour):
         if self._found is not None:
             return self._face(self._found, situation, yaw_rad, stay)
         if abs(self._turned_rad) >= self._laps * math.tau:
-            return Outcome(False, f"no {self._class_name} seen in {self._laps:g} laps")
+            return Outcome(False, f"no {self._class_name} seen in {laps_text(self._laps)}")
         waiting = now_ns < self._look_until_ns
         rate = 0.0 if waiting else self._turn * self._rate_radps
         return Setpoint.velocity(stay, now_ns, yaw_rate_radps=rate)
@@ -132,7 +134,7 @@ class SeekBehaviour(Behaviour):
             self._found = None
             self._sightings.clear()
             return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
-        if abs(wrap_angle(found.bearing_rad - yaw_rad)) > FACING_RAD:
+        if unseen_s > SIGHT_FRESH_S or abs(wrap_angle(found.bearing_rad - yaw_rad)) > FACING_RAD:
             self._facing_since_ns = None
         elif self._facing_since_ns is None:
             self._facing_since_ns = now_ns

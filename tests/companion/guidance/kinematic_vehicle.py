@@ -1,0 +1,175 @@
+"""A vehicle for lockstep tests: it follows velocity, position, yaw and yaw rate with a short lag."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
+from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.target import RangeSource, Target
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from vision.rotation import quaternion_from_euler, wrap_angle
+
+START_NS = 1_000_000_000_000
+
+
+@dataclass
+class KinematicVehicle:
+    """Local NED. Velocity and yaw rate answer as a first-order lag, like a multirotor's outer loops."""
+
+    position: list[float] = field(default_factory=lambda: [0.0, 0.0, -5.0])
+    velocity: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    yaw_rad: float = 0.0
+    yaw_rate_radps: float = 0.0
+    now_ns: int = START_NS
+    mode: FlightMode = FlightMode.OFFBOARD
+    armed: bool = True
+    landed: LandedState = LandedState.IN_AIR
+    lag_s: float = 0.3
+
+    @property
+    def state(self) -> VehicleState:
+        return VehicleState(
+            heartbeat_ns=self.now_ns,
+            attitude_ns=self.now_ns,
+            position_ns=self.now_ns,
+            landed_ns=self.now_ns,
+            armed=self.armed,
+            mode=self.mode,
+            landed=self.landed,
+            ready_to_arm=True,
+            position_ned_m=tuple(self.position),
+            velocity_ned_mps=tuple(self.velocity),
+            attitude=quaternion_from_euler(0.0, 0.0, self.yaw_rad),
+            home_altitude_amsl_m=489.0,
+            home_position_ned_m=(0.0, 0.0, 0.0),
+        )
+
+    def fly(self, setpoint: Setpoint, dt_s: float) -> None:
+        wanted = setpoint.velocity_ned_mps
+        if setpoint.position_ned_m is not None:
+            error = [a - b for a, b in zip(setpoint.position_ned_m, self.position, strict=True)]
+            length = max(1e-9, math.hypot(*error))
+            wanted = tuple(0.95 * e * min(1.0, 5.0 / (0.95 * length)) for e in error)
+        rate = setpoint.yaw_rate_radps or 0.0
+        if setpoint.yaw_rad is not None:
+            rate = max(-1.5, min(1.5, 2.0 * wrap_angle(setpoint.yaw_rad - self.yaw_rad)))
+        mix = dt_s / (self.lag_s + dt_s)
+        for axis in range(3):
+            self.velocity[axis] += (wanted[axis] - self.velocity[axis]) * mix
+            self.position[axis] += self.velocity[axis] * dt_s
+        self.yaw_rate_radps += (rate - self.yaw_rate_radps) * dt_s / (0.15 + dt_s)
+        self.yaw_rad = wrap_angle(self.yaw_rad + self.yaw_rate_radps * dt_s)
+        self.now_ns += round(dt_s * 1e9)
+
+
+@dataclass
+class SeenObject:
+    """Something that stands on the ground, with the camera's view of it."""
+
+    class_name: str
+    north: float
+    east: float
+    confidence: float = 0.8
+    radius_m: float = 0.0
+    visible: bool = True
+    with_range: bool = True
+
+
+def look(
+    vehicle: KinematicVehicle,
+    objects: Sequence[SeenObject],
+    captured_ns: int,
+    *,
+    half_view_rad: float = math.radians(40),
+    noise: Callable[[], float] = lambda: 0.0,
+) -> tuple[Target, ...]:
+    """What a level camera looking forward makes of them."""
+    targets = []
+    for thing in objects:
+        north, east = thing.north - vehicle.position[0], thing.east - vehicle.position[1]
+        distance = math.hypot(north, east)
+        bearing = math.atan2(east, north)
+        if not thing.visible or abs(wrap_angle(bearing - vehicle.yaw_rad)) > half_view_rad:
+            continue
+        range_m = max(0.1, (distance - thing.radius_m) * (1.0 + noise()))
+        place = (
+            vehicle.position[0] + range_m * math.cos(bearing),
+            vehicle.position[1] + range_m * math.sin(bearing),
+            0.0,
+        )
+        targets.append(
+            Target(
+                thing.class_name,
+                thing.confidence,
+                captured_ns,
+                bearing,
+                math.atan2(vehicle.position[2], distance),
+                range_m if thing.with_range else math.nan,
+                RangeSource.GROUND_PLANE if thing.with_range else RangeSource.NONE,
+                place if thing.with_range else None,
+            )
+        )
+    return tuple(targets)
+
+
+@dataclass
+class Flight:
+    """A behaviour flown in lockstep: guidance at 50 Hz, camera at 10 Hz whose results come 0.1 s late."""
+
+    behaviour: Behaviour
+    vehicle: KinematicVehicle = field(default_factory=KinematicVehicle)
+    objects: list[SeenObject] = field(default_factory=list)
+    perception_alive: bool = True
+    noise: Callable[[], float] = lambda: 0.0
+    limits: Limits = field(default_factory=Limits)
+    rate_hz: float = 50.0
+    camera_hz: float = 10.0
+    latency_s: float = 0.1
+    steps: list[object] = field(default_factory=list)
+    track: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def run(
+        self, seconds: float, each: Callable[[float, KinematicVehicle], None] = lambda t, v: None
+    ) -> Outcome | None:
+        """Fly until it ends or the time is over (None). `each(seconds, vehicle)` runs every step."""
+        dt_s, envelope = 1.0 / self.rate_hz, Envelope(self.limits)
+        pending: list[tuple[int, tuple[Target, ...]]] = []
+        shown: tuple[Target, ...] = ()
+        newest_ns, next_frame_ns = 0, self.vehicle.now_ns
+        start_ns, sent, activated = self.vehicle.now_ns, None, False
+        while self.vehicle.now_ns - start_ns < seconds * 1e9:
+            now_ns = self.vehicle.now_ns
+            each((now_ns - start_ns) / 1e9, self.vehicle)
+            if now_ns >= next_frame_ns and self.perception_alive:
+                pending.append((now_ns, look(self.vehicle, self.objects, now_ns, noise=self.noise)))
+                next_frame_ns += round(1e9 / self.camera_hz)
+            while pending and now_ns - pending[0][0] >= self.latency_s * 1e9:
+                newest_ns, shown = pending.pop(0)
+            fresh = newest_ns > 0 and now_ns - newest_ns <= 0.5e9
+            situation = Situation(
+                now_ns,
+                self.vehicle.state,
+                shown if fresh else (),
+                (now_ns - newest_ns) / 1e9 if newest_ns else None,
+                fresh,
+                sent,
+            )
+            if not activated:
+                self.behaviour.on_activate(situation)
+                activated = True
+            step = self.behaviour.update(dt_s, situation)
+            self.steps.append(step)
+            assert self.behaviour.status
+            if isinstance(step, Outcome):
+                return step
+            if isinstance(step, ModeRequest):
+                self.vehicle.now_ns += round(dt_s * 1e9)
+                continue
+            sent, _ = envelope.apply(step, situation.state, now_ns, dt_s)
+            self.vehicle.fly(sent, dt_s)
+            self.track.append(tuple(self.vehicle.position))
+        return None

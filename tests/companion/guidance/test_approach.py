@@ -1,0 +1,140 @@
+import math
+import random
+
+import pytest
+from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+
+from companion.guidance.approach import ApproachBehaviour
+
+
+def distance_to(vehicle, thing):
+    return math.dist(vehicle.position[:2], (thing.north, thing.east)) - thing.radius_m
+
+
+@pytest.mark.parametrize(("north", "east"), [(20.0, 5.0), (8.0, -3.0), (45.0, 0.0), (6.0, 0.0)])
+def test_approach_stops_at_the_asked_distance_without_passing_it(north, east):
+    car = SeenObject("car", north, east)
+    vehicle = KinematicVehicle()
+    nearest = []
+    flight = Flight(ApproachBehaviour("car", distance_m=5.0), vehicle, [car])
+    outcome = flight.run(120.0, lambda seconds, v: nearest.append(distance_to(v, car)))
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert outcome.reason.startswith("reached car at ")
+    assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.35)
+    assert min(nearest) > 4.6
+    assert abs(vehicle.position[2] + 5.0) < 0.1
+    assert math.hypot(*vehicle.velocity) < 0.3
+
+
+def test_approach_arrives_with_noisy_ranges():
+    noise = random.Random(7)
+    car = SeenObject("car", 25.0, -6.0)
+    vehicle = KinematicVehicle()
+    flight = Flight(ApproachBehaviour("car"), vehicle, [car], noise=lambda: noise.gauss(0.0, 0.06))
+    outcome = flight.run(120.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.8)
+
+
+def test_approach_backs_off_when_it_begins_too_near():
+    person = SeenObject("person", 2.0, 0.0)
+    vehicle = KinematicVehicle()
+    outcome = Flight(ApproachBehaviour("person", distance_m=4.0), vehicle, [person]).run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_to(vehicle, person) == pytest.approx(4.0, abs=0.35)
+
+
+def test_approach_stays_with_its_object_when_a_nearer_one_of_the_class_appears():
+    first, second = SeenObject("car", 25.0, 0.0), SeenObject("car", 14.0, 7.0, visible=False)
+    vehicle = KinematicVehicle()
+
+    def each(seconds, vehicle):
+        second.visible = seconds > 2.0
+
+    outcome = Flight(ApproachBehaviour("car"), vehicle, [first, second]).run(90.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_to(vehicle, first) == pytest.approx(5.0, abs=0.35)
+
+
+def test_approach_follows_an_object_that_walks():
+    person = SeenObject("person", 20.0, 0.0)
+
+    def each(seconds, vehicle):
+        if seconds < 10.0:
+            person.east = 0.8 * seconds
+
+    vehicle = KinematicVehicle()
+    outcome = Flight(ApproachBehaviour("person"), vehicle, [person]).run(90.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_to(vehicle, person) == pytest.approx(5.0, abs=0.5)
+
+
+def test_a_lost_object_brakes_the_vehicle_and_ends_the_approach_after_the_timeout():
+    car = SeenObject("car", 40.0, 0.0)
+    vehicle = KinematicVehicle()
+    stopped_at = []
+
+    def each(seconds, vehicle):
+        car.visible = seconds < 5.0
+        if seconds > 9.0:
+            stopped_at.append(vehicle.position[0])
+
+    outcome = Flight(ApproachBehaviour("car", lost_timeout_s=6.0), vehicle, [car]).run(60.0, each)
+    assert outcome is not None
+    assert not outcome.success
+    assert outcome.reason.startswith("lost the car")
+    assert max(stopped_at) - min(stopped_at) < 0.2
+
+
+def test_an_object_that_comes_back_in_time_is_approached_on():
+    car = SeenObject("car", 25.0, 0.0)
+
+    def each(seconds, vehicle):
+        car.visible = not 4.0 < seconds < 7.0
+
+    vehicle = KinematicVehicle()
+    outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(90.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+
+
+def test_a_silent_detector_brakes_and_ends_the_approach():
+    flight = Flight(ApproachBehaviour("car"), objects=[SeenObject("car", 40.0, 0.0)])
+
+    def each(seconds, vehicle):
+        flight.perception_alive = seconds < 4.0
+
+    outcome = flight.run(60.0, each)
+    assert outcome is not None
+    assert not outcome.success
+    assert "detector" in outcome.reason
+    assert math.hypot(*flight.vehicle.velocity) < 0.1
+
+
+def test_without_any_range_the_vehicle_turns_to_the_object_but_does_not_fly_at_it():
+    car = SeenObject("car", 20.0, 12.0, with_range=False)
+    vehicle = KinematicVehicle()
+    outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(60.0)
+    assert outcome is not None
+    assert not outcome.success
+    assert "range" in outcome.reason
+    assert math.dist(vehicle.position, (0, 0, -5)) < 0.1
+    assert vehicle.yaw_rad == pytest.approx(math.atan2(12.0, 20.0), abs=0.05)
+
+
+def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away():
+    car = SeenObject("car", 20.0, 2.0)
+
+    def each(seconds, vehicle):
+        car.with_range = distance_to(vehicle, car) > 7.0
+
+    vehicle = KinematicVehicle()
+    outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(60.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.5)

@@ -1,0 +1,211 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.guidance.envelope import Envelope, Limits
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import VehicleState
+from vision.rotation import quaternion_from_euler, wrap_angle
+
+LIMITS = Limits()
+NOW = 10**12
+
+
+def vehicle(position=(0.0, 0.0, -10.0), velocity=(0.0, 0.0, 0.0), yaw=0.0, home=(0.0, 0.0, 0.0)):
+    return VehicleState(
+        position_ned_m=position,
+        velocity_ned_mps=velocity,
+        attitude=quaternion_from_euler(0, 0, yaw),
+        home_position_ned_m=home,
+    )
+
+
+def settled(envelope, setpoint, state, seconds=20.0):
+    """What is sent once slew limits have run out."""
+    for _ in range(round(seconds / 0.1)):
+        sent, reasons = envelope.apply(setpoint, state, NOW, 0.1)
+    return sent, reasons
+
+
+speeds = st.floats(-20, 20)
+velocities = st.tuples(speeds, speeds, speeds)
+places = st.tuples(st.floats(-400, 400), st.floats(-400, 400), st.floats(-100, 20))
+states = st.builds(vehicle, places, velocities, st.floats(-3, 3), st.tuples(*[st.floats(-20, 20)] * 3))
+yaw_arguments = st.one_of(
+    st.just({}),
+    st.builds(lambda v: {"yaw_rad": v}, st.floats(-3, 3)),
+    st.builds(lambda v: {"yaw_rate_radps": v}, st.floats(-6, 6)),
+)
+velocity_setpoints = st.builds(lambda v, yaw: Setpoint.velocity(v, NOW, **yaw), velocities, yaw_arguments)
+setpoints = velocity_setpoints | st.builds(
+    lambda p, yaw: Setpoint.position(p, NOW, yaw_rad=yaw), places, st.floats(-3, 3)
+)
+durations = st.floats(0, 0.5)
+
+
+@given(st.lists(st.tuples(velocity_setpoints, states, durations), min_size=1, max_size=6))
+def test_a_velocity_never_leaves_faster_than_it_came_nor_beyond_a_limit(steps):
+    envelope = Envelope(LIMITS)
+    for asked, state, dt_s in steps:
+        sent, _ = envelope.apply(asked, state, NOW, dt_s)
+        north, east, down = sent.velocity_ned_mps
+        asked_north, asked_east, asked_down = asked.velocity_ned_mps
+        assert math.hypot(north, east) <= math.hypot(asked_north, asked_east) + 1e-6
+        assert abs(down) <= abs(asked_down) + 1e-9
+        assert down * asked_down >= 0
+        assert math.hypot(north, east) <= LIMITS.max_horizontal_speed_mps + 1e-6
+        assert -LIMITS.max_climb_mps <= down <= LIMITS.max_descend_mps
+        if sent.yaw_rate_radps is not None:
+            assert abs(sent.yaw_rate_radps) <= LIMITS.max_yaw_rate_radps
+        assert sent.deadline_ns == asked.deadline_ns
+
+
+inside_states = st.builds(
+    vehicle,
+    st.tuples(st.floats(-140, 140), st.floats(-140, 140), st.floats(-49, -1)),
+    velocities,
+    st.floats(-3, 3),
+)
+
+
+# A vehicle outside the fences is led back step by step, so its positions do change from step to step.
+@given(setpoints, inside_states, durations)
+def test_what_was_let_through_passes_again_unchanged(asked, state, dt_s):
+    envelope = Envelope(LIMITS)
+    once, _ = envelope.apply(asked, state, NOW, dt_s)
+    again, _ = envelope.apply(once, state, NOW, dt_s)
+    for name in ("position_ned_m", "velocity_ned_mps"):
+        first, second = getattr(once, name), getattr(again, name)
+        assert (first is None) == (second is None)
+        if first is not None:
+            assert second == pytest.approx(first, abs=1e-6)
+    if once.yaw_rad is not None:
+        assert wrap_angle(again.yaw_rad - once.yaw_rad) == pytest.approx(0.0, abs=1e-6)
+    assert again.yaw_rate_radps == once.yaw_rate_radps
+
+
+@given(
+    st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-1.9, 0.9)),
+    st.tuples(st.floats(-100, 100), st.floats(-100, 100), st.floats(-40, -5)),
+)
+def test_inside_every_limit_the_very_same_setpoint_is_sent(velocity, place):
+    envelope = Envelope(LIMITS)
+    asked = Setpoint.velocity(velocity, NOW, yaw_rate_radps=0.5)
+    sent, reasons = envelope.apply(asked, vehicle(place, velocity), NOW, 0.02)
+    assert sent is asked
+    assert reasons == ()
+
+
+@given(places, states)
+def test_a_position_leaves_inside_the_band_of_altitudes_unless_the_way_there_is_long(place, state):
+    sent, _ = Envelope(LIMITS).apply(Setpoint.position(place, NOW), state, NOW, 0.02)
+    north, east, down = sent.position_ned_m
+    here = state.position_ned_m
+    assert math.dist((north, east), here[:2]) <= LIMITS.max_horizontal_speed_mps + 1e-6
+    assert -LIMITS.max_climb_mps - 1e-6 <= down - here[2] <= LIMITS.max_descend_mps + 1e-6
+
+
+def test_a_position_outside_the_fence_becomes_the_nearest_one_inside():
+    state = vehicle((199.0, 0.0, -49.5))
+    sent, reasons = Envelope(LIMITS).apply(Setpoint.position((300.0, 0.0, -80.0), NOW), state, NOW, 0.02)
+    assert sent.position_ned_m == pytest.approx((200.0, 0.0, -50.0))
+    assert len(reasons) == 2
+
+
+def test_a_velocity_grows_with_no_more_than_the_greatest_acceleration():
+    envelope, state, previous = Envelope(LIMITS), vehicle(), 0.0
+    for _ in range(40):
+        sent, _ = envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05)
+        speed = sent.velocity_ned_mps[0]
+        assert speed - previous <= 2.0 * 0.05 + 1e-9
+        previous = speed
+    assert previous == pytest.approx(4.0)
+    assert envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05).reasons == ()
+
+
+def test_braking_is_never_delayed():
+    envelope = Envelope(LIMITS)
+    settled(envelope, Setpoint.velocity((5.0, 0.0, 1.0), NOW), vehicle())
+    sent, _ = envelope.apply(Setpoint.brake(NOW), vehicle(velocity=(5.0, 0.0, 1.0)), NOW, 0.02)
+    assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
+
+
+def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves():
+    envelope = Envelope(LIMITS)
+    sent, _ = envelope.apply(
+        Setpoint.velocity((4.0, 0.0, 0.0), NOW), vehicle(velocity=(3.0, 0.0, 0.0)), NOW, 0.1
+    )
+    assert sent.velocity_ned_mps[0] == pytest.approx(3.2)
+
+
+@pytest.mark.parametrize(
+    ("asked", "state", "component", "sign"),
+    [
+        ((0.0, 0.0, 1.0), vehicle((0, 0, -1.0)), 2, 1),
+        ((0.0, 0.0, 1.0), vehicle((0, 0, -0.4)), 2, 1),
+        ((0.0, 0.0, -2.0), vehicle((0, 0, -50.0)), 2, -1),
+        ((3.0, 0.0, 0.0), vehicle((200.0, 0, -10)), 0, 1),
+        ((3.0, 0.0, 0.0), vehicle((250.0, 0, -10)), 0, 1),
+    ],
+    ids=["floor", "below the floor", "ceiling", "fence", "beyond the fence"],
+)
+def test_at_a_fence_nothing_goes_further_out(asked, state, component, sign):
+    sent, reasons = settled(Envelope(LIMITS), Setpoint.velocity(asked, NOW), state)
+    assert sent.velocity_ned_mps[component] * sign <= 1e-9
+    assert reasons
+
+
+def test_along_and_back_from_the_fence_the_vehicle_may_fly():
+    state = vehicle((220.0, 0.0, -10.0))
+    back, _ = settled(Envelope(LIMITS), Setpoint.velocity((-3.0, 0.0, 0.0), NOW), state)
+    assert back.velocity_ned_mps == pytest.approx((-3.0, 0.0, 0.0))
+    along, _ = settled(Envelope(LIMITS), Setpoint.velocity((1.0, 3.0, 0.0), NOW), state)
+    assert along.velocity_ned_mps == pytest.approx((0.0, 3.0, 0.0), abs=1e-6)
+
+
+def test_the_fence_is_around_home_not_around_the_origin():
+    state = vehicle((250.0, 0.0, -10.0), home=(200.0, 0.0, 5.0))
+    sent, _ = settled(Envelope(LIMITS), Setpoint.velocity((3.0, 0.0, 0.0), NOW), state)
+    assert sent.velocity_ned_mps[0] == pytest.approx(3.0)
+
+
+def test_a_vehicle_flown_against_the_fence_stops_inside_it():
+    envelope, north, speed = Envelope(LIMITS), 150.0, 0.0
+    for _ in range(2000):
+        state = vehicle((north, 0.0, -10.0), (speed, 0.0, 0.0))
+        sent, _ = envelope.apply(Setpoint.velocity((5.0, 0.0, 0.0), NOW), state, NOW, 0.02)
+        speed += (sent.velocity_ned_mps[0] - speed) * 0.02 / 0.3
+        north += speed * 0.02
+    assert 199.0 < north < 200.3
+
+
+def test_a_wanted_heading_runs_ahead_no_faster_than_the_yaw_rate():
+    envelope, headings = Envelope(LIMITS), []
+    for _ in range(50):
+        asked = Setpoint.velocity((0.0, 0.0, 0.0), NOW, yaw_rad=-3.0)
+        headings.append(envelope.apply(asked, vehicle(yaw=3.0), NOW, 0.02).sent.yaw_rad)
+    steps = [wrap_angle(b - a) for a, b in zip([3.0, *headings], headings, strict=False)]
+    assert all(0 <= step <= 0.02 + 1e-9 for step in steps)
+    assert headings[-1] == pytest.approx(-3.0)
+
+
+def test_without_a_position_a_position_setpoint_becomes_a_brake():
+    sent, reasons = Envelope(LIMITS).apply(Setpoint.position((5, 0, -5), NOW), VehicleState(), NOW, 0.02)
+    assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert reasons == ("position unknown",)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"max_climb_mps": 0.0},
+        {"max_distance_m": math.nan},
+        {"min_altitude_m": 60.0},
+        {"max_yaw_rate_radps": -1},
+    ],
+)
+def test_limits_that_make_no_sense_are_refused_by_name(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        Limits(**arguments)

@@ -1,0 +1,173 @@
+import math
+from dataclasses import fields
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.guidance import grammar
+from companion.guidance.grammar import (
+    COMMANDS,
+    Approach,
+    Command,
+    GrammarError,
+    Hold,
+    Land,
+    Orbit,
+    Rtl,
+    Seek,
+    Stop,
+    Takeoff,
+    describe,
+    parse,
+)
+from companion.guidance.registry import behaviour_for
+
+NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
+
+
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        ("takeoff 5", Takeoff(5.0)),
+        ("takeoff", Takeoff(2.5)),
+        ("takeoff altitude=7.5m", Takeoff(7.5)),
+        ("TAKEOFF 5", Takeoff(5.0)),
+        ("seek car", Seek("car")),
+        ("seek class=car laps=1", Seek("car", laps=1.0)),
+        ("approach person distance=3", Approach("person", distance_m=3.0)),
+        ("orbit radius=10 speed=2", Orbit(radius_m=10.0, speed_mps=2.0)),
+        (
+            "orbit radius=10m speed=2m/s direction=counterclockwise",
+            Orbit("", 10.0, 2.0, 0.0, "counterclockwise"),
+        ),
+        ("orbit car radius=8", Orbit("car", 8.0)),
+        ("hold", Hold()),
+        ("  land \n", Land()),
+        ("rtl", Rtl()),
+        ("stop", Stop()),
+        ('seek "traffic light"', Seek("traffic light")),
+        ("seek traffic_light", Seek("traffic light")),
+        ("seek Traffic-Light", Seek("traffic light")),
+        ("seek traffic light", Seek("traffic light")),
+        ("seek fire hydrant laps=3", Seek("fire_hydrant", laps=3.0)),
+        ('approach class="traffic light"', Approach("traffic light")),
+    ],
+)
+def test_commands_are_read_as_they_are_written(text, command):
+    assert parse(text, NAMES) == command
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["no command", "takeoff"]),
+        ("   ", ["no command"]),
+        ("sek car", ["'sek'", "seek"]),
+        ("fly", ["unknown command 'fly'"]),
+        ("seek", ["class is missing", "seek CLASS"]),
+        ("seek trcuk", ["unknown class 'trcuk'", "truck"]),
+        ("seek zebra", ["unknown class 'zebra'", "person"]),
+        ("approach person distance=0", ["distance", "1 to 100 m", "0"]),
+        ("approach person distance=near", ["distance", "1 to 100 m", "'near'"]),
+        ("approach person distance=nan", ["distance", "nan"]),
+        ("approach person distnce=3", ["unknown argument 'distnce'", "distance"]),
+        ("takeoff 500", ["altitude", "1 to 50 m", "500"]),
+        ("takeoff 5 6", ["'6'", "too much"]),
+        ("takeoff 5 altitude=6", ["altitude", "twice"]),
+        ("land now=1", ["unknown argument 'now'", "it takes none"]),
+        ("land now", ["'now'", "too much"]),
+        ('seek "car', ["quote"]),
+        ("orbit direction=left", ["direction", "clockwise", "'left'"]),
+        ("orbit radius=1 speed=5", ["speed", "1.41 m/s", "5"]),
+        ("takeoff=5", ["unknown command 'takeoff=5'"]),
+    ],
+)
+def test_errors_are_one_line_that_says_what_would_be_right(text, parts):
+    with pytest.raises(GrammarError) as caught:
+        parse(text, NAMES)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_without_class_names_any_name_is_taken():
+    assert parse("seek dragon") == Seek("dragon")
+
+
+def test_a_command_made_in_code_is_held_to_the_same_ranges():
+    with pytest.raises(GrammarError, match="altitude"):
+        Takeoff(0.1)
+    with pytest.raises(GrammarError, match="class"):
+        Seek("")
+    with pytest.raises(GrammarError, match="laps"):
+        Seek("car", laps=math.nan)
+
+
+def test_the_help_names_every_command_and_every_argument_with_its_range():
+    text = describe()
+    for kind in COMMANDS.values():
+        assert kind.word in text
+    assert "distance: where to stop, to its surface (1 to 100 m)" in text
+    assert "takeoff [altitude=2.5]" in text
+
+
+def number(low, high):
+    return st.floats(low, high, allow_nan=False)
+
+
+class_names = st.text(st.characters(min_codepoint=32, max_codepoint=0x24F), min_size=1, max_size=20).filter(
+    lambda name: name.strip() and name.isprintable()
+)
+directions = st.sampled_from(["clockwise", "counterclockwise"])
+orbits = st.tuples(number(1, 100), number(0.1, 1.0)).flatmap(
+    lambda pair: st.builds(
+        Orbit,
+        st.just("") | class_names,
+        st.just(pair[0]),
+        st.just(min(10.0, max(0.1, pair[1] * math.sqrt(2.0 * pair[0]) * 0.999))),
+        number(0, 100),
+        directions,
+    )
+)
+commands = st.one_of(
+    st.builds(Takeoff, number(1, 50)),
+    st.builds(Land),
+    st.builds(Rtl),
+    st.builds(Stop),
+    st.builds(Hold, number(0, 3600)),
+    orbits,
+    st.builds(Seek, class_names, number(0.25, 20), number(0.05, 1), number(0.05, 1), directions),
+    st.builds(Approach, class_names, number(1, 100), number(0.2, 10), number(0.05, 1), number(0.5, 60)),
+)
+
+
+@given(commands)
+def test_what_is_written_is_read_back(command: Command):
+    assert parse(str(command)) == command
+
+
+@given(commands)
+def test_every_command_has_a_behaviour_of_its_name(command: Command):
+    behaviour = behaviour_for(command)
+    assert behaviour.name == command.word
+    name = getattr(command, "class_name", "")
+    assert behaviour.class_names == ((name,) if name else ())
+
+
+@given(st.text(max_size=60))
+def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text):
+    try:
+        command = parse(text, NAMES)
+    except GrammarError as error:
+        said = str(error)
+    else:
+        said = str(command)
+    assert said
+    assert "\n" not in said
+
+
+def test_every_field_of_every_command_has_its_place_in_the_grammar():
+    for kind in COMMANDS.values():
+        assert len(grammar._arguments(kind)) == len(fields(kind))

@@ -1,0 +1,99 @@
+import itertools
+import math
+
+import pytest
+from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+
+from companion.guidance.behaviour import Situation
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.orbit import OrbitBehaviour
+from companion.vehicle.setpoint import Setpoint
+from vision.rotation import wrap_angle
+
+
+def test_hold_keeps_the_place_and_heading_it_began_with():
+    vehicle = KinematicVehicle(position=[3.0, -2.0, -6.0], yaw_rad=1.2)
+    flight = Flight(HoldBehaviour(), vehicle)
+    assert flight.run(5.0) is None
+    assert math.dist(vehicle.position, (3.0, -2.0, -6.0)) < 0.01
+    first = flight.steps[0]
+    assert isinstance(first, Setpoint)
+    assert first.position_ned_m == (3.0, -2.0, -6.0)
+    assert first.yaw_rad == pytest.approx(1.2)
+
+
+def test_hold_brakes_first_and_does_not_fly_back_to_where_it_began():
+    vehicle = KinematicVehicle(velocity=[4.0, 0.0, 0.0])
+    flight = Flight(HoldBehaviour(), vehicle)
+    flight.run(8.0)
+    furthest = max(place[0] for place in flight.track)
+    assert vehicle.position[0] > 0.5
+    assert furthest - vehicle.position[0] < 0.15
+    assert math.hypot(*vehicle.velocity) < 0.05
+
+
+def test_hold_with_a_duration_ends_by_itself():
+    outcome = Flight(HoldBehaviour(duration_s=2.0)).run(3.0)
+    assert outcome is not None
+    assert outcome.success
+    assert "2 s" in outcome.reason
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+def test_orbit_flies_its_laps_at_its_radius_with_the_nose_to_the_centre(clockwise):
+    vehicle = KinematicVehicle(yaw_rad=math.pi / 2)
+    centre = (0.0, 10.0)
+    seen = []
+
+    def each(seconds, vehicle):
+        north, east = vehicle.position[0] - centre[0], vehicle.position[1] - centre[1]
+        if seconds > 8.0:
+            to_centre = math.atan2(-east, -north)
+            seen.append(
+                (
+                    math.hypot(north, east),
+                    math.hypot(*vehicle.velocity),
+                    abs(wrap_angle(to_centre - vehicle.yaw_rad)),
+                    wrap_angle(math.atan2(east, north)),
+                    vehicle.position[2],
+                )
+            )
+
+    outcome = Flight(OrbitBehaviour(10.0, 2.0, laps=2.0, clockwise=clockwise), vehicle).run(120.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert all(abs(distance - 10.0) < 0.5 for distance, *_ in seen)
+    assert all(abs(speed - 2.0) < 0.2 for _, speed, *_ in seen)
+    assert all(off < math.radians(12) for _, _, off, *_ in seen)
+    assert all(abs(down + 5.0) < 0.1 for *_, down in seen)
+    turned = sum(wrap_angle(b[3] - a[3]) for a, b in itertools.pairwise(seen))
+    assert (turned > 0) is clockwise
+
+
+def test_orbit_about_an_object_comes_onto_the_circle_from_afar():
+    car = SeenObject("car", 30.0, 4.0)
+    vehicle = KinematicVehicle()
+    flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, class_name="car"), vehicle, [car])
+    # The behaviour begins when the camera has delivered, as the pilot's requirement has it.
+    flight.latency_s = 0.0
+    outcome = flight.run(90.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert math.dist(vehicle.position[:2], (30.0, 4.0)) == pytest.approx(8.0, abs=0.6)
+
+
+def test_orbit_about_an_object_that_is_not_in_sight_ends_with_the_reason():
+    outcome = Flight(OrbitBehaviour(class_name="boat")).run(5.0)
+    assert outcome is not None
+    assert not outcome.success
+    assert "boat" in outcome.reason
+
+
+def test_an_orbit_pushed_into_its_centre_still_gives_finite_setpoints():
+    behaviour = OrbitBehaviour(5.0, 1.0)
+    vehicle = KinematicVehicle()
+    flight = Flight(behaviour, vehicle)
+    flight.run(0.1)
+    vehicle.position[:2] = [5.0, 0.0]
+    step = behaviour.update(0.02, Situation(vehicle.now_ns, vehicle.state))
+    assert isinstance(step, Setpoint)

@@ -1,0 +1,205 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from companion.guidance.target import RangeSource
+from companion.guidance.targets import HistoryError, StateHistory, slerp, targets_from_detections
+from companion.vehicle.state import VehicleState
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import euler_from_quaternion, matrix_from_quaternion, quaternion_from_euler, wrap_angle
+
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80))
+DISTORTED = replace(CAMERA, distortion=(-0.12, 0.03, 0.001, -0.001, 0.0))
+MOUNT = CameraMount(forward_m=0.1, down_m=0.05, pitch_rad=math.radians(-20))
+T0 = 5_000_000_000
+
+
+def state_at(stamp_ns, attitude, position=(0.0, 0.0, -8.0), home=(0.0, 0.0, 0.0)):
+    return VehicleState(
+        attitude_ns=stamp_ns,
+        position_ns=stamp_ns,
+        attitude=attitude,
+        position_ned_m=position,
+        home_position_ned_m=home,
+    )
+
+
+def history_of(attitude, position=(0.0, 0.0, -8.0), home=(0.0, 0.0, 0.0)):
+    history = StateHistory()
+    for step in range(10):
+        history.add(state_at(T0 + step * 20_000_000, attitude, position, home))
+    return history
+
+
+def detection(xyxy, range_m=None, name="car"):
+    left, top, right, bottom = xyxy
+    return {
+        "class_id": 2,
+        "class_name": name,
+        "confidence": 0.8,
+        "xyxy": list(xyxy),
+        "center": [(left + right) / 2, (top + bottom) / 2],
+        "range_m": range_m,
+    }
+
+
+def optical_point(camera, mount, attitude, position, point):
+    body = matrix_from_quaternion(attitude).T @ (np.array(point) - position) - mount.position_frd_m
+    return mount.body_from_optical.T @ body
+
+
+angles = st.floats(-0.5, 0.5)
+scenes = st.tuples(
+    angles,
+    angles,
+    st.floats(-math.pi, math.pi),
+    st.floats(2.0, 40.0),  # distance
+    st.floats(-0.6, 0.6),  # bearing off the nose
+    st.floats(3.0, 15.0),  # height
+    st.tuples(st.floats(-100, 100), st.floats(-100, 100)),
+)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
+@given(scene=scenes)
+def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, scene):
+    roll, pitch, yaw, distance, off, height, (north, east) = scene
+    attitude = quaternion_from_euler(roll, pitch, yaw)
+    home_down = 1.5
+    position = (north, east, home_down - height)
+    bearing = yaw + off
+    point = (north + distance * math.cos(bearing), east + distance * math.sin(bearing), home_down)
+    optical = optical_point(camera, MOUNT, attitude, position, point)
+    assume(optical[2] > 0.5)
+    x, y = camera.project(optical)[0]
+    assume(20 < x < 620 and 40 < y < 470)
+    assume(math.atan2(height, distance) > math.radians(4))
+    history = history_of(attitude, position, (0.0, 0.0, home_down))
+    box = (x - 10, y - 30, x + 10, y)
+    (target,) = targets_from_detections([detection(box)], T0 + 50_000_000, camera, MOUNT, history)
+    assert target.range_source is RangeSource.GROUND_PLANE
+    assert target.position_ned_m == pytest.approx(point, abs=0.02 * distance)
+    assert target.range_m == pytest.approx(distance, rel=0.02)
+
+
+@given(scene=scenes, down=st.floats(-4.0, 4.0))
+def test_a_point_in_space_is_found_again_from_its_depth(scene, down):
+    roll, pitch, yaw, distance, off, height, (north, east) = scene
+    attitude = quaternion_from_euler(roll, pitch, yaw)
+    position = (north, east, -height)
+    bearing = yaw + off
+    point = (north + distance * math.cos(bearing), east + distance * math.sin(bearing), -height + down)
+    optical = optical_point(CAMERA, MOUNT, attitude, position, point)
+    assume(optical[2] > 0.5)
+    x, y = CAMERA.project(optical)[0]
+    assume(0 < x < 640 and 0 < y < 480)
+    box = (x - 12, y - 7, x + 12, y + 7)
+    (target,) = targets_from_detections(
+        [detection(box, float(optical[2]))], T0, CAMERA, MOUNT, history_of(attitude, position)
+    )
+    assert target.range_source is RangeSource.DEPTH
+    assert target.position_ned_m == pytest.approx(point, abs=1e-6)
+    assert target.range_m == pytest.approx(distance, abs=1e-6)
+    # The bearing is that of the camera's ray; the camera sits a little before the vehicle's origin.
+    assert abs(wrap_angle(target.bearing_rad - bearing)) < 0.2 / (distance - 0.2)
+
+
+def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range():
+    history = history_of(quaternion_from_euler(0, 0, 0.7))
+    (target,) = targets_from_detections([detection((300, 300, 339, 479))], T0, CAMERA, MOUNT, history)
+    assert target.range_source is RangeSource.NONE
+    assert target.position_ned_m is None
+    assert math.isnan(target.range_m)
+    assert target.bearing_rad == pytest.approx(0.7, abs=0.01)
+    assert target.elevation_rad < 0
+
+
+def test_a_foot_near_the_horizon_has_no_range():
+    level = CameraMount()
+    (target,) = targets_from_detections(
+        [detection((310, 230, 330, 245))], T0, CAMERA, level, history_of(quaternion_from_euler(0, 0, 0))
+    )
+    assert target.range_source is RangeSource.NONE
+
+
+def test_on_the_ground_there_is_no_ground_plane_range():
+    history = history_of(quaternion_from_euler(0, 0, 0), (0.0, 0.0, -0.1))
+    (target,) = targets_from_detections([detection((310, 300, 330, 400))], T0, CAMERA, MOUNT, history)
+    assert target.range_source is RangeSource.NONE
+
+
+def test_a_depth_that_is_no_number_falls_back_to_the_ground():
+    history = history_of(quaternion_from_euler(0, 0, 0))
+    (target,) = targets_from_detections(
+        [detection((310, 300, 330, 400), math.nan)], T0, CAMERA, MOUNT, history
+    )
+    assert target.range_source is RangeSource.GROUND_PLANE
+
+
+def test_the_attitude_is_that_of_the_capture_not_of_now():
+    history = StateHistory()
+    for step in range(20):
+        yaw = 0.05 * step
+        history.add(state_at(T0 + step * 50_000_000, quaternion_from_euler(0, 0, yaw)))
+    captured_ns = T0 + 425_000_000  # half way between two samples
+    (target,) = targets_from_detections(
+        [detection((309.5, 200, 329.5, 300))], captured_ns, CAMERA, MOUNT, history
+    )
+    assert target.bearing_rad == pytest.approx(0.425, abs=1e-6)
+
+
+def test_position_and_height_are_interpolated_at_their_own_stamps():
+    history = StateHistory()
+    attitude = quaternion_from_euler(0, 0, 0)
+    for step in range(5):
+        state = state_at(T0 + step * 40_000_000, attitude, (float(step), 0.0, -float(step)))
+        history.add(replace(state, attitude_ns=T0 + step * 35_000_000))
+    pose = history.at(T0 + 60_000_000)
+    assert pose.position_ned_m == pytest.approx((1.5, 0.0, -1.5))
+    assert pose.height_m == pytest.approx(1.5)
+
+
+def test_moments_outside_the_history_are_refused_by_how_much():
+    history = history_of(quaternion_from_euler(0, 0, 0))
+    history.at(T0 - 190_000_000)
+    history.at(T0 + 180_000_000 + 190_000_000)
+    with pytest.raises(HistoryError, match=r"0\.30 s older"):
+        history.at(T0 - 300_000_000)
+    with pytest.raises(HistoryError, match=r"0\.32 s newer"):
+        history.at(T0 + 500_000_000)
+    with pytest.raises(HistoryError, match="known yet"):
+        StateHistory().at(T0)
+
+
+def test_the_history_is_bounded_and_passes_over_old_stamps():
+    history = StateHistory(duration_s=1.0)
+    for step in range(1000):
+        history.add(state_at(T0 + step * 20_000_000, quaternion_from_euler(0, 0, 0)))
+        history.add(state_at(T0, quaternion_from_euler(0, 0, 1)))
+    assert len(history._attitudes) <= 51
+    assert len(history._positions) <= 51
+
+
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.01)
+
+
+@given(quaternions, quaternions, st.floats(0, 1))
+def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction):
+    def angle(a, b):
+        a, b = (np.array(q) / np.linalg.norm(q) for q in (a, b))
+        return 2 * math.acos(min(1.0, abs(float(a @ b))))
+
+    middle = slerp(first, second, fraction)
+    assert math.isclose(sum(v * v for v in middle), 1.0, rel_tol=1e-9)
+    whole = angle(first, second)
+    assert angle(first, middle) == pytest.approx(whole * fraction, abs=2e-3)
+    assert angle(middle, second) == pytest.approx(whole * (1 - fraction), abs=2e-3)
+
+
+def test_slerp_takes_the_sign_of_quaternions_for_nothing():
+    half = slerp(quaternion_from_euler(0, 0, 0.4), tuple(-v for v in quaternion_from_euler(0, 0, 0.8)), 0.5)
+    assert euler_from_quaternion(half)[2] == pytest.approx(0.6)
