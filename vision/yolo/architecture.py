@@ -30,6 +30,7 @@ __all__ = [
 STRIDES = (8, 16, 32)
 _IMAGE = -1
 _LARGEST_CHANNELS = 1 << 14
+_MOST_REPEATS = 64
 
 
 class YoloModel(nn.Module):
@@ -175,7 +176,12 @@ def _scaled_channels(count: int, description: ModelDescription) -> int:
 
 
 def _scaled_repeats(row: LayerRow, description: ModelDescription) -> int:
-    return row.repeats if row.repeats == 1 else max(1, round(row.repeats * description.depth_multiple))
+    if row.repeats == 1:
+        return 1
+    repeats = max(1, round(row.repeats * description.depth_multiple))
+    if repeats > _MOST_REPEATS:
+        raise ArchitectureError(f"would repeat {repeats} times, at most {_MOST_REPEATS} make sense")
+    return repeats
 
 
 def _single(inputs: tuple[int, ...], row: LayerRow) -> int:

@@ -19,8 +19,8 @@ YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
     "l": (1.0, 1.00, 512),
     "x": (1.0, 1.25, 512),
 }
-_LARGEST_REPEATS = 256
-_LARGEST_ROWS = 512
+_LARGEST_REPEATS = 64
+_LARGEST_ROWS = 128
 
 
 class ArchitectureError(ValueError):

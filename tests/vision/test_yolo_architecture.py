@@ -1,0 +1,203 @@
+"""The network as its description tells it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+import torch
+
+from vision.yolo.architecture import (
+    ArchitectureError,
+    LayerRow,
+    ModelDescription,
+    anchor_points,
+    build,
+    decode_boxes,
+    yolov8_description,
+)
+
+COCO_SIZED = [f"class {index}" for index in range(80)]
+SMALL = (0.1, 0.01, 64)
+
+
+def small_table(**changes: Any) -> dict[str, Any]:
+    return yolov8_description(SMALL, ("car", "dog")).to_plain() | changes
+
+
+@pytest.mark.parametrize(
+    ("scale", "count"),
+    [("n", 3_157_200), ("s", 11_166_560), ("m", 25_902_640), ("l", 43_691_520), ("x", 68_229_648)],
+)
+def test_each_scale_has_the_published_number_of_parameters(scale: str, count: int) -> None:
+    with torch.device("meta"):
+        model = build(yolov8_description(scale, COCO_SIZED))
+    assert sum(parameter.numel() for parameter in model.parameters()) == count
+
+
+def test_the_parameters_bear_the_names_of_checkpoints_in_circulation() -> None:
+    with torch.device("meta"):
+        names = set(build(yolov8_description("n", COCO_SIZED)).state_dict())
+    assert {
+        "model.0.conv.weight",
+        "model.0.bn.running_var",
+        "model.2.cv1.conv.weight",
+        "model.2.m.0.cv1.conv.weight",
+        "model.9.cv2.bn.bias",
+        "model.22.cv2.0.0.conv.weight",
+        "model.22.cv3.2.2.bias",
+        "model.22.dfl.conv.weight",
+    } <= names
+
+
+def test_the_maps_have_one_size_per_stride() -> None:
+    model = build(yolov8_description(SMALL, ("car", "dog", "boat"))).eval()
+    with torch.inference_mode():
+        maps = model(torch.rand(2, 3, 96, 160))
+        decoded = model.decode(maps)
+    assert [tuple(level.shape) for level in maps] == [(2, 67, 12, 20), (2, 67, 6, 10), (2, 67, 3, 5)]
+    assert decoded.shape == (2, 12 * 20 + 6 * 10 + 3 * 5, 4 + 3)
+    assert bool(((decoded[..., 4:] >= 0) & (decoded[..., 4:] <= 1)).all())
+
+
+def test_training_reaches_every_parameter_but_the_bins() -> None:
+    model = build(yolov8_description(SMALL, ("car", "dog")))
+    sum(level.square().sum() for level in model(torch.rand(2, 3, 64, 64))).backward()
+    without = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert without == ["model.22.dfl.conv.weight"]
+
+
+def test_a_whole_network_with_folded_normalisation_gives_the_same_maps() -> None:
+    torch.manual_seed(2)
+    model = build(yolov8_description(SMALL, ("car", "dog")))
+    for _ in range(3):
+        model(torch.rand(4, 3, 64, 64))  # Gives the normalisations statistics of their own.
+    model.eval()
+    x = torch.rand(1, 3, 64, 96)
+    with torch.inference_mode():
+        before = model(x)
+        after = model.fuse()(x)
+    for a, b in zip(before, after, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+
+
+def test_cells_are_numbered_row_by_row_and_level_by_level() -> None:
+    centres, strides = anchor_points([torch.zeros(1, 1, 2, 3), torch.zeros(1, 1, 1, 1)], (8, 16))
+    assert centres.tolist() == [
+        [0.5, 0.5],
+        [1.5, 0.5],
+        [2.5, 0.5],
+        [0.5, 1.5],
+        [1.5, 1.5],
+        [2.5, 1.5],
+        [0.5, 0.5],
+    ]
+    assert strides.flatten().tolist() == [8] * 6 + [16]
+
+
+def test_distances_from_a_cell_become_a_box_in_pixels() -> None:
+    box = decode_boxes(
+        torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([[5.5, 6.5]]), torch.tensor([[8.0]])
+    )
+    assert box.tolist() == [[4.5 * 8, 4.5 * 8, 8.5 * 8, 10.5 * 8]]
+
+
+def test_a_description_survives_being_written_and_read() -> None:
+    description = dataclasses.replace(
+        yolov8_description("m", ("a", "b")), activation="ReLU", reg_max=8, unscaled_channels=(64,)
+    )
+    assert ModelDescription.from_plain(description.to_plain()) == description
+
+
+def test_the_table_of_scales_and_the_letter_choose_the_multiples() -> None:
+    table = small_table(scales={"n": [0.33, 0.25, 1024], "x": [1.0, 1.25, 512]}, scale="x")
+    description = ModelDescription.from_plain(table)
+    assert (description.depth_multiple, description.width_multiple) == (1.0, 1.25)
+    assert description.max_channels == 512
+    del table["scale"]
+    assert ModelDescription.from_plain(table).width_multiple == 0.25
+
+
+def test_a_channel_count_that_is_declared_unscaled_stays() -> None:
+    description = dataclasses.replace(yolov8_description("n", ("a",)), unscaled_channels=(64,))
+    with torch.device("meta"):
+        model = build(description)
+    assert model.state_dict()["model.0.conv.weight"].shape[0] == 64
+    assert model.state_dict()["model.1.conv.weight"].shape[:2] == (32, 64)
+
+
+@pytest.mark.parametrize(
+    ("position", "row", "expected"),
+    [
+        pytest.param(3, [-1, 1, "Quantum", [64]], r"row 3: unknown layer 'Quantum'; known are", id="layer"),
+        pytest.param(2, [-1, 1, "C2f", ["wide"]], r"row 2 \(C2f\): channels .* got 'wide'", id="channels"),
+        pytest.param(2, [-1, 1, "C2f", [64, 3]], r"row 2 \(C2f\): the shortcut", id="shortcut"),
+        pytest.param(2, [-1, 64, "C2f", [64]], r"", id="many repeats are cut by the depth multiple"),
+        pytest.param(2, [-1, 10**9, "C2f", [64]], r"row 2: repeats must be", id="endless repeats"),
+        pytest.param(1, [7, 1, "Conv", [64, 3, 2]], r"row 1 \(Conv\) reads \(7,\)", id="reads ahead"),
+        pytest.param(1, ["x", 1, "Conv", [64]], r"row 1: 'from' must be", id="from"),
+        pytest.param(1, [-1, 1, "Conv"], r"row 1 must be", id="short row"),
+        pytest.param(1, [-1, 1, "Conv", [64, 2, 2]], r"row 1 \(Conv\): the kernel must be odd", id="even"),
+        pytest.param(
+            1, [-1, 1, "Conv", [64, 3, 1]], r"different sizes|must read maps", id="no longer halves"
+        ),
+        pytest.param(1, [-1, 1, "Detect", ["nc"]], r"row 1 is 'Detect': the last row", id="early head"),
+        pytest.param(9, [-1, 1, "SPPF", [64, 5, 1, 1]], r"row 9 \(SPPF\): takes at most 2", id="arguments"),
+    ],
+)
+def test_a_row_that_cannot_be_built_is_named(position: int, row: list[Any], expected: str) -> None:
+    table = small_table()
+    table["backbone"][position] = row
+    with torch.device("meta"):
+        if not expected:
+            build(ModelDescription.from_plain(table))
+            return
+        with pytest.raises(ArchitectureError, match=expected):
+            build(ModelDescription.from_plain(table))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"names": []},
+        {"names": "car"},
+        {"names": [1, 2]},
+        {"depth_multiple": 0.0},
+        {"width_multiple": "wide"},
+        {"width_multiple": float("nan")},
+        {"max_channels": -1},
+        {"channels": 10**9},
+        {"activation": "os.system"},
+        {"backbone": None},
+        {"head": "rows"},
+        {"backbone": [], "head": []},
+        {"scales": {"n": [1, 2]}},
+        {"scales": {"n": [0.3, 0.3, 64]}, "scale": "q"},
+        {"scales": 3},
+        {"end2end": True},
+        {"unscaled_channels": 3},
+        {"unscaled_channels": ["x"]},
+    ],
+    ids=str,
+)
+def test_a_senseless_table_is_refused_by_name(changes: dict[str, Any]) -> None:
+    with torch.device("meta"), pytest.raises(ArchitectureError):
+        build(ModelDescription.from_plain(small_table(**changes)))
+
+
+def test_an_unknown_scale_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ArchitectureError, match="unknown scale 'q'; known are n, s, m, l, x"):
+        yolov8_description("q", ("a",))
+
+
+def test_a_head_must_come_last() -> None:
+    description = yolov8_description(SMALL, ("a",))
+    cut = dataclasses.replace(description, head=description.head[:-1])
+    with torch.device("meta"), pytest.raises(ArchitectureError, match=r"row 21 is 'C2f': the last row"):
+        build(cut)
+
+
+def test_a_single_source_is_written_as_a_number() -> None:
+    assert LayerRow((-1,), 1, "Conv", (8,)).to_plain() == [-1, 1, "Conv", [8]]
+    assert LayerRow((-1, 6), 1, "Concat", (1,)).to_plain() == [[-1, 6], 1, "Concat", [1]]
