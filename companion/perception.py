@@ -12,13 +12,14 @@ import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.perception_messages import (
     Ended,
     Heartbeat,
+    Hud,
     LogLine,
     Message,
     ProtocolError,
@@ -95,7 +96,7 @@ class PerceptionKeeper:
         self._pulse: Pulse | None = None
         self._input: StandardInput | None = None
         self._ready: Ready | None = None
-        self._lines: tuple[str, ...] = ()
+        self._hud = Hud((), None)
         self._problem = ""
         self._restarts = 0
         self._deaths_s: deque[float] = deque()
@@ -149,11 +150,16 @@ class PerceptionKeeper:
             self._input.close()
         self._state = PerceptionState.STOPPED
 
-    def send_hud(self, lines: tuple[str, ...]) -> None:
-        """Lines to draw on the recorded video from now on."""
-        self._lines = lines
+    def send_hud(self, lines: Sequence[str], highlight: str | None = None) -> None:
+        """What to draw on the recorded video from now on.
+
+        Args:
+            lines: text for the panel.
+            highlight: the class whose surest detection is the one that matters now.
+        """
+        self._hud = Hud(tuple(lines), highlight)
         if self._process is not None and self._settings.recording.video is not None:
-            self._process.show(lines)
+            self._process.show(self._hud)
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -339,8 +345,7 @@ class PerceptionKeeper:
     def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
         self._ready = ready
         self._state = PerceptionState.RUNNING
-        if self._lines:
-            self.send_hud(self._lines)
+        self.send_hud(self._hud.lines, self._hud.highlight)
         if self._lost_s is not None:
             self._on_event("info", f"perception is back after {time.monotonic() - self._lost_s:.1f} s")
             self._lost_s = None

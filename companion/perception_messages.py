@@ -34,9 +34,10 @@ class Begin:
 
 @dataclass(frozen=True, slots=True)
 class Hud:
-    """Lines for the recorded video's next frames."""
+    """Lines for the recorded video's next frames, and the class to highlight in them."""
 
     lines: tuple[str, ...]
+    highlight: str | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,10 +76,10 @@ class PerceptionProcess:
         """The next message; None when the worker has closed its end, which it does by dying too."""
         return await read_message(self._reader)
 
-    def show(self, lines: tuple[str, ...]) -> None:
-        """Lines for the recorded video. Left out while the worker takes no orders."""
+    def show(self, hud: Hud) -> None:
+        """Tell what to draw on the recorded video. Left out while the worker takes no orders."""
         if self._writer.transport.get_write_buffer_size() < _UNREAD_BYTES:
-            self._put(Hud(lines))
+            self._put(hud)
 
     def ask_to_stop(self) -> None:
         self._put(Stop())

@@ -17,7 +17,6 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from companion.perception_messages import (
@@ -33,8 +32,10 @@ from companion.perception_messages import (
 )
 from companion.perception_outbox import Outbox, OutboxHandler
 from companion.settings import Settings
-from vision.pipeline import PerceptionResult, Pipeline, Recording
+from vision.pipeline import PerceptionResult, Pipeline
+from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
+from vision.video_writer import VideoWriterError
 
 if TYPE_CHECKING:
     from vision.detector import Detector
@@ -54,12 +55,12 @@ class Orders:
 
     Attributes:
         stop: end now.
-        lines: for the recorded video's next frames.
+        hud: for the recorded video's next frames.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self.stop = threading.Event()
-        self.lines: tuple[str, ...] = ()
+        self.hud = Hud((), None)
         self._connection = connection
         self._finished = threading.Event()
         threading.Thread(target=self._take, name="inbox", daemon=True).start()
@@ -71,7 +72,7 @@ class Orders:
     def _take(self) -> None:
         while (message := receive(self._connection)) is not None:
             if isinstance(message, Hud):
-                self.lines = message.lines
+                self.hud = message
             elif isinstance(message, Stop):
                 self.stop.set()
         # The service is gone. Whoever is stuck in a driver by then will not come back from there.
@@ -126,7 +127,12 @@ def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFa
     with contextlib.ExitStack() as stack:
         try:
             perception = _open(settings, stack)
-        except (SourceError, ValueError, OSError) as error:  # CheckpointError is a ValueError
+        except (
+            SourceError,
+            VideoWriterError,
+            ValueError,
+            OSError,
+        ) as error:  # CheckpointError is a ValueError
             return StartFailed(_one_line(error))
         except Exception as error:  # a fault of ours: where it happened goes to standard error
             traceback.print_exc()
@@ -136,7 +142,7 @@ def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFa
             perception.source,
             perception.detector,
             every=settings.detector.every,
-            recording=perception.recording,
+            recorder=perception.recording,
         )
         try:
             _run(pipeline, perception, orders, outbox)
@@ -154,11 +160,12 @@ def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFa
 def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
     recording = None
     if settings.recording.video is not None:
-        recording = Recording(Path(settings.recording.video), settings.recording.rate_hz)
+        recording = Recording(settings.recording.video, settings.recording.rate_hz)
+        stack.callback(recording.close)
     detector = _load(settings) if settings.detector.enabled else None
     source = stack.enter_context(open_source(settings.source.uri, settings.source.opening()))
     if recording is not None:
-        # Closed before the source, which may take its time in a driver.
+        # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)
     return Perception(source, detector, recording)
 
@@ -196,7 +203,8 @@ def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Out
 
     while not orders.stop.is_set():
         if perception.recording is not None:
-            perception.recording.lines = orders.lines
+            perception.recording.lines = orders.hud.lines
+            perception.recording.highlight = orders.hud.highlight
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - said_s >= HEARTBEAT_S:
             outbox.put_newest(Heartbeat(pipeline.frames, perception.source.statistics))

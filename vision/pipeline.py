@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,11 +14,6 @@ from vision.depth import range_of_boxes
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.sources import Source
-
-if TYPE_CHECKING:
-    from vision.video_writer import VideoWriter
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +26,7 @@ class PerceptionResult:
         inferred_ns: of the moment when the detections were known.
         width, height: the frame's size, pixels.
         detections: in the frame's pixels, with ranges where the frame has depth.
-        timing_ms: stage → milliseconds: `preprocess`, `inference`, `postprocess`, `range`, `total` of this
-            frame, and `record` of the frame before (this one is drawn after the result has left).
+        timing_ms: stage → milliseconds: `preprocess`, `inference`, `postprocess`, `range`, and `total`.
         dropped: frames lost so far, between the source and here; those left out on purpose do not count.
     """
 
@@ -70,53 +61,10 @@ class FrameDetector(Protocol):
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections: ...
 
 
-class Recording:
-    """The annotated video: every frame, the newest detections drawn on it, and lines told from outside.
+class FrameRecorder(Protocol):
+    """What keeps the frames; `vision.recording.Recording` does."""
 
-    A recording that fails (a full disk) says so once and ends; perception goes on.
-
-    Attributes:
-        lines: text to draw on the next frames.
-        highlight: index of the detection to draw as the chosen one, or None.
-    """
-
-    def __init__(self, path: Path, rate_hz: float) -> None:
-        """Raises OSError if the file cannot be made there."""
-        self.lines: tuple[str, ...] = ()
-        self._path = path
-        self._rate_hz = rate_hz
-        self._writer: VideoWriter | None = None
-        self._size = (0, 0)
-        self._ended = False
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"cannot record to {path}: the folder {path.parent} does not exist")
-
-    def write(self, frame: Frame, detections: Detections) -> None:
-        """Draw and add one frame."""
-        if self._ended:
-            return
-        # Only here: the service shares this module for its values, and draws nothing.
-        from vision.annotate import annotate
-        from vision.video_writer import VideoWriter
-
-        drawn = annotate(frame.image, detections, lines=self.lines)
-        try:
-            if self._writer is None:
-                self._size = (frame.width, frame.height)
-                self._writer = VideoWriter(self._path, frame.width, frame.height, self._rate_hz)
-            if (frame.width, frame.height) != self._size:
-                drawn = cv2.resize(drawn, self._size).astype(np.uint8, copy=False)
-            self._writer.write(drawn, frame.captured_ns)
-        except OSError as error:
-            self._ended = True
-            logger.error("the recording to %s has ended: %s", self._path, error)
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._ended = True
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+    def write(self, frame: Frame, detections: Detections, /) -> None: ...
 
 
 class Pipeline:
@@ -133,24 +81,23 @@ class Pipeline:
         detector: FrameDetector | None,
         *,
         every: int = 1,
-        recording: Recording | None = None,
+        recorder: FrameRecorder | None = None,
     ) -> None:
         """
         Args:
             source: open; the caller closes it.
             detector: None: nothing is looked for, and every result is empty.
             every: look at every N-th frame that was read. The others are only recorded.
-            recording: the caller closes it.
+            recorder: is given every frame with the newest detections, after the result has left.
         """
         if every < 1:
             raise ValueError(f"every must be at least 1, got {every}")
         self._source = source
         self._detector = detector
         self._every = every
-        self._recording = recording
+        self._recorder = recorder
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
-        self._record_ms = 0.0
         self.frames = 0
         self.dropped = 0
 
@@ -174,10 +121,8 @@ class Pipeline:
             result = self._look(frame)
             self._newest = result.detections
             deliver(result)
-        if self._recording is not None:
-            started_ns = time.perf_counter_ns()
-            self._recording.write(frame, self._newest)
-            self._record_ms = (time.perf_counter_ns() - started_ns) / 1e6
+        if self._recorder is not None:
+            self._recorder.write(frame, self._newest)
         return True
 
     def _look(self, frame: Frame) -> PerceptionResult:
@@ -198,7 +143,6 @@ class Pipeline:
         done_ns = time.perf_counter_ns()
         timing_ms["range"] = (done_ns - detected_ns) / 1e6
         timing_ms["total"] = (done_ns - started_ns) / 1e6
-        timing_ms["record"] = self._record_ms
         return PerceptionResult(
             sequence=frame.sequence,
             captured_ns=frame.captured_ns,

@@ -20,6 +20,7 @@ import pytest
 from companion.config import Settings, load_settings
 from companion.perception import PerceptionKeeper, PerceptionStartError, PerceptionState
 from vision.pipeline import PerceptionResult
+from vision.sources import SourceSettings, open_source
 
 DEADLINE_S = 60.0
 
@@ -159,7 +160,7 @@ async def test_the_end_of_the_source_is_the_end_and_not_a_loss(photos: Path) -> 
     [
         ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4: no such file"),
         ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt: no such file"),
-        ({"recording.video": "/nowhere/v.mp4"}, "the folder /nowhere does not exist"),
+        ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm: cannot be written: "),
     ],
 )
 async def test_what_cannot_start_is_told_in_one_line(
@@ -283,6 +284,32 @@ async def test_warnings_of_the_worker_are_events_and_lesser_lines_are_log(
         await until(lambda: keeper.status.state is PerceptionState.FINISHED)
         assert any(level == "warning" and "1.png" in text for level, text in heard.events)
         assert any(record.name == "vision.detector" for record in caplog.records)
+
+
+async def test_the_video_is_finished_at_the_end_with_the_lines_of_the_service(
+    photos: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "film" / "flight.webm"
+    settings = settings_of(photos, **{"recording.video": str(path)})
+    async with kept(settings) as (keeper, heard):
+        keeper.send_hud(("seek car", "height 5.0 m"), "car")
+        await until(lambda: len(heard.results) >= 20)
+    with open_source(str(path), SourceSettings()) as source:
+        assert len(list(source)) >= 3
+
+
+async def test_a_replaced_worker_films_into_a_file_of_its_own(photos: Path, tmp_path: Path) -> None:
+    settings = settings_of(photos, **{"recording.video": str(tmp_path / "flight.webm")})
+    async with kept(settings) as (keeper, heard):
+        await until(lambda: len(heard.results) >= 3)
+        assert keeper.status.pid is not None
+        os.kill(keeper.status.pid, signal.SIGKILL)
+        await until(lambda: keeper.status.restarts == 1 and keeper.status.state is PerceptionState.RUNNING)
+        before = len(heard.results)
+        await until(lambda: len(heard.results) > before + 3)
+    assert (tmp_path / "flight.webm").exists()
+    with open_source(str(tmp_path / "flight-2.webm"), SourceSettings()) as source:
+        assert len(list(source)) >= 1
 
 
 SERVICE = """

@@ -116,7 +116,7 @@ def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.soc
 
 def test_messages_of_any_size_come_through_in_pieces(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
-    message = Hud(("x" * 300_000,))
+    message = Hud(("x" * 300_000,), None)
     sending = threading.Thread(target=worker.sendall, args=(packed(message) * 2,))
     sending.start()
     assert receive(service) == message
@@ -133,7 +133,7 @@ def test_what_is_no_message_is_refused(ends: tuple[socket.socket, socket.socket]
 
 async def test_an_end_in_the_middle_of_a_message_is_an_end() -> None:
     reader = asyncio.StreamReader()
-    reader.feed_data(packed(Hud(("a",)))[:-1])
+    reader.feed_data(packed(Hud(("a",), "car"))[:-1])
     reader.feed_eof()
     assert await read_message(reader) is None
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import logging
 import pickle
 import time
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import pytest
 
 from vision.detections import Detections
 from vision.frame import Frame
-from vision.pipeline import PerceptionResult, Pipeline, Recording
+from vision.pipeline import PerceptionResult, Pipeline
 from vision.sources import EndOfStream, Source, SourceSettings, SourceStatistics, open_source
 
 WIDTH, HEIGHT = 96, 64
@@ -97,7 +96,6 @@ def test_the_time_of_every_stage_is_told() -> None:
     assert result.timing_ms["inference"] == 2.0
     assert result.timing_ms["postprocess"] == 3.0
     assert result.timing_ms["total"] >= result.timing_ms["range"] >= 0
-    assert result.timing_ms["record"] == 0
 
 
 def test_depth_gives_every_detection_its_range() -> None:
@@ -146,48 +144,19 @@ def test_every_must_be_a_count() -> None:
         Pipeline(Frames(), BrightSpot(), every=0)
 
 
-def played(path: Path) -> list[np.ndarray]:
-    with open_source(str(path), SourceSettings()) as source:
-        return [frame.image for frame in source]
+class Kept:
+    """A recorder that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.kept: list[tuple[int, int]] = []
+
+    def write(self, frame: Frame, detections: Detections, /) -> None:
+        self.kept.append((frame.sequence, len(detections)))
 
 
-def test_the_recording_shows_every_frame_also_those_that_were_not_looked_at(tmp_path: Path) -> None:
-    path = tmp_path / "flight.mp4"
-    frames = [
-        Frame(frame.image, 10**9 + number * 50_000_000, number)
-        for number, frame in enumerate(frame_of(0) for _ in range(6))
-    ]
-    recording = Recording(path, 20.0)
-    recording.lines = ("hold", "height 5.0 m")
-    run(Pipeline(Frames(*frames), BrightSpot(), every=2, recording=recording))
-    recording.close()
-    images = played(path)
-    assert len(images) == 6
-    assert images[0].shape == (HEIGHT, WIDTH, 3)
-
-
-def test_a_frame_of_another_size_goes_on_in_the_size_of_the_first(tmp_path: Path) -> None:
-    path = tmp_path / "flight.mp4"
-    other = Frame(np.zeros((32, 48, 3), np.uint8), 10**9 + 50_000_000, 1)
-    recording = Recording(path, 20.0)
-    run(Pipeline(Frames(Frame(frame_of(0).image, 10**9, 0), other), BrightSpot(), recording=recording))
-    recording.close()
-    assert {image.shape for image in played(path)} == {(HEIGHT, WIDTH, 3)}
-
-
-def test_a_recording_that_cannot_be_made_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="does not exist"):
-        Recording(tmp_path / "no" / "flight.mp4", 20.0)
-
-
-def test_a_recording_that_fails_says_so_once_and_perception_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "flight.mp4"
-    path.mkdir()  # nothing can be written there
-    with caplog.at_level(logging.ERROR):
-        results = run(
-            Pipeline(Frames(*(frame_of(n) for n in range(3))), BrightSpot(), recording=Recording(path, 20.0))
-        )
-    assert len(results) == 3
-    assert sum(str(path) in record.getMessage() for record in caplog.records) == 1
+def test_every_frame_is_recorded_with_the_newest_detections() -> None:
+    dark = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic_ns(), 3)
+    recorder = Kept()
+    frames = [frame_of(0), frame_of(1), frame_of(2), dark]
+    run(Pipeline(Frames(*frames), BrightSpot(), every=3, recorder=recorder))
+    assert recorder.kept == [(0, 1), (1, 1), (2, 1), (3, 0)]

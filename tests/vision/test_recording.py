@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vision.detections import Detections
+from vision.frame import Frame
+from vision.recording import Recording
+from vision.sources import SourceSettings, open_source
+from vision.video_writer import VideoWriterError
+
+WIDTH, HEIGHT = 96, 64
+SPOT = Detections(
+    np.array([[40, 20, 56, 36]], np.float32), np.ones(1, np.float32), np.zeros(1, np.int64), ("spot",)
+)
+
+
+def frame_of(sequence: int, *, rate_hz: float = 20.0, width: int = WIDTH, height: int = HEIGHT) -> Frame:
+    return Frame(np.full((height, width, 3), 90, np.uint8), 10**9 + round(sequence / rate_hz * 1e9), sequence)
+
+
+def give(recording: Recording, frame: Frame, detections: Detections = SPOT) -> None:
+    """Give a frame as a camera does that is slower than the encoder."""
+    deadline_s = time.monotonic() + 30
+    while recording._queue.full():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.001)
+    recording.write(frame, detections)
+
+
+def played(path: Path) -> list[np.ndarray]:
+    with open_source(str(path), SourceSettings()) as source:
+        return [frame.image for frame in source]
+
+
+def test_the_film_shows_every_frame_with_what_was_seen_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 20.0)
+    for sequence in range(8):
+        give(recording, frame_of(sequence), SPOT if sequence < 4 else SPOT[:0])
+    recording.close()
+    images = played(path)
+    assert len(images) == 8
+    assert images[0].shape == (HEIGHT, WIDTH, 3)
+    assert np.ptp(images[2]) > 60  # a box is drawn on the grey
+    assert np.ptp(images[7]) < 30
+    assert recording.skipped == 0
+
+
+def test_lines_and_the_highlighted_class_change_the_picture(tmp_path: Path) -> None:
+    films = []
+    for name, lines, highlight in (
+        ("a", (), None),
+        ("b", ("seek car",), None),
+        ("c", (), "spot"),
+        ("d", (), "x"),
+    ):
+        path = tmp_path / f"{name}.webm"
+        recording = Recording(path, 20.0)
+        recording.lines, recording.highlight = lines, highlight
+        give(recording, frame_of(0))
+        recording.close()
+        films.append(played(path)[0].astype(int))
+    plain, panel, marked, other = films
+    assert np.abs(panel - plain).max() > 40
+    assert np.abs(marked - plain).max() > 20
+    assert np.array_equal(other, plain)
+
+
+def test_a_recording_without_frames_leaves_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.webm"
+    Recording(path, 20.0).close()
+    assert not path.exists()
+
+
+def test_frames_beyond_the_films_rate_are_not_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 10.0)
+    for sequence in range(41):
+        give(recording, frame_of(sequence, rate_hz=40.0))
+    recording.close()
+    assert len(played(path)) == 11
+    assert recording.skipped == 0
+
+
+def test_a_frame_of_another_size_goes_on_in_the_size_of_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 20.0)
+    give(recording, frame_of(0))
+    give(recording, frame_of(1, width=48, height=32), SPOT[:0])
+    recording.close()
+    assert [image.shape for image in played(path)] == [(HEIGHT, WIDTH, 3)] * 2
+
+
+def test_an_encoder_that_is_too_slow_costs_frames_and_no_time(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recording = Recording(tmp_path / "flight.webm", 200.0)
+    large = np.random.default_rng(1).integers(0, 255, (1080, 1920, 3), np.uint8)
+    for sequence in range(100):
+        recording.write(Frame(large, sequence * 5_000_000, sequence), SPOT)
+    recording.close()
+    assert recording.skipped > 0
+    assert any("the encoder was too slow" in record.getMessage() for record in caplog.records)
+
+
+@pytest.mark.parametrize("name", ["flight.mp4", "blocked/flight.webm"])
+def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    (tmp_path / "blocked").write_bytes(b"")
+    with pytest.raises(VideoWriterError, match=name.rpartition("/")[2]):
+        Recording(tmp_path / name, 20.0)
+
+
+def test_a_recording_that_fails_says_so_once_and_takes_no_more(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 20.0)
+    path.unlink()
+    path.mkdir()  # nothing can be written there any more
+    with caplog.at_level(logging.ERROR):
+        for sequence in range(10):
+            give(recording, frame_of(sequence))
+        recording.close()
+        recording.close()
+    assert (
+        len([record for record in caplog.records if "the recording has failed" in record.getMessage()]) == 1
+    )

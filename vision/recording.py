@@ -1,0 +1,132 @@
+"""The annotated video, in a thread of its own: to encode a frame can take longer than to look at it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vision.annotate import annotate
+from vision.detections import Detections
+from vision.frame import Frame
+from vision.video_writer import VideoWriter, VideoWriterError
+
+logger = logging.getLogger(__name__)
+
+# Frames that wait for the encoder. More would only be memory: an encoder that is too slow stays too slow.
+_QUEUED_FRAMES = 4
+# The network, in the same process, comes first.
+_NICENESS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    frame: Frame
+    detections: Detections
+    lines: tuple[str, ...]
+    highlight: str | None
+
+
+class Recording:
+    """Every frame that the film's rate has room for, with what was seen in it and lines told from outside.
+
+    A recording that fails (a full disk) says so once and ends; whoever gives it frames goes on.
+
+    Attributes:
+        lines: text to draw on the next frames.
+        highlight: the class whose surest detection is drawn as the one that matters, or None.
+        skipped: frames that the encoder had no time for.
+    """
+
+    def __init__(self, path: Path | str, rate_hz: float) -> None:
+        """
+        Args:
+            path: ends in `.webm`.
+            rate_hz: frames a second of the film.
+
+        Raises:
+            VideoWriterError: no file can be made there.
+        """
+        self.lines: tuple[str, ...] = ()
+        self.highlight: str | None = None
+        self.skipped = 0
+        self._path = Path(path)
+        self._period_ns = 1e9 / rate_hz
+        self._rate_hz = rate_hz
+        self._first_ns: int | None = None
+        self._next_slot = 0
+        self._queue: queue.Queue[_Picture | None] = queue.Queue(_QUEUED_FRAMES)
+        self._failed = threading.Event()
+        # A size is known only with the first frame; that nothing can be written there is known now.
+        with VideoWriter(self._path, 16, 16, rate_hz):
+            pass
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    def write(self, frame: Frame, detections: Detections) -> None:
+        """Give it one frame. Never waits."""
+        if self._first_ns is None:
+            self._first_ns = frame.captured_ns
+        slot = round((frame.captured_ns - self._first_ns) / self._period_ns)
+        if slot < self._next_slot or self._failed.is_set():
+            return
+        try:
+            self._queue.put_nowait(_Picture(frame, detections, self.lines, self.highlight))
+        except queue.Full:
+            self.skipped += 1
+        else:
+            self._next_slot = slot + 1
+
+    def close(self) -> None:
+        """Finish the file; no file is left if it got no frame. A second call does nothing."""
+        if not self._thread.is_alive():
+            return
+        self._queue.put(None)
+        self._thread.join()
+        if self.skipped:
+            logger.warning(
+                "%s: %d frames are not in it, the encoder was too slow; a lower rate_hz suits this computer",
+                self._path,
+                self.skipped,
+            )
+
+    def _run(self) -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        writer: VideoWriter | None = None
+        while (picture := self._queue.get()) is not None:
+            if self._failed.is_set():
+                continue
+            try:
+                if writer is None:
+                    writer = VideoWriter(self._path, picture.frame.width, picture.frame.height, self._rate_hz)
+                _add(writer, picture)
+            except (VideoWriterError, OSError) as error:
+                self._fail(error)
+        try:
+            if writer is not None:
+                writer.close()
+            elif not self._failed.is_set():
+                self._path.unlink(missing_ok=True)  # a film without a frame is none
+        except (VideoWriterError, OSError) as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        if not self._failed.is_set():
+            self._failed.set()
+            logger.error("the recording has failed: %s", error)
+
+
+def _add(writer: VideoWriter, picture: _Picture) -> None:
+    names = picture.detections.names
+    highlight = names.index(picture.highlight) if picture.highlight in names else None
+    drawn = annotate(picture.frame.image, picture.detections, lines=picture.lines, highlight=highlight)
+    size = (writer.width, writer.height)
+    if (picture.frame.width, picture.frame.height) != size:
+        drawn = cv2.resize(drawn, size).astype(np.uint8, copy=False)
+    writer.write(drawn, picture.frame.captured_ns)
