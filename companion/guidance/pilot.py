@@ -22,7 +22,7 @@ from companion.guidance.refusal import refusal
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
-from companion.vehicle.streamer import Streamer
+from companion.vehicle.streamer import SILENCE_S, Streamer, StreamState
 
 logger = logging.getLogger(__name__)
 
@@ -163,11 +163,15 @@ class Pilot:
     def update(self, situation: Situation) -> None:
         """One turn of the guidance loop. Never waits."""
         situation = replace(situation, sent=self.sent)
-        self._situation = situation
+        before, self._situation = self._situation, situation
         if self._behaviour is None:
             return
-        by_setpoint = self._phase in (_Phase.ENGAGING, _Phase.OFFBOARD)
-        why = self._authority.lost(situation.state, situation.now_ns, flying_by_setpoint=by_setpoint)
+        paused_s = 0.0 if before is None else (situation.now_ns - before.now_ns) / 1e9
+        why = self._silent(paused_s) or self._authority.lost(
+            situation.state,
+            situation.now_ns,
+            flying_by_setpoint=self._phase in (_Phase.ENGAGING, _Phase.OFFBOARD),
+        )
         if why is not None:
             self._lose(why)
             return
@@ -234,6 +238,19 @@ class Pilot:
         self._begin(hold, None)
         if self._phase is _Phase.OFFBOARD:
             self._run(hold, situation)
+
+    def _silent(self, paused_s: float) -> str | None:
+        """Why our setpoints failed to go out, if they did.
+
+        PX4 would take OFFBOARD up again by itself if setpoints came back; only an operator may.
+        """
+        if not self._streaming:
+            return None
+        if paused_s > SILENCE_S:
+            return f"our own guidance stood still for {paused_s:.1f} s"
+        if self._streamer.state is StreamState.EXPIRED:
+            return "no setpoint left for too long, the autopilot's failsafe has the vehicle"
+        return None
 
     def _position_known(self, situation: Situation) -> bool:
         """False: brake for now; for too long: give the command up."""

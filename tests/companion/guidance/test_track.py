@@ -1,0 +1,86 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.guidance.target import RangeSource, Target
+from companion.guidance.track import ObjectTrack
+
+T0 = 10**12
+FRAME_NS = 100_000_000
+
+
+def seen(place, vehicle=(0.0, 0.0, -5.0), frame=0, *, source=RangeSource.GROUND_PLANE, name="car"):
+    north, east = place[0] - vehicle[0], place[1] - vehicle[1]
+    known = source is not RangeSource.NONE
+    return Target(
+        name,
+        0.8,
+        T0 + frame * FRAME_NS,
+        math.atan2(east, north),
+        -0.3,
+        math.hypot(north, east) if known else math.nan,
+        source,
+        (place[0], place[1], 0.0) if known else None,
+    )
+
+
+def test_a_track_cannot_begin_without_a_place():
+    with pytest.raises(ValueError, match="no range"):
+        ObjectTrack(seen((5.0, 0.0), source=RangeSource.NONE), (0.0, 0.0, -5.0))
+
+
+@given(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 6.28))
+def test_repeated_measurements_draw_the_place_to_the_truth(north, east, direction):
+    truth = (north, east)
+    start = (north + math.cos(direction), east + math.sin(direction))
+    vehicle = (-40.0, -40.0, -5.0)
+    track = ObjectTrack(seen(start, vehicle), vehicle)
+    for frame in range(1, 40):
+        assert track.update([seen(truth, vehicle, frame)], vehicle)
+    assert math.dist(track.position_ned_m[:2], truth) < 0.3
+
+
+def test_a_frame_already_seen_changes_nothing():
+    vehicle = (0.0, 0.0, -5.0)
+    track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+    assert not track.update([seen((20.5, 0.0), frame=0)], vehicle)
+    assert track.update([seen((20.5, 0.0), frame=1)], vehicle)
+    place = track.position_ned_m
+    assert not track.update([seen((20.5, 0.0), frame=1)], vehicle)
+    assert track.position_ned_m == place
+
+
+@pytest.mark.parametrize("source", list(RangeSource))
+def test_an_object_in_another_direction_is_another_object(source):
+    vehicle = (0.0, 0.0, -5.0)
+    track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+    assert not track.update([seen((18.0, 9.0), frame=1, source=source)], vehicle)
+    assert not track.update([seen((20.0, 0.0), frame=2, name="truck")], vehicle)
+
+
+def test_of_two_candidates_the_nearer_one_is_taken():
+    vehicle = (0.0, 0.0, -5.0)
+    track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+    assert track.update([seen((20.0, 1.5), frame=1), seen((20.2, 0.1), frame=1)], vehicle)
+    assert track.position_ned_m[1] == pytest.approx(0.05, abs=0.1)
+
+
+def test_a_bearing_alone_corrects_across_and_leaves_the_range():
+    vehicle = (0.0, 0.0, -5.0)
+    track = ObjectTrack(seen((20.0, 0.0), source=RangeSource.DEPTH), vehicle)
+    for frame in range(1, 20):
+        assert track.update([seen((10.0, 0.4), vehicle, frame, source=RangeSource.NONE)], vehicle)
+    north, east, _ = track.position_ned_m
+    assert math.atan2(east, north) == pytest.approx(math.atan2(0.4, 10.0), abs=0.01)
+    assert math.hypot(north, east) == pytest.approx(20.0, abs=0.1)
+
+
+def test_a_long_unseen_object_may_have_wandered():
+    vehicle = (0.0, 0.0, -5.0)
+    near = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
+    late = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
+    moved = (10.0, 3.5)
+    assert not near.update([seen(moved, frame=1, source=RangeSource.DEPTH)], vehicle)
+    assert late.update([seen(moved, frame=30, source=RangeSource.DEPTH)], vehicle)
