@@ -28,7 +28,7 @@ class Inert:
 
     name: str
     arguments: tuple[Any, ...] = ()
-    state: dict[str, Any] = field(default_factory=dict)
+    state: dict[Any, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,9 +226,8 @@ class _Machine:
             raise UnsafeCheckpointError(
                 f"its pickle sets attributes of a {type(target).__name__}; nothing was run"
             )
-        if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
-            raise CheckpointError(f"its pickle gives {target.name} a state that is not a dictionary")
-        target.state.update(state)
+        # Some classes (numpy.dtype) have a state of their own kind; it is kept, and means nothing here.
+        target.state.update(state if isinstance(state, dict) else {"__setstate__": state})
 
     def persistent_id(self) -> None:
         identity = self._pop()
