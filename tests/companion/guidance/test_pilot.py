@@ -281,7 +281,7 @@ async def test_a_loop_that_hung_gives_up_its_command_and_sends_not_one_setpoint_
     # The whole loop stands still; the vehicle flies on, and its failsafe is not known here yet.
     cockpit.autopilot.step(2.0)
     await cockpit.turn(1.0)
-    assert "no setpoint left for too long" in future.result().reason
+    assert future.result().reason == "our own guidance stood still for 2.0 s"
     assert len(cockpit.autopilot.setpoints) == sent
     cockpit.pilot.command(HoldBehaviour())
     await cockpit.until(lambda: cockpit.pilot.phase == "offboard", 5.0)
@@ -482,17 +482,6 @@ async def test_closing_ends_the_behaviour_and_the_stream():
     await cockpit.turn(0.5)
     assert len(cockpit.autopilot.setpoints) == sent
     assert asyncio.all_tasks() == {asyncio.current_task()}
-
-
-async def test_a_guidance_loop_that_stood_still_does_not_take_the_vehicle_back():
-    cockpit = Cockpit(flying())
-    future = await engaged(cockpit)
-    cockpit.vehicle.now_ns += 2_000_000_000
-    await cockpit.turn()
-    assert future.result().reason.startswith("our own guidance stood still for 2")
-    sent = len(cockpit.autopilot.setpoints)
-    await cockpit.turn(2.0)
-    assert len(cockpit.autopilot.setpoints) == sent
 
 
 async def test_a_stream_that_fell_silent_ends_the_command_with_its_reason():
