@@ -78,7 +78,11 @@ class Service:
             self.driver.send_setpoint, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s
         )
         self.pilot = Pilot(
-            self.driver, self.streamer, Envelope(_limits(settings)), on_event=self._pilot_event
+            self.driver,
+            self.streamer,
+            Envelope(_limits(settings)),
+            on_event=self._pilot_event,
+            class_names=self._class_names,
         )
         self.perception = PerceptionKeeper(settings, on_result=self._result, on_event=self._event)
         self.bus = Bus(settings.zenoh, settings.vehicle.name, on_event=self._event, on_command=self.command)
@@ -133,7 +137,7 @@ class Service:
         A command without an end of its own (`hold`, `orbit` with no laps) is answered when it is under way.
         """
         try:
-            command = grammar.parse(text, self.perception.status.class_names or None)
+            command = grammar.parse(text, self._class_names())
         except grammar.GrammarError as error:
             return {"command": text, "success": False, "reason": str(error)}
         self._event("info", f"command: {command}")
@@ -318,6 +322,10 @@ class Service:
             self.settings.camera.mount(),
             self._history,
         )
+
+    def _class_names(self) -> tuple[str, ...] | None:
+        """What the detector knows; None while there is none to ask."""
+        return self.perception.status.class_names or None
 
     def _hud(self) -> tuple[str, ...]:
         state: VehicleState = self.driver.state

@@ -82,12 +82,12 @@ class RunningSimulator:
                 self.events.clear()
                 return
 
-    def wait_for_event(self, text: str, timeout_s: float = 30.0) -> str:
-        """The first printed line that contains `text`, already printed or yet to come.
+    def wait_for_event(self, text: str, timeout_s: float = 30.0, *, after: int = 0) -> str:
+        """The first printed line that contains `text`, already printed (from line `after` on) or yet to come.
 
         Raises TimeoutError or, if the simulator ended, RuntimeError.
         """
-        for line in self.events:
+        for line in self.events[after:]:
             if text in line:
                 return line
         deadline = time.monotonic() + timeout_s

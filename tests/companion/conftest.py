@@ -1,0 +1,43 @@
+"""A small model and a small source, made here: no test of the service needs anything from outside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.yolo.architecture import build
+from vision.yolo.checkpoint import save_checkpoint
+from vision.yolo.description import yolov8_description
+
+
+@pytest.fixture(scope="session")
+def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network with random weights: real in every way but that it has learnt nothing."""
+    path = tmp_path_factory.mktemp("model") / "small.pt"
+    model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()
+    save_checkpoint(path, model, metadata={"licence": "Apache-2.0"})
+    return path
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of twenty small pictures."""
+    folder = tmp_path_factory.mktemp("pictures")
+    rng = np.random.default_rng(0)
+    for index in range(20):
+        picture = cv2.resize(rng.integers(0, 255, (12, 16, 3), dtype=np.uint8), (160, 120))
+        assert cv2.imwrite(str(folder / f"{index:03d}.png"), picture)
+    return folder
+
+
+@pytest.fixture
+def seeing(small_model: Path, pictures: Path) -> list[str]:
+    """Flags for a service that looks at the pictures, over and over, ten times a second."""
+    return [
+        *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
+        *("--model", str(small_model), "--detector-image-size", "160"),
+        *("--guidance-perception-max-age-s", "3"),
+    ]

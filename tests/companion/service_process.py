@@ -1,0 +1,118 @@
+"""`companion run` as a process of its own, for integration tests; the same way a user runs it."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from companion.bus.client import client_settings, open_client, send_command
+from companion.settings import ZenohSection
+
+START_S = 60.0
+
+
+def free_tcp_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class ServiceProcess:
+    """A running `companion run`. `lines` is what it said on standard error so far."""
+
+    def __init__(self, process: subprocess.Popen[bytes], endpoint: str) -> None:
+        self.process = process
+        self.endpoint = endpoint
+        self.lines: list[str] = []
+        self._queue: queue.Queue[str | None] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self._queue.put(line.decode(errors="replace").rstrip("\n"))
+        self._queue.put(None)
+
+    def wait_for_line(self, text: str, timeout_s: float = 30.0, *, after: int = 0) -> str:
+        """The first line with `text`, from line number `after` on. TimeoutError tells all that was said."""
+        for line in self.lines[after:]:
+            if text in line:
+                return line
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                line = self._queue.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise TimeoutError(f"{text!r} was not said; said: {self.lines}") from None
+            if line is None:
+                raise TimeoutError(f"the service ended before it said {text!r}; said: {self.lines}")
+            self.lines.append(line)
+            if text in line:
+                return line
+
+    @contextmanager
+    def client(self) -> Iterator[zenoh.Session]:
+        with open_client(client_settings(ZenohSection(listen=(self.endpoint,))), timeout_s=15.0) as session:
+            yield session
+
+    def command(self, text: str, timeout_s: float = 60.0) -> dict[str, Any]:
+        with self.client() as session:
+            return send_command(session, "vehicle1", text, timeout_s=timeout_s)
+
+    def signal(self, number: signal.Signals) -> None:
+        os.kill(self.pid, number)
+
+    def stop(self) -> int:
+        if self.process.poll() is None:
+            self.signal(signal.SIGCONT)
+            self.process.terminate()
+        try:
+            return self.process.wait(20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            raise
+        finally:
+            self._reader.join(10)
+
+
+@contextmanager
+def running_service(
+    onboard_port: int,
+    flags: Sequence[str],
+    *,
+    cwd: Path,
+    endpoint: str | None = None,
+    stdin: int = subprocess.DEVNULL,
+) -> Iterator[ServiceProcess]:
+    """Start `companion run`, wait until it takes commands, end it afterwards."""
+    command = [sys.executable, "-m", "companion.cli", "run"]
+    command += ["--vehicle-url", f"udpin://127.0.0.1:{onboard_port}", "--detector-threads", "1", *flags]
+    if endpoint is None:
+        endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+        command += ["--zenoh-listen", endpoint]
+    process = subprocess.Popen(command, stdin=stdin, stderr=subprocess.PIPE, cwd=cwd)
+    service = ServiceProcess(process, endpoint)
+    try:
+        service.wait_for_line("ready: commands on", START_S)
+        yield service
+    finally:
+        service.stop()
+        assert process.stderr is not None
+        process.stderr.close()

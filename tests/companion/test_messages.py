@@ -1,0 +1,103 @@
+"""The published shapes are a contract; JSON has neither NaN nor infinity."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+
+from companion.bus.topics import NO_OBJECTS
+from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, VehicleState
+from vision.detections import Detections
+from vision.pipeline import PerceptionResult
+
+NAMES = ("person", "car")
+
+
+def result(detections: Detections) -> PerceptionResult:
+    return PerceptionResult(7, 1_000, 2_000, 640, 480, detections, {"inference": 20.123}, 3)
+
+
+def strictly(value: object) -> object:
+    """Through JSON as a strict reader sees it."""
+    return json.loads(json.dumps(value, allow_nan=False))
+
+
+def one_car(range_m: float) -> Detections:
+    return Detections(
+        np.array([[10, 20, 30, 60]], np.float32),
+        np.array([0.9], np.float32),
+        np.array([1], np.int64),
+        NAMES,
+        np.array([range_m], np.float32),
+    )
+
+
+def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
+    message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000))
+    assert message == {
+        "vehicle": "alpha",
+        "sequence": 7,
+        "captured_ns": 1_000,
+        "inferred_ns": 2_000,
+        "published_ns": 3_000,
+        "width": 640,
+        "height": 480,
+        "timing_ms": {"inference": 20.12},
+        "dropped": 3,
+        "detections": [
+            {
+                "class_id": 1,
+                "class_name": "car",
+                "confidence": 0.9,
+                "xyxy": [10.0, 20.0, 30.0, 60.0],
+                "center": [20.0, 40.0],
+                "range_m": 11.5,
+            }
+        ],
+    }
+
+
+def test_an_unknown_range_is_null() -> None:
+    message = strictly(detections_message(result(one_car(math.nan)), "alpha", 3_000))
+    assert message["detections"][0]["range_m"] is None  # type: ignore[index]
+
+
+def test_labels_are_names_in_order_or_say_that_there_is_nothing() -> None:
+    assert labels_message(result(one_car(1.0))) == "car"
+    assert labels_message(result(Detections.empty(NAMES))) == NO_OBJECTS
+
+
+def test_a_vehicle_of_which_nothing_is_known_yet_is_valid_json() -> None:
+    message = strictly(vehicle_message(VehicleState(), 5_000_000_000))
+    assert message["connected"] is False  # type: ignore[index]
+    assert message["position_ned_m"] is None  # type: ignore[index]
+    assert message["heartbeat_age_s"] is None  # type: ignore[index]
+
+
+def test_a_flying_vehicle_is_told_with_height_above_home_and_ages() -> None:
+    now_ns = 10_000_000_000
+    state = VehicleState(
+        heartbeat_ns=now_ns - 500_000_000,
+        position_ns=now_ns - 20_000_000,
+        armed=True,
+        mode=FlightMode.OFFBOARD,
+        position_ned_m=(1.0, 2.0, -4.0),
+        home_position_ned_m=(0.0, 0.0, 1.0),
+        attitude=(1.0, 0.0, 0.0, 0.0),
+    )
+    message = vehicle_message(state, now_ns)
+    assert message["connected"]
+    assert message["altitude_m"] == 5.0
+    assert message["position_age_s"] == 0.02
+    assert message["mode"] == "offboard"
+
+
+def test_a_setpoint_tells_what_it_does_not_control_as_null() -> None:
+    message = strictly(setpoint_message(Setpoint.velocity((1.0, 0.0, 0.0), 0)))
+    assert message["position_ned_m"] is None  # type: ignore[index]
+    assert message["velocity_ned_mps"] == [1.0, 0.0, 0.0]  # type: ignore[index]
+    assert setpoint_message(None) is None

@@ -1,0 +1,185 @@
+"""The service as a user runs it: real processes, sockets, zenoh sessions, and signals that kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from service_process import ServiceProcess, running_service
+
+from companion.bus.client import listen
+from mavlink_sim.testing import running_simulator
+
+# COM_OF_LOSS_T of the built-in vehicle, as PX4's default, and what the promise allows beyond it.
+LOSS_S, ALLOWED_S = 1.0, 0.5
+
+
+def truth(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+
+
+def wait_for_truth(path: Path, condition: Any, timeout_s: float = 30.0) -> dict[str, Any]:
+    """The first row that meets the condition."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        for row in truth(path):
+            if condition(row):
+                return row
+        time.sleep(0.02)
+    raise TimeoutError(f"never true; the last row: {truth(path)[-1:]}")
+
+
+def fly(service: ServiceProcess) -> None:
+    """In the air and in OFFBOARD."""
+    assert service.command("takeoff 2.5")["success"]
+    assert service.command("hold") == {"command": "hold", "success": True, "reason": "under way"}
+
+
+@pytest.mark.parametrize("driver", ["mavsdk", "pymavlink"])
+def test_a_flight_by_commands_while_a_subscriber_receives_every_detection_message(
+    driver: str, seeing: list[str], tmp_path: Path
+) -> None:
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, [*seeing, "--driver", driver], cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
+        assert service.command("takeoff 2.5")["success"]
+        assert service.command("orbit radius=3 speed=1")["success"]
+        refused = service.command("seek bicycle")
+        assert not refused["success"]
+        assert "unknown class 'bicycle'" in refused["reason"]
+        assert service.command("land")["success"]
+        simulator.wait_for_event("disarmed")
+        messages = [received.get(timeout=10) for _ in range(30)]
+    published = [message["published_ns"] for message in messages]
+    assert published == sorted(published)
+    # Numbers may be left out (newest frame wins) but none comes twice.
+    sequences = [message["sequence"] for message in messages]
+    assert sequences == sorted(set(sequences))
+    assert all(m["captured_ns"] <= m["inferred_ns"] <= m["published_ns"] for m in messages)
+
+
+def test_a_stopped_service_leaves_the_vehicle_to_its_failsafe_and_does_not_take_it_back(
+    seeing: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "truth.jsonl"
+    with (
+        running_simulator(truth=path) as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+    ):
+        fly(service)
+        stopped_ns = time.monotonic_ns()
+        service.signal(signal.SIGSTOP)
+        row = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and r["mode"] != "OFFBOARD")
+        assert row["armed"]
+        assert (row["stamp_ns"] - stopped_ns) / 1e9 <= LOSS_S + ALLOWED_S
+        service.signal(signal.SIGCONT)
+        service.wait_for_line("command lost")
+        landed = wait_for_truth(path, lambda r: r["stamp_ns"] > stopped_ns and not r["armed"], 60.0)
+        between = [r for r in truth(path) if row["stamp_ns"] <= r["stamp_ns"] < landed["stamp_ns"]]
+        assert "OFFBOARD" not in {r["mode"] for r in between}
+
+
+def test_a_killed_perception_worker_is_replaced_while_the_vehicle_holds(
+    seeing: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "truth.jsonl"
+    with (
+        running_simulator(truth=path) as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+        fly(service)
+        before = statuses.get(timeout=10)["perception"]
+        while not statuses.empty():
+            before = statuses.get()["perception"]
+        said = len(service.lines)
+        os.kill(before["pid"], signal.SIGKILL)
+        service.wait_for_line("perception", after=said)
+        deadline = time.monotonic() + 40
+        while True:
+            after = statuses.get(timeout=max(0.1, deadline - time.monotonic()))["perception"]
+            if (
+                after["state"] == "running"
+                and after["pid"] != before["pid"]
+                and after["results"] > before["results"]
+            ):
+                break
+        assert after["restarts"] == 1
+        assert truth(path)[-1]["mode"] == "OFFBOARD"
+
+
+def test_a_vehicle_that_vanishes_is_told_and_found_again(seeing: list[str], tmp_path: Path) -> None:
+    with running_simulator() as first:
+        ports = {"onboard_port": first.onboard_port, "onboard_bind": first.onboard_bind}
+        with running_service(first.onboard_port, seeing, cwd=tmp_path) as service:
+            fly(service)
+            first.kill()
+            service.wait_for_line("the autopilot is not heard any more")
+            said = len(service.lines)
+            with running_simulator(**ports) as second:
+                service.wait_for_line("the autopilot is heard", after=said)
+                assert service.command("takeoff 2.5")["success"]
+                second.wait_for_event("takeoff")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_service_that_is_ended_in_flight_lets_the_autopilot_hold(
+    number: signal.Signals, seeing: list[str], tmp_path: Path
+) -> None:
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+    ):
+        fly(service)
+        simulator.wait_for_event("mode OFFBOARD")
+        offboard = simulator.events.index("mode OFFBOARD")
+        service.signal(number)
+        assert service.process.wait(20) == 0
+        simulator.wait_for_event("mode HOLD", after=offboard)
+
+
+def test_frames_from_standard_input(small_model: Path, tmp_path: Path) -> None:
+    writer = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import os, time\nwhile True:\n    os.write(1, bytes(64 * 48 * 3)); time.sleep(0.05)\n",
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    assert writer.stdout is not None
+    flags = [
+        *("--source", "-", "--source-pixel-format", "bgr24", "--source-width", "64", "--source-height", "48"),
+        *("--model", str(small_model), "--detector-image-size", "64"),
+    ]
+    try:
+        with (
+            running_simulator() as simulator,
+            running_service(
+                simulator.onboard_port, flags, cwd=tmp_path, stdin=writer.stdout.fileno()
+            ) as service,
+            service.client() as session,
+        ):
+            received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+            listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
+            messages = [received.get(timeout=20) for _ in range(3)]
+        assert {(message["width"], message["height"]) for message in messages} == {(64, 48)}
+    finally:
+        writer.kill()
+        writer.wait()
+        writer.stdout.close()
