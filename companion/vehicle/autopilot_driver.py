@@ -70,6 +70,7 @@ WANTED_RATES_HZ = {
 }
 _MEASURE_S = 1.5
 _RATE_TOLERANCE = 0.7
+_BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 
 
@@ -84,7 +85,6 @@ class AutopilotDriver(ABC):
         self._own_system_id = own_system_id
         self._own_component_id = own_component_id
         self._started_ns = time.monotonic_ns()
-        self._state = VehicleState()
         self._subscribers: dict[object, Callable[[VehicleState], None]] = {}
         self._watchers: dict[object, Callable[[str, Fields], None]] = {}
         self._command_locks: dict[int, asyncio.Lock] = {}
@@ -92,11 +92,16 @@ class AutopilotDriver(ABC):
         self._reset()
 
     def _reset(self) -> None:
+        self._state = VehicleState()
         self._framer = Framer()
         self._system_id: int | None = None
         self._autopilot_kind: int | None = None
+        self._source: Source = None
+        self._newest_heartbeat: Frame | None = None
+        self._boot_ms = 0
+        self._restarted = asyncio.Event()
         self._heard = asyncio.Event()
-        self._others: set[tuple[int, int]] = set()
+        self._others: set[tuple[Any, ...]] = set()
         self._received_count: Counter[int] = Counter()
         self._mode_ns = 0
         self._sequence = 0
@@ -158,10 +163,12 @@ class AutopilotDriver(ABC):
         if keeper is not None:
             keeper.cancel()
             await asyncio.gather(keeper, return_exceptions=True)
-        await self._detach()
-        link, self._link = self._link, None
-        if link is not None:
-            await link.close()
+        try:
+            await self._detach()
+        finally:
+            link, self._link = self._link, None
+            if link is not None:
+                await link.close()
 
     async def _first_heartbeat(self, timeout_s: float) -> None:
         with contextlib.suppress(TimeoutError):
@@ -179,7 +186,7 @@ class AutopilotDriver(ABC):
             "autopilot" if self._wanted_system_id is None else f"autopilot of system {self._wanted_system_id}"
         )
         if self._others:
-            heard = ", ".join(f"{system}/{component}" for system, component in sorted(self._others))
+            heard = ", ".join(f"{sender[0]}/{sender[1]}" for sender in sorted(self._others))
             advice = f"heard only system/component {heard}; check the system id and what is connected"
         elif self._framer.skipped_bytes:
             count = self._framer.skipped_bytes
@@ -205,7 +212,7 @@ class AutopilotDriver(ABC):
         for frame in self._framer.feed(data, datagram=link.datagrams):
             if frame.message_id == HEARTBEAT_ID:
                 self._heartbeat_from(frame, source)
-            if frame.system_id == self._system_id:
+            if frame.system_id == self._system_id and source == self._source:
                 ours.append(frame)
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._received_count[frame.message_id] += 1
@@ -220,21 +227,36 @@ class AutopilotDriver(ABC):
         is_autopilot = frame.component_id == AUTOPILOT_COMPONENT and autopilot != _AUTOPILOT_INVALID
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
-            if sender not in self._others:
-                self._others.add(sender)
-                logger.info("%s: system/component %d/%d is also on this link", self.url, *sender)
+            self._note_other(sender, "system/component %d/%d is also on this link")
             return
-        if self._link is not None:
-            self._link.answer_to(source)
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
+        elif source != self._source and self._state.connected(time.monotonic_ns()):
+            # Obeying whoever spoke last would fly two vehicles by turns.
+            self._note_other(
+                (*sender, source), "a second autopilot %d/%d sends from %s; it is ignored: give it its own id"
+            )
+            return
+        self._source = source
+        if self._link is not None:
+            self._link.answer_to(source)
+        self._newest_heartbeat = frame
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
         self._handle("HEARTBEAT", fields)
         self._heard.set()
 
+    def _note_other(self, sender: tuple[Any, ...], text: str) -> None:
+        if sender not in self._others:
+            self._others.add(sender)
+            logger.info("%s: " + text, self.url, *sender)
+
     def _handle(self, name: str, fields: Fields) -> None:
         """One message of the autopilot: into the state, and to whoever waits for it."""
         now_ns = time.monotonic_ns()
+        if name == "LOCAL_POSITION_NED":
+            if fields["time_boot_ms"] < self._boot_ms - _BOOT_TOLERANCE_MS:
+                self._restarted.set()
+            self._boot_ms = fields["time_boot_ms"]
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             self._mode_ns = now_ns
         state = fold(self._state, name, fields, now_ns)
@@ -422,7 +444,9 @@ class AutopilotDriver(ABC):
         """Ask for the streams we need, and say when the autopilot goes silent and when it comes back."""
         while True:
             await self._ask_for_streams()
-            await self._silence()
+            if not await self._silence():
+                logger.warning("%s: system %s has restarted", self.url, self._system_id)
+                continue
             logger.error(
                 "%s: system %s is silent: no heartbeat for %g s",
                 self.url,
@@ -432,16 +456,18 @@ class AutopilotDriver(ABC):
             await self._until(lambda: self._state.connected(time.monotonic_ns()), None)
             logger.warning("%s: system %s is back", self.url, self._system_id)
 
-    async def _silence(self) -> None:
-        """Wait until the newest heartbeat is too old."""
-        while True:
+    async def _silence(self) -> bool:
+        """Wait until the newest heartbeat is too old (True) or the autopilot's clock began anew (False)."""
+        while self._state.connected(time.monotonic_ns()):
             left_s = (self._state.heartbeat_ns - time.monotonic_ns()) / 1e9 + HEARTBEAT_MAX_AGE_S
-            if left_s < 0.0:
-                return
-            await asyncio.sleep(left_s + 1e-3)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._restarted.wait(), max(left_s, 0.0) + 1e-3)
+                return False
+        return True
 
     async def _ask_for_streams(self) -> None:
         """SET_MESSAGE_INTERVAL for what comes too slowly, and home's position if it has not come."""
+        self._restarted.clear()
         self._received_count.clear()
         began = time.monotonic()
         await asyncio.sleep(_MEASURE_S)

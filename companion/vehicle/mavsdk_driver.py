@@ -52,6 +52,7 @@ class MavsdkDriver(AutopilotDriver):
     async def _attach(self, timeout_s: float) -> None:
         _log_through_python()
         self._loop = asyncio.get_running_loop()
+        self._awaited: set[asyncio.Future[Any]] = set()
         self._blocking = ThreadPoolExecutor(1, thread_name_prefix="mavsdk-driver")
         configuration = mavsdk.Configuration.create_manual(self._own_system_id, self._own_component_id, False)
         self._mavsdk = mavsdk.Mavsdk(configuration)
@@ -60,6 +61,8 @@ class MavsdkDriver(AutopilotDriver):
         self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)
         found: asyncio.Future[Any] = self._loop.create_future()
         self._mavsdk.first_autopilot_async(timeout_s, lambda system: self._hop(_resolve, found, system))
+        if self._newest_heartbeat is not None:
+            self._take_frames([self._newest_heartbeat])  # the next one may be a second away
         system = await found
         if system is None:
             raise LinkError(f"{self.url}: MAVSDK did not find the autopilot within {timeout_s:g} s")
@@ -72,6 +75,10 @@ class MavsdkDriver(AutopilotDriver):
         library, self._mavsdk = self._mavsdk, None
         if library is None:
             return
+        for future in list(self._awaited):  # MAVSDK forgets them when it is destroyed
+            future.set_exception(
+                CommandRefusedError(f"{self.url}: the link was closed before an answer came")
+            )
         # A parameter request that is under way holds the one thread; destroying waits its turn behind it.
         await self._loop.run_in_executor(self._blocking, library.destroy)
         self._blocking.shutdown(wait=False)
@@ -138,6 +145,8 @@ class MavsdkDriver(AutopilotDriver):
         for number, value in enumerate(parameters, start=1):
             fields[f"param{number}"] = None if value != value else float(value)  # JSON has no NaN
         answered: asyncio.Future[tuple[MavlinkDirectResult, MavlinkMessage]] = self._loop.create_future()
+        self._awaited.add(answered)
+        answered.add_done_callback(self._awaited.discard)
         self._direct.send_command_async(
             self._direct_message("COMMAND_LONG", fields),
             lambda result, ack, _: self._hop(_resolve, answered, (result, ack)),
