@@ -27,6 +27,8 @@ ARRIVAL_SPEED_MPS = 0.3
 ARRIVAL_S = 1.0
 # Detectors miss single frames; this long without the object and the vehicle brakes.
 LOST_AFTER_S = 1.0
+# What appears where a lost object was, in this direction and at half to twice its range, is taken for it.
+SAME_BEARING_RAD = math.radians(6.0)
 # Nearer than this the bearing to the object's nearest point swings too much to be followed.
 MIN_YAW_RANGE_M = 1.0
 BASE_TIMEOUT_S = 45.0
@@ -125,6 +127,8 @@ class ApproachBehaviour(Behaviour):
         if self._track is not None:
             if self._track.update(fitting, position):
                 self._seen_ns = self._track.captured_ns
+            elif situation.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
+                self._find_again(self._track, fitting, position)
             return
         if not fitting:
             return
@@ -134,6 +138,18 @@ class ApproachBehaviour(Behaviour):
             self._bearing_rad = chosen.bearing_rad
             return
         self._begin(chosen, position, situation.now_ns)
+
+    def _find_again(self, lost: ObjectTrack, fitting: list[Target], position: Vector3) -> None:
+        """A wrong range can lead the track away from its object: begin anew with what is where it was."""
+        north, east = lost.position_ned_m[0] - position[0], lost.position_ned_m[1] - position[1]
+        bearing, range_m = math.atan2(east, north), math.hypot(north, east)
+        for target in fitting:
+            if target.captured_ns <= self._seen_ns or target.position_ned_m is None:
+                continue
+            off = abs(wrap_angle(target.bearing_rad - bearing))
+            if off < SAME_BEARING_RAD and 0.5 * range_m < target.range_m < 2.0 * range_m:
+                self._track, self._seen_ns = ObjectTrack(target, position), target.captured_ns
+                return
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
         self._track = ObjectTrack(target, position)

@@ -75,7 +75,7 @@ class Command:
             value = getattr(self, field.name)
             if value == _default(field):
                 continue
-            written = repr(value) if isinstance(value, float) else _quoted(str(value))
+            written = _quoted(value) if isinstance(value, str) else _plain_number(value)
             required = field.default is MISSING
             words.append(written if required else f"{argument.key}={written}")
         return " ".join(words)
@@ -353,6 +353,12 @@ def _quoted(text: str) -> str:
     if re.fullmatch(r"[\w.:/+-]+", text):
         return text
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _plain_number(value: float) -> str:
+    """As people write it, where nothing is lost by that."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
 
 
 def _arguments(kind: type[Command]) -> list[tuple[Field[Any], Argument]]:

@@ -27,15 +27,20 @@ class LandBehaviour(Behaviour):
     def __init__(self) -> None:
         self._until_ns: float = 0
         self._landed = LandedState.UNKNOWN
+        self._flew = False
 
     def on_activate(self, situation: Situation) -> None:
         self._until_ns = situation.now_ns + self.timeout_s(situation.state) * 1e9
+        self._flew = situation.state.armed
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         state = situation.state
         self._landed = state.landed
+        self._flew |= state.armed
         if not state.armed and state.landed is LandedState.ON_GROUND:
-            return Outcome(True, f"{self.did} and disarmed")
+            return Outcome(
+                True, f"{self.did} and disarmed" if self._flew else "already on the ground, disarmed"
+            )
         if situation.now_ns > self._until_ns:
             armed = "armed" if state.armed else "disarmed"
             return Outcome(

@@ -318,8 +318,6 @@ class Pilot:
 
     def _fail(self, why: str) -> None:
         """The autopilot did not do what was asked."""
-        name = "" if self._behaviour is None else f"{self._behaviour.name}: "
-        logger.warning("%s%s", name, why)
         self._end(Outcome(False, why))
         if self._phase is _Phase.REQUESTING and self._streaming:
             # Still flying setpoints: hold. If the mode changed after all, that ends our command.
@@ -334,7 +332,6 @@ class Pilot:
         self._silence()
         behaviour = self._behaviour
         outcome = Outcome(False, why)
-        logger.warning("command lost: %s", why)
         self._end(outcome, told=True)
         self._release()
         if behaviour is not None:
@@ -386,7 +383,8 @@ class Pilot:
         self, kind: PilotEventKind, behaviour: Behaviour, message: str, outcome: Outcome | None = None
     ) -> None:
         stamp_ns = 0 if self._situation is None else self._situation.now_ns
-        logger.info("%s: %s", behaviour.name, message)
+        # Whoever listens writes the record; here it is only for finding faults.
+        logger.debug("%s: %s", behaviour.name, message)
         try:
             self._on_event(PilotEvent(stamp_ns, kind, behaviour.name, message, outcome))
         except Exception:

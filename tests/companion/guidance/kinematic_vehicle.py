@@ -77,6 +77,7 @@ class SeenObject:
     radius_m: float = 0.0
     visible: bool = True
     with_range: bool = True
+    source: RangeSource = RangeSource.GROUND_PLANE
 
 
 def look(
@@ -109,7 +110,7 @@ def look(
                 bearing,
                 math.atan2(vehicle.position[2], distance),
                 range_m if thing.with_range else math.nan,
-                RangeSource.GROUND_PLANE if thing.with_range else RangeSource.NONE,
+                thing.source if thing.with_range else RangeSource.NONE,
                 place if thing.with_range else None,
             )
         )

@@ -5,6 +5,7 @@ import pytest
 from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
 
 from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.target import RangeSource
 
 
 def distance_to(vehicle, thing):
@@ -138,3 +139,19 @@ def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away():
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize("source", [RangeSource.DEPTH, RangeSource.GROUND_PLANE])
+def test_a_first_range_that_was_wrong_does_not_lose_the_object_for_good(source):
+    car = SeenObject("car", 16.0, 1.0, source=source)
+    wrong = [0.8]
+
+    def noise():
+        return wrong.pop() if wrong else 0.0
+
+    vehicle = KinematicVehicle()
+    flight = Flight(ApproachBehaviour("car"), vehicle, [car], noise=noise)
+    outcome = flight.run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.4)

@@ -1,0 +1,114 @@
+"""What these behaviours ask for and how they end. How the pilot carries it out is tested with the pilot."""
+
+from dataclasses import replace
+
+import pytest
+from kinematic_vehicle import START_NS, KinematicVehicle
+
+from companion.guidance.behaviour import ModeRequest, Outcome, Situation
+from companion.guidance.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.stop import StopBehaviour
+from companion.guidance.takeoff import TakeoffBehaviour
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, LandedState
+
+PARKED = replace(
+    KinematicVehicle(position=[0.0, 0.0, 0.0], armed=False, landed=LandedState.ON_GROUND).state,
+    mode=FlightMode.HOLD,
+)
+
+
+def situation(seconds, state=PARKED, **changes):
+    now_ns = START_NS + round(seconds * 1e9)
+    return Situation(now_ns, replace(state, attitude_ns=now_ns, position_ns=now_ns, **changes))
+
+
+def climbing(altitude_m, mode=FlightMode.TAKEOFF, landed=LandedState.TAKING_OFF):
+    return {"armed": True, "mode": mode, "landed": landed, "position_ned_m": (0.0, 0.0, -altitude_m)}
+
+
+def test_takeoff_asks_the_autopilot_until_it_holds_near_the_height():
+    behaviour = TakeoffBehaviour(5.0)
+    behaviour.on_activate(situation(0))
+    request = ModeRequest(FlightMode.TAKEOFF, 5.0, arm=True)
+    assert behaviour.update(0.0, situation(0)) == request
+    assert behaviour.update(0.02, situation(5, **climbing(4.8))) == request
+    holding = climbing(4.7, FlightMode.HOLD, LandedState.IN_AIR)
+    assert behaviour.update(0.02, situation(6, **holding)) == Outcome(True, "in the air at 4.7 m")
+
+
+def test_takeoff_finishes_a_climb_that_was_ended_short_once_the_vehicle_has_settled():
+    behaviour = TakeoffBehaviour(2.5)
+    behaviour.on_activate(situation(0))
+    short = climbing(1.8, FlightMode.HOLD, LandedState.IN_AIR)
+    assert isinstance(behaviour.update(0.02, situation(5.0, **short)), ModeRequest)
+    assert isinstance(behaviour.update(0.02, situation(5.9, **short)), ModeRequest)
+    step = behaviour.update(0.02, situation(6.1, **short))
+    assert isinstance(step, Setpoint)
+    assert step.position_ned_m == pytest.approx((0.0, 0.0, -2.5))
+    risen = climbing(2.3, FlightMode.OFFBOARD, LandedState.IN_AIR)
+    assert behaviour.update(0.02, situation(8.0, **risen)) == Outcome(True, "in the air at 2.3 m")
+
+
+def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached():
+    behaviour = TakeoffBehaviour(5.0)
+    behaviour.on_activate(situation(0))
+    outcome = behaviour.update(0.02, situation(60, armed=True, mode=FlightMode.TAKEOFF))
+    assert outcome == Outcome(False, "take-off timed out: 0.0 m of 5 m reached")
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "mode", "words"),
+    [
+        (LandBehaviour, FlightMode.LAND, "landed and disarmed"),
+        (ReturnBehaviour, FlightMode.RETURN, "returned, landed and disarmed"),
+    ],
+)
+def test_the_ways_down_end_when_the_autopilot_has_disarmed(behaviour, mode, words):
+    behaviour = behaviour()
+    behaviour.on_activate(situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR)))
+    assert behaviour.update(
+        0.0, situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR))
+    ) == ModeRequest(mode)
+    touched = {"armed": True, "mode": mode, "landed": LandedState.ON_GROUND}
+    assert behaviour.update(0.02, situation(9, **touched)) == ModeRequest(mode)
+    # PX4 shows the mode from before the landing once it has disarmed.
+    assert behaviour.update(0.02, situation(11, mode=FlightMode.OFFBOARD)) == Outcome(True, words)
+
+
+@pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour])
+def test_landing_what_stands_on_the_ground_is_done_at_once(behaviour):
+    behaviour = behaviour()
+    behaviour.on_activate(situation(0))
+    assert behaviour.update(0.0, situation(0)) == Outcome(True, "already on the ground, disarmed")
+
+
+@pytest.mark.parametrize(("behaviour", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
+def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(behaviour, seconds):
+    behaviour = behaviour()
+    aloft = climbing(5.0, FlightMode.LAND, LandedState.LANDING)
+    behaviour.on_activate(situation(0, **aloft))
+    outcome = behaviour.update(0.02, situation(seconds, **aloft))
+    assert not outcome.success
+    assert outcome.reason == f"{behaviour.name} timed out: landing and armed"
+
+
+def test_a_higher_or_further_vehicle_is_given_more_time():
+    near = situation(0, **climbing(5.0)).state
+    far = replace(near, position_ned_m=(150.0, 0.0, -40.0))
+    assert LandBehaviour().timeout_s(far) > LandBehaviour().timeout_s(near) + 50
+    assert ReturnBehaviour().timeout_s(far) > ReturnBehaviour().timeout_s(near) + 50
+
+
+def test_stop_asks_for_hold_once_more_even_when_it_is_shown_already():
+    behaviour = StopBehaviour()
+    behaviour.on_activate(situation(0))
+    assert behaviour.update(0.0, situation(0)) == ModeRequest(FlightMode.HOLD)
+    assert behaviour.update(0.02, situation(0.1)) == Outcome(True, "stopped: the autopilot holds")
+
+
+def test_stop_that_the_autopilot_does_not_follow_times_out_with_its_mode():
+    behaviour = StopBehaviour()
+    behaviour.on_activate(situation(0))
+    outcome = behaviour.update(0.02, situation(6, mode=FlightMode.OFFBOARD))
+    assert outcome == Outcome(False, "hold mode was not reached in 5 s: offboard mode")
