@@ -22,7 +22,7 @@ from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
 from companion.guidance.target import Target
-from companion.guidance.targets import StateHistory, targets_from_detections
+from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
 from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
 from companion.operator.console import run_console, terminal_is_free
 from companion.perception import PerceptionKeeper, PerceptionState
@@ -91,6 +91,7 @@ class Service:
         self._notifier = SystemdNotifier()
         self._history = StateHistory()
         self._targets: tuple[Target, ...] = ()
+        self._unplaced = ""
         self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
         self._started_ns = time.monotonic_ns()
         self._linked = False
@@ -270,6 +271,7 @@ class Service:
                 "setpoints_sent": self.streamer.sent_count,
             },
             "perception": self.perception.status.as_dict(),
+            "targets": {"count": len(self._targets), "problem": self._unplaced},
             "bus": {
                 "connected": self.bus.connected,
                 "published": dict(self.bus.published),
@@ -315,13 +317,18 @@ class Service:
         name = self.settings.vehicle.name
         self.bus.publish(topics.DETECTIONS, detections_message(result, name, time.monotonic_ns()))
         self.bus.publish(topics.LABELS, labels_message(result))
-        self._targets = targets_from_detections(
-            result.detections.records(),
-            result.captured_ns,
-            self.settings.camera.model(result.width, result.height),
-            self.settings.camera.mount(),
-            self._history,
-        )
+        try:
+            self._targets = targets_from_detections(
+                result.detections.records(),
+                result.captured_ns,
+                self.settings.camera.model(result.width, result.height),
+                self.settings.camera.mount(),
+                self._history,
+            )
+            self._unplaced = ""
+        except HistoryError as error:
+            # Without the attitude of that moment a box has no direction: seen and published, not steered by.
+            self._targets, self._unplaced = (), str(error)
 
     def _class_names(self) -> tuple[str, ...] | None:
         """What the detector knows; None while there is none to ask."""
