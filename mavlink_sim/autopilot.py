@@ -1,4 +1,4 @@
-"""PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, automatic disarming.
+"""PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, auto-disarming.
 
 `update` runs once a physics step. Whatever PX4 would tell a ground station is queued in `texts`.
 Times are seconds since boot. Names in capitals are PX4's parameters.
@@ -10,57 +10,39 @@ import math
 import struct
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from mavlink_sim import flight
-from mavlink_sim.control import NAN, Demand, PositionController, TrajectorySetpoint
+from mavlink_sim.announcements import (
+    ARMED_EVENT,
+    ARMING_DENIED_EVENT,
+    CRITICAL,
+    DEFAULT_ALTITUDE_EVENT,
+    DISARMED_EVENT,
+    GIMBAL_COMMANDS,
+    INFO,
+    LANDED_EVENT,
+    LANDING_EVENT,
+    TAKEOFF_EVENT,
+    GimbalCommand,
+    Text,
+)
+from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
 
-CRITICAL = 2  # MAV_SEVERITY_CRITICAL
-INFO = 6  # MAV_SEVERITY_INFO
-
 ACCEPTED = 0  # MAV_RESULT
 TEMPORARILY_REJECTED = 1
 
-# Measured: an armed vehicle that does not take off is disarmed 11.2 s after arming with COM_DISARM_PRFLT = 10.
+# Measured: a vehicle that does not take off is disarmed 11.2 s after arming with COM_DISARM_PRFLT = 10.
 PREFLIGHT_DISARM_MARGIN_S = 1.2
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
 TAKEOFF_DETECTION_HEIGHT_M = 0.12
+# As recorded: the vehicle creeps up while the ramp is still raising the thrust to hover, then climbs.
+RAMP_THRUST_SHARE = 0.9
+RAMP_CREEP_MPS = 0.2
 IDLE_THRUST_MPS2 = 0.6
-
-
-@dataclass(frozen=True, slots=True)
-class Text:
-    """One status text, with the event (identifier, log levels, arguments) that says the same, if PX4 has one."""
-
-    severity: int
-    text: str
-    event: tuple[int, int, bytes] | None = None
-
-
-# Event identifiers, log levels and arguments as a PX4 v1.17 emitted them in a recorded flight.
-ARMED_EVENT = (0x0190CAF3, 0x66, b"\x04")
-TAKEOFF_EVENT = (0x01414569, 0x66, b"")
-LANDING_EVENT = (0x0132B2DE, 0x66, b"")
-LANDED_EVENT = (0x019638AC, 0x66, b"")
-DISARMED_EVENT = 0x01F46777
-ARMING_DENIED_EVENT = (0x0102089D, 0x62, b"")
-DEFAULT_ALTITUDE_EVENT = 0x013B2FC7
-
-GimbalCommand = tuple[int, int, tuple[float, float, float, float, float, float, float]]
-# What a landing PX4 sends to look after a gimbal: (seconds after the landing began, command, confirmation, values).
-_TAKE_CONTROL = (1.0, 1.0, -1.0, -1.0, 0.0, 0.0, 0.0)
-GIMBAL_COMMANDS: tuple[tuple[float, GimbalCommand], ...] = (
-    (0.24, (1001, 0, _TAKE_CONTROL)),
-    (0.24, (1000, 0, (NAN, NAN, NAN, NAN, 2.0, 0.0, 0.0))),
-    (0.24, (1001, 0, (-3.0, -3.0, -1.0, -1.0, 0.0, 0.0, 0.0))),
-    (1.26, (1001, 1, _TAKE_CONTROL)),
-    (1.77, (1001, 2, _TAKE_CONTROL)),
-    (2.29, (1001, 3, _TAKE_CONTROL)),
-)
 
 
 class Autopilot:
@@ -178,7 +160,7 @@ class Autopilot:
         return ACCEPTED
 
     def set_mode(self, mode: Mode, tell: bool = False) -> int:
-        """MAV_RESULT of a request for a mode; `tell` it by a text if it is refused (requests from component 190)."""
+        """MAV_RESULT of a request for a mode; with `tell`, a refusal is also a text."""
         if self.armed and not self.can_run(mode):
             if tell:
                 self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
@@ -303,14 +285,17 @@ class Autopilot:
         return False
 
     def _climb_limit(self) -> float:
-        """PX4's take-off ramp: MPC_TKO_RAMP_T from nothing to MPC_TKO_SPEED, then free."""
+        """PX4's take-off ramp: hardly any climb while thrust builds up, up to MPC_TKO_SPEED, then free."""
         if self._lifting_since_s is None:
             return math.inf
-        progress = (self.now_s - self._lifting_since_s) / max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)
-        if progress >= 1.0:
-            self._lifting_since_s = None if not self.landed else self._lifting_since_s
-            return math.inf if not self.landed else self._parameters.number("MPC_TKO_SPEED")
-        return self._parameters.number("MPC_TKO_SPEED") * max(0.1, progress)
+        ramp = max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)
+        progress = (self.now_s - self._lifting_since_s) / ramp
+        if progress >= 1.0 and not self.landed:
+            self._lifting_since_s = None
+            return math.inf
+        speed = self._parameters.number("MPC_TKO_SPEED")
+        rise = (progress - RAMP_THRUST_SHARE) / (1.0 - RAMP_THRUST_SHARE)
+        return min(max(speed * rise, RAMP_CREEP_MPS), speed)
 
     def _detect_landing(self, setpoint: TrajectorySetpoint) -> None:
         airframe = self._airframe

@@ -135,7 +135,8 @@ def _run(simulation: Simulation, ready_file: Path | None) -> None:
         partial.write_text(json.dumps(report) + "\n", encoding="utf-8")
         partial.replace(ready_file)
     _say(
-        f"ready: system {options.system_id}, onboard {options.host}:{ports['onboard']} -> {options.onboard_port}, "
+        f"ready: system {options.system_id}, "
+        f"onboard {options.host}:{ports['onboard']} -> {options.onboard_port}, "
         f"ground station {options.host}:{ports['gcs']} -> {options.gcs_port}"
     )
     simulation.run()

@@ -1,4 +1,4 @@
-"""COMMAND_LONG and COMMAND_INT: which commands the vehicle knows, and the MAV_RESULT that PX4 gives for each."""
+"""COMMAND_LONG and COMMAND_INT: which commands the vehicle knows, and PX4's MAV_RESULT for each."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.autopilot import ACCEPTED, CRITICAL, TEMPORARILY_REJECTED, Text
+from mavlink_sim.announcements import CRITICAL, Text
+from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
+from mavlink_sim.geography import geographic, local
+from mavlink_sim.messages import dialect
 from mavlink_sim.modes import CUSTOM_MODE_ENABLED, mode_of
-from mavlink_sim.telemetry import MESSAGE_IDS, geographic, local
+from mavlink_sim.telemetry import MESSAGE_IDS
 
 if TYPE_CHECKING:
-    from mavlink_sim.vehicle import Link, Vehicle
+    from mavlink_sim.links import Link
+    from mavlink_sim.vehicle import Vehicle
 
 DENIED = 2  # MAV_RESULT
 UNSUPPORTED = 3
@@ -34,11 +38,10 @@ REQUEST_MESSAGE = 512
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command with its seven parameters: latitude and longitude (5, 6) in degrees, altitude (7) AMSL metres."""
+    """A command; of its parameters, 5 and 6 are latitude and longitude in degrees, 7 is AMSL metres."""
 
     identifier: int
     parameters: tuple[float, float, float, float, float, float, float]
-    source_system: int
     source_component: int
 
 
@@ -51,7 +54,7 @@ def command_of(message: Any) -> Command:
     else:
         tail = (message.param5, message.param6, message.param7)
     head = (message.param1, message.param2, message.param3, message.param4)
-    return Command(int(message.command), head + tail, message.get_srcSystem(), message.get_srcComponent())
+    return Command(int(message.command), head + tail, message.get_srcComponent())
 
 
 def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
@@ -154,7 +157,7 @@ def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int
 def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     interval = command.parameters[1]
-    if name is None or name == "HEARTBEAT" or not link.has_stream(name) or not math.isfinite(interval):
+    if name is None or name == "HEARTBEAT" or name not in link.streams or not math.isfinite(interval):
         return FAILED
     link.streams.set_interval(name, round(interval), vehicle.boot_us)
     return ACCEPTED
@@ -162,7 +165,9 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
 
 def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
     identifier = _identifier(command.parameters[0])
-    vehicle.send_interval(link, identifier, MESSAGE_IDS.get(identifier))
+    name = MESSAGE_IDS.get(identifier)
+    interval = 0 if name is None else link.streams.interval_us(name)  # 0: no such stream, -1: off
+    link.send(dialect.MAVLink_message_interval_message(identifier & 0xFFFF, interval))
     return ACCEPTED
 
 
@@ -182,7 +187,7 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     245: _accept,  # PREFLIGHT_STORAGE
     300: _deny,  # MISSION_START: there is no mission
     ARM_DISARM: _arm,
-    401: _accept,  # COMPONENT_ARM_DISARM's neighbour RUN_PREARM_CHECKS
+    401: _accept,  # RUN_PREARM_CHECKS
     GET_MESSAGE_INTERVAL: _get_message_interval,
     SET_MESSAGE_INTERVAL: _set_message_interval,
     REQUEST_MESSAGE: _request_message,
@@ -190,5 +195,5 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     520: _request_capabilities,  # REQUEST_AUTOPILOT_CAPABILITIES
 }
 
-# Flown by Commander a moment later, after the receiver's own answer (see `Vehicle.handle`).
+# PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).
 ANSWERED_TWICE = frozenset({DO_SET_MODE})

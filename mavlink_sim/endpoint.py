@@ -1,4 +1,4 @@
-"""UDP endpoints that carry a vehicle's links: bound like PX4's, sending to a fixed port until somebody answers."""
+"""UDP endpoints for a vehicle's links: bound like PX4's, sending to a fixed port until somebody answers."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class PortInUseError(OSError):
 class UdpEndpoint:
     """One bound UDP socket, non-blocking.
 
-    Sends to `peer` from the start, as PX4 does, and to whoever sent to it since (its first correspondent, until that
-    one falls silent). Each outgoing message is one datagram.
+    Sends to `peer_port` from the start, as PX4 does, then to its first correspondent until that falls silent.
+    Each outgoing message is one datagram.
 
     Raises:
         PortInUseError: `bind_port` is taken; 0 chooses a free one.
@@ -42,11 +42,10 @@ class UdpEndpoint:
             self.socket.close()
             if error.errno == errno.EADDRINUSE:
                 raise PortInUseError(
-                    f"UDP port {host}:{bind_port} is already in use; stop the other vehicle or choose another port"
+                    f"UDP port {host}:{bind_port} is already in use; stop its user or choose another port"
                 ) from error
             raise
         self.peer: tuple[str, int] = (host, peer_port)
-        self._default_peer = self.peer
         self._peer_heard_s: float | None = None
         self._codec = parser(system_id)
         self._refused = False
@@ -83,17 +82,14 @@ class UdpEndpoint:
         now = time.monotonic()
         if self._peer_heard_s is None or sender == self.peer or now - self._peer_heard_s > PEER_SILENCE_S:
             if sender != self.peer:
-                logger.info("link on port %d talks to %s:%d", self.port, *sender)
+                logger.info("the link on port %d talks to %s:%d", self.port, *sender)
             self.peer = sender
             self._peer_heard_s = now
 
     def send(self, outgoing: Iterable[Outgoing]) -> None:
         """Send each message; what the network cannot take now is dropped, as a radio would."""
-        codec = self._codec
         for item in outgoing:
-            codec.srcSystem, codec.srcComponent = item.system, item.component
-            packet = item.message.pack(codec)
-            codec.seq = (codec.seq + 1) % 256
+            packet = item.pack(self._codec)
             try:
                 self.socket.sendto(packet, self.peer)
             except (BlockingIOError, ConnectionRefusedError):

@@ -1,6 +1,6 @@
 """The flight tasks: what each mode asks of the position controller while it runs.
 
-A task is made when its mode begins and asked for a `TrajectorySetpoint` at every step. Positions are local NED.
+A task is made when its mode begins and asked for a `TrajectorySetpoint` at every step. Positions: local NED.
 """
 
 from __future__ import annotations
@@ -14,7 +14,11 @@ from mavlink_sim.physics import Multirotor, Vector
 # Share of the acceleration limit that the planned braking uses, so that the vehicle can follow it.
 BRAKING_SHARE = 0.6
 # Climb towards the take-off altitude slows down with the height left; tuned to the recorded 6.5-9 s to HOLD.
-TAKEOFF_APPROACH_PER_S = 0.42
+TAKEOFF_APPROACH_PER_S = 0.3
+# On the ramp the planned height must not run away from a vehicle that may not follow it yet.
+TAKEOFF_LEAD_M = 0.3
+# Measured: a take-off to 2.5 m is over at 1.8-2.2 m, a little inside NAV_MC_ALT_RAD.
+TAKEOFF_ACCEPTANCE = 0.8
 
 
 class Trajectory:
@@ -26,6 +30,11 @@ class Trajectory:
         self.position = airframe.position
         self.velocity = airframe.velocity
         self.yaw_rad = airframe.yaw_rad
+
+    def keep_within(self, lead_m: float) -> None:
+        """Let the planned height lead the vehicle's by at most this much."""
+        x, y, z = self.position
+        self.position = (x, y, max(z, self._airframe.position[2] - lead_m))
 
     def stopping_point(self) -> Vector:
         """Where the vehicle comes to rest if it brakes now."""
@@ -121,7 +130,8 @@ class Takeoff(Task):
         assert self.goal is not None
         left = self._airframe.position[2] - self.goal[2]
         climb = min(self._parameters.number("MPC_TKO_SPEED"), max(0.25, TAKEOFF_APPROACH_PER_S * abs(left)))
-        self.finished = abs(left) < self._parameters.number("NAV_MC_ALT_RAD")
+        self.finished = abs(left) < TAKEOFF_ACCEPTANCE * self._parameters.number("NAV_MC_ALT_RAD")
+        self._trajectory.keep_within(TAKEOFF_LEAD_M)
         return self._trajectory.towards(self.goal, dt_s, max_up_mps=climb)
 
 

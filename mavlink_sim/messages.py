@@ -1,8 +1,10 @@
 """The MAVLink dialect the vehicle speaks: pymavlink's `development`, and PX4's messages that it lacks.
 
-PX4 is built with MAVLink's development dialect. pymavlink's copy of it has CURRENT_MODE (436) and AVAILABLE_MODES (435)
-but not LINK_NODE_STATUS, TIME_ESTIMATE_TO_TARGET, EVENT and CURRENT_EVENT_SEQUENCE; those are defined here from the
-public XML definitions. A client whose dialect lacks one of them sees it as UNKNOWN_<id>, as it does with PX4.
+PX4 is built with MAVLink's development dialect. pymavlink's copy of it has CURRENT_MODE (436), but not
+LINK_NODE_STATUS, TIME_ESTIMATE_TO_TARGET, EVENT and CURRENT_EVENT_SEQUENCE; those are defined here from the
+public XML definitions. A client whose dialect lacks one of them sees it as UNKNOWN_<id>, as it does with PX4:
+with pymavlink's `common` that includes CURRENT_MODE (id 436, CRC extra 193, payload `<IIB`: custom mode,
+intended custom mode, standard mode); `development` and `all` decode it.
 """
 
 from __future__ import annotations
@@ -31,11 +33,24 @@ _EVENT_SEQUENCE = struct.Struct("<HB")
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """A message on its way out of the vehicle, with the component it comes from (a forwarded one has another)."""
+    """A message on its way out of the vehicle, with the component it comes from.
+
+    `forwarded`: it came in on another link and is passed on byte for byte.
+    """
 
     message: Any
     system: int
     component: int
+    forwarded: bool = False
+
+    def pack(self, codec: Any) -> bytes:
+        """Its bytes, numbered and sealed by a `parser()` of the link it goes out on."""
+        if self.forwarded:
+            return bytes(self.message.get_msgbuf())
+        codec.srcSystem, codec.srcComponent = self.system, self.component
+        packed: bytes = self.message.pack(codec)
+        codec.seq = (codec.seq + 1) % 256
+        return packed
 
 
 class _PackedMessage(dialect.MAVLink_message):  # type: ignore[misc]
@@ -99,7 +114,7 @@ def current_event_sequence(sequence: int) -> Any:
 
 
 def parser(system: int = 1, component: int = 1) -> Any:
-    """A pymavlink codec: reads a stream of bytes without raising on garbage, packs with its own sequence numbers."""
+    """A pymavlink codec: reads a stream of bytes without raising on garbage, numbers what it packs."""
     codec = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
     codec.robust_parsing = True
     return codec

@@ -1,6 +1,6 @@
 """PX4's flight modes: how HEARTBEAT and CURRENT_MODE encode them, and how DO_SET_MODE names them.
 
-The custom mode is `main << 16 | sub << 24` (PX4's `px4_custom_mode.h`); the base mode's bits are MAV_MODE_FLAG.
+The custom mode is `main << 16 | sub << 24` (PX4's `px4_custom_mode.h`); the base mode is MAV_MODE_FLAG bits.
 """
 
 from __future__ import annotations
@@ -104,12 +104,12 @@ _BY_CUSTOM[(3, 1)] = Mode.POSCTL
 
 
 def mode_of(main: int, sub: int) -> Mode | None:
-    """The mode that DO_SET_MODE's parameters 2 and 3 name; None where PX4 refuses them (AUTO.READY, RATTITUDE…)."""
+    """The mode that DO_SET_MODE's parameters 2 and 3 name; None where PX4 refuses them."""
     return _BY_CUSTOM.get((main, sub if main in (3, 4) else 0))
 
 
 def base_mode(mode: Mode, armed: bool, has_setpoints: bool) -> int:
-    """HEARTBEAT.base_mode. `has_setpoints`: an OFFBOARD setpoint stream is present (it matters in OFFBOARD alone)."""
+    """HEARTBEAT.base_mode. `has_setpoints`: a setpoint stream is present (it matters in OFFBOARD alone)."""
     if mode is Mode.OFFBOARD:
         flags = STABILIZE_ENABLED if has_setpoints else 0
     elif mode is Mode.ACRO:

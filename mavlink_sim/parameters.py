@@ -87,6 +87,9 @@ class Parameters:
                 f"this vehicle has no parameter {name!r}; PARAM_REQUEST_LIST names all {len(self)}"
             ) from None
 
+    def get(self, name: str) -> Parameter | None:
+        return self._parameters.get(name)
+
     def number(self, name: str) -> float:
         return self[name].value
 
@@ -98,7 +101,7 @@ class Parameters:
         return self._names.index(name)
 
     def set(self, name: str, value: float) -> Parameter:
-        """Set a value; PX4 checks no range. Raises UnknownParameterError, ValueError for a fraction in an INT32."""
+        """Set a value; PX4 checks no range. Raises UnknownParameterError or ValueError."""
         parameter = self[name]
         if not math.isfinite(value):
             raise ValueError(f"parameter {name} needs a finite number, got {value}")
@@ -114,7 +117,7 @@ class Parameters:
         return changed
 
     def hash(self) -> int:
-        """PX4's _HASH_CHECK: CRC-32 (no inversions) over every name and value in order, as in `param_hash_check`."""
+        """PX4's _HASH_CHECK: CRC-32 without inversions over every name and value in order."""
         crc = 0xFFFFFFFF
         for parameter in self:
             packed = struct.pack("<i" if parameter.kind == INT32 else "<f", parameter.value)

@@ -1,8 +1,8 @@
-"""The motion of a multirotor: a point mass under thrust, drag and wind, with an attitude that follows demands.
+"""The motion of a multirotor: a point mass under thrust, drag and wind, with attitude control.
 
-World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, drag and thrust are
-those of PX4's own SIH quadrotor (SIH_MASS 1 kg, SIH_KDV 1 N/(m/s), 4 × SIH_T_MAX 5 N). Plain floats throughout:
-numpy's scalars would make the 250 Hz step several times dearer.
+World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, drag and thrust
+are those of PX4's own SIH quadrotor (SIH_MASS 1 kg, SIH_KDV 1 N/(m/s), 4 × SIH_T_MAX 5 N). Plain floats
+throughout: numpy's scalars would make the 250 Hz step several times dearer.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ GRAVITY_MPS2 = 9.80665
 MAX_THRUST_MPS2 = 20.0  # 4 rotors of SIH_T_MAX 5 N on SIH_MASS 1 kg
 LINEAR_DRAG_PER_S = 1.0  # SIH_KDV / SIH_MASS
 THRUST_TIME_CONSTANT_S = 0.05  # SIH_T_TAU
-ATTITUDE_GAIN_PER_S = 6.5  # MC_ROLL_P 4 plus the rate loop's feed-forward: tuned to the recorded 10 m step
+ATTITUDE_GAIN_PER_S = 4.0  # MC_ROLL_P, MC_PITCH_P
 MAX_TILT_RATE_RADPS = math.radians(220.0)  # MC_ROLLRATE_MAX
 RATE_TIME_CONSTANT_S = 0.05
 YAW_RATE_TIME_CONSTANT_S = 0.15
@@ -28,12 +28,12 @@ class Multirotor:
     """One airframe. Deterministic: the same seed and the same demands give the same flight.
 
     Attributes:
-        position: NED metres; velocity: NED m/s; acceleration: NED m/s² without gravity's reaction (kinematic).
+        position: NED metres; velocity: NED m/s; acceleration: NED m/s², kinematic.
         roll_rad, pitch_rad, yaw_rad: attitude, aerospace sequence.
         rates: body angular rates about FRD, rad/s.
         thrust_mps2: collective thrust per mass, along body up.
         on_ground: touching the ground.
-        wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation, per horizontal axis) come on top.
+        wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
     """
 
     __slots__ = (
@@ -136,7 +136,7 @@ class Multirotor:
         self.acceleration = (ax, ay, az)
 
     def _air(self, dt_s: float) -> Vector:
-        """The air's velocity: the steady wind plus gusts (first-order Gauss-Markov), a third as strong vertically."""
+        """The air's velocity: the steady wind plus gusts (a first-order Gauss-Markov process)."""
         gx, gy, gz = self._gust
         if self.gusts_mps > 0.0:
             decay = dt_s / GUST_TIME_CONSTANT_S
@@ -144,7 +144,7 @@ class Multirotor:
             gauss = self._random.gauss
             gx += -gx * decay + gauss(0.0, spread)
             gy += -gy * decay + gauss(0.0, spread)
-            gz += -gz * decay + gauss(0.0, spread / 3.0)
+            gz += -gz * decay + gauss(0.0, spread)
             self._gust = (gx, gy, gz)
         wx, wy, wz = self.wind
         return (wx + gx, wy + gy, wz + gz)

@@ -1,7 +1,7 @@
 """A vehicle in real time: UDP links, the camera in its own process, the truth on record.
 
-One thread, one loop: wait for the sockets until the next physics step is due, take in what came, step, send. Rendering
-happens in a process of its own and is never waited for.
+One thread, one loop: wait for the sockets until the next physics step is due, take in what came, step, send.
+Rendering happens in a process of its own and is never waited for.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from mavlink_sim import telemetry
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.vehicle import STEP_S, Vehicle
 
 logger = logging.getLogger(__name__)
@@ -93,7 +93,7 @@ class Simulation:
                 )
             }
             self.vehicle.add_link("onboard")
-            self.vehicle.add_link("gcs", telemetry.GCS_RATES_HZ)
+            self.vehicle.add_link("gcs", GCS_RATES_HZ)
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:

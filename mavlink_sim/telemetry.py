@@ -1,7 +1,4 @@
-"""The message streams: what each message says of the vehicle, and how often each kind of link gets it.
-
-Rates in `ONBOARD_RATES_HZ` are those measured on a PX4's onboard link, `GCS_RATES_HZ` on its ground-station link.
-"""
+"""What each telemetry message says of the vehicle: one builder a message."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from mavlink_sim.geography import HOME_ALTITUDE_M, HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
 from mavlink_sim.physics import MAX_THRUST_MPS2
 from vision.rotation import quaternion_from_euler
@@ -17,107 +15,13 @@ from vision.rotation import quaternion_from_euler
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
 
-ONBOARD_RATES_HZ: dict[str, float] = {
-    "HEARTBEAT": 1.0,
-    "ATTITUDE": 98.5,
-    "ATTITUDE_QUATERNION": 49.0,
-    "GLOBAL_POSITION_INT": 49.0,
-    "HIGHRES_IMU": 49.0,
-    "LOCAL_POSITION_NED": 29.5,
-    "ODOMETRY": 29.5,
-    "TIMESYNC": 9.85,
-    "ALTITUDE": 9.85,
-    "DISTANCE_SENSOR": 9.85,
-    "ATTITUDE_TARGET": 9.85,
-    "POSITION_TARGET_LOCAL_NED": 9.85,
-    "POSITION_TARGET_GLOBAL_INT": 9.85,
-    "SERVO_OUTPUT_RAW": 9.85,
-    "VFR_HUD": 9.85,
-    "GPS_RAW_INT": 7.9,
-    "EXTENDED_SYS_STATE": 4.95,
-    "SYS_STATUS": 4.95,
-    "ESTIMATOR_STATUS": 1.0,
-    "OPEN_DRONE_ID_LOCATION": 1.0,
-    "OPEN_DRONE_ID_SYSTEM": 1.0,
-    "PING": 1.0,
-    "SCALED_PRESSURE": 1.0,
-    "SYSTEM_TIME": 1.0,
-    "LINK_NODE_STATUS": 1.0,
-    "MISSION_CURRENT": 1.0,
-    "BATTERY_STATUS": 0.5,
-    "CURRENT_MODE": 0.5,
-    "HOME_POSITION": 0.5,
-    "VIBRATION": 0.5,
-    "TIME_ESTIMATE_TO_TARGET": 0.5,
-    "CURRENT_EVENT_SEQUENCE": 0.3,
-    "GPS_GLOBAL_ORIGIN": 0.0,  # on change alone
-}
-GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
-    "HEARTBEAT": 1.0,
-    "ATTITUDE": 49.0,
-    "ATTITUDE_QUATERNION": 49.0,
-    "ATTITUDE_TARGET": 49.0,
-    "GLOBAL_POSITION_INT": 49.0,
-    "LOCAL_POSITION_NED": 49.0,
-    "POSITION_TARGET_LOCAL_NED": 49.0,
-    "SERVO_OUTPUT_RAW": 49.0,
-    "GPS_RAW_INT": 5.0,
-    "ALTITUDE": 1.0,
-    "EXTENDED_SYS_STATE": 1.0,
-    "ESTIMATOR_STATUS": 0.5,
-    "POSITION_TARGET_GLOBAL_INT": 1.0,
-    "SCALED_PRESSURE": 1.0,
-    "SYSTEM_TIME": 1.0,
-    "SYS_STATUS": 1.0,
-    "VFR_HUD": 1.0,
-    "MISSION_CURRENT": 1.0,
-    "OPEN_DRONE_ID_LOCATION": 1.0,
-    "OPEN_DRONE_ID_SYSTEM": 1.0,
-    "LINK_NODE_STATUS": 1.0,
-    "BATTERY_STATUS": 0.5,
-    "CURRENT_MODE": 0.5,
-    "HOME_POSITION": 0.5,
-    "TIME_ESTIMATE_TO_TARGET": 0.5,
-    "DISTANCE_SENSOR": 0.5,
-    "CURRENT_EVENT_SEQUENCE": 0.3,
-    "PING": 0.1,
-    "VIBRATION": 0.1,
-}
-
 PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
-# (present, enabled, health) of SYS_STATUS as recorded from PX4's SIH quadrotor, before and after its estimator started
+# (present, enabled, health) of SYS_STATUS as recorded from a PX4, before and after its estimator started
 SENSORS_STARTING = (0x402F, 0x1402F, 0x320883F)
 SENSORS_READY = (0x402F, 0x1402F, 0x320C83F)
 
-HOME_LATITUDE_DEG = 47.397743225  # SIH_LOC_LAT0
-HOME_LONGITUDE_DEG = 8.545594215
-HOME_ALTITUDE_M = 489.4  # SIH_LOC_H0, above mean sea level
-EARTH_RADIUS_M = 6371000.0
-_METRES_PER_DEGREE = math.radians(1.0) * EARTH_RADIUS_M
-_LONGITUDE_SCALE = math.cos(math.radians(HOME_LATITUDE_DEG))
-
-# PX4 clears these with every message it cannot fill.
 _U16_UNKNOWN = 65535
 _NAN = math.nan
-
-
-def geographic(position: tuple[float, float, float]) -> tuple[float, float, float]:
-    """(latitude °, longitude °, altitude AMSL m) of a local NED position."""
-    north, east, down = position
-    return (
-        HOME_LATITUDE_DEG + north / _METRES_PER_DEGREE,
-        HOME_LONGITUDE_DEG + east / (_METRES_PER_DEGREE * _LONGITUDE_SCALE),
-        HOME_ALTITUDE_M - down,
-    )
-
-
-def local(latitude_deg: float, longitude_deg: float, altitude_m: float) -> tuple[float, float, float]:
-    """The local NED position of a place; NaN stays NaN."""
-    return (
-        (latitude_deg - HOME_LATITUDE_DEG) * _METRES_PER_DEGREE,
-        (longitude_deg - HOME_LONGITUDE_DEG) * _METRES_PER_DEGREE * _LONGITUDE_SCALE,
-        HOME_ALTITUDE_M - altitude_m,
-    )
 
 
 def _heartbeat(vehicle: Vehicle) -> Any:
@@ -436,6 +340,8 @@ def _current_mode(vehicle: Vehicle) -> Any:
 
 
 def _home_position(vehicle: Vehicle) -> Any:
+    if not vehicle.autopilot.sensors_ready:
+        return None  # there is no home before there is a position
     home = vehicle.autopilot.home
     latitude, longitude, altitude = geographic(home)
     return dialect.MAVLink_home_position_message(
@@ -540,46 +446,3 @@ MESSAGE_IDS: dict[int, str] = {
     for identifier, message in dialect.mavlink_map.items()
     if message.msgname in BUILDERS or message.msgname in REQUESTED
 } | {8: "LINK_NODE_STATUS", 380: "TIME_ESTIMATE_TO_TARGET", 411: "CURRENT_EVENT_SEQUENCE"}
-
-
-class Streams:
-    """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1."""
-
-    def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0) -> None:
-        self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
-        self._interval_us = dict(self._default_us)
-        self._due_us = {
-            name: int(phase_s * 1e6) + interval
-            for name, interval in self._interval_us.items()
-            if interval > 0
-        }
-        self._next_us = min(self._due_us.values(), default=0)
-
-    def interval_us(self, name: str) -> int:
-        return self._interval_us.get(name, -1)
-
-    def set_interval(self, name: str, interval_us: int, now_us: int) -> None:
-        """-1 switches off, 0 restores the default."""
-        interval = self._default_us[name] if interval_us == 0 else max(interval_us, -1)
-        self._interval_us[name] = interval
-        if interval > 0:
-            self._due_us[name] = now_us + interval
-        else:
-            self._due_us.pop(name, None)
-        self._next_us = 0
-
-    def due(self, now_us: int) -> list[str]:
-        """The messages to send now. A stream that fell behind by more than one interval skips, it does not burst."""
-        if now_us < self._next_us:
-            return []
-        names = [name for name, due in self._due_us.items() if due <= now_us]
-        for name in names:
-            interval = self._interval_us[name]
-            following = self._due_us[name] + interval
-            self._due_us[name] = following if following > now_us else now_us + interval
-        self._next_us = min(self._due_us.values(), default=now_us + 1_000_000)
-        return names
-
-
-def _interval_us(rate_hz: float) -> int:
-    return round(1e6 / rate_hz) if rate_hz > 0.0 else -1

@@ -1,0 +1,42 @@
+"""What the autopilot says unasked: status texts, their events, and the commands PX4 sends to a gimbal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mavlink_sim.control import NAN
+
+CRITICAL = 2  # MAV_SEVERITY_CRITICAL
+INFO = 6  # MAV_SEVERITY_INFO
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A status text, and the event (identifier, log levels, arguments) that says the same, if PX4 has one."""
+
+    severity: int
+    text: str
+    event: tuple[int, int, bytes] | None = None
+
+
+# Event identifiers, log levels and arguments as a PX4 v1.17 emitted them in a recorded flight.
+ARMED_EVENT = (0x0190CAF3, 0x66, b"\x04")
+TAKEOFF_EVENT = (0x01414569, 0x66, b"")
+LANDING_EVENT = (0x0132B2DE, 0x66, b"")
+LANDED_EVENT = (0x019638AC, 0x66, b"")
+DISARMED_EVENT = 0x01F46777
+ARMING_DENIED_EVENT = (0x0102089D, 0x62, b"")
+DEFAULT_ALTITUDE_EVENT = 0x013B2FC7
+
+# command, confirmation, its seven parameters
+GimbalCommand = tuple[int, int, tuple[float, float, float, float, float, float, float]]
+# What PX4 sends at a landing to look after a gimbal: (seconds since it began, command as above).
+_TAKE_CONTROL = (1.0, 1.0, -1.0, -1.0, 0.0, 0.0, 0.0)
+GIMBAL_COMMANDS: tuple[tuple[float, GimbalCommand], ...] = (
+    (0.24, (1001, 0, _TAKE_CONTROL)),
+    (0.24, (1000, 0, (NAN, NAN, NAN, NAN, 2.0, 0.0, 0.0))),
+    (0.24, (1001, 0, (-3.0, -3.0, -1.0, -1.0, 0.0, 0.0, 0.0))),
+    (1.26, (1001, 1, _TAKE_CONTROL)),
+    (1.77, (1001, 2, _TAKE_CONTROL)),
+    (2.29, (1001, 3, _TAKE_CONTROL)),
+)

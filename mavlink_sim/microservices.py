@@ -1,0 +1,106 @@
+"""How the vehicle answers each message it understands (MAVLink's "microservices")."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim import commands, parameter_protocol
+from mavlink_sim.announcements import CRITICAL, Text
+from mavlink_sim.autopilot import ACCEPTED
+from mavlink_sim.messages import dialect
+from mavlink_sim.setpoints import SetpointRejectedError, trajectory_setpoint
+
+if TYPE_CHECKING:
+    from mavlink_sim.links import Link
+    from mavlink_sim.vehicle import Vehicle
+
+MAV_TYPE_GCS = 6
+MAV_TYPE_ONBOARD_CONTROLLER = 18
+# Commander looks at a mode request a moment after the receiver has answered it: 0-10 ms were measured.
+COMMANDER_DELAY_S = 0.004
+
+
+def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if message.type == MAV_TYPE_GCS:
+        link.ground_station_seen_s = vehicle.now_s
+    elif message.type == MAV_TYPE_ONBOARD_CONTROLLER and message.get_srcSystem() == vehicle.system_id:
+        vehicle.companion_heard()
+
+
+def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
+    command = commands.command_of(message)
+    if command.identifier in commands.ANSWERED_TWICE:
+        _acknowledge(link, message, command.identifier, ACCEPTED)
+        vehicle.after(COMMANDER_DELAY_S, lambda: _execute(vehicle, link, message, command))
+    else:
+        _execute(vehicle, link, message, command)
+
+
+def _execute(vehicle: Vehicle, link: Link, message: Any, command: commands.Command) -> None:
+    result = commands.execute(vehicle, link, command)
+    if result is not None:
+        _acknowledge(link, message, command.identifier, result)
+
+
+def _acknowledge(link: Link, message: Any, command: int, result: int) -> None:
+    link.send(
+        dialect.MAVLink_command_ack_message(
+            command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+        )
+    )
+
+
+def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
+    custom = int(message.custom_mode)
+    result = commands.set_mode(
+        vehicle, message.base_mode, custom >> 16 & 0xFF, custom >> 24 & 0xFF, message.get_srcComponent()
+    )
+    _acknowledge(link, message, commands.DO_SET_MODE, result)
+
+
+def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+    try:
+        setpoint = trajectory_setpoint(message, vehicle.airframe.yaw_rad)
+    except SetpointRejectedError as error:
+        vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
+        return
+    vehicle.autopilot.offboard_setpoint(setpoint)
+
+
+def _timesync(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if message.tc1 == 0:
+        link.send(dialect.MAVLink_timesync_message(vehicle.clock_ns(), message.ts1))
+
+
+def _ping(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if message.target_system == 0 and message.target_component == 0:  # else it is an answer
+        link.send(
+            dialect.MAVLink_ping_message(
+                message.time_usec, message.seq, message.get_srcSystem(), message.get_srcComponent()
+            )
+        )
+
+
+def _mission_request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
+    kind = getattr(message, "mission_type", 0)
+    link.send(
+        dialect.MAVLink_mission_count_message(message.get_srcSystem(), message.get_srcComponent(), 0, kind)
+    )
+
+
+Handler = Callable[["Vehicle", "Link", Any], None]
+
+HANDLERS: dict[str, Handler] = {
+    "HEARTBEAT": _heartbeat,
+    "COMMAND_LONG": _command,
+    "COMMAND_INT": _command,
+    "SET_MODE": _set_mode,
+    "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
+    "TIMESYNC": _timesync,
+    "PING": _ping,
+    "PARAM_REQUEST_LIST": parameter_protocol.request_list,
+    "PARAM_REQUEST_READ": parameter_protocol.request_read,
+    "PARAM_SET": parameter_protocol.set_parameter,
+    "MISSION_REQUEST_LIST": _mission_request_list,
+}

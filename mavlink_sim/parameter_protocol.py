@@ -1,0 +1,116 @@
+"""MAVLink's parameter protocol as PX4 speaks it: the hash first, the list in order, PARAM_ERROR otherwise."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.messages import dialect
+from mavlink_sim.parameters import (
+    HASH_CHECK,
+    HASH_CHECK_INDEX,
+    UINT32,
+    Parameter,
+    Parameters,
+    decode_wire_value,
+)
+
+if TYPE_CHECKING:
+    from mavlink_sim.links import Link
+    from mavlink_sim.vehicle import Vehicle
+
+logger = logging.getLogger(__name__)
+
+FIRST_ANSWER_S = 0.01
+LIST_RATE_HZ = 1000.0
+SECOND_ECHO_S = 0.015
+DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
+TYPE_MISMATCH = 7
+
+
+def request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_LIST: the hash, then every parameter at about a thousand a second."""
+    vehicle.after(FIRST_ANSWER_S, lambda: _begin_list(vehicle, link))
+
+
+def _begin_list(vehicle: Vehicle, link: Link) -> None:
+    _send_hash(link, vehicle.parameters)
+    link.parameters_left = deque(vehicle.parameters)
+    link.parameter_credit = 0.0
+
+
+def continue_list(link: Link, parameters: Parameters, dt_s: float) -> None:
+    """Send the part of a running list that is due after `dt_s` more."""
+    link.parameter_credit += LIST_RATE_HZ * dt_s
+    while link.parameter_credit >= 1.0 and link.parameters_left:
+        link.parameter_credit -= 1.0
+        _send(link, parameters, parameters[link.parameters_left.popleft().name])
+
+
+def request_read(vehicle: Vehicle, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_READ, by index or (index -1) by name."""
+    index = int(message.param_index)
+    name = _text_of(message.param_id)
+    if index < 0 and name == HASH_CHECK:
+        _send_hash(link, vehicle.parameters)
+        return
+    parameter = vehicle.parameters.at(index) if index >= 0 else vehicle.parameters.get(name)
+    if parameter is None:
+        _send_error(link, message, name, index, DOES_NOT_EXIST)
+    else:
+        _send(link, vehicle.parameters, parameter)
+
+
+def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
+    """PARAM_SET: the new value twice, at once and 15 ms later, as measured."""
+    name = _text_of(message.param_id)
+    if name == HASH_CHECK:
+        link.parameters_left.clear()  # the client has a matching cache and wants no list
+        return
+    if name not in vehicle.parameters:
+        _send_error(link, message, name, -1, DOES_NOT_EXIST)
+        return
+    parameter = vehicle.parameters[name]
+    if parameter.kind != message.param_type:
+        _send_error(link, message, name, -1, TYPE_MISMATCH)
+        return
+    try:
+        parameter = vehicle.parameters.set(name, decode_wire_value(parameter.kind, message.param_value))
+    except ValueError as error:
+        logger.info("PARAM_SET refused, the old value stands: %s", error)
+    _send(link, vehicle.parameters, parameter)
+    vehicle.after(SECOND_ECHO_S, lambda: _send(link, vehicle.parameters, vehicle.parameters[name]))
+
+
+def _send(link: Link, parameters: Parameters, parameter: Parameter) -> None:
+    link.send(
+        dialect.MAVLink_param_value_message(
+            parameter.name.encode(),
+            parameter.wire_value,
+            parameter.kind,
+            len(parameters),
+            parameters.index(parameter.name),
+        )
+    )
+
+
+def _send_hash(link: Link, parameters: Parameters) -> None:
+    link.send(
+        dialect.MAVLink_param_value_message(
+            HASH_CHECK.encode(), parameters.hash_wire_value(), UINT32, len(parameters), HASH_CHECK_INDEX
+        )
+    )
+
+
+def _send_error(link: Link, message: Any, name: str, index: int, error: int) -> None:
+    link.send(
+        dialect.MAVLink_param_error_message(
+            message.get_srcSystem(), message.get_srcComponent(), name.encode(), index, error
+        )
+    )
+
+
+def _text_of(field: str | bytes) -> str:
+    text = field.decode(errors="replace") if isinstance(field, bytes) else field
+    return text.split("\0", 1)[0]

@@ -1,0 +1,120 @@
+"""How often each kind of link gets each message.
+
+`ONBOARD_RATES_HZ` were measured on a PX4's onboard link, `GCS_RATES_HZ` on its ground station's.
+"""
+
+from __future__ import annotations
+
+ONBOARD_RATES_HZ: dict[str, float] = {
+    "HEARTBEAT": 1.0,
+    "ATTITUDE": 98.5,
+    "ATTITUDE_QUATERNION": 49.0,
+    "GLOBAL_POSITION_INT": 49.0,
+    "HIGHRES_IMU": 49.0,
+    "LOCAL_POSITION_NED": 29.5,
+    "ODOMETRY": 29.5,
+    "TIMESYNC": 9.85,
+    "ALTITUDE": 9.85,
+    "DISTANCE_SENSOR": 9.85,
+    "ATTITUDE_TARGET": 9.85,
+    "POSITION_TARGET_LOCAL_NED": 9.85,
+    "POSITION_TARGET_GLOBAL_INT": 9.85,
+    "SERVO_OUTPUT_RAW": 9.85,
+    "VFR_HUD": 9.85,
+    "GPS_RAW_INT": 7.9,
+    "EXTENDED_SYS_STATE": 4.95,
+    "SYS_STATUS": 4.95,
+    "ESTIMATOR_STATUS": 1.0,
+    "OPEN_DRONE_ID_LOCATION": 1.0,
+    "OPEN_DRONE_ID_SYSTEM": 1.0,
+    "PING": 1.0,
+    "SCALED_PRESSURE": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "LINK_NODE_STATUS": 1.0,
+    "MISSION_CURRENT": 1.0,
+    "BATTERY_STATUS": 0.5,
+    "CURRENT_MODE": 0.5,
+    "HOME_POSITION": 0.5,
+    "VIBRATION": 0.5,
+    "TIME_ESTIMATE_TO_TARGET": 0.5,
+    "CURRENT_EVENT_SEQUENCE": 0.3,
+    "GPS_GLOBAL_ORIGIN": 0.0,  # on change alone
+}
+GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
+    "HEARTBEAT": 1.0,
+    "ATTITUDE": 49.0,
+    "ATTITUDE_QUATERNION": 49.0,
+    "ATTITUDE_TARGET": 49.0,
+    "GLOBAL_POSITION_INT": 49.0,
+    "LOCAL_POSITION_NED": 49.0,
+    "POSITION_TARGET_LOCAL_NED": 49.0,
+    "SERVO_OUTPUT_RAW": 49.0,
+    "GPS_RAW_INT": 5.0,
+    "ALTITUDE": 1.0,
+    "EXTENDED_SYS_STATE": 1.0,
+    "ESTIMATOR_STATUS": 0.5,
+    "POSITION_TARGET_GLOBAL_INT": 1.0,
+    "SCALED_PRESSURE": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "SYS_STATUS": 1.0,
+    "VFR_HUD": 1.0,
+    "MISSION_CURRENT": 1.0,
+    "OPEN_DRONE_ID_LOCATION": 1.0,
+    "OPEN_DRONE_ID_SYSTEM": 1.0,
+    "LINK_NODE_STATUS": 1.0,
+    "BATTERY_STATUS": 0.5,
+    "CURRENT_MODE": 0.5,
+    "HOME_POSITION": 0.5,
+    "TIME_ESTIMATE_TO_TARGET": 0.5,
+    "DISTANCE_SENSOR": 0.5,
+    "CURRENT_EVENT_SEQUENCE": 0.3,
+    "PING": 0.1,
+    "VIBRATION": 0.1,
+}
+
+
+class Streams:
+    """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1."""
+
+    def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0) -> None:
+        self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
+        self._interval_us = dict(self._default_us)
+        self._due_us = {
+            name: int(phase_s * 1e6) + interval
+            for name, interval in self._interval_us.items()
+            if interval > 0
+        }
+        self._next_us = min(self._due_us.values(), default=0)
+
+    def __contains__(self, name: str) -> bool:
+        """Whether there is such a stream, on or off."""
+        return name in self._default_us
+
+    def interval_us(self, name: str) -> int:
+        return self._interval_us.get(name, -1)
+
+    def set_interval(self, name: str, interval_us: int, now_us: int) -> None:
+        """-1 switches off, 0 restores the default."""
+        interval = self._default_us[name] if interval_us == 0 else max(interval_us, -1)
+        self._interval_us[name] = interval
+        if interval > 0:
+            self._due_us[name] = now_us + interval
+        else:
+            self._due_us.pop(name, None)
+        self._next_us = 0
+
+    def due(self, now_us: int) -> list[str]:
+        """The messages to send now. A stream that fell behind by more than an interval skips."""
+        if now_us < self._next_us:
+            return []
+        names = [name for name, due in self._due_us.items() if due <= now_us]
+        for name in names:
+            interval = self._interval_us[name]
+            following = self._due_us[name] + interval
+            self._due_us[name] = following if following > now_us else now_us + interval
+        self._next_us = min(self._due_us.values(), default=now_us + 1_000_000)
+        return names
+
+
+def _interval_us(rate_hz: float) -> int:
+    return round(1e6 / rate_hz) if rate_hz > 0.0 else -1
