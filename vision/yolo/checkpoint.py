@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.architecture import STRIDES, ArchitectureError, ModelDescription, YoloModel
-from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError
+from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line
 from vision.yolo.torch_archive import read_archive
 
 __all__ = [
@@ -90,7 +90,7 @@ def load_checkpoint(path: str | Path) -> LoadedModel:
         return _interpret(content)
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
-        raise kind(f"{path}: {error}") from None
+        raise kind(one_line(f"{path}: {error}")) from None
 
 
 def _interpret(content: Any) -> LoadedModel:

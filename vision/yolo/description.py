@@ -91,6 +91,9 @@ class ModelDescription:
     def __post_init__(self) -> None:
         if not self.class_names or not all(isinstance(name, str) for name in self.class_names):
             raise ArchitectureError(f"a model needs the names of its classes, got {self.class_names!s:.200}")
+        for name in self.class_names:
+            if not name or not name.isprintable():
+                raise ArchitectureError(f"a class name must be printable text, got {name!r:.100}")
         for name in ("depth_multiple", "width_multiple"):
             value = getattr(self, name)
             if type(value) not in (int, float) or not 0 < value <= 16:

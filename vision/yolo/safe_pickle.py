@@ -45,6 +45,11 @@ class Admitted:
         return Inert(self.name, arguments) if self.make is None else self.make(arguments)
 
 
+def one_line(message: str) -> str:
+    """A message that may quote the file: control characters escaped, so that it cannot steer a terminal."""
+    return "".join(character if character.isprintable() else repr(character)[1:-1] for character in message)
+
+
 _MARK = object()
 _SCALARS = (str, int, float, bool, type(None))
 
@@ -238,7 +243,7 @@ class _Machine:
 
 def _text(data: bytes) -> str:
     try:
-        return data.decode("utf-8", "surrogatepass")
+        return data.decode("utf-8")
     except UnicodeDecodeError:
         raise CheckpointError("its pickle holds a text that is not UTF-8") from None
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vision.yolo.safe_pickle import Admitted, CheckpointError, UnsafeCheckpointError, unpickle
+from vision.yolo.safe_pickle import Admitted, CheckpointError, UnsafeCheckpointError, one_line, unpickle
 
 _STORAGES: dict[str, torch.dtype] = {
     "torch.DoubleStorage": torch.float64,
@@ -115,7 +115,7 @@ def read_archive(path: str | Path) -> Any:
     try:
         return _read(path)
     except CheckpointError as error:
-        raise type(error)(f"{path}: {error}") from None
+        raise type(error)(one_line(f"{path}: {error}")) from None
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file; give the path of a .pt checkpoint") from None
     except IsADirectoryError:

@@ -1,0 +1,225 @@
+"""Frames in, detections out; and real photographs against an independent implementation's results."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from vision import detector as detector_module
+from vision.detector import Detector, resolve_classes
+from vision.yolo.architecture import YoloModel, build, yolov8_description
+from vision.yolo.checkpoint import CheckpointError, save_checkpoint
+
+NAMES = ("person", "bicycle", "car", "dog")
+TEST_DATA = Path(
+    os.environ.get("COMPANION_TEST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
+)
+REFERENCE = TEST_DATA / "coco" / "reference_detections.json"
+COCO_MODEL = TEST_DATA / "models" / "yolov8n_coco.pt"
+
+
+def eager_model(class_id: int = 2) -> YoloModel:
+    """A network that sees a box of 2 × 2 cells of class `class_id` in every cell of its coarsest level."""
+    torch.manual_seed(0)
+    model = build(yolov8_description((0.1, 0.01, 64), NAMES)).eval()
+    for level, (sides, classes) in enumerate(zip(model.detect.cv2, model.detect.cv3, strict=True)):
+        for last in (sides[-1], classes[-1]):
+            last.weight.data.zero_()
+            last.bias.data.fill_(-20.0)
+        sides[-1].bias.data.view(4, 16)[:, 1] = 20.0
+        if level == 2:
+            classes[-1].bias.data[class_id] = 1.0
+    return model
+
+
+@pytest.fixture
+def model_path(tmp_path: Path) -> Path:
+    save_checkpoint(tmp_path / "m.pt", eager_model(), metadata={"licence": "Apache-2.0"})
+    return tmp_path / "m.pt"
+
+
+@pytest.fixture
+def frame() -> np.ndarray[Any, Any]:
+    return np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+
+
+def test_boxes_are_in_the_pixels_of_the_frame(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    found = Detector(model_path, image_size=64).detect(frame)
+    # The input is half the frame's size; each cell of 32 sees 2 × 2 cells around its middle.
+    assert len(found) == 2
+    assert set(found.names) == {"car"}
+    np.testing.assert_allclose(sorted(found.xyxy.tolist()), [[0, 0, 96, 64], [32, 0, 128, 64]], atol=0.05)
+    assert found.xyxy.dtype == np.float32
+    assert found.confidence[0] == pytest.approx(1 / (1 + np.exp(-1.0)), abs=1e-3)
+
+
+def test_a_frame_of_another_size_needs_no_new_detector(model_path: Path) -> None:
+    detector = Detector(model_path, image_size=64)
+    for height, width in ((64, 128), (128, 96), (33, 250), (1, 1)):
+        found = detector.detect(np.zeros((height, width, 3), np.uint8))
+        assert np.all(found.xyxy >= 0)
+        assert np.all(found.xyxy <= [width, height, width, height])
+
+
+def test_only_the_classes_asked_for_are_reported(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    assert len(Detector(model_path, classes=["person", "car"], image_size=64).detect(frame))
+    assert len(Detector(model_path, classes=[2], image_size=64).detect(frame))
+    assert not len(Detector(model_path, classes=["person", 1], image_size=64).detect(frame))
+
+
+def test_a_detection_says_how_long_its_parts_took(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    detector = Detector(model_path, image_size=64)
+    assert detector.last_timing is None
+    detector.detect(frame)
+    timing = detector.last_timing
+    assert timing is not None
+    assert min(timing.preprocess_ms, timing.inference_ms, timing.postprocess_ms) > 0
+    assert timing.total_ms == timing.preprocess_ms + timing.inference_ms + timing.postprocess_ms
+
+
+def test_a_detector_tells_what_it_was_made_from(model_path: Path) -> None:
+    detector = Detector(model_path, image_size=64)
+    assert detector.class_names == NAMES
+    assert detector.metadata == {"licence": "Apache-2.0"}
+    assert detector.description.class_names == NAMES
+
+
+def test_bfloat16_sees_the_same(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    full = Detector(model_path, image_size=64, precision="float32")
+    half = Detector(model_path, image_size=64, precision="bfloat16")
+    assert (full.precision, half.precision) == ("float32", "bfloat16")
+    a, b = full.detect(frame), half.detect(frame)
+    np.testing.assert_allclose(sorted(a.xyxy.tolist()), sorted(b.xyxy.tolist()), atol=1.0)
+
+
+def test_without_native_bfloat16_auto_is_float32(model_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "")
+    detector = Detector(model_path, image_size=64)
+    assert detector.precision == "float32"
+    assert "does not compute in bfloat16" in detector.precision_reason
+
+
+@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (9.0, "float32")])
+def test_with_native_bfloat16_auto_takes_the_faster(
+    model_path: Path, monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
+) -> None:
+    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "amx_bf16")
+    times = {torch.float32: 5.0, torch.bfloat16: half_ms}
+    monkeypatch.setattr(Detector, "_measure_ms", lambda self, dtype: times[dtype])
+    detector = Detector(model_path, image_size=64)
+    assert detector.precision == chosen
+    assert "5.0 ms in float32" in detector.precision_reason
+
+
+def test_auto_measures_both_where_it_must(model_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "amx_bf16")
+    detector = Detector(model_path, image_size=64)
+    assert detector.precision in ("float32", "bfloat16")
+    assert detector.precision_reason.startswith("measured")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        pytest.param({"classes": ["persn"]}, "no class 'persn'; nearest of its 4: person", id="near name"),
+        pytest.param({"classes": ["Car"]}, "no class 'Car'; nearest of its 4: car", id="capital"),
+        pytest.param({"classes": ["zebra"]}, "no class 'zebra'; nearest", id="far name"),
+        pytest.param({"classes": [4]}, r"classes 0\.\.3, not 4", id="id too large"),
+        pytest.param({"classes": [-1]}, r"classes 0\.\.3, not -1", id="negative id"),
+        pytest.param({"classes": "car"}, "must be a list", id="a bare text"),
+        pytest.param({"classes": []}, "must be a list", id="no class"),
+        pytest.param({"confidence": 1.5}, r"confidence must be in 0\.\.1, got 1.5", id="confidence"),
+        pytest.param({"confidence": float("nan")}, r"confidence must be in 0\.\.1", id="not a number"),
+        pytest.param({"iou": -0.1}, r"iou must be in 0\.\.1, got -0.1", id="iou"),
+        pytest.param({"image_size": 100}, "multiple of 32", id="image size"),
+        pytest.param({"precision": "float8"}, "precision must be auto, float32 or bfloat16", id="precision"),
+        pytest.param({"threads": 0}, "threads must be at least 1", id="threads"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_refused_by_name(
+    model_path: Path, arguments: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ValueError, match=expected):
+        Detector(model_path, **arguments)
+
+
+def test_classes_may_be_names_or_ids_or_ids_as_text() -> None:
+    assert resolve_classes(["dog", 0, "2", "car"], NAMES) == (0, 2, 3)
+
+
+def test_a_class_whose_name_is_a_number_is_found_by_name() -> None:
+    assert resolve_classes(["7"], ("5", "7")) == (1,)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 4), np.uint8),
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4, 3), np.float32),
+        np.zeros((0, 4, 3), np.uint8),
+    ],
+    ids=["grey", "with alpha", "float", "empty"],
+)
+def test_something_that_is_no_frame_is_refused(model_path: Path, image: np.ndarray[Any, Any]) -> None:
+    with pytest.raises(ValueError, match="frame"):
+        Detector(model_path, image_size=64).detect(image)
+
+
+def test_a_missing_model_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no such file"):
+        Detector(tmp_path / "none.pt")
+
+
+def test_an_installation_without_the_bundled_model_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(detector_module, "DEFAULT_WEIGHTS", tmp_path / "default.pt")
+    with pytest.raises(CheckpointError, match=r"bundled model is missing .*companion train"):
+        Detector()
+
+
+def intersection_over_union(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    common = max(width, 0.0) * max(height, 0.0)
+    return float(common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common))
+
+
+@pytest.mark.skipif(not REFERENCE.is_file(), reason=f"{REFERENCE} is not here; set COMPANION_TEST_DATA")
+@pytest.mark.parametrize(
+    ("variant", "arguments"),
+    [
+        ("rect", {}),
+        ("rect_person_car", {"classes": [0, 2]}),
+        ("square", {"square": True}),
+    ],
+)
+def test_real_photographs_give_what_the_reference_gives(variant: str, arguments: dict[str, Any]) -> None:
+    detector = Detector(COCO_MODEL, precision="float32", **arguments)
+    for picture in json.loads(REFERENCE.read_text())["images"]:
+        image = cv2.imread(str(TEST_DATA / "coco" / "images" / picture["name"]))
+        assert image is not None
+        if hashlib.sha256(image.tobytes()).hexdigest() != picture["pixels_bgr_sha256"]:
+            pytest.skip("this machine's JPEG decoder gives other pixels than the reference's")
+        found = detector.detect(image)
+        unmatched = set(range(len(found)))
+        for expected in picture[variant]:
+            overlap, best = max(
+                (intersection_over_union(np.array(expected["xyxy"]), found.xyxy[index]), index)
+                for index in unmatched
+                if found.class_id[index] == expected["class_id"]
+            )
+            assert overlap >= 0.99, (picture["name"], expected)
+            assert found.confidence[best] == pytest.approx(expected["confidence"], abs=0.005)
+            assert found.names[best] == expected["class_name"]
+            unmatched.remove(best)
+        assert all(found.confidence[index] <= 0.26 for index in unmatched), picture["name"]
