@@ -1,0 +1,85 @@
+"""What the documents say can be typed can be typed, and what they link to is there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+
+from companion.cli import app as companion_app
+from mavlink_sim.cli import app as simulator_app
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    ROOT / "systemd" / "companion.service",
+]
+APPS = {"companion": companion_app, "mavlink-sim": simulator_app}
+
+
+def shell_lines(document: Path) -> Iterator[str]:
+    for block in re.findall(r"^```sh\n(.*?)^```", document.read_text(), re.MULTILINE | re.DOTALL):
+        yield from (line for line in block.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+
+
+def commands(document: Path) -> Iterator[list[str]]:
+    """Each command of the document's shell blocks and of its `code` in running text, split into words."""
+    for line in shell_lines(document):
+        for part in line.split(" | "):
+            yield shlex.split(part, comments=True)
+    for code in re.findall(r"`([^`\n]+)`", document.read_text()):
+        if code.startswith(("companion ", "mavlink-sim ")):
+            yield shlex.split(code)
+
+
+OURS = [
+    pytest.param(words, id=f"{document.name}: {' '.join(words)[:60]}")
+    for document in DOCUMENTS
+    for words in commands(document)
+    if words and words[0] in APPS and not any("…" in word or "|" in word for word in words)
+]
+
+
+@pytest.mark.parametrize("words", OURS)
+def test_every_command_in_the_documents_is_one_that_exists(words: list[str]) -> None:
+    command = typer.main.get_command(APPS[words[0]])
+    arguments = words[1:]
+    context = command.make_context(words[0], list(arguments), resilient_parsing=False)
+    # A group hands what is left to its command; that one must take it all.
+    while hasattr(command, "resolve_command"):
+        rest = [*context._protected_args, *context.args]
+        assert rest, f"{' '.join(words)}: no command"
+        name, command, rest = command.resolve_command(context, rest)
+        assert command is not None, f"{' '.join(words)}: no command {name!r}"
+        context = command.make_context(name, rest, parent=context)
+
+
+def test_every_make_target_in_the_documents_exists() -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for document in DOCUMENTS:
+        for words in commands(document):
+            if words and words[0] == "make":
+                assert words[1] in targets, f"{document.name}: make {words[1]}"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_link_in_the_documents_leads_somewhere(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)", document.read_text()):
+        if "://" not in target:
+            assert (document.parent / target).exists(), f"{document.name} links to {target}"
+
+
+def test_every_file_in_the_architecture_exists() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    sections = re.split(r"^`(vision|mavlink_sim|companion)/` ", text, flags=re.MULTILINE)
+    for package, section in zip(sections[1::2], sections[2::2], strict=True):
+        table = section.split("\n## ")[0]
+        rooms = re.findall(r"^\| (?:\d \| )?(`[^|]+`) \|", table, re.MULTILINE)
+        assert rooms
+        for name in re.findall(r"`([^`]+)`", " ".join(rooms)):
+            assert list((ROOT / package).glob(name)), f"docs/architecture.md: {package}/{name} does not exist"
