@@ -1,7 +1,7 @@
 """Motion JPEG: JPEG images one after another, with or without other bytes between them.
 
-An image is found by walking its segments (ITU-T T.81, annex B): a segment with a length is stepped over, so
-a thumbnail's own markers inside APPn mean nothing, and in the entropy-coded data only a true marker (not FF00,
+Images are found by walking their segments (ITU-T T.81, annex B): one with a length is stepped over, so
+a thumbnail's markers inside APPn mean nothing, and in the entropy-coded data only a true marker (not FF00,
 not a restart) counts.
 """
 

@@ -1,0 +1,208 @@
+"""Drawing what was seen onto the picture, for people."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.detections import Detections
+
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_GOLDEN_RATIO = 0.618033988749895
+_DARK = (24, 22, 20)
+_LIGHT = (250, 250, 250)
+
+Colour = tuple[int, int, int]
+Rectangle = tuple[int, int, int, int]  # left, top, right, bottom; the last two outside
+
+
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """Every measure of the drawing, in pixels, from the image's size: 1 at 640x480."""
+
+    line: int
+    font_scale: float
+    stroke: int
+    padding: int
+
+    @classmethod
+    def of(cls, width: int, height: int) -> _Sizes:
+        scale = max((width * height / (640 * 480)) ** 0.5, 0.3)
+        return cls(
+            max(1, round(2 * scale)),
+            max(0.3, 0.47 * scale),
+            max(1, round(scale)),
+            max(2, round(4 * scale)),
+        )
+
+
+def class_colour(class_id: int) -> Colour:
+    """A class's own colour, BGR: hues far apart for neighbouring ids, bright on any ground."""
+    hue = (0.33 + class_id * _GOLDEN_RATIO) % 1.0
+    saturation = (0.80, 0.60, 0.95)[class_id % 3]
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 1.0)
+    return round(blue * 255), round(green * 255), round(red * 255)
+
+
+def annotate(
+    image: NDArray[np.uint8],
+    detections: Detections,
+    *,
+    lines: Sequence[str] = (),
+    highlight: int | None = None,
+) -> NDArray[np.uint8]:
+    """A copy of the image with boxes, labels and a panel of text.
+
+    Args:
+        image: (height, width, 3) uint8, BGR. Lines and letters scale with its size.
+        detections: each gets a box of its class's colour and a plate: name, confidence, range where known.
+        lines: text for a panel at the top left.
+        highlight: index of the detection that matters now: drawn last, tinted, with bracketed corners.
+
+    Returns:
+        (height, width, 3) uint8, BGR.
+
+    Raises:
+        IndexError: `highlight` is not one of the detections.
+    """
+    if highlight is not None and not 0 <= highlight < len(detections):
+        raise IndexError(f"highlight must be 0..{len(detections) - 1}, got {highlight}")
+    drawn = image.copy()
+    height, width = drawn.shape[:2]
+    sizes = _Sizes.of(width, height)
+    # The surest last, over the doubtful; the one that matters over all.
+    order = sorted(range(len(detections)), key=lambda index: float(detections.confidence[index]))
+    if highlight is not None:
+        order.remove(highlight)
+        order.append(highlight)
+    boxes = {index: _pixels(detections.xyxy[index], width, height) for index in order}
+    for index in order:
+        colour = class_colour(int(detections.class_id[index]))
+        _draw_box(drawn, boxes[index], colour, sizes, marked=index == highlight)
+    taken: list[Rectangle] = []
+    if lines:
+        taken.append(_draw_panel(drawn, lines, sizes))
+    for index in reversed(order):  # the surest choose their plate's place first
+        taken.append(_draw_plate(drawn, boxes[index], detections, index, sizes, taken))
+    return drawn
+
+
+def _pixels(xyxy: NDArray[np.float32], width: int, height: int) -> Rectangle:
+    limits = np.array([width - 1, height - 1, width - 1, height - 1], np.float32)
+    left, top, right, bottom = np.clip(np.rint(xyxy), 0, limits).astype(int).tolist()
+    return left, top, right, bottom
+
+
+def _draw_box(
+    image: NDArray[np.uint8], box: Rectangle, colour: Colour, sizes: _Sizes, *, marked: bool
+) -> None:
+    left, top, right, bottom = box
+    if marked:
+        _blend(image, box, colour, 0.18)
+    # A dark rim keeps a bright box visible on a bright ground.
+    cv2.rectangle(image, (left, top), (right, bottom), _DARK, sizes.line + 2, cv2.LINE_AA)
+    cv2.rectangle(image, (left, top), (right, bottom), colour, sizes.line, cv2.LINE_AA)
+    if marked:
+        _draw_corners(image, box, sizes)
+
+
+def _draw_corners(image: NDArray[np.uint8], box: Rectangle, sizes: _Sizes) -> None:
+    left, top, right, bottom = box
+    gap = sizes.line * 2
+    reach = max(gap * 2, min(right - left, bottom - top) // 4)
+    for x, y, across, down in (
+        (left - gap, top - gap, 1, 1),
+        (right + gap, top - gap, -1, 1),
+        (left - gap, bottom + gap, 1, -1),
+        (right + gap, bottom + gap, -1, -1),
+    ):
+        bracket = np.array([[x, y + down * reach], [x, y], [x + across * reach, y]], np.int32)
+        cv2.polylines(image, [bracket], False, _DARK, sizes.line + 2, cv2.LINE_AA)
+        cv2.polylines(image, [bracket], False, _LIGHT, sizes.line, cv2.LINE_AA)
+
+
+def _draw_plate(
+    image: NDArray[np.uint8],
+    box: Rectangle,
+    detections: Detections,
+    index: int,
+    sizes: _Sizes,
+    taken: Sequence[Rectangle],
+) -> Rectangle:
+    class_id = int(detections.class_id[index])
+    text = f"{detections.class_names[class_id]} {float(detections.confidence[index]):.2f}"
+    range_m = float(detections.range_m[index])
+    if not np.isnan(range_m):
+        text += f"  {range_m:.1f} m"
+    (text_width, text_height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
+    plate_width = text_width + 2 * sizes.padding
+    plate_height = text_height + baseline + sizes.padding
+    plate = _free_place(box, plate_width, plate_height, image.shape[1], image.shape[0], taken)
+    colour = class_colour(class_id)
+    left, top, right, bottom = plate
+    cv2.rectangle(image, (left, top), (right - 1, bottom - 1), colour, cv2.FILLED)
+    at = (left + sizes.padding, top + sizes.padding // 2 + text_height)
+    cv2.putText(image, text, at, _FONT, sizes.font_scale, _ink_on(colour), sizes.stroke, cv2.LINE_AA)
+    return plate
+
+
+def _free_place(
+    box: Rectangle, width: int, height: int, image_width: int, image_height: int, taken: Sequence[Rectangle]
+) -> Rectangle:
+    """Where the plate goes: above its box, inside, below, or wherever near it is free."""
+    box_left, box_top, box_right, box_bottom = box
+    left = min(max(box_left - 1, 0), max(image_width - width, 0))
+    end = min(max(box_right - width + 1, 0), max(image_width - width, 0))
+    tops = (box_top - height, box_top, box_bottom, box_bottom - height)
+    places = [(x, y) for y in tops for x in (left, end) if 0 <= y <= image_height - height]
+    if not places:
+        places = [(left, min(max(box_top - height, 0), max(image_height - height, 0)))]
+    rectangles = [(x, y, x + width, y + height) for x, y in places]
+    return min(rectangles, key=lambda plate: sum(_overlap(plate, other) for other in taken))
+
+
+def _overlap(one: Rectangle, other: Rectangle) -> int:
+    across = min(one[2], other[2]) - max(one[0], other[0])
+    down = min(one[3], other[3]) - max(one[1], other[1])
+    return max(across, 0) * max(down, 0)
+
+
+def _draw_panel(image: NDArray[np.uint8], lines: Sequence[str], sizes: _Sizes) -> Rectangle:
+    height, width = image.shape[:2]
+    scale = sizes.font_scale
+    margin, inside = 2 * sizes.padding, 2 * sizes.padding
+    widest = max(cv2.getTextSize(line, _FONT, scale, sizes.stroke)[0][0] for line in lines)
+    room = width - 2 * margin - 2 * inside
+    if widest > room > 0:  # a long line is set smaller, never cut
+        scale *= room / widest
+        widest = room
+    (_, text_height), baseline = cv2.getTextSize("Ag", _FONT, scale, sizes.stroke)
+    pitch = text_height + baseline + sizes.padding
+    panel = (
+        margin,
+        margin,
+        min(margin + widest + 2 * inside, width),
+        min(margin + len(lines) * pitch + 2 * inside - sizes.padding, height),
+    )
+    _blend(image, panel, _DARK, 0.62)
+    for row, line in enumerate(lines):
+        at = (margin + inside, margin + inside + row * pitch + text_height)
+        cv2.putText(image, line, at, _FONT, scale, _LIGHT, sizes.stroke, cv2.LINE_AA)
+    return panel
+
+
+def _blend(image: NDArray[np.uint8], area: Rectangle, colour: Colour, opacity: float) -> None:
+    left, top, right, bottom = area
+    part = image[top:bottom, left:right]
+    if part.size:
+        part[:] = cv2.addWeighted(part, 1.0 - opacity, np.full_like(part, colour), opacity, 0.0)
+
+
+def _ink_on(colour: Colour) -> Colour:
+    blue, green, red = colour
+    return _DARK if 0.114 * blue + 0.587 * green + 0.299 * red > 110 else _LIGHT
