@@ -176,8 +176,7 @@ class AutopilotDriver(ABC):
                 while not self._heard.is_set():
                     if self.url.scheme is not LinkScheme.UDP_IN:
                         self.send_heartbeat(SystemStatus.ACTIVE)
-                    with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(self._heard.wait(), 1.0)
+                    await _happens(self._heard, 1.0)
         if not self._heard.is_set():
             raise LinkError(self._why_no_autopilot(timeout_s))
 
@@ -301,7 +300,8 @@ class AutopilotDriver(ABC):
         async with self._watching(check):
             check("", {})
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(done, timeout_s)
+                async with asyncio.timeout(timeout_s):
+                    await done
         return met()
 
     # --- sending ------------------------------------------------------------------------------------
@@ -460,8 +460,7 @@ class AutopilotDriver(ABC):
         """Wait until the newest heartbeat is too old (True) or the autopilot's clock began anew (False)."""
         while self._state.connected(time.monotonic_ns()):
             left_s = (self._state.heartbeat_ns - time.monotonic_ns()) / 1e9 + HEARTBEAT_MAX_AGE_S
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._restarted.wait(), max(left_s, 0.0) + 1e-3)
+            if await _happens(self._restarted, max(left_s, 0.0) + 1e-3):
                 return False
         return True
 
@@ -484,7 +483,7 @@ class AutopilotDriver(ABC):
                 result = await self._command(command, *parameters)
             except CommandRefusedError as error:
                 logger.warning("%s: asking for message %d: %s", self.url, parameters[0], error)
-                continue
+                return  # the link is down; it is asked again when it is back
             if result != ACCEPTED:
                 what = "at the rate wanted" if command == _SET_MESSAGE_INTERVAL else "now"
                 logger.info(
@@ -494,6 +493,14 @@ class AutopilotDriver(ABC):
                     what,
                     _named(result),
                 )
+
+
+async def _happens(event: asyncio.Event, timeout_s: float) -> bool:
+    # Not asyncio.wait_for: until Python 3.12 it loses a cancellation that comes together with the event.
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(timeout_s):
+            await event.wait()
+    return event.is_set()
 
 
 def _named(result: int) -> str:

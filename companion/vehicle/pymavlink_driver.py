@@ -103,6 +103,8 @@ class PymavlinkDriver(AutopilotDriver):
 
         async with self._watching(watch):
             for attempt in range(_ATTEMPTS):
+                if self._link is None:
+                    raise CommandRefusedError(f"{self.url}: the link was closed before an answer came")
                 self._send_command(command, parameters, attempt)
                 result = await _next_result(results, _ATTEMPT_S)
                 while result == IN_PROGRESS:
@@ -197,7 +199,8 @@ class PymavlinkDriver(AutopilotDriver):
 
 async def _next_result(results: asyncio.Queue[int], timeout_s: float) -> int | None:
     with contextlib.suppress(TimeoutError):
-        return await asyncio.wait_for(results.get(), timeout_s)
+        async with asyncio.timeout(timeout_s):
+            return await results.get()
     return None
 
 

@@ -1,0 +1,48 @@
+"""A fake autopilot and a driver connected to it."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+from fake_autopilot import FakeAutopilot, free_port
+
+from companion.vehicle.driver import Driver
+from companion.vehicle.drivers import open_driver
+
+
+@pytest.fixture(params=["mavsdk", "pymavlink"])
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+async def autopilot(port: int) -> AsyncIterator[FakeAutopilot]:
+    fake = FakeAutopilot(port)
+    fake.start()
+    yield fake
+    await fake.stop()
+
+
+@pytest.fixture
+async def driver(kind: str, port: int, autopilot: FakeAutopilot) -> AsyncIterator[Driver]:
+    """Connected to the fake autopilot."""
+    opened = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    await opened.connect(10.0)
+    yield opened
+    await opened.close()
+
+
+@pytest.fixture(autouse=True)
+def no_loop_noise(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """Nothing may be left to asyncio's exception handler: no destroyed task, no failed callback."""
+    yield
+    noise = [
+        record.getMessage() for record in caplog.records if record.name == "asyncio" and record.levelno >= 40
+    ]
+    assert not noise

@@ -1,0 +1,126 @@
+"""A small real peer on a UDP socket: it says what it is told and keeps what it hears."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.driver import Driver
+from companion.vehicle.framing import Framer, frames_of
+from companion.vehicle.state import VehicleState
+
+HOLD, OFFBOARD, MISSION = 0x03040000, 0x00060000, 0x04040000
+
+
+class FakeAutopilot:
+    """Speaks first to `port` on loopback, as PX4's onboard link does. Answers through `answers`.
+
+    Attributes:
+        heard: (decoded message, raw frame) in the order of arrival.
+        answers: message name → what to do when one is heard.
+    """
+
+    def __init__(self, port: int, *, system_id: int = 1, component_id: int = 1, autopilot: int = 12) -> None:
+        self.heard: list[tuple[Any, bytes]] = []
+        self.answers: dict[str, Callable[[Any], None]] = {
+            "COMMAND_LONG": lambda m: self.acknowledge(m.command)
+        }
+        self.custom_mode, self.base_mode, self.system_status = HOLD, 29, 3
+        self.autopilot = autopilot
+        self.beating = True
+        self._port = port
+        self._codec = mavlink.MAVLink(None, system_id, component_id)
+        self._framer = Framer()
+        self._task: asyncio.Task[None] | None = None
+        self.open()
+
+    def open(self) -> None:
+        """Take a new socket, so a new source port."""
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.setblocking(False)
+
+    def say(self, message: Any) -> None:
+        self.socket.sendto(message.pack(self._codec), ("127.0.0.1", self._port))
+        self._codec.seq = (self._codec.seq + 1) % 256
+
+    def say_bytes(self, data: bytes) -> None:
+        self.socket.sendto(data, ("127.0.0.1", self._port))
+
+    def heartbeat(self) -> None:
+        self.say(
+            mavlink.MAVLink_heartbeat_message(
+                2, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
+            )
+        )
+
+    def acknowledge(self, command: int, result: int = 0) -> None:
+        self.say(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 191))
+
+    def home(self, altitude_amsl_m: float = 488.0) -> None:
+        altitude = round(altitude_amsl_m * 1000)
+        self.say(mavlink.MAVLink_home_position_message(0, 0, altitude, 0.0, 0.0, 0.0, [1, 0, 0, 0], 0, 0, 0))
+
+    def listen(self) -> None:
+        """Take in what has come, now."""
+        while True:
+            try:
+                data = self.socket.recv(2048)
+            except BlockingIOError:
+                return
+            for frame in frames_of(data):
+                message = self._codec.decode(bytearray(frame.raw))
+                self.heard.append((message, frame.raw))
+                self.answers.get(message.get_type(), lambda _: None)(message)
+
+    async def _live(self) -> None:
+        for turn in range(10**9):
+            if self.beating and turn % 10 == 0:
+                self.heartbeat()
+            self.listen()
+            await asyncio.sleep(0.01)
+
+    def start(self) -> None:
+        self._task = asyncio.create_task(self._live())
+
+    async def stop(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        self.socket.close()
+
+    def heard_named(self, name: str) -> list[Any]:
+        return [message for message, _ in self.heard if message.get_type() == name]
+
+    async def hears(self, name: str, count: int = 1, timeout_s: float = 10.0) -> list[Any]:
+        """The messages of that name, once there are so many."""
+        await wait_until(lambda: len(self.heard_named(name)) >= count, timeout_s, lambda: f"{count} {name}")
+        return self.heard_named(name)
+
+
+async def wait_until(
+    met: Callable[[], bool], timeout_s: float, wanted: Callable[[], object] = lambda: "it"
+) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not met():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"waited {timeout_s} s for {wanted()}")
+        await asyncio.sleep(0.01)
+
+
+async def state_shows(
+    driver: Driver, met: Callable[[VehicleState], bool], timeout_s: float = 20.0
+) -> VehicleState:
+    await wait_until(lambda: met(driver.state), timeout_s, lambda: f"another state than {driver.state}")
+    return driver.state
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as candidate:
+        candidate.bind(("127.0.0.1", 0))
+        return int(candidate.getsockname()[1])
