@@ -9,8 +9,10 @@ from companion.guidance.motion import (
     correction,
     ground_speed,
     position_and_yaw,
+    pressed,
     stay_at,
     stopping_speed,
+    towards,
 )
 from companion.guidance.target import Target
 from companion.guidance.track import ObjectTrack
@@ -22,9 +24,15 @@ from vision.rotation import wrap_angle
 DECELERATION_MPS2 = 0.7
 # Away from an object that is too near: slowly, the camera does not look backwards.
 MAX_RETREAT_MPS = 1.0
-ARRIVAL_TOLERANCE_M = 0.3
-ARRIVAL_SPEED_MPS = 0.3
-ARRIVAL_S = 1.0
+# There: so near (m), so slow (m/s), for so long (s). A real PX4 holds a position to 0.26 m (one sigma) in
+# calm air and moves at up to 0.5 m/s doing so; in gusts it never stands as still: what lasts may be coarser.
+STANDING_MPS = 0.3
+ARRIVALS = ((0.3, 0.5, 1.0), (0.8, 1.0, 5.0))
+# The last of the way is flown to a fixed place before the object, so that wind does not carry the vehicle
+# around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
+ANCHOR_M = (1.5, 3.0)
+# Answer to what is missing to that place, 1/s; stiffer than the autopilot's own, see `pressed`.
+ANCHOR_GAIN = 1.3
 # Detectors miss single frames; this long without the object and the vehicle brakes.
 LOST_AFTER_S = 1.0
 # What appears where a lost object was, in this direction and at half to twice its range, is taken for it.
@@ -65,7 +73,8 @@ class ApproachBehaviour(Behaviour):
         self._started_ns = 0
         self._bearing_rad: float | None = None
         self._wait_place: Vector3 | None = None
-        self._arrived_since_ns: int | None = None
+        self._anchor_rad: float | None = None
+        self._arrived_since_ns: list[int | None] = [None] * len(ARRIVALS)
         self._range_m = math.nan
 
     def on_activate(self, situation: Situation) -> None:
@@ -73,7 +82,8 @@ class ApproachBehaviour(Behaviour):
         self._down_m = position[2]
         self._started_ns = self._seen_ns = situation.now_ns
         self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
-        self._track = self._bearing_rad = self._wait_place = self._arrived_since_ns = None
+        self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
+        self._arrived_since_ns = [None] * len(ARRIVALS)
         self._range_m = math.nan
 
     def update(self, dt_s: float, situation: Situation) -> Step:
@@ -99,15 +109,17 @@ class ApproachBehaviour(Behaviour):
         error_m = self._range_m - self._distance_m
         if self._arrived(error_m, ground_speed(state), now_ns):
             return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m")
-        top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
-        speed = stopping_speed(error_m, top, DECELERATION_MPS2)
-        # Towards what the camera does not look at yet, only as fast as the nose comes round.
-        speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
-        velocity = (
-            speed * math.cos(bearing),
-            speed * math.sin(bearing),
-            correction(self._down_m - position[2]),
-        )
+        anchor = self._anchor(track.position_ned_m, position, bearing)
+        if anchor is not None:
+            wanted = towards(anchor, position, ANCHOR_GAIN)
+        else:
+            top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
+            speed = stopping_speed(error_m, top, DECELERATION_MPS2)
+            # Towards what the camera does not look at yet, only as fast as the nose comes round.
+            speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
+            wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
+        north_mps, east_mps = pressed(wanted, state, self._speed_mps)
+        velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
 
     @property
@@ -157,17 +169,34 @@ class ApproachBehaviour(Behaviour):
         way_m = abs(target.range_m - self._distance_m)
         self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * way_m / self._speed_mps) * 1e9
 
+    def _anchor(self, place: Vector3, position: Vector3, bearing: float) -> Vector3 | None:
+        """The place to stop at, once it is near: on the side of the object from which the vehicle came."""
+        chosen = self._anchor_rad is not None
+        away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
+        anchor = (
+            place[0] + self._distance_m * math.cos(away_rad),
+            place[1] + self._distance_m * math.sin(away_rad),
+            self._down_m,
+        )
+        near = math.dist(anchor[:2], position[:2]) < ANCHOR_M[1 if chosen else 0]
+        self._anchor_rad = away_rad if near else None
+        return anchor if near else None
+
     def _arrived(self, error_m: float, speed_mps: float, now_ns: int) -> bool:
-        if abs(error_m) > ARRIVAL_TOLERANCE_M or speed_mps > ARRIVAL_SPEED_MPS:
-            self._arrived_since_ns = None
-            return False
-        if self._arrived_since_ns is None:
-            self._arrived_since_ns = now_ns
-        return now_ns - self._arrived_since_ns >= ARRIVAL_S * 1e9
+        for index, (tolerance_m, slow_mps, lasting_s) in enumerate(ARRIVALS):
+            since_ns = self._arrived_since_ns[index]
+            if abs(error_m) > tolerance_m or speed_mps > slow_mps:
+                self._arrived_since_ns[index] = None
+            elif since_ns is None:
+                self._arrived_since_ns[index] = now_ns
+            elif now_ns - since_ns >= lasting_s * 1e9:
+                return True
+        return False
 
     def _wait(self, situation: Situation, position: Vector3, unseen_s: float) -> Step:
         """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""
-        self._arrived_since_ns = None
+        self._arrived_since_ns = [None] * len(ARRIVALS)
+        self._anchor_rad = None
         if unseen_s > self._lost_timeout_s:
             if not situation.perception_fresh:
                 why = "nothing comes from the detector"
@@ -176,7 +205,7 @@ class ApproachBehaviour(Behaviour):
             else:
                 why = f"last seen {self._range_m:.1f} m away"
             return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
-        if self._wait_place is None and ground_speed(situation.state) < ARRIVAL_SPEED_MPS:
+        if self._wait_place is None and ground_speed(situation.state) < STANDING_MPS:
             self._wait_place = (position[0], position[1], self._down_m)
         if self._wait_place is None:
             velocity = (0.0, 0.0, correction(self._down_m - position[2]))
