@@ -27,6 +27,7 @@ from mavlink_sim.announcements import (
     Text,
 )
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
+from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
@@ -210,6 +211,11 @@ class Autopilot:
             self.task = flight.Hold(self._airframe, self._parameters, (x, y, z), yaw_rad)
         return ACCEPTED
 
+    def pilot_takes_over(self, mode: Mode = Mode.POSCTL) -> int:
+        """A pilot with a remote control switches the mode, taking the vehicle from a companion."""
+        self.pilot_has_sticks = True
+        return self.set_mode(mode)
+
     def offboard_setpoint(self, setpoint: TrajectorySetpoint) -> None:
         """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
         self._last_setpoint_s = self.now_s
@@ -232,7 +238,10 @@ class Autopilot:
             return
         task = self.task
         assert task is not None
+        was_landing = task.landing
         setpoint = task.update(dt_s)
+        if task.landing and not was_landing:
+            self._say(INFO, "RTL: land at destination\t")
         if self._on_ground_and_idle(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
@@ -390,7 +399,11 @@ class Autopilot:
         elif self.mode in (Mode.LAND, Mode.PRECLAND):
             self.task = flight.Land(airframe, parameters)
         elif self.mode is Mode.RTL:
-            self.task = flight.Return(airframe, parameters, self.home)
+            task = flight.Return(airframe, parameters, self.home)
+            self.task = task
+            height = task.return_height_m
+            above_sea = HOME_ALTITUDE_M - self.home[2] + height
+            self._say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
         else:
             self.task = flight.Hold(airframe, parameters)
 

@@ -10,13 +10,16 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.parameters import UnknownParameterError
 from mavlink_sim.simulation import Simulation, SimulationOptions
+
+# click's UsageError, by way of its public subclass: some versions of typer carry a click of their own
+_USAGE_ERROR: Any = typer.BadParameter.__base__
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -132,8 +135,11 @@ def _run(simulation: Simulation, ready_file: Path | None) -> None:
     if ready_file is not None:
         report = {"pid": os.getpid(), "onboard_bind": ports["onboard"], "gcs_bind": ports["gcs"]}
         partial = ready_file.with_name(ready_file.name + ".partial")
-        partial.write_text(json.dumps(report) + "\n", encoding="utf-8")
-        partial.replace(ready_file)
+        try:
+            partial.write_text(json.dumps(report) + "\n", encoding="utf-8")
+            partial.replace(ready_file)  # whoever waits for the file finds it whole
+        except OSError as error:
+            _fail(f"--ready-file: {error}")
     _say(
         f"ready: system {options.system_id}, "
         f"onboard {options.host}:{ports['onboard']} -> {options.onboard_port}, "
@@ -144,5 +150,10 @@ def _run(simulation: Simulation, ready_file: Path | None) -> None:
 
 
 def main() -> None:
-    """The console script's entry."""
-    app()
+    """The console script's entry: what cannot be is said in one line, with exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except _USAGE_ERROR as error:
+        print(f"mavlink-sim: {error.format_message()}", file=sys.stderr)
+        code = 2
+    sys.exit(code or 0)

@@ -23,6 +23,8 @@ UNSUPPORTED = 3
 FAILED = 4
 
 FORCE_DISARM = 21196.0
+MAX_ALTITUDE_M = 100_000.0
+MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL carries an int32
 GROUND_STATION_COMPONENT = 190  # MAV_COMP_ID_MISSIONPLANNER
 
 NAV_RETURN_TO_LAUNCH = 20
@@ -95,6 +97,7 @@ def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
     altitude = command.parameters[6]
     if not math.isfinite(altitude):
         return vehicle.autopilot.takeoff(None)
+    altitude = min(max(altitude, -MAX_ALTITUDE_M), MAX_ALTITUDE_M)
     home_altitude = geographic(vehicle.autopilot.home)[2]
     return vehicle.autopilot.takeoff(altitude - home_altitude)
 
@@ -108,13 +111,18 @@ def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 
 def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
-    if not int(command.parameters[1]) & 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
+    if not _identifier(command.parameters[1]) & 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
         return UNSUPPORTED
     yaw = command.parameters[3]
     latitude, longitude, altitude = command.parameters[4:7]
-    if abs(latitude) > 90.0 or abs(longitude) > 180.0:
+    if not _is_on_earth(latitude, longitude, altitude):
         return DENIED
     return vehicle.autopilot.reposition(local(latitude, longitude, altitude), yaw)
+
+
+def _is_on_earth(latitude: float, longitude: float, altitude: float) -> bool:
+    """False for a place that cannot be; NaN, "as it is now", can."""
+    return not (abs(latitude) > 90.0 or abs(longitude) > 180.0 or abs(altitude) > MAX_ALTITUDE_M)
 
 
 def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -130,6 +138,8 @@ def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
         vehicle.autopilot.home = vehicle.airframe.position
         return ACCEPTED
     place = command.parameters[4:7]
+    if not _is_on_earth(*place):
+        return DENIED
     if all(math.isfinite(value) for value in place):
         vehicle.autopilot.home = local(*place)
     return ACCEPTED
@@ -159,7 +169,7 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
     interval = command.parameters[1]
     if name is None or name == "HEARTBEAT" or name not in link.streams or not math.isfinite(interval):
         return FAILED
-    link.streams.set_interval(name, round(interval), vehicle.boot_us)
+    link.streams.set_interval(name, min(round(interval), MAX_INTERVAL_US), vehicle.boot_us)
     return ACCEPTED
 
 

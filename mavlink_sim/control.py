@@ -15,6 +15,8 @@ NAN = math.nan
 NOTHING: Vector = (NAN, NAN, NAN)
 # Tuned so that a 10 m step overshoots as measured on the real vehicle (0.6-1.15 m), gains being PX4's own.
 ANTI_WINDUP = 0.5
+# Far above what any vehicle can do: keeps absurd setpoints and gains, which PX4 accepts, within arithmetic.
+MAX_DEMAND_MPS2 = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +56,14 @@ class PositionController:
 
     def _load(self) -> None:
         value = self._parameters.number
+        positive = self._parameters.positive
         self._revision = self._parameters.revision
         self._position_p = (value("MPC_XY_P"), value("MPC_XY_P"), value("MPC_Z_P"))
-        self._velocity_p = (value("MPC_XY_VEL_P_ACC"), value("MPC_XY_VEL_P_ACC"), value("MPC_Z_VEL_P_ACC"))
+        self._velocity_p = (
+            positive("MPC_XY_VEL_P_ACC"),
+            positive("MPC_XY_VEL_P_ACC"),
+            positive("MPC_Z_VEL_P_ACC"),
+        )
         self._velocity_i = (value("MPC_XY_VEL_I_ACC"), value("MPC_XY_VEL_I_ACC"), value("MPC_Z_VEL_I_ACC"))
         self._velocity_d = (value("MPC_XY_VEL_D_ACC"), value("MPC_XY_VEL_D_ACC"), value("MPC_Z_VEL_D_ACC"))
         self._max_xy = value("MPC_XY_VEL_MAX")
@@ -101,6 +108,7 @@ class PositionController:
                 )
             if forward == forward:
                 demanded[axis] += forward
+            demanded[axis] = min(max(demanded[axis], -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
         thrust, achieved_x, achieved_y, achieved_z = self._allocate(demanded[0], demanded[1], demanded[2])
         self._integrate(dt_s, error, demanded, (achieved_x, achieved_y, achieved_z))
         self.position = setpoint.position
@@ -123,7 +131,11 @@ class PositionController:
         if x == x and y == y:
             speed = math.hypot(x, y)
             if speed > self._max_xy:
-                x, y = x * self._max_xy / speed, y * self._max_xy / speed
+                x, y = x / speed * self._max_xy, y / speed * self._max_xy
+        else:
+            x, y = (
+                min(max(value, -self._max_xy), self._max_xy) if value == value else NAN for value in (x, y)
+            )
         if z == z:
             z = min(max(z, -min(self._max_up, max_up_mps)), self._max_down)
         return (x, y, z)

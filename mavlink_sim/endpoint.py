@@ -31,6 +31,7 @@ class UdpEndpoint:
 
     Raises:
         PortInUseError: `bind_port` is taken; 0 chooses a free one.
+        OSError: `host` is no address of this machine.
     """
 
     def __init__(self, host: str, bind_port: int, peer_port: int, system_id: int = 1) -> None:
@@ -44,7 +45,7 @@ class UdpEndpoint:
                 raise PortInUseError(
                     f"UDP port {host}:{bind_port} is already in use; stop its user or choose another port"
                 ) from error
-            raise
+            raise OSError(f"cannot bind UDP {host}:{bind_port}: {error}") from error
         self.peer: tuple[str, int] = (host, peer_port)
         self._peer_heard_s: float | None = None
         self._codec = parser(system_id)

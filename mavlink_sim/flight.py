@@ -38,7 +38,7 @@ class Trajectory:
 
     def stopping_point(self) -> Vector:
         """Where the vehicle comes to rest if it brakes now."""
-        braking = BRAKING_SHARE * self._parameters.number("MPC_ACC_HOR")
+        braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
         x, y, z = self.position
         vx, vy, vz = self.velocity
         path_s = math.hypot(vx, vy) / (2.0 * braking)
@@ -56,8 +56,8 @@ class Trajectory:
         """Advance by `dt_s` and return the setpoint."""
         value = self._parameters.number
         lag = math.dist(self.position, self._airframe.position)
-        pace = dt_s * max(0.0, 1.0 - lag / value("MPC_XY_ERR_MAX"))
-        braking = BRAKING_SHARE * value("MPC_ACC_HOR")
+        pace = dt_s * max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
+        braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
         dx, dy, dz = (goal[axis] - self.position[axis] for axis in range(3))
         far = math.hypot(dx, dy)
         speed = min(value("MPC_XY_CRUISE"), max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
@@ -71,7 +71,7 @@ class Trajectory:
         vx, vy, vz = self.velocity
         change_x, change_y = wanted_x - vx, wanted_y - vy
         change = math.hypot(change_x, change_y)
-        allowed = value("MPC_ACC_HOR") * dt_s
+        allowed = self._parameters.positive("MPC_ACC_HOR") * dt_s
         if change > allowed:
             change_x, change_y = change_x / change * allowed, change_y / change * allowed
         allowed_z = value("MPC_ACC_DOWN_MAX") * dt_s
@@ -89,7 +89,7 @@ class Trajectory:
 class Task:
     """The common face of the flight tasks. `landing` and `finished` are read after each `update`."""
 
-    landing = False
+    landing = False  # on the final descent
     finished = False
     goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
 

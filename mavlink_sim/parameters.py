@@ -93,6 +93,10 @@ class Parameters:
     def number(self, name: str) -> float:
         return self[name].value
 
+    def positive(self, name: str) -> float:
+        """A value to divide by or to take a root of: PX4 accepts any, this stays above zero."""
+        return max(self[name].value, 0.01)
+
     def at(self, index: int) -> Parameter | None:
         """The parameter at an index of the list, None outside it."""
         return self._parameters[self._names[index]] if 0 <= index < len(self._names) else None

@@ -27,8 +27,8 @@ class SetpointRejectedError(ValueError):
 def trajectory_setpoint(message: Any, yaw_rad: float) -> TrajectorySetpoint:
     """The setpoint of a SET_POSITION_TARGET_LOCAL_NED message.
 
-    In LOCAL_NED each axis counts unless its ignore bit is set. In BODY_NED the position is always ignored, the
-    velocity is turned by the vehicle's yaw (not by its tilt), and one ignored axis disables all three.
+    In LOCAL_NED each axis counts unless its ignore bit is set. In BODY_NED the position is always ignored,
+    the velocity is turned by the vehicle's yaw (not by its tilt), and one ignored axis disables all three.
 
     Raises:
         SetpointRejectedError: another frame, force setpoints, or nothing left to control.

@@ -367,9 +367,9 @@ def _time_estimate(vehicle: Vehicle) -> Any:
     home = vehicle.autopilot.home
     position = vehicle.airframe.position
     away = math.hypot(position[0] - home[0], position[1] - home[1])
-    value = vehicle.parameters.number
-    seconds = away / value("MPC_XY_CRUISE") + (home[2] - position[2]) / value("MPC_LAND_SPEED")
-    return time_estimate_to_target(round(seconds * value("RTL_TIME_FACTOR")), -1)
+    positive = vehicle.parameters.positive
+    seconds = away / positive("MPC_XY_CRUISE") + (home[2] - position[2]) / positive("MPC_LAND_SPEED")
+    return time_estimate_to_target(round(seconds * vehicle.parameters.number("RTL_TIME_FACTOR")), -1)
 
 
 def _current_event_sequence(vehicle: Vehicle) -> Any:

@@ -86,6 +86,7 @@ class Vehicle:
         self._used_charge = 0.0
         self._companion_seen_s: float | None = None
         self._companion_lost = False
+        self._origin_told = False
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._later_count = itertools.count()
 
@@ -196,8 +197,12 @@ class Vehicle:
             value = self.parameters.number
             self.airframe.wind = (value("SIH_WIND_N"), value("SIH_WIND_E"), 0.0)
         self.autopilot.update(STEP_S)
+        if self.autopilot.sensors_ready and not self._origin_told:
+            self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
+            for link in self.links.values():
+                self.send_built(link, "GPS_GLOBAL_ORIGIN")
         if self.autopilot.armed:
-            self._used_charge += STEP_S / max(self.parameters.number("SIM_BAT_DRAIN"), 1.0) / 2.0
+            self._used_charge += STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
         self._watch_companion()
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()

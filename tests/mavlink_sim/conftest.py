@@ -1,0 +1,208 @@
+"""A cockpit for the vehicle in lockstep: send it messages, let time pass, look at what it answered."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from mavlink_sim.messages import dialect
+from mavlink_sim.streams import GCS_RATES_HZ
+from mavlink_sim.vehicle import STEP_S, Vehicle
+
+NAN = math.nan
+COMPANION = (1, 191)
+GROUND_STATION = (245, 190)
+
+
+class Cockpit:
+    """A vehicle with an onboard and a ground-station link, without sockets and without a clock.
+
+    `inbox[link]` holds every message received since the last `forget`, as (time, message).
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self.events: list[str] = []
+        self.vehicle = Vehicle(on_event=self.events.append, **{"gusts_mps": 0.0, **options})
+        self.vehicle.add_link("onboard")
+        self.vehicle.add_link("gcs", GCS_RATES_HZ)
+        self.inbox: dict[str, list[tuple[float, Any]]] = defaultdict(list)
+        self.heartbeats: list[tuple[str, tuple[int, int], int]] = []
+        self._next_heartbeat_s = 0.0
+
+    # ---- time
+
+    @property
+    def now_s(self) -> float:
+        return self.vehicle.now_s
+
+    def fly(self, seconds: float, setpoint: Any = None, rate_hz: float = 20.0) -> None:
+        """Let time pass, sending `setpoint` at a rate and the heartbeats that are switched on."""
+        self.until(lambda: False, seconds, setpoint, rate_hz, must=False)
+
+    def until(
+        self,
+        condition: Callable[[], bool],
+        limit_s: float = 60.0,
+        setpoint: Any = None,
+        rate_hz: float = 20.0,
+        must: bool = True,
+    ) -> float:
+        """Let time pass until `condition`; returns how long that took."""
+        started = self.now_s
+        next_setpoint = started
+        while self.now_s - started < limit_s - STEP_S / 2:
+            if self.heartbeats and self.now_s >= self._next_heartbeat_s:
+                self._next_heartbeat_s = self.now_s + 1.0
+                for link, source, kind in self.heartbeats:
+                    self.send(dialect.MAVLink_heartbeat_message(kind, 8, 0, 0, 4, 3), link, source)
+            if setpoint is not None and self.now_s >= next_setpoint - 1e-9:
+                next_setpoint += 1.0 / rate_hz
+                self.send(setpoint)
+            self.vehicle.step(STEP_S)
+            self._take()
+            if condition():
+                return self.now_s - started
+        if must:
+            raise AssertionError(f"not within {limit_s} s; mode {self.mode}, events {self.events}")
+        return limit_s
+
+    def _take(self) -> None:
+        for link in self.vehicle.links:
+            self.inbox[link] += [(self.now_s, item) for item in self.vehicle.outgoing(link)]
+
+    # ---- messages
+
+    def send(self, message: Any, link: str = "onboard", source: tuple[int, int] = COMPANION) -> None:
+        header = message.get_header()
+        header.srcSystem, header.srcComponent = source
+        self.vehicle.handle(link, message)
+        self._take()
+
+    def received(self, kind: str, link: str = "onboard") -> list[Any]:
+        return [item.message for _, item in self.inbox[link] if item.message.get_type() == kind]
+
+    def forget(self) -> None:
+        self.inbox.clear()
+
+    def command(
+        self,
+        command: int,
+        *values: float,
+        target: tuple[int, int] = (1, 1),
+        source: tuple[int, int] = COMPANION,
+        link: str = "onboard",
+    ) -> list[int]:
+        """Send COMMAND_LONG; the MAV_RESULTs of every COMMAND_ACK to it within 40 ms."""
+        padded = (*values, *([0.0] * (7 - len(values))))
+        return self._answers(
+            dialect.MAVLink_command_long_message(*target, command, 0, *padded), command, source, link
+        )
+
+    def command_int(
+        self, command: int, values: tuple[float, ...], x: int, y: int, z: float, frame: int = 5
+    ) -> list[int]:
+        message = dialect.MAVLink_command_int_message(1, 1, frame, command, 0, 0, *values, x, y, z)
+        return self._answers(message, command, COMPANION, "onboard")
+
+    def _answers(self, message: Any, command: int, source: tuple[int, int], link: str) -> list[int]:
+        before = len(self.received("COMMAND_ACK", link))
+        self.send(message, link, source)
+        self.fly(0.04)
+        answers = self.received("COMMAND_ACK", link)[before:]
+        assert all((answer.target_system, answer.target_component) == source for answer in answers)
+        assert all(answer.command == command and answer.progress == 0 for answer in answers)
+        return [answer.result for answer in answers]
+
+    def set_mode(self, main: int, sub: int = 0, base: int = 1, **options: Any) -> list[int]:
+        return self.command(176, base, main, sub, **options)
+
+    def heartbeat(self) -> Any:
+        """The next HEARTBEAT of the vehicle."""
+        self.forget()
+        self.until(lambda: bool(self.received("HEARTBEAT")), 1.1)
+        return self.received("HEARTBEAT")[-1]
+
+    def texts(self, link: str = "gcs") -> list[str]:
+        """STATUSTEXTs received, their chunks put together."""
+        whole: list[str] = []
+        for message in self.received("STATUSTEXT", link):
+            text = message.text.decode() if isinstance(message.text, bytes) else message.text
+            text = text.rstrip("\0")
+            if message.id and message.chunk_seq:
+                whole[-1] += text
+            else:
+                whole.append(text)
+        return whole
+
+    # ---- flying
+
+    @property
+    def mode(self) -> str:
+        return self.vehicle.autopilot.mode.name
+
+    @property
+    def armed(self) -> bool:
+        return self.vehicle.autopilot.armed
+
+    @property
+    def height_m(self) -> float:
+        return -self.vehicle.airframe.position[2]
+
+    def wait_ready(self) -> None:
+        self.until(lambda: self.vehicle.autopilot.can_arm, 10.0)
+
+    def take_off(self, height_m: float | None = None) -> None:
+        """Arm, take off, wait for HOLD and a moment more."""
+        self.wait_ready()
+        assert self.command(400, 1) == [0]
+        altitude = NAN if height_m is None else 489.4 + height_m
+        assert self.command(22, NAN, 0, 0, NAN, NAN, NAN, altitude) == [0]
+        self.until(lambda: self.mode == "HOLD")
+        self.fly(4.0)
+
+    def offboard(self, setpoint: Any) -> None:
+        """Switch to OFFBOARD with a stream of this setpoint."""
+        self.fly(0.2, setpoint)
+        assert self.set_mode(6) == [0, 0]
+        self.fly(0.1, setpoint)
+        assert self.mode == "OFFBOARD"
+
+
+def velocity(forward: float, right: float, down: float, yaw_rate: float = 0.0, frame: int = 8) -> Any:
+    """A velocity setpoint as the flight recorded from a real vehicle sent them (type mask 1479)."""
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, frame, 1479, 0, 0, 0, forward, right, down, 0, 0, 0, 0, yaw_rate
+    )
+
+
+def position(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
+    """A position setpoint in LOCAL_NED (type mask 2552)."""
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 2552, north, east, down, 0, 0, 0, 0, 0, 0, yaw, 0
+    )
+
+
+@pytest.fixture
+def cockpit() -> Cockpit:
+    """A vehicle in still air, on the ground, just booted."""
+    return Cockpit()
+
+
+@pytest.fixture(scope="session")
+def make_cockpit() -> type[Cockpit]:
+    """Makes vehicles with other options."""
+    return Cockpit
+
+
+@pytest.fixture
+def velocity_setpoint() -> Callable[..., Any]:
+    return velocity
+
+
+@pytest.fixture
+def position_setpoint() -> Callable[..., Any]:
+    return position

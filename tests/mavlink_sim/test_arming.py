@@ -1,0 +1,112 @@
+"""Arming, disarming, readiness, and what HEARTBEAT and SYS_STATUS tell of them."""
+
+from typing import Any
+
+import pytest
+
+PREARM_CHECK = 0x10000000
+REJECTED = 1
+
+
+def prearm(cockpit: Any) -> bool:
+    cockpit.forget()
+    cockpit.fly(0.25)
+    return bool(cockpit.received("SYS_STATUS")[-1].onboard_control_sensors_health & PREARM_CHECK)
+
+
+def test_it_boots_in_hold_and_becomes_ready_after_a_moment(cockpit: Any) -> None:
+    assert not prearm(cockpit)
+    first = cockpit.heartbeat()
+    assert (first.type, first.autopilot, first.mavlink_version) == (2, 12, 3)
+    assert (first.custom_mode, first.base_mode, first.system_status) == (0x03040000, 29, 0)
+    cockpit.wait_ready()
+    assert prearm(cockpit)
+    assert cockpit.heartbeat().system_status == 3
+
+
+def test_arming_too_early_is_temporarily_rejected(cockpit: Any) -> None:
+    cockpit.fly(1.0)
+    assert cockpit.command(400, 1) == [REJECTED]
+    assert not cockpit.armed
+
+
+def test_arming_when_ready_is_accepted_and_shown(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(400, 1) == [0]
+    beat = cockpit.heartbeat()
+    assert (beat.base_mode, beat.system_status) == (157, 4)
+    assert cockpit.command(400, 1) == [0]  # once more is no error
+
+
+def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    cockpit.command(400, 1)
+    assert cockpit.command(400, 0) == [0]
+    assert not cockpit.armed
+    assert cockpit.command(400, 0) == [0]
+
+
+def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Any) -> None:
+    cockpit.take_off()
+    assert cockpit.command(400, 0) == [REJECTED]
+    assert cockpit.armed
+    assert cockpit.command(400, 0, 21196) == [0]
+    assert not cockpit.armed
+    cockpit.until(lambda: "landed" in cockpit.events, 5.0)
+    assert cockpit.height_m == 0.0
+
+
+def test_a_strange_arming_value_is_unsupported(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(400, 2) == [3]
+
+
+def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    cockpit.command(400, 1)
+    assert 10.8 < cockpit.until(lambda: not cockpit.armed, 15.0) < 11.6
+
+
+def test_the_time_to_the_preflight_disarm_is_a_parameter(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={"COM_DISARM_PRFLT": 2.0})
+    cockpit.wait_ready()
+    cockpit.command(400, 1)
+    assert 2.9 < cockpit.until(lambda: not cockpit.armed, 15.0) < 3.5
+
+
+@pytest.mark.parametrize(
+    ("main", "sub", "ready"),
+    [
+        (4, 3, True),  # HOLD
+        (4, 2, True),  # TAKEOFF
+        (4, 5, False),  # RTL
+        (4, 6, False),  # LAND
+        (4, 4, False),  # MISSION
+        (3, 0, False),  # POSCTL, without a remote control
+        (6, 0, False),  # OFFBOARD, without setpoints
+    ],
+)
+def test_readiness_depends_on_the_mode(cockpit: Any, main: int, sub: int, ready: bool) -> None:
+    cockpit.wait_ready()
+    assert cockpit.set_mode(main, sub) == [0, 0]
+    assert prearm(cockpit) is ready
+    assert cockpit.heartbeat().system_status == (3 if ready else 0)
+    assert cockpit.command(400, 1) == [0 if ready else REJECTED]
+
+
+def test_a_remote_control_makes_position_mode_ready(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    assert cockpit.vehicle.autopilot.pilot_takes_over() == 0
+    assert cockpit.mode == "POSCTL"
+    assert cockpit.command(400, 1) == [0]
+
+
+def test_an_offboard_stream_makes_offboard_ready(cockpit: Any, velocity_setpoint: Any) -> None:
+    cockpit.wait_ready()
+    cockpit.offboard(velocity_setpoint(0, 0, 0))
+    assert prearm(cockpit)
+    cockpit.fly(1.1)  # the stream has stopped
+    assert cockpit.heartbeat().base_mode == 1
+    assert not prearm(cockpit)
+    assert cockpit.heartbeat().system_status == 0
+    assert cockpit.command(400, 1) == [REJECTED]

@@ -1,0 +1,97 @@
+"""DO_SET_MODE and SET_MODE: two answers, the second one true."""
+
+from typing import Any
+
+import pytest
+
+from mavlink_sim.messages import dialect
+
+ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
+
+
+@pytest.mark.parametrize(("main", "sub"), ALL_MODES)
+def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Any, main: int, sub: int) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.set_mode(main, sub) == [0, 0]
+    assert cockpit.heartbeat().custom_mode == main << 16 | sub << 24
+
+
+def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    cockpit.forget()
+    cockpit.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
+    assert len(cockpit.received("COMMAND_ACK")) == 1
+    cockpit.fly(0.012)
+    assert len(cockpit.received("COMMAND_ACK")) == 2
+
+
+@pytest.mark.parametrize(("main", "sub", "base"), [(8, 0, 1), (4, 1, 1), (4, 99, 1), (77, 0, 1), (4, 3, 0)])
+def test_what_is_no_mode_is_accepted_then_rejected(cockpit: Any, main: int, sub: int, base: int) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.set_mode(main, sub, base) == [0, 1]
+    assert cockpit.mode == "HOLD"
+
+
+@pytest.mark.parametrize(("main", "sub"), [(3, 0), (2, 0), (7, 0), (1, 0), (4, 4), (6, 0)])
+def test_in_the_air_a_mode_that_cannot_be_flown_is_accepted_then_rejected(
+    cockpit: Any, main: int, sub: int
+) -> None:
+    cockpit.take_off()
+    assert cockpit.set_mode(main, sub) == [0, 1]
+    assert cockpit.heartbeat().custom_mode == 0x03040000
+
+
+def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(cockpit: Any) -> None:
+    cockpit.heartbeats.append(("gcs", (245, 190), 6))
+    cockpit.take_off()
+    cockpit.forget()
+    cockpit.set_mode(6)  # asked by the companion: no words
+    assert cockpit.texts() == []
+    cockpit.set_mode(6, source=(245, 190), link="gcs")
+    assert cockpit.texts() == ["Switching to Offboard is currently not available\t"]
+    cockpit.set_mode(3, source=(245, 190), link="gcs")
+    assert cockpit.texts()[-1] == "Switching to Position is currently not available\t"
+
+
+def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(cockpit: Any) -> None:
+    cockpit.take_off()
+    cockpit.forget()
+    cockpit.send(dialect.MAVLink_set_mode_message(1, 1, 0x00030000))
+    cockpit.fly(0.05)
+    cockpit.send(dialect.MAVLink_set_mode_message(1, 1, 0x05040000))
+    cockpit.fly(0.05)
+    answers = cockpit.received("COMMAND_ACK")
+    assert [(answer.command, answer.result) for answer in answers] == [(176, 1), (176, 0)]
+    assert cockpit.mode == "RTL"
+
+
+def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    cockpit.heartbeat()
+    cockpit.forget()
+    cockpit.set_mode(4, 2)
+    cockpit.fly(0.9)
+    assert cockpit.received("HEARTBEAT") == []
+
+
+def test_current_mode_tells_the_mode_and_the_intention_as_fast_as_asked(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(511, 436, 50_000) == [0]
+    cockpit.set_mode(4, 5)
+    cockpit.forget()
+    cockpit.fly(1.0)
+    seen = cockpit.received("CURRENT_MODE")
+    assert 19 <= len(seen) <= 21
+    assert {(m.standard_mode, m.custom_mode, m.intended_custom_mode) for m in seen} == {
+        (5, 0x05040000, 0x05040000)
+    }
+
+
+def test_another_system_may_take_the_vehicle_from_the_companion(cockpit: Any, velocity_setpoint: Any) -> None:
+    cockpit.take_off()
+    stream = velocity_setpoint(1, 0, 0)
+    cockpit.offboard(stream)
+    assert cockpit.set_mode(4, 3, source=(245, 190), link="gcs") == [0, 0]
+    cockpit.fly(5.0, stream)  # the companion goes on sending, in vain
+    assert cockpit.mode == "HOLD"
+    assert abs(cockpit.vehicle.airframe.velocity[0]) < 0.2

@@ -1,0 +1,195 @@
+"""Commands that are not about flying: who is answered, and with which MAV_RESULT."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink_sim.messages import dialect
+
+
+@pytest.mark.parametrize(
+    ("command", "values", "result"),
+    [
+        (178, (1, 5, -1, 0), 0),
+        (179, (1,), 0),
+        (401, (), 0),
+        (245, (1,), 0),
+        (185, (0,), 2),
+        (193, (0,), 3),
+        (92, (), 3),
+        (183, (), 3),
+        (252, (), 3),
+        (2000, (), 3),
+        (31010, (), 3),
+        (43000, (), 3),
+        (60000, (), 3),
+    ],
+)
+def test_the_result_of_a_command_is_as_measured(
+    cockpit: Any, command: int, values: tuple[float, ...], result: int
+) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(command, *values) == [result]
+
+
+@pytest.mark.parametrize(
+    ("target", "answers"), [((1, 1), 1), ((1, 0), 1), ((0, 0), 1), ((2, 1), 0), ((1, 100), 0)]
+)
+def test_only_what_is_addressed_to_the_autopilot_is_answered(
+    cockpit: Any, target: tuple[int, int], answers: int
+) -> None:
+    cockpit.fly(0.1)
+    assert len(cockpit.command(401, target=target)) == answers
+
+
+def test_command_zero_is_not_answered(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(0) == []
+
+
+def test_another_system_id_is_answered_under_it(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(system_id=7)
+    cockpit.fly(0.1)
+    assert cockpit.command(401, target=(1, 1)) == []
+    assert cockpit.command(401, target=(7, 1)) == [0]
+    assert {item.system for _, item in cockpit.inbox["onboard"]} == {7}
+    assert cockpit.vehicle.parameters.number("MAV_SYS_ID") == 7
+
+
+@pytest.mark.parametrize(("command", "values"), [(512, (148,)), (520, (1,))])
+def test_the_version_comes_before_the_acknowledgement(
+    cockpit: Any, command: int, values: tuple[float, ...]
+) -> None:
+    cockpit.fly(0.1)
+    cockpit.forget()
+    assert cockpit.command(command, *values) == [0]
+    order = [
+        item.message.get_type()
+        for _, item in cockpit.inbox["onboard"]
+        if item.message.get_type() in ("AUTOPILOT_VERSION", "COMMAND_ACK")
+    ]
+    assert order == ["AUTOPILOT_VERSION", "COMMAND_ACK"]
+    version = cockpit.received("AUTOPILOT_VERSION")[0]
+    assert version.capabilities == 59647
+    assert version.flight_sw_version == 0x01110040
+    assert list(version.flight_custom_version) == [0, 0, 0, 253, 175, 214, 222, 89]
+    assert (version.board_version, version.vendor_id, version.product_id) == (1, 0, 0)
+    assert version.uid == 5283920058631409231
+
+
+@pytest.mark.parametrize("identifier", [259, 280, 60000, 27])
+def test_a_message_that_it_does_not_have_is_denied(cockpit: Any, identifier: int) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(512, identifier) == [2]
+
+
+def test_home_cannot_be_asked_for_before_it_is_known(cockpit: Any) -> None:
+    cockpit.fly(0.5)
+    assert cockpit.command(512, 242) == [2]
+    cockpit.wait_ready()
+    assert cockpit.command(512, 242) == [0]
+    assert cockpit.received("HOME_POSITION")[-1].altitude == 489400
+
+
+def test_an_interval_is_honoured_switched_off_and_restored(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+
+    def count(seconds: float) -> int:
+        cockpit.forget()
+        cockpit.fly(seconds)
+        return len(cockpit.received("ATTITUDE"))
+
+    assert 97 <= count(1.0) <= 99
+    assert cockpit.command(511, 30, 100_000) == [0]
+    assert count(2.0) == 20
+    assert cockpit.command(511, 30, -1) == [0]
+    assert count(1.0) == 0
+    assert cockpit.command(511, 30, 0) == [0]
+    assert 97 <= count(1.0) <= 99
+
+
+@pytest.mark.parametrize("identifier", [27, 0, 60000])
+def test_the_interval_of_what_it_does_not_stream_cannot_be_set(cockpit: Any, identifier: int) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(511, identifier, 100_000) == [4]
+
+
+def test_an_interval_set_on_one_link_leaves_the_other_alone(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    cockpit.command(511, 30, -1)
+    cockpit.forget()
+    cockpit.fly(1.0)
+    assert cockpit.received("ATTITUDE", "onboard") == []
+    assert len(cockpit.received("ATTITUDE", "gcs")) == 49
+
+
+def test_the_interval_can_be_read_back(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    cockpit.command(511, 32, 250_000)
+    for identifier, interval in ((32, 250_000), (30, 10_152), (27, 0)):
+        assert cockpit.command(510, identifier) == [0]
+        answer = cockpit.received("MESSAGE_INTERVAL")[-1]
+        assert (answer.message_id, answer.interval_us) == (identifier, interval)
+
+
+def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(cockpit: Any) -> None:
+    cockpit.fly(0.5)
+    cockpit.forget()
+    cockpit.send(dialect.MAVLink_timesync_message(0, 123456789))
+    answer = cockpit.received("TIMESYNC")[0]
+    assert (answer.ts1, answer.tc1) == (123456789, 500_000_000)
+    cockpit.forget()
+    cockpit.fly(1.0)
+    assert {message.tc1 for message in cockpit.received("TIMESYNC")} == {0}  # its own requests
+
+
+def test_a_timesync_answer_is_not_answered(cockpit: Any) -> None:
+    cockpit.send(dialect.MAVLink_timesync_message(5, 123))
+    assert cockpit.received("TIMESYNC") == []
+
+
+def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(cockpit: Any) -> None:
+    cockpit.send(dialect.MAVLink_ping_message(77, 5, 0, 0))
+    answer = cockpit.received("PING")[0]
+    assert (answer.time_usec, answer.seq, answer.target_system, answer.target_component) == (77, 5, 1, 191)
+    cockpit.forget()
+    cockpit.send(dialect.MAVLink_ping_message(78, 6, 1, 1))
+    assert cockpit.received("PING") == []
+
+
+def test_there_is_no_mission_on_board(cockpit: Any) -> None:
+    cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 1))
+    count = cockpit.received("MISSION_COUNT")[0]
+    assert (count.count, count.mission_type, count.target_component) == (0, 1, 191)
+    assert cockpit.command(300) == [2]
+
+
+numbers = st.one_of(
+    st.sampled_from([0.0, 1.0, -1.0, float("nan"), float("inf"), 3.0e38, -3.0e38, 21196.0, 192.0]),
+    st.floats(width=32),
+)
+COMMANDS = [16, 20, 21, 22, 176, 178, 179, 185, 192, 193, 245, 300, 400, 401, 510, 511, 512, 519, 520]
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(COMMANDS), st.lists(numbers, min_size=7, max_size=7)),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_no_command_with_any_values_can_stop_the_vehicle(
+    make_cockpit: Any, requests: list[tuple[int, list[float]]]
+) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0)
+    cockpit.command(400, 1)
+    for command, values in requests:
+        for result in cockpit.command(command, *values):
+            assert 0 <= result <= 4
+    cockpit.fly(1.0)
+    codec = dialect.MAVLink(None, 1, 1)
+    for _, item in cockpit.inbox["onboard"]:
+        assert item.pack(codec)

@@ -1,0 +1,196 @@
+"""`mavlink-sim` as a process: its options, its ports, its words, its end."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from pymavlink import mavutil
+
+from mavlink_sim.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
+from mavlink_sim.messages import Outgoing, dialect, parser
+from mavlink_sim.testing import free_udp_ports, running_simulator
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mavlink_sim", *arguments], capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--param", "COM_OF_LOST_T=1"], ["COM_OF_LOST_T"]),
+        (["--param", "COM_OF_LOSS_T"], ["COM_OF_LOSS_T", "NAME=NUMBER"]),
+        (["--param", "COM_OF_LOSS_T=fast"], ["fast", "NAME=NUMBER"]),
+        (["--param", "NAV_RCL_ACT=1.5"], ["NAV_RCL_ACT", "INT32", "1.5"]),
+        (["--speed", "0"], ["--speed", "0.05 to 20"]),
+        (["--speed", "nan"], ["--speed", "0.05 to 20"]),
+        (["--speed", "fast"], ["--speed", "valid number"]),
+        (["--bogus"], ["--bogus"]),
+        (["--wind", "-3"], ["--wind", "0 to 20"]),
+        (["--onboard-port", "0"], ["--onboard-port", "1 to 65535"]),
+        (["--gcs-bind", "70000"], ["--gcs-bind", "0 to 65535"]),
+        (["--system-id", "256"], ["--system-id", "1 to 255"]),
+        (["--host", "not.a.host.invalid"], ["not.a.host.invalid"]),
+        (["--truth", "/nonexistent/folder/truth.jsonl"], ["truth.jsonl"]),
+        (["--ready-file", "/nonexistent/folder/ready"], ["ready"]),
+    ],
+    ids=lambda value: "_".join(value) if isinstance(value, list) else str(value),
+)
+def test_a_bad_value_gives_one_clear_line_and_code_two(arguments: list[str], words: list[str]) -> None:
+    finished = run("--onboard-bind", "0", "--gcs-bind", "0", *arguments)
+    assert finished.returncode == 2
+    lines = finished.stderr.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("mavlink-sim: ")
+    for word in words:
+        assert word in lines[0]
+    assert finished.stdout == ""
+
+
+def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        finished = run("--onboard-bind", str(port), "--gcs-bind", "0")
+    assert finished.returncode == 2
+    assert finished.stderr.strip() == (
+        f"mavlink-sim: UDP port 127.0.0.1:{port} is already in use; stop its user or choose another port"
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_in_good_order(number: signal.Signals) -> None:
+    with running_simulator() as simulator:
+        simulator.process.send_signal(number)
+        assert simulator.wait_for_event("stopped", 20.0) == "stopped"
+        assert simulator.process.wait(20.0) == 0
+
+
+def test_the_ready_file_tells_pid_and_ports(tmp_path: Path) -> None:
+    ready = tmp_path / "ready.json"
+    with running_simulator(ready_file=ready) as simulator:
+        assert json.loads(ready.read_text()) == {
+            "pid": simulator.pid,
+            "onboard_bind": simulator.onboard_bind,
+            "gcs_bind": simulator.gcs_bind,
+        }
+
+
+def test_both_links_send_from_the_start_and_answer() -> None:
+    with running_simulator(system_id=3) as simulator:
+        for port in (simulator.onboard_port, simulator.gcs_port):
+            link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245)
+            beat = link.wait_heartbeat(timeout=20)
+            assert (beat.get_srcSystem(), beat.get_srcComponent()) == (3, 1)
+            link.mav.param_request_read_send(3, 1, b"COM_OF_LOSS_T", -1)
+            value = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=20)
+            assert value.param_value == 1.0
+            link.close()
+
+
+def test_the_clock_runs_as_fast_as_asked() -> None:
+    with running_simulator(speed=8.0) as simulator:
+        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
+        first = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
+        started = time.monotonic()
+        last = first
+        while last.time_boot_ms - first.time_boot_ms < 8000:
+            last = link.recv_match(type="ATTITUDE", blocking=True, timeout=20)
+        # only one side can be bounded: a busy machine makes it slower, nothing may make it faster
+        assert time.monotonic() - started > 0.6
+        link.close()
+
+
+def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
+    truth = tmp_path / "truth.jsonl"
+    pytest.importorskip("mavlink_sim.world")
+    with running_simulator(truth=truth, speed=4.0) as simulator:
+        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
+        while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < 3000:
+            pass
+        lines = truth.read_text().splitlines()  # while it runs
+        link.close()
+    records = [json.loads(line) for line in lines]
+    assert len(records) > 30
+    last = records[-1]
+    assert set(last) == {
+        "stamp_ns",
+        "position_ned_m",
+        "velocity_ned_mps",
+        "yaw_rad",
+        "mode",
+        "armed",
+        "landed",
+        "objects",
+    }
+    assert (last["mode"], last["armed"], last["landed"]) == ("HOLD", False, True)
+    assert last["objects"]
+    assert set(last["objects"][0]) == {"identifier", "class_name", "position_ned_m", "range_m"}
+    assert 0 <= time.monotonic_ns() - last["stamp_ns"] < 60e9
+
+
+# ---- the endpoint itself
+
+
+def test_an_endpoint_says_which_port_is_taken() -> None:
+    first = UdpEndpoint("127.0.0.1", 0, 9)
+    try:
+        with pytest.raises(PortInUseError, match=str(first.port)):
+            UdpEndpoint("127.0.0.1", first.port, 9)
+    finally:
+        first.close()
+
+
+def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (unheard,) = free_udp_ports(1)
+    endpoint = UdpEndpoint("127.0.0.1", 0, unheard)
+    peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+    beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    clock = [100.0]
+    monkeypatch.setattr("mavlink_sim.endpoint.time.monotonic", lambda: clock[0])
+    try:
+        for peer in peers:
+            peer.bind(("127.0.0.1", 0))
+            peer.settimeout(10.0)
+        for peer in peers:
+            peer.sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
+        deadline = time.perf_counter() + 10.0
+        heard = 0
+        while heard < 2 and time.perf_counter() < deadline:
+            heard += len(endpoint.receive())
+        assert endpoint.peer == peers[0].getsockname()
+        clock[0] += PEER_SILENCE_S + 0.1
+        peers[1].sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
+        while not endpoint.receive() and time.perf_counter() < deadline:
+            pass
+        endpoint.send([Outgoing(beat, 1, 1)])
+        assert peers[1].recv(1000)
+    finally:
+        for peer in peers:
+            peer.close()
+        endpoint.close()
+
+
+def test_garbage_is_skipped_and_the_message_after_it_read() -> None:
+    endpoint = UdpEndpoint("127.0.0.1", 0, 9)
+    beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for datagram in (b"", b"\xfd" * 300, bytes(range(256)), b"hello", b"\x00" * 600):
+            peer.sendto(datagram, ("127.0.0.1", endpoint.port))
+        for _ in range(8):  # a broken length may swallow some
+            peer.sendto(beat.pack(parser(1, 191)), ("127.0.0.1", endpoint.port))
+        found: list[str] = []
+        deadline = time.perf_counter() + 10.0
+        while not found and time.perf_counter() < deadline:
+            found += [message.get_type() for message in endpoint.receive()]
+    endpoint.close()
+    assert set(found) == {"HEARTBEAT"}

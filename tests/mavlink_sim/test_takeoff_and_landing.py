@@ -1,0 +1,183 @@
+"""TAKEOFF, LAND, RTL, HOLD and DO_REPOSITION, with the landed states they pass through."""
+
+import math
+from typing import Any
+
+import pytest
+
+NAN = math.nan
+
+
+def landed_states(cockpit: Any) -> list[int]:
+    """The EXTENDED_SYS_STATE.landed_state received, without repetitions."""
+    found: list[int] = []
+    for message in cockpit.received("EXTENDED_SYS_STATE"):
+        if found[-1:] != [message.landed_state]:
+            found.append(message.landed_state)
+    return found
+
+
+def test_take_off_climbs_to_two_and_a_half_metres_and_holds(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(400, 1) == [0]
+    cockpit.forget()
+    armed_s = cockpit.now_s
+    assert cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN) == [0]
+    assert cockpit.mode == "TAKEOFF"
+    cockpit.until(lambda: not cockpit.vehicle.autopilot.landed)
+    assert 1.5 < cockpit.now_s - armed_s < 2.5
+    cockpit.until(lambda: cockpit.mode == "HOLD")
+    assert 6.3 < cockpit.now_s - armed_s < 9.0
+    assert 1.7 < cockpit.height_m < 2.3
+    cockpit.fly(6.0)
+    assert cockpit.height_m == pytest.approx(2.5, abs=0.15)
+    assert landed_states(cockpit) == [1, 3, 2]
+
+
+def test_take_off_to_a_given_altitude_above_sea(cockpit: Any) -> None:
+    cockpit.take_off(6.0)
+    cockpit.fly(6.0)
+    assert cockpit.height_m == pytest.approx(6.0, abs=0.3)
+
+
+def test_take_off_is_accepted_before_arming_and_waits_for_it(cockpit: Any) -> None:
+    cockpit.fly(0.5)  # not even ready
+    assert cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN) == [0]
+    assert not cockpit.armed
+    cockpit.wait_ready()
+    assert cockpit.command(400, 1) == [0]
+    cockpit.until(lambda: cockpit.mode == "HOLD")
+    assert cockpit.height_m > 1.5
+
+
+def test_the_mode_take_off_alone_takes_off_once_armed(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    assert cockpit.set_mode(4, 2) == [0, 0]
+    assert cockpit.command(400, 1) == [0]
+    cockpit.until(lambda: cockpit.mode == "HOLD")
+    assert cockpit.height_m > 1.5
+
+
+def test_take_off_while_flying_is_accepted_and_does_not_descend(cockpit: Any) -> None:
+    cockpit.take_off(6.0)
+    cockpit.fly(5.0)
+    assert cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN) == [0]
+    cockpit.fly(3.0)
+    assert cockpit.height_m > 5.5
+    assert cockpit.mode == "HOLD"
+
+
+def test_landing_touches_down_softly_and_disarms_two_seconds_later(cockpit: Any) -> None:
+    cockpit.take_off(4.0)
+    cockpit.fly(4.0)
+    cockpit.forget()
+    assert cockpit.command(21, 0, 0, 0, NAN, NAN, NAN, NAN) == [0]
+    assert cockpit.heartbeat().custom_mode == 0x06040000
+    took = cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 20.0)
+    cockpit.until(lambda: cockpit.vehicle.autopilot.landed, 5.0)
+    assert 5.0 < took < 12.0
+    assert 1.9 < cockpit.until(lambda: not cockpit.armed, 5.0) < 2.1
+    cockpit.fly(0.5)
+    assert landed_states(cockpit) == [4, 1]
+
+
+def test_after_a_landing_the_mode_chosen_before_it_comes_back(cockpit: Any) -> None:
+    cockpit.take_off()
+    cockpit.command(21)
+    cockpit.until(lambda: not cockpit.armed, 30.0)
+    assert cockpit.mode == "HOLD"
+    assert cockpit.heartbeat().system_status == 3
+
+
+def test_leaving_land_in_the_air_is_in_air_again(cockpit: Any) -> None:
+    cockpit.take_off(5.0)
+    cockpit.forget()
+    cockpit.command(21)
+    cockpit.fly(1.0)
+    cockpit.set_mode(4, 3)
+    cockpit.fly(1.0)
+    assert landed_states(cockpit)[-2:] == [4, 2]
+
+
+def test_return_close_to_home_stays_low_lands_and_disarms(cockpit: Any) -> None:
+    cockpit.heartbeats.append(("gcs", (245, 190), 6))
+    cockpit.take_off(4.0)
+    cockpit.fly(4.0)
+    cockpit.forget()
+    highest = cockpit.height_m
+    assert cockpit.command(20) == [0]
+    assert cockpit.mode == "RTL"
+    cockpit.until(lambda: not cockpit.armed, 60.0)
+    assert highest < 4.5
+    assert landed_states(cockpit)[-2:] == [4, 1]
+    said = cockpit.texts()
+    assert said[:2] == ["Returning to launch\t", "RTL: start return at 493 m (4 m above destination)\t"]
+    assert said[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
+
+
+def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={"RTL_RETURN_ALT": 12.0})
+    cockpit.take_off(4.0)
+    assert cockpit.command_int(192, (-1, 1, 0, NAN), 473980000, 85455942, 494.4) == [0]
+    cockpit.fly(14.0)
+    assert math.dist(cockpit.vehicle.airframe.position, (28.5, 0.0, -5.0)) < 1.5
+    cockpit.command(20)
+    highest = 0.0
+
+    def done() -> bool:
+        nonlocal highest
+        highest = max(highest, cockpit.height_m)
+        return not cockpit.armed
+
+    cockpit.until(done, 90.0)
+    assert 11.5 < highest < 13.0
+    assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 1.0
+    assert abs(math.degrees(cockpit.vehicle.airframe.yaw_rad)) > 150.0  # it flew nose first
+
+
+def test_reposition_flies_there_and_turns_to_the_given_heading(cockpit: Any) -> None:
+    cockpit.take_off(5.0)
+    assert cockpit.command_int(192, (-1, 1, 0, math.pi / 2), 473978330, 85455942, 497.4) == [0]
+    cockpit.fly(25.0)
+    north, east, down = cockpit.vehicle.airframe.position
+    assert north == pytest.approx(10.0, abs=0.6)  # the integrator lets go slowly
+    assert east == pytest.approx(0.0, abs=0.3)
+    assert down == pytest.approx(-8.0, abs=0.3)
+    assert cockpit.vehicle.airframe.yaw_rad == pytest.approx(math.pi / 2, abs=0.05)
+    assert cockpit.mode == "HOLD"
+
+
+def test_reposition_without_the_change_of_mode_is_unsupported(cockpit: Any) -> None:
+    cockpit.take_off()
+    assert cockpit.command_int(192, (-1, 0, 0, NAN), 473978330, 85455942, 497.4) == [3]
+
+
+def test_hold_brakes_and_stays(cockpit: Any, velocity_setpoint: Any) -> None:
+    cockpit.take_off(5.0)
+    fast = velocity_setpoint(4, 0, 0)
+    cockpit.offboard(fast)
+    cockpit.fly(5.0, fast)
+    before = cockpit.vehicle.airframe.position[0]
+    cockpit.set_mode(4, 3)
+    cockpit.fly(12.0)
+    assert math.hypot(*cockpit.vehicle.airframe.velocity) < 0.12
+    assert 1.0 < cockpit.vehicle.airframe.position[0] - before < 8.0
+
+
+def test_a_gimbal_is_looked_after_at_every_landing(cockpit: Any) -> None:
+    cockpit.take_off(4.0)
+    cockpit.forget()
+    cockpit.command(21)
+    cockpit.fly(3.0)
+    sent = [
+        (m.target_system, m.target_component, m.command, m.confirmation)
+        for m in cockpit.received("COMMAND_LONG")
+    ]
+    assert sent == [
+        (1, 0, 1001, 0),
+        (1, 0, 1000, 0),
+        (1, 0, 1001, 0),
+        (1, 0, 1001, 1),
+        (1, 0, 1001, 2),
+        (1, 0, 1001, 3),
+    ]
