@@ -1,0 +1,243 @@
+"""The camera's picture of a world, drawn in software: colour, depth, and what is seen of each object.
+
+Ground, then shadows, then objects against a depth buffer, then sky and haze. One call is one frame; nothing
+is kept between frames, so any pose can be drawn at any time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.ground_view import Buffers, View, add_haze, draw_ground, draw_sky
+from mavlink_sim.image_effects import ImageEffects, apply_effects
+from mavlink_sim.object_view import FACE_BITS, FAR_PX, NEAR_M, SUBPIXEL_BITS, PlacedObject, Sighting
+from mavlink_sim.painting_order import clip_polygon
+from mavlink_sim.textures import Image, Plane
+from mavlink_sim.world import World, WorldObject, range_to
+from vision.camera_model import CameraModel, CameraMount
+
+DEFAULT_CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+DEFAULT_MOUNT = CameraMount(forward_m=0.12, pitch_rad=math.radians(-20.0))
+
+LOWEST_EYE_M = 0.05
+"""A landed vehicle's camera would touch the ground; the picture is taken from no lower than this."""
+MAX_SHADOW_SOLIDS_AT_PX = 14.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VisibleObject:
+    """What is seen of one object.
+
+    Attributes:
+        world_object: the object.
+        xyxy: edges of the box around its visible pixels: left, top, and right, bottom past the last pixel.
+        visible_fraction: visible pixels against all that it would cover if nothing stood before it and the
+            image were larger, 0..1.
+        pixel_count: number of visible pixels.
+        range_m: horizontal metres from the camera to its footprint.
+    """
+
+    world_object: WorldObject
+    xyxy: tuple[float, float, float, float]
+    visible_fraction: float
+    pixel_count: int
+    range_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendered:
+    """One frame.
+
+    Attributes:
+        image: (H, W, 3) uint8 BGR.
+        depth_m: (H, W) float32 along the optical axis, NaN in the sky and beyond 10 km.
+        objects: those of which at least one pixel is seen, in the world's order.
+    """
+
+    image: Image
+    depth_m: Plane
+    objects: list[VisibleObject]
+
+
+class Renderer:
+    """Draws one world through one camera.
+
+    Raises ValueError if the camera has lens distortion, which is not drawn yet.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        camera: CameraModel = DEFAULT_CAMERA,
+        mount: CameraMount = DEFAULT_MOUNT,
+        effects: ImageEffects | None = None,
+        buffers: Buffers | None = None,
+    ) -> None:
+        if any(camera.distortion):
+            raise ValueError(
+                f"the renderer draws no lens distortion, the camera has {camera.distortion}; "
+                "use a camera without distortion coefficients"
+            )
+        self.world, self.camera, self.mount, self.effects = world, camera, mount, effects
+        self._buffers = buffers or Buffers(camera.width, camera.height)
+        self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
+        self._rng = np.random.default_rng(0)
+
+    def render(self, position_ned_m: Sequence[float], ned_from_body: NDArray[np.float64]) -> Rendered:
+        """The frame seen when the body is at `position_ned_m` (3,) with attitude `ned_from_body` (3, 3)."""
+        view = self.view(position_ned_m, ned_from_body)
+        buffers, world = self._buffers, self.world
+        inverse_depth = np.empty((view.height, view.width), np.float32)
+        image = draw_ground(world, view, buffers, inverse_depth)
+        seen = [placed for placed in self._placed if placed.may_be_seen(view)]
+        self._cast_shadows(view, image)
+        draw_sky(world.sky, world.light, view, inverse_depth, image)
+        labels = np.zeros((view.height, view.width), np.int32)
+        sightings = self._draw_objects(seen, view, image, inverse_depth, labels)
+        _soften_edges(image, labels, sightings)
+        add_haze(world.sky, inverse_depth, buffers, image)
+        if self.effects is not None:
+            image = apply_effects(image, self.effects, self._rng)
+        objects = [_visible(placed, sighting, number, labels, view) for placed, sighting, number in sightings]
+        with np.errstate(divide="ignore"):
+            depth_m = np.divide(np.float32(1.0), inverse_depth, out=inverse_depth)
+        np.copyto(depth_m, np.nan, where=np.isinf(depth_m))
+        return Rendered(image, depth_m, [item for item in objects if item is not None])
+
+    def view(self, position_ned_m: Sequence[float], ned_from_body: NDArray[np.float64]) -> View:
+        """The camera's pose for a body's pose, with matrices between pixels and NED."""
+        ned_from_optical = ned_from_body @ self.mount.body_from_optical
+        eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ self.mount.position_frd_m
+        eye[2] = min(eye[2], -LOWEST_EYE_M)
+        matrix = self.camera.matrix
+        return View(
+            eye=eye,
+            ned_from_pixel=ned_from_optical @ np.linalg.inv(matrix),
+            pixel_from_ned=matrix @ ned_from_optical.T,
+            focal_px=(self.camera.fx + self.camera.fy) / 2,
+            width=self.camera.width,
+            height=self.camera.height,
+        )
+
+    def _cast_shadows(self, view: View, image: Image) -> None:
+        """Darken the ground where an object keeps the sun off."""
+        darkness = self.world.light.shadow
+        if darkness <= 0.0:
+            return
+        mask: Image | None = None
+        left, top, right, bottom = view.width, view.height, 0, 0
+        for placed in self._placed:
+            outlines = _shadows_in_view(placed, view)
+            if not outlines:
+                continue
+            if mask is None:
+                mask = np.zeros((view.height, view.width), np.uint8)
+            for outline in outlines:
+                low, high = outline.min(axis=0), outline.max(axis=0)
+                if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
+                    continue
+                left, top = min(left, int(low[0])), min(top, int(low[1]))
+                right, bottom = max(right, int(high[0])), max(bottom, int(high[1]))
+                fixed = np.rint(np.clip(outline, -FAR_PX, FAR_PX) * (1 << SUBPIXEL_BITS)).astype(np.int32)
+                cv2.fillConvexPoly(mask, fixed, 255, cv2.LINE_8, SUBPIXEL_BITS)
+        left, top = max(left - 4, 0), max(top - 4, 0)
+        right, bottom = min(right + 5, view.width), min(bottom + 5, view.height)
+        if mask is None or right <= left or bottom <= top:
+            return
+        soft = cv2.blur(mask[top:bottom, left:right], (5, 5))
+        factor = cv2.cvtColor(255 - cv2.convertScaleAbs(soft, alpha=darkness), cv2.COLOR_GRAY2BGR)
+        part = image[top:bottom, left:right]
+        cv2.multiply(part, factor, dst=part, scale=1 / 255)
+
+    @staticmethod
+    def _draw_objects(
+        seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane, labels: NDArray[np.int32]
+    ) -> list[tuple[PlacedObject, Sighting, int]]:
+        sightings: list[tuple[PlacedObject, Sighting, int]] = []
+        flat_depth, flat_labels, flat_image = inverse_depth.reshape(-1), labels.reshape(-1), image.reshape(-1, 3)
+        for placed in seen:
+            sighting = placed.draw(view)
+            if sighting is None:
+                continue
+            number = len(sightings) + 1
+            nearer = sighting.inverse_depth > flat_depth.take(sighting.pixels)
+            pixels = sighting.pixels[nearer]
+            flat_depth[pixels] = sighting.inverse_depth[nearer]
+            flat_labels[pixels] = sighting.faces[nearer] + (number << FACE_BITS)
+            flat_image[pixels] = np.clip(sighting.colours[nearer], 0, 255).astype(np.uint8)
+            sightings.append((placed, sighting, number))
+        return sightings
+
+
+def _shadows_in_view(placed: PlacedObject, view: View) -> list[NDArray[np.float64]]:
+    """Projected shadow outlines (K, 2), cut at the near plane; one for all where it is small anyway."""
+    outlines = placed.shadow
+    joined = np.concatenate(outlines)
+    projected = (joined - view.eye) @ view.pixel_from_ned.T
+    depth = projected[:, 2]
+    if float(depth.max()) < NEAR_M:
+        return []
+    if float(depth.min()) >= NEAR_M:
+        points = projected[:, :2] / projected[:, 2:]
+        low, high = points.min(axis=0), points.max(axis=0)
+        if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
+            return []
+        if float((high - low).max()) < MAX_SHADOW_SOLIDS_AT_PX:
+            return [cv2.convexHull(points.astype(np.float32)).reshape(-1, 2).astype(np.float64)]
+        return np.split(points, np.cumsum([len(outline) for outline in outlines])[:-1])
+    forward = np.array([0.0, 0.0, 1.0])
+    cut: list[NDArray[np.float64]] = []
+    for piece in np.split(projected, np.cumsum([len(outline) for outline in outlines])[:-1]):
+        kept = clip_polygon(piece, forward, NEAR_M)
+        if len(kept) >= 3:
+            cut.append(kept[:, :2] / kept[:, 2:])
+    return cut
+
+
+def _soften_edges(
+    image: Image, labels: NDArray[np.int32], sightings: list[tuple[PlacedObject, Sighting, int]]
+) -> None:
+    """Blend pixels along the edges of faces with their neighbours, so that edges are not jagged."""
+    if not sightings:
+        return
+    left = max(min(sighting.left for _, sighting, _ in sightings) - 2, 0)
+    top = max(min(sighting.top for _, sighting, _ in sightings) - 2, 0)
+    right = max(sighting.right for _, sighting, _ in sightings) + 2
+    bottom = max(sighting.bottom for _, sighting, _ in sightings) + 2
+    part, label = image[top:bottom, left:right], labels[top:bottom, left:right]
+    across = label[:, 1:] != label[:, :-1]
+    along = label[1:] != label[:-1]
+    edge = np.zeros(label.shape, np.bool_)
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= along
+    edge[:-1] |= along
+    blurred = cv2.GaussianBlur(part, (3, 3), 0.6)
+    cv2.copyTo(blurred, edge.view(np.uint8), part)
+
+
+def _visible(
+    placed: PlacedObject, sighting: Sighting, number: int, labels: NDArray[np.int32], view: View
+) -> VisibleObject | None:
+    box = labels[sighting.top : sighting.bottom, sighting.left : sighting.right]
+    own = (box >> FACE_BITS) == number
+    columns, rows = np.flatnonzero(own.any(axis=0)), np.flatnonzero(own.any(axis=1))
+    if not len(columns):
+        return None
+    count = int(np.count_nonzero(own))
+    xyxy = (
+        float(sighting.left + columns[0]),
+        float(sighting.top + rows[0]),
+        float(sighting.left + columns[-1] + 1),
+        float(sighting.top + rows[-1] + 1),
+    )
+    fraction = count / len(sighting.pixels) * sighting.inside_share
+    return VisibleObject(
+        placed.item, xyxy, min(1.0, fraction), count, range_to(placed.item, (view.eye[0], view.eye[1]))
+    )
