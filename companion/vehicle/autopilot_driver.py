@@ -373,7 +373,7 @@ class AutopilotDriver(ABC):
         result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
         if result != ACCEPTED:
             if not armed:
-                reason = f"it is {self._state.landed}"
+                reason = f"it is {self._state.landed.replace('_', ' ')}"
             elif self._state.ready_to_arm:
                 reason = f"in mode {self._state.mode}"
             else:

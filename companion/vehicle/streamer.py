@@ -92,6 +92,9 @@ class Streamer:
         newest = self._newest
         if newest is None or self._state is StreamState.EXPIRED:
             return
+        if self._state is StreamState.SILENT and newest.expired(now_ns):
+            # Nothing was flying by us, so there is nothing to brake: a brake would only take command.
+            return
         if self._was_silent(now_ns):
             self._enter(StreamState.EXPIRED)
         elif not newest.expired(now_ns):

@@ -1,0 +1,153 @@
+"""One contract, two drivers: each flies the built-in vehicle through its own process and a real socket."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from fake_autopilot import state_shows, wait_until
+
+from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.drivers import open_driver
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.streamer import Streamer
+from mavlink_sim.testing import RunningSimulator, running_simulator
+
+# Simulated seconds are short; the loss timeout is long enough in them for a busy test machine.
+FLIGHT = {"COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
+
+
+@asynccontextmanager
+async def connected(kind: str, simulator: RunningSimulator, **options: int) -> AsyncIterator[Driver]:
+    driver = open_driver(kind, f"udpin://127.0.0.1:{simulator.onboard_port}", **options)
+    await driver.connect(20.0)
+    try:
+        yield driver
+    finally:
+        await driver.close()
+
+
+def complete(state: VehicleState) -> bool:
+    return (
+        state.position_fresh(time.monotonic_ns())
+        and state.connected(time.monotonic_ns())
+        and state.landed is not LandedState.UNKNOWN
+        and state.home_position_ned_m is not None
+        and state.ready_to_arm
+        and state.battery_fraction is not None
+        and math.isfinite(state.latitude_deg)
+    )
+
+
+@asynccontextmanager
+async def streaming(
+    driver: Driver, velocity: Callable[[], tuple[float, float, float]]
+) -> AsyncIterator[Streamer]:
+    """A behaviour that wants a velocity, kept fresh until the block ends."""
+    streamer = Streamer(driver.send_setpoint, brake_s=0.1)
+
+    async def want() -> None:
+        while True:
+            streamer.submit(Setpoint.velocity(velocity(), time.monotonic_ns(), yaw_rate_radps=0.0))
+            await asyncio.sleep(0.05)
+
+    tasks = [asyncio.create_task(want()), asyncio.create_task(streamer.run())]
+    try:
+        yield streamer
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_on_the_ground_state_parameters_modes_and_arming_work(kind: str) -> None:
+    with running_simulator(speed=4.0) as simulator:
+        async with connected(kind, simulator) as driver:
+            state = await state_shows(driver, complete)
+            assert state.mode is FlightMode.HOLD
+            assert state.landed is LandedState.ON_GROUND
+            assert state.altitude_m == pytest.approx(0.0, abs=0.5)
+            assert abs(state.altitude_amsl_m - state.home_altitude_amsl_m) < 1.0
+
+            assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
+            await driver.set_parameter("COM_OF_LOSS_T", 0.75)
+            await driver.set_parameter("COM_OBL_RC_ACT", 4)
+            assert await driver.get_parameter("COM_OF_LOSS_T") == 0.75
+            assert await driver.get_parameter("COM_OBL_RC_ACT") == 4.0
+            with pytest.raises(CommandRefusedError, match="COM_NO_SUCH: there is no such parameter"):
+                await driver.get_parameter("COM_NO_SUCH")
+
+            # Disarmed, PX4 takes every mode, and in MISSION without a mission it is never ready.
+            await driver.set_mode(FlightMode.MISSION)
+            await state_shows(driver, lambda s: not s.ready_to_arm)
+            with pytest.raises(
+                CommandRefusedError, match=r"refused to arm .*pre-arm checks fail in mode mission"
+            ):
+                await driver.arm()
+            assert not driver.state.armed
+            await driver.set_mode(FlightMode.HOLD)
+            await state_shows(driver, lambda s: s.ready_to_arm)
+            await driver.arm()
+            assert driver.state.armed
+            await driver.disarm()
+            assert not driver.state.armed
+
+
+async def test_a_flight_by_setpoints_ends_in_the_failsafe_when_they_end(kind: str) -> None:
+    with running_simulator(speed=4.0, parameters=FLIGHT) as simulator:
+        async with connected(kind, simulator) as driver:
+            await state_shows(driver, complete)
+            await driver.takeoff(3.0)
+            await driver.arm()
+            await state_shows(driver, lambda s: s.landed is LandedState.IN_AIR and s.mode is FlightMode.HOLD)
+            assert driver.state.altitude_m == pytest.approx(3.0, abs=1.0)
+
+            with pytest.raises(CommandRefusedError, match=r"refused to disarm .*in air"):
+                await driver.disarm()
+            # PX4 acknowledges both with ACCEPTED first.
+            with pytest.raises(CommandRefusedError, match=r"refused mode mission .*it shows hold"):
+                await driver.set_mode(FlightMode.MISSION)
+            with pytest.raises(
+                CommandRefusedError, match=r"refused mode offboard .*is a setpoint stream running"
+            ):
+                await driver.set_mode(FlightMode.OFFBOARD)
+
+            async with streaming(driver, lambda: (1.5, 0.0, 0.0)) as streamer:
+                await wait_until(lambda: streamer.sent_count > 0, 5.0)
+                await driver.set_mode(FlightMode.OFFBOARD)
+                await state_shows(driver, lambda s: abs(s.velocity_ned_mps[0] - 1.5) < 0.3)
+                assert driver.state.mode is FlightMode.OFFBOARD
+            await state_shows(driver, lambda s: s.failsafe and s.mode is FlightMode.LAND)
+            await state_shows(driver, lambda s: not s.armed and s.landed is LandedState.ON_GROUND, 30.0)
+
+
+async def test_a_vehicle_that_restarts_is_flown_on_without_a_new_driver(kind: str, caplog) -> None:
+    caplog.set_level(logging.INFO)
+    with running_simulator(speed=4.0) as first:
+        async with connected(kind, first) as driver:
+            await state_shows(driver, complete)
+            first.kill()
+            await wait_until(lambda: "is silent" in caplog.text, 15.0)
+            assert not driver.state.connected(time.monotonic_ns())
+            with running_simulator(speed=4.0, onboard_port=first.onboard_port):
+                await wait_until(lambda: "is back" in caplog.text, 15.0)
+                await state_shows(driver, complete)
+                await driver.arm()
+                await driver.disarm()
+
+
+async def test_two_vehicles_are_flown_side_by_side(kind: str) -> None:
+    with running_simulator(speed=4.0) as one, running_simulator(speed=4.0, system_id=2) as two:
+        async with connected(kind, one) as first, connected(kind, two, system_id=2) as second:
+            await asyncio.gather(state_shows(first, complete), state_shows(second, complete))
+            await asyncio.gather(second.takeoff(3.0), second.arm())
+            await state_shows(second, lambda s: s.altitude_m > 1.0)
+            assert not first.state.armed
+            assert first.state.altitude_m < 0.5
+            await second.set_mode(FlightMode.LAND)

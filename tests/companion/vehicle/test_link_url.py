@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.vehicle.driver import LinkError
+from companion.vehicle.link_url import LinkScheme, LinkUrl, LinkUrlError, parse_link_url
+
+
+@pytest.mark.parametrize(
+    ("text", "scheme", "address"),
+    [
+        ("udpin://0.0.0.0:14540", LinkScheme.UDP_IN, ("0.0.0.0", 14540)),
+        ("udpin://127.0.0.1:1", LinkScheme.UDP_IN, ("127.0.0.1", 1)),
+        ("udpout://vehicle.local:14580", LinkScheme.UDP_OUT, ("vehicle.local", 14580)),
+        ("udpin://[::1]:14540", LinkScheme.UDP_IN, ("::1", 14540)),
+        ("tcp://localhost:5760/", LinkScheme.TCP, ("localhost", 5760)),
+        ("serial:///dev/ttyAMA0:921600", LinkScheme.SERIAL, ("/dev/ttyAMA0", 921600)),
+        (
+            "serial:///dev/serial/by-path/platform-usb-0:1:1.0:57600",
+            LinkScheme.SERIAL,
+            ("/dev/serial/by-path/platform-usb-0:1:1.0", 57600),
+        ),
+    ],
+)
+def test_every_shape_is_read_and_written_back(text, scheme, address) -> None:
+    url = parse_link_url(text)
+    assert url == LinkUrl(scheme, address)
+    assert parse_link_url(str(url)) == url
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not a link url"),
+        ("14540", "is not a link url"),
+        ("/dev/ttyAMA0", "is not a link url"),
+        ("udp://:14540", "say udpin:// to listen or udpout:// to send"),
+        ("udpin:127.0.0.1:14540", "is not a link url"),
+        ("udpin://14540", r"is not of the shape udpin://HOST:PORT"),
+        ("udpin://127.0.0.1", r"is not of the shape udpin://HOST:PORT"),
+        ("udpin://127.0.0.1:0", r"the port must be 1\.\.65535, got 0"),
+        ("udpin://127.0.0.1:65536", r"the port must be 1\.\.65535, got 65536"),
+        ("udpin://127.0.0.1:14540;rm", "is not of the shape"),
+        ("tcp://a b:1", "is not of the shape"),
+        ("serial://ttyAMA0:57600", r"is not of the shape serial:///dev/NAME:BAUD"),
+        ("serial:///dev/ttyAMA0", r"is not of the shape serial:///dev/NAME:BAUD"),
+        ("serial:///dev/ttyAMA0:0", "baud rate must be above 0"),
+        ("http://127.0.0.1:80", "is not a link url"),
+    ],
+)
+def test_anything_else_is_refused_in_one_line_with_examples(text, message) -> None:
+    with pytest.raises(LinkUrlError, match=message) as caught:
+        parse_link_url(text)
+    assert isinstance(caught.value, ValueError)
+    assert isinstance(caught.value, LinkError)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.text())
+def test_no_text_breaks_the_reader(text) -> None:
+    try:
+        url = parse_link_url(text)
+    except LinkUrlError:
+        return
+    assert parse_link_url(str(url)) == url

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
+
+POSITION = (1.0, 2.0, -3.0)
+finite = st.floats(-1e6, 1e6)
+vectors = st.tuples(finite, finite, finite)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        pytest.param({}, "exactly one", id="nothing"),
+        pytest.param({"position_ned_m": POSITION, "velocity_ned_mps": POSITION}, "exactly one", id="both"),
+        pytest.param(
+            {"position_ned_m": POSITION, "yaw_rad": 0.0, "yaw_rate_radps": 0.0},
+            "not both",
+            id="yaw and its rate",
+        ),
+        pytest.param({"velocity_ned_mps": (math.nan, 0.0, 0.0)}, "finite", id="not a number"),
+        pytest.param({"position_ned_m": (0.0, math.inf, 0.0)}, "finite", id="infinite"),
+        pytest.param({"velocity_ned_mps": POSITION, "yaw_rad": math.nan}, "finite", id="yaw is not a number"),
+        pytest.param(
+            {"velocity_ned_mps": POSITION, "yaw_rate_radps": math.inf}, "finite", id="rate infinite"
+        ),
+    ],
+)
+def test_a_shape_px4_does_not_take_is_refused(values, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        Setpoint(0, **values)
+
+
+# POSITION_TARGET_TYPEMASK, each axis' bit by its name in the specification
+_IGNORE = {
+    "position": mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE,
+    "velocity": mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE,
+    "acceleration": mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE,
+    "yaw": mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE,
+    "yaw rate": mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE,
+}
+
+
+@given(vector=vectors, is_position=st.booleans(), turn=st.sampled_from([None, "yaw", "rate"]), angle=finite)
+def test_the_type_mask_ignores_exactly_what_is_not_given(vector, is_position, turn, angle) -> None:
+    setpoint = Setpoint(
+        0,
+        position_ned_m=vector if is_position else None,
+        velocity_ned_mps=None if is_position else vector,
+        yaw_rad=angle if turn == "yaw" else None,
+        yaw_rate_radps=angle if turn == "rate" else None,
+    )
+    mask = setpoint.type_mask
+    assert bool(mask & _IGNORE["position"]) is not is_position
+    assert bool(mask & _IGNORE["velocity"]) is is_position
+    assert mask & _IGNORE["acceleration"] == _IGNORE["acceleration"]
+    assert bool(mask & _IGNORE["yaw"]) is (turn != "yaw")
+    assert bool(mask & _IGNORE["yaw rate"]) is (turn != "rate")
+    assert not mask & mavlink.POSITION_TARGET_TYPEMASK_FORCE_SET
+    assert mask < 1 << 12
+
+
+@given(now_ns=st.integers(0, 2**62), lifetime_s=st.floats(0.001, 1000.0), vector=vectors)
+def test_a_setpoint_lives_as_long_as_it_was_given(now_ns, lifetime_s, vector) -> None:
+    for make in (Setpoint.velocity, Setpoint.position):
+        setpoint = make(vector, now_ns, lifetime_s=lifetime_s)
+        assert not setpoint.expired(now_ns)
+        assert not setpoint.expired(setpoint.deadline_ns)
+        assert setpoint.expired(setpoint.deadline_ns + 1)
+        assert setpoint.deadline_ns - now_ns == round(lifetime_s * 1e9)
+
+
+def test_a_brake_stands_still_and_does_not_turn() -> None:
+    brake = Setpoint.brake(1000)
+    assert brake.velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert brake.yaw_rate_radps == 0.0
+    assert brake.deadline_ns == 1000 + round(DEFAULT_LIFETIME_S * 1e9)
+
+
+def test_with_velocity_keeps_the_deadline_and_the_turn() -> None:
+    setpoint = Setpoint.velocity((1.0, 0.0, 0.0), 5, yaw_rad=1.0)
+    slower = setpoint.with_velocity((0.5, 0.0, 0.0))
+    assert (slower.deadline_ns, slower.yaw_rad) == (setpoint.deadline_ns, 1.0)
+    assert slower.velocity_ned_mps == (0.5, 0.0, 0.0)

@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, TELEMETRY_MAX_AGE_S, VehicleState
+
+S = 1_000_000_000
+
+
+@given(yaw=st.floats(-3.14, 3.14), pitch=st.floats(-1.2, 1.2), roll=st.floats(-3.0, 3.0))
+def test_yaw_is_the_heading_at_any_tilt(yaw, pitch, roll) -> None:
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    attitude = (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+    assert VehicleState(attitude=attitude).yaw_rad == pytest.approx(yaw, abs=1e-9)
+
+
+def test_what_was_never_told_is_unknown() -> None:
+    state = VehicleState()
+    assert state.yaw_rad is None
+    assert state.altitude_m is None
+    assert not state.connected(0)
+    assert not state.position_fresh(0)
+
+
+def test_altitude_is_above_home_and_above_the_origin_while_home_is_unknown() -> None:
+    assert VehicleState(position_ned_m=(0.0, 0.0, -5.0)).altitude_m == 5.0
+    assert (
+        VehicleState(position_ned_m=(0.0, 0.0, -5.0), home_position_ned_m=(1.0, 1.0, -2.0)).altitude_m == 3.0
+    )
+
+
+def test_a_link_counts_until_three_heartbeats_are_missing() -> None:
+    state = VehicleState(heartbeat_ns=10 * S)
+    last_ns = 10 * S + round(HEARTBEAT_MAX_AGE_S * S)
+    assert state.connected(last_ns)
+    assert not state.connected(last_ns + 1)
+
+
+@pytest.mark.parametrize("late", ["position_ns", "attitude_ns"])
+def test_a_position_is_fresh_only_with_position_and_attitude(late) -> None:
+    stamps = {"position_ns": 10 * S, "attitude_ns": 10 * S}
+    known = {"position_ned_m": (0.0, 0.0, 0.0), "attitude": (1.0, 0.0, 0.0, 0.0)}
+    now_ns = 10 * S + round(TELEMETRY_MAX_AGE_S * S)
+    assert VehicleState(**stamps, **known).position_fresh(now_ns)
+    assert not VehicleState(**stamps | {late: 10 * S - 1}, **known).position_fresh(now_ns)
+    for missing in known:
+        assert not VehicleState(**stamps, **known | {missing: None}).position_fresh(now_ns)
