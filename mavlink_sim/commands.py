@@ -75,22 +75,16 @@ def _arm(vehicle: Vehicle, link: Link, command: Command) -> int:
     return UNSUPPORTED
 
 
-def set_mode(vehicle: Vehicle, base: float, main: float, sub: float, source_component: int) -> int:
-    """Commander's answer to DO_SET_MODE and to the older SET_MODE message."""
+def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
     autopilot = vehicle.autopilot
-    values = (base, main, sub)
-    if not all(math.isfinite(value) for value in values) or not int(base) & CUSTOM_MODE_ENABLED:
+    base, main, sub = command.parameters[:3]
+    if not all(map(math.isfinite, (base, main, sub))) or not int(base) & CUSTOM_MODE_ENABLED:
         return TEMPORARILY_REJECTED
     mode = mode_of(int(main), int(sub))
     if mode is None:
         autopilot.texts.append(Text(CRITICAL, "Unsupported main mode\t"))
         return TEMPORARILY_REJECTED
-    return autopilot.set_mode(mode, tell=source_component == GROUND_STATION_COMPONENT)
-
-
-def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
-    base, main, sub = command.parameters[:3]
-    return set_mode(vehicle, base, main, sub, command.source_component)
+    return autopilot.set_mode(mode, tell=command.source_component == GROUND_STATION_COMPONENT)
 
 
 def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -207,3 +201,5 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
 
 # PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).
 ANSWERED_TWICE = frozenset({DO_SET_MODE})
+# These never get to Commander's queue.
+ANSWERED_BY_RECEIVER = frozenset({GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, 519, 520})

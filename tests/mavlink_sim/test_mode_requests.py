@@ -25,6 +25,15 @@ def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds
     assert len(cockpit.received("COMMAND_ACK")) == 2
 
 
+def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(cockpit: Any) -> None:
+    cockpit.take_off(4.0)
+    for _ in range(3):
+        cockpit.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
+        cockpit.send(dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, 0, 0, 0, 0))
+    cockpit.fly(0.1)
+    assert cockpit.mode == "LAND"
+
+
 @pytest.mark.parametrize(("main", "sub", "base"), [(8, 0, 1), (4, 1, 1), (4, 99, 1), (77, 0, 1), (4, 3, 0)])
 def test_what_is_no_mode_is_accepted_then_rejected(cockpit: Any, main: int, sub: int, base: int) -> None:
     cockpit.fly(0.1)
