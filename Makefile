@@ -1,10 +1,17 @@
 # Everything a person does here: `make demo`, `make test`, `make lint`. Each makes the virtual environment once.
 PYTHON ?= python3
 VENV ?= .venv
-# Where torch is taken from, e.g. TORCH_INDEX=URL of a CPU wheel index. Empty: pip's own configuration.
+# Where torch is taken from, e.g. TORCH_INDEX=URL of an index of CPU wheels. Empty: pip's own configuration.
 TORCH_INDEX ?=
+# Gigabytes of CUDA come only when asked for: ALLOW_CUDA=1.
+ALLOW_CUDA ?=
+TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
+
+define REFUSE_CUDA
+import json, sys; names = [i["metadata"]["name"] for i in json.load(sys.stdin)["install"]]; cuda = [n for n in names if n.lower().startswith(("nvidia", "cuda", "triton"))]; sys.exit("torch would bring %s: name an index of CPU wheels with TORCH_INDEX=..., or ask for it with ALLOW_CUDA=1" % ", ".join(cuda) if cuda else 0)
+endef
 
 .PHONY: demo test lint format clean
 
@@ -26,7 +33,8 @@ format: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "companion needs Python 3.11 or newer, this is %d.%d; set PYTHON=" % sys.version_info[:2])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	$(if $(ALLOW_CUDA),,$(BIN)/python -m pip install --quiet --dry-run --report - $(TORCH) | $(BIN)/python -c '$(REFUSE_CUDA)')
+	$(BIN)/python -m pip install --quiet $(TORCH)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 

@@ -6,20 +6,23 @@ import asyncio
 import os
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from companion.bench import percentiles
+from companion.guidance.behaviour import Situation
 from companion.rehearsal import (
     ALTITUDE_M,
     RehearsalError,
     free_port,
     rehearsal_settings,
-    running_service,
     simulator,
     until_ready_to_arm,
+    with_service,
 )
 from companion.service import Service
 from companion.vehicle.setpoint import Setpoint
+from vision.pipeline import PerceptionResult
 
 
 def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
@@ -43,16 +46,7 @@ async def _measure(folder: Path, seconds: float, driver: str) -> dict[str, objec
         settings = rehearsal_settings(port, camera, driver=driver)
         service = Service(settings)
         _measure_sent(service, latency_ms, beyond_ms)
-        async with running_service(service):
-            await until_ready_to_arm(service)
-            reply = await service.command(f"takeoff {ALTITUDE_M:g}")
-            if not reply["success"]:
-                raise RehearsalError(f"cannot measure in flight: {reply['reason']}")
-            latency_ms.clear()
-            beyond_ms.clear()
-            flight = asyncio.create_task(_look_around(service))
-            await asyncio.sleep(seconds)
-            flight.cancel()
+        await with_service(service, lambda: _fly(service, seconds, latency_ms, beyond_ms))
     if not latency_ms:
         raise RehearsalError("no setpoint followed a detection message")
     return {
@@ -63,25 +57,44 @@ async def _measure(folder: Path, seconds: float, driver: str) -> dict[str, objec
     }
 
 
-async def _look_around(service: Service) -> None:
-    await service.command("seek car")
-    await service.command("approach car distance=5")
-    await service.command("hold")
+async def _fly(service: Service, seconds: float, latency_ms: list[float], beyond_ms: list[float]) -> None:
+    await until_ready_to_arm(service)
+    reply = await service.command(f"takeoff {ALTITUDE_M:g}")
+    if not reply["success"]:
+        raise RehearsalError(f"cannot measure in flight: {reply['reason']}")
+    latency_ms.clear()
+    beyond_ms.clear()
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            for command in ("seek car", "approach car distance=5", "orbit radius=5 speed=1"):
+                await service.command(command)
+            await asyncio.sleep(seconds)
 
 
 def _measure_sent(service: Service, latency_ms: list[float], beyond_ms: list[float]) -> None:
-    """Time what the streamer puts on the wire, without changing it."""
-    send = service.driver.send_setpoint
-    seen = -1
+    """Time what goes on the wire, without changing it.
 
-    def timed(setpoint: Setpoint) -> None:
-        nonlocal seen
-        send(setpoint)
+    `Pilot.update` makes a setpoint of the newest detections; what counts is when that very setpoint leaves.
+    """
+    update, send = service.pilot.update, service.driver.send_setpoint
+    seen = -1
+    awaited: tuple[Setpoint | None, PerceptionResult] | None = None
+
+    def noted(situation: Situation) -> None:
+        nonlocal seen, awaited
+        update(situation)
         newest = service.newest
         if newest is not None and newest.sequence != seen:
-            seen = newest.sequence
+            seen, awaited = newest.sequence, (service.pilot.sent, newest)
+
+    def timed(setpoint: Setpoint) -> None:
+        nonlocal awaited
+        send(setpoint)
+        if awaited is not None and setpoint is awaited[0]:
+            newest, awaited = awaited[1], None
             elapsed_ms = (time.monotonic_ns() - newest.captured_ns) / 1e6
             latency_ms.append(elapsed_ms)
             beyond_ms.append(elapsed_ms - newest.timing_ms["total"])
 
+    service.pilot.update = noted  # type: ignore[method-assign]
     service.streamer.send = timed

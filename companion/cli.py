@@ -10,7 +10,6 @@ import asyncio
 import functools
 import json
 import logging
-import os
 import signal
 import sys
 import time
@@ -137,7 +136,7 @@ def detect(
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     if precision not in ("auto", "float32", "bfloat16"):
         raise typer.BadParameter(f"{precision!r} is not auto, float32 or bfloat16", param_hint="--precision")
-    with plain_errors(CheckpointError, SourceError, ValueError, OSError):
+    with plain_errors(CheckpointError, ValueError):
         detector = Detector(
             model,
             classes=parse_classes(classes),
@@ -150,11 +149,11 @@ def detect(
         settings = SourceSettings(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
-        with open_source(source, settings) as frames:
-            write = functools.partial(print, flush=True)
-            looked_at = detect_source(
-                frames, detector, every=every, limit=limit, save=save, as_json=as_json, write=write
-            )
+    write = functools.partial(print, flush=True)
+    with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
+        looked_at = detect_source(
+            frames, detector, every=every, limit=limit, save=save, as_json=as_json, write=write
+        )
     if not looked_at:
         typer.echo(f"companion: {source} had no frames", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
@@ -231,9 +230,13 @@ def bench_latency(
 ) -> None:
     """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
     from companion.bench_latency import measure_latency
+    from companion.bus.session import BusError
+    from companion.config import ConfigurationError
+    from companion.perception import PerceptionStartError
     from companion.rehearsal import RehearsalError
+    from companion.vehicle.driver import LinkError
 
-    with plain_errors(RehearsalError):
+    with plain_errors(RehearsalError, ConfigurationError, LinkError, PerceptionStartError, BusError):
         _print_figures(measure_latency(seconds, driver=driver), as_json)
 
 
@@ -320,12 +323,10 @@ def echo(
 
 def main() -> None:
     """The console script."""
-    try:
-        app()
-    except BrokenPipeError:
-        # The reader of our output has gone (`| head`): not an error of ours, and nothing more can be said.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(EXIT_FAILED) from None
+    # The reader of our output may go (`| head`): end quietly, as other programs of a pipeline do.
+    if sys.argv[1:2] in (["detect"], ["echo"]):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    app()
 
 
 if __name__ == "__main__":

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 from companion.config import load_settings
 from companion.service import Service
@@ -20,7 +23,9 @@ from companion.settings import Settings
 ALTITUDE_M = 4.0
 
 _SIMULATOR_START_S = 20.0
+_SIMULATOR_END_S = 5.0
 _ARMABLE_S = 20.0
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class RehearsalError(RuntimeError):
@@ -48,7 +53,16 @@ async def simulator(
     ]
     arguments += ["--camera", camera, "--truth", str(truth_path), "--seed", str(seed)]
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "mavlink_sim", *arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        sys.executable,
+        "-m",
+        "mavlink_sim",
+        *arguments,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        # Ctrl-C is for the service: it must be able to leave a vehicle that still flies.
+        process_group=0,
+        preexec_fn=_end_with_us,
     )
     assert process.stdout is not None
     lines: list[str] = []
@@ -58,12 +72,26 @@ async def simulator(
         copying = asyncio.create_task(_copy(process.stdout, lines))
         yield process
     finally:
-        if process.returncode is None:
-            process.terminate()
-        await process.wait()
+        await _end(process)
         if copying is not None:
             await copying
         log_path.write_text("".join(lines))  # noqa: ASYNC240 - the loop has nothing else to do any more
+
+
+def _end_with_us() -> None:
+    """Run in the new process: however we end, the simulator is told to end too (prctl(2))."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is None:
+        process.terminate()
+    try:
+        await asyncio.wait_for(process.wait(), _SIMULATOR_END_S)
+    except TimeoutError:
+        process.kill()
+        await process.wait()
 
 
 async def _until_ready(stream: asyncio.StreamReader, lines: list[str]) -> None:
@@ -107,25 +135,33 @@ def rehearsal_settings(
     return load_settings(Path(os.devnull), overrides, environment={})
 
 
-@asynccontextmanager
-async def running_service(service: Service) -> AsyncIterator[None]:
-    """The service, ready; stopped at the end. What fails in it is raised here.
+async def with_service(service: Service, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run the service, and `work` once it is ready; then end the service.
+
+    What fails in the service is raised here and ends the work, and the other way round.
 
     Raises:
         LinkError, PerceptionStartError, BusError: as `Service.run`.
     """
     ready = asyncio.Event()
+
+    async def when_ready() -> None:
+        await ready.wait()
+        await work()
+
     running = asyncio.create_task(service.run(ready.set))
-    waiting = asyncio.create_task(ready.wait())
+    working = asyncio.create_task(when_ready())
     try:
-        await asyncio.wait({running, waiting}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({running, working}, return_when=asyncio.FIRST_COMPLETED)
         if running.done():
             running.result()
-        yield
+            raise RehearsalError("the service ended before its work was done")
+        working.result()
     finally:
-        waiting.cancel()
-        service.stop()
-        await running
+        working.cancel()
+        # Before it is ready there is nothing to leave in order.
+        service.stop() if service.ready else running.cancel()
+        await asyncio.gather(running, working, return_exceptions=True)
 
 
 async def until_ready_to_arm(service: Service) -> None:

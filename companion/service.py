@@ -72,7 +72,10 @@ class Service:
         self.events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
         guidance = settings.guidance
         self.driver: Driver = open_driver(
-            settings.vehicle.driver, settings.vehicle.url, system_id=settings.vehicle.system_id
+            settings.vehicle.driver,
+            settings.vehicle.url,
+            system_id=settings.vehicle.system_id,
+            own_system_id=settings.vehicle.system_id,
         )
         self.streamer = Streamer(
             self.driver.send_setpoint, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s
@@ -83,6 +86,7 @@ class Service:
             Envelope(_limits(settings)),
             on_event=self._pilot_event,
             class_names=self._class_names,
+            lifetime_s=guidance.setpoint_lifetime_s,
         )
         self.perception = PerceptionKeeper(settings, on_result=self._result, on_event=self._event)
         self.bus = Bus(settings.zenoh, settings.vehicle.name, on_event=self._event, on_command=self.command)
@@ -96,6 +100,7 @@ class Service:
         self._started_ns = time.monotonic_ns()
         self._linked = False
         self._stop = asyncio.Event()
+        self._ending = False
 
     async def run(self, ready: Callable[[], None] | None = None) -> None:
         """Start everything, call `ready`, and work until `stop()`; then let the autopilot hold and end.
@@ -109,15 +114,17 @@ class Service:
             await self._start()
             loops = [self._guide(), self.streamer.run(), self._tell_vehicle(), self._tell_status()]
             if self._console and terminal_is_free(self.settings.source.uri):
-                loops.append(run_console(self.command, self.stop, grammar.describe()))
+                loops.append(self._take_console())
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("flying" if self.driver.state.armed else "ready")
             self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")
             self.ready = True
             if ready is not None:
                 ready()
-            await self._until_stopped(tasks)
-            await self._leave()
+            try:
+                await self._until_stopped(tasks)
+            finally:
+                await self._leave()
         finally:
             self._notifier.stopping()
             unsubscribe()
@@ -125,7 +132,8 @@ class Service:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            await asyncio.gather(self.perception.stop(), self.bus.close(), self.driver.close())
+            await self.bus.close()  # first: it lets answers go out
+            await asyncio.gather(self.perception.stop(), self.driver.close())
             self._notifier.close()
 
     def stop(self) -> None:
@@ -137,6 +145,9 @@ class Service:
 
         A command without an end of its own (`hold`, `orbit` with no laps) is answered when it is under way.
         """
+        if not self.ready or self._ending:
+            reason = "the service is ending" if self._ending else "the service is still starting"
+            return {"command": text, "success": False, "reason": reason}
         try:
             command = grammar.parse(text, self._class_names())
         except grammar.GrammarError as error:
@@ -149,7 +160,7 @@ class Service:
     async def _outcome_of(self, command: grammar.Command) -> Outcome:
         behaviour = behaviour_for(command)
         ended = self.pilot.command(behaviour)
-        if not _endless(command):
+        if ended.done() or not _endless(command):
             return await asyncio.shield(ended)
         under_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._awaited = (behaviour, under_way)
@@ -194,13 +205,24 @@ class Service:
             stopped.cancel()
 
     async def _leave(self) -> None:
-        """Hand the vehicle to the autopilot's own hold, if we had it."""
-        if not self.pilot.in_command or self.driver.state.mode is not FlightMode.OFFBOARD:
+        """Take no more commands, and hand the vehicle to the autopilot's own hold if it flies our setpoints."""
+        self._ending = True
+        flying = self.streamer.state is not StreamState.SILENT
+        self.pilot.close("the service ends")
+        if not flying or not self.driver.state.connected(time.monotonic_ns()):
             return
         try:
             await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
         except CommandRefusedError as error:
             self._event("error", f"leaving: {error}; the autopilot's offboard-loss failsafe takes over")
+
+    async def _take_console(self) -> None:
+        """The terminal is a convenience: whatever goes wrong there, the flight goes on."""
+        try:
+            await run_console(self.command, self.stop, grammar.describe())
+        except Exception as error:
+            logger.exception("the console failed")
+            self._event("warning", f"the console has ended: {type(error).__name__}: {error}")
 
     async def _guide(self) -> None:
         """The loop that steers; the heartbeat, the watchdog and the video's text go with it."""
@@ -314,6 +336,15 @@ class Service:
 
     def _result(self, result: PerceptionResult) -> None:
         self.newest = result
+        try:
+            self._use(result)
+        except Exception as error:
+            # Perception itself is well: it must not be ended for a fault on this side.
+            logger.exception("a detection message could not be used")
+            self._targets, self._unplaced = (), f"{type(error).__name__}: {error}"
+
+    def _use(self, result: PerceptionResult) -> None:
+        """Publish it, and work out where what it shows is."""
         name = self.settings.vehicle.name
         self.bus.publish(topics.DETECTIONS, detections_message(result, name, time.monotonic_ns()))
         self.bus.publish(topics.LABELS, labels_message(result))

@@ -9,10 +9,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import zenoh
+from pydantic import ValidationError
 
 from companion.bus.session import zenoh_config
-from companion.bus.topics import ROOT, command_key
+from companion.bus.topics import ROOT, alive_key, command_key
 from companion.settings import ZenohSection
+
+_DISCOVERY_S = 3.0
 
 
 class NoAnswerError(TimeoutError):
@@ -23,14 +26,23 @@ def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> Ze
     """How to reach the service that has these settings: as a client of its router, or of itself.
 
     A client, as two peers of one router do not see each other (zenoh routes between peers only if told to).
+
+    Raises:
+        NoAnswerError: there is no endpoint, or what is given is none.
     """
     endpoints = connect or settings.connect or settings.listen
-    return ZenohSection(
-        mode="client",
-        connect=tuple(endpoint.replace("0.0.0.0", "127.0.0.1") for endpoint in endpoints),
-        listen=(),
-        multicast_scouting=settings.multicast_scouting,
-    )
+    try:
+        return ZenohSection(
+            mode="client",
+            connect=tuple(endpoint.replace("0.0.0.0", "127.0.0.1") for endpoint in endpoints),
+            listen=(),
+            multicast_scouting=settings.multicast_scouting,
+        )
+    except ValidationError as error:
+        where = ", ".join(endpoints) or "no address"
+        raise NoAnswerError(
+            f"cannot look for the service at {where}: give --connect an endpoint such as tcp/127.0.0.1:7447"
+        ) from error
 
 
 @contextmanager
@@ -69,17 +81,27 @@ def send_command(
     Raises:
         NoAnswerError: no service for this vehicle, or it did not end in `timeout_s`.
     """
-    # The queryable's declaration may still be on its way just after connecting.
-    deadline = time.monotonic() + min(3.0, timeout_s)
-    while True:
-        for reply in session.get(command_key(vehicle), payload=text, timeout=timeout_s):
-            if reply.ok is not None:
-                answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
-                return answer
+    _wait_for_service(session, vehicle)
+    # Sent once: a command that was heard and not answered may be flying.
+    for reply in session.get(command_key(vehicle), payload=text, timeout=timeout_s):
+        if reply.ok is not None:
+            answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
+            return answer
+    raise NoAnswerError(
+        f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` tells what it does"
+    )
+
+
+def _wait_for_service(session: zenoh.Session, vehicle: str) -> None:
+    """Until the service's own token is seen: just after connecting it may still be on its way."""
+    deadline = time.monotonic() + _DISCOVERY_S
+    while not any(
+        reply.ok is not None for reply in session.liveliness().get(alive_key(vehicle), timeout=1.0)
+    ):
         if time.monotonic() > deadline:
             raise NoAnswerError(
-                f"no service answered for vehicle {vehicle!r} on {command_key(vehicle)}: "
-                f"wrong vehicle.name, or it did not end within {timeout_s:g} s"
+                f"no service for vehicle {vehicle!r} here: is that its vehicle.name? "
+                "`companion echo status` shows who is there"
             )
         time.sleep(0.05)
 

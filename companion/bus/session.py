@@ -10,13 +10,13 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
 import zenoh
 
-from companion.bus.topics import TOPICS, Topic, command_key
+from companion.bus.topics import TOPICS, Topic, alive_key, command_key
 from companion.settings import ZenohSection
 
 logger = logging.getLogger(__name__)
@@ -25,6 +25,7 @@ CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
 
 _RETRY_MIN_S, _RETRY_MAX_S = 0.5, 5.0
 _WATCH_PERIOD_S = 0.25
+_ANSWER_S = 0.5
 
 
 class BusError(ConnectionError):
@@ -74,6 +75,7 @@ class Bus:
         self._tasks: set[asyncio.Task[None]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._connected = False
+        self._watching: asyncio.Task[None] | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._queryable: zenoh.Queryable[None] | None = None
         self.published: dict[str, int] = {topic.name: 0 for topic in TOPICS}
@@ -105,10 +107,16 @@ class Bus:
                     f"zenoh cannot listen on {endpoints}: {_first_line(error)}. "
                     "Is a router or another service there? Set zenoh.connect to it and zenoh.listen to none"
                 ) from error
-        self._spawn(self._watch())
+        self._watching = self._spawn(self._watch())
 
     async def close(self) -> None:
         """End the session; bounded in time."""
+        if self._watching is not None:
+            self._watching.cancel()
+        # Answers that are ready go out; those that are not are told so.
+        answers = self._tasks - {self._watching}
+        if answers:
+            await asyncio.wait(answers, timeout=_ANSWER_S)
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -139,14 +147,14 @@ class Bus:
             topic.name: session.declare_publisher(
                 topic.key(self._vehicle),
                 encoding=topic.encoding,
-                congestion_control=topic.congestion_control,
+                congestion_control=zenoh.CongestionControl.DROP,
                 priority=topic.priority,
                 express=topic.express,
             )
             for topic in TOPICS
         }
         # Presence for free: the token goes when we go, however we go.
-        self._token = session.liveliness().declare_token(f"companion/{self._vehicle}/alive")
+        self._token = session.liveliness().declare_token(alive_key(self._vehicle))
         self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
@@ -155,9 +163,16 @@ class Bus:
 
     async def _answer(self, query: zenoh.Query) -> None:
         text = _command_text(query)
-        reply = await self._on_command(text)
-        with query:
-            query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
+        reply: dict[str, Any] = {"command": text, "success": False, "reason": "the service has ended"}
+        try:
+            reply = await self._on_command(text)
+        except Exception as error:
+            logger.exception("command %r failed", text)
+            reply["reason"] = f"{type(error).__name__}: {error}"
+        finally:
+            # Whatever happens here, the other side is not left waiting: it must not send the command again.
+            with query:
+                query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
 
     async def _watch(self) -> None:
         """Open the session if it is not (client), then tell when the nodes in `connect` come and go."""
@@ -187,10 +202,11 @@ class Bus:
                     )
             await asyncio.sleep(_WATCH_PERIOD_S)
 
-    def _spawn(self, work: Any) -> None:
-        task = asyncio.ensure_future(work)
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._finished)
+        return task
 
     def _finished(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)

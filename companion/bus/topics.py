@@ -21,8 +21,8 @@ class Topic:
         rate_hz: nominal; None where it follows the camera or happens on occasion.
         max_age_s: past this a value says nothing of the present; None where it does not age (events).
         encoding: of the payload.
-        priority, congestion_control, express: zenoh's quality of service. Nothing here ever blocks the sender
-            but events, which are few and must not be lost.
+        priority, express: zenoh's quality of service. Congestion control is DROP for every topic: with BLOCK
+            one frozen reader stops the loop that steers, for seconds.
     """
 
     name: str
@@ -30,7 +30,6 @@ class Topic:
     max_age_s: float | None
     encoding: zenoh.Encoding
     priority: zenoh.Priority
-    congestion_control: zenoh.CongestionControl
     express: bool
     description: str
 
@@ -40,12 +39,11 @@ class Topic:
 
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
-_DROP = zenoh.CongestionControl.DROP
 _REAL_TIME = zenoh.Priority.REAL_TIME
 _DATA = zenoh.Priority.DATA
 
 DETECTIONS: Final = Topic(
-    "detections", None, 0.5, _JSON, _REAL_TIME, _DROP, True, "what one frame shows, one message a frame"
+    "detections", None, 0.5, _JSON, _REAL_TIME, True, "what one frame shows, one message a frame"
 )
 LABELS: Final = Topic(
     "labels",
@@ -53,22 +51,18 @@ LABELS: Final = Topic(
     0.5,
     zenoh.Encoding.TEXT_PLAIN,
     _DATA,
-    _DROP,
     False,
     "the class names of one frame, comma separated",
 )
-VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, _DROP, True, "state of the vehicle")
-SETPOINT: Final = Topic(
-    "setpoint", 10.0, 0.5, _JSON, _DATA, _DROP, True, "the setpoint asked for and the one sent"
-)
-STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, _DROP, False, "how every part of the service is")
+VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
+SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
+STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
 EVENTS: Final = Topic(
     "events",
     None,
     None,
     _JSON,
     _DATA,
-    zenoh.CongestionControl.BLOCK,
     False,
     "what happened: modes, behaviours, parts lost and found",
 )
@@ -84,3 +78,8 @@ NO_OBJECTS = "no objects detected"
 def command_key(vehicle: str) -> str:
     """The queryable that takes commands for one vehicle."""
     return f"{ROOT}/{vehicle}/{COMMAND}"
+
+
+def alive_key(vehicle: str) -> str:
+    """The liveliness token of one vehicle's service; it goes when the service goes, however it goes."""
+    return f"{ROOT}/{vehicle}/alive"

@@ -20,7 +20,7 @@ from companion.guidance.hold import HoldBehaviour
 from companion.guidance.mode_request import perform
 from companion.guidance.refusal import refusal
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
-from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import SILENCE_S, Streamer, StreamState
 
@@ -86,7 +86,9 @@ class Pilot:
         *,
         on_event: Callable[[PilotEvent], None],
         class_names: Callable[[], Sequence[str] | None] = lambda: None,
+        lifetime_s: float = DEFAULT_LIFETIME_S,
     ) -> None:
+        self._lifetime_s = lifetime_s
         self._driver, self._streamer, self._envelope = driver, streamer, envelope
         self._on_event, self._class_names = on_event, class_names
         self._authority = Authority()
@@ -218,9 +220,11 @@ class Pilot:
                 if step != self._requested:
                     self._start_request(step, situation)
             case Setpoint() if self._phase is _Phase.OFFBOARD:
-                self.asked = step
+                # How long a setpoint counts is the operator's setting, whatever its behaviour wrote.
+                deadline_ns = situation.now_ns + round(self._lifetime_s * 1e9)
+                self.asked = replace(step, deadline_ns=deadline_ns)
                 self.sent, self.limited_by = self._envelope.apply(
-                    step, situation.state, situation.now_ns, dt_s
+                    self.asked, situation.state, situation.now_ns, dt_s
                 )
                 self._streamer.submit(self.sent)
             case Setpoint() if self._phase is not _Phase.ENGAGING:
@@ -268,7 +272,7 @@ class Pilot:
 
     def _brake(self, situation: Situation) -> None:
         self.asked, self.limited_by = None, ()
-        self.sent = Setpoint.brake(situation.now_ns)
+        self.sent = Setpoint.brake(situation.now_ns, self._lifetime_s)
         self._envelope.reset()
         self._streamer.submit(self.sent)
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import sys
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import aioconsole
+
+logger = logging.getLogger(__name__)
 
 _BANNER = "type a command (help, quit): takeoff 5, seek car, approach car distance=5, hold, land, rtl, stop"
 
@@ -20,7 +23,11 @@ async def run_console(
     running: set[asyncio.Task[None]] = set()
 
     async def answer(text: str) -> None:
-        reply = await command(text)
+        try:
+            reply = await command(text)
+        except Exception as error:
+            logger.exception("command %r failed", text)
+            reply = {"success": False, "reason": f"{type(error).__name__}: {error}"}
         sign = "done" if reply["success"] else "no"
         await aioconsole.aprint(f"{text}: {sign}: {reply['reason']}", use_stderr=True)
 
