@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.motion import correction, in_degrees, laps_text, position_and_yaw
+from companion.guidance.motion import correction, in_degrees, laps_text, position_and_yaw, pressed
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -13,6 +13,10 @@ from vision.rotation import wrap_angle
 
 # Nearer to the centre than this there is no direction outwards.
 MIN_RADIUS_M = 0.2
+# How late a multirotor's velocity follows; of the order of 1 / MPC_XY_VEL_P_ACC.
+VELOCITY_DELAY_S = 0.4
+# What may be asked for beyond the wanted speed so that drag does not make it less.
+SPEED_MARGIN = 1.25
 
 
 class OrbitBehaviour(Behaviour):
@@ -85,11 +89,11 @@ class OrbitBehaviour(Behaviour):
             outward, bearing = (north / distance, east / distance), math.atan2(-east, -north)
         radial = correction(self._radius_m - distance, self._speed_mps)
         along = self._turn * math.sqrt(max(0.0, self._speed_mps**2 - radial**2))
-        velocity = (
-            outward[0] * radial - outward[1] * along,
-            outward[1] * radial + outward[0] * along,
-            correction(self._down_m - position[2]),
-        )
+        # The vehicle flies what was asked a moment ago: the centripetal acceleration of that moment is missing.
+        radial -= VELOCITY_DELAY_S * along**2 / max(distance, self._radius_m)
+        wanted = (outward[0] * radial - outward[1] * along, outward[1] * radial + outward[0] * along)
+        north_mps, east_mps = pressed(wanted, situation.state, SPEED_MARGIN * self._speed_mps)
+        velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
         return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=bearing)
 
     @property
