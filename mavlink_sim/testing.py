@@ -7,15 +7,13 @@
 from __future__ import annotations
 
 import os
-import queue
 import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -40,14 +38,16 @@ class RunningSimulator:
         onboard_port: the UDP port a companion listens on (`udpin:127.0.0.1:<port>`); the vehicle sends there.
         gcs_port: the same for a ground station.
         onboard_bind, gcs_bind: the ports the vehicle itself is bound to.
-        events: every line it printed so far, without the ready line.
+        events: every line it printed so far, in order, without the ready line.
     """
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.process = process
         self.events: list[str] = []
         self.onboard_port = self.onboard_bind = self.gcs_port = self.gcs_bind = 0
-        self._lines: queue.Queue[str | None] = queue.Queue()
+        self._ready = False
+        self._ended = False
+        self._changed = threading.Condition()
         self._reader = threading.Thread(target=self._read, name="simulator-output", daemon=True)
         self._reader.start()
 
@@ -58,42 +58,50 @@ class RunningSimulator:
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self._lines.put(line.rstrip("\n"))
-        self._lines.put(None)
+            self._take(line.rstrip("\n"))
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
 
-    def _next_line(self, deadline_s: float) -> str:
-        try:
-            line = self._lines.get(timeout=max(deadline_s - time.monotonic(), 0.0))
-        except queue.Empty:
-            raise TimeoutError(f"the simulator did not say it in time; it said {self.events}") from None
-        if line is None:
-            raise RuntimeError(f"the simulator ended with code {self.process.wait()}; it said {self.events}")
-        self.events.append(line)
-        return line
-
-    def wait_until_ready(self, timeout_s: float) -> None:
-        deadline = time.monotonic() + timeout_s
-        while True:
-            found = READY.match(self._next_line(deadline))
+    def _take(self, line: str) -> None:
+        found = READY.match(line)
+        with self._changed:
             if found:
                 _, self.onboard_bind, self.onboard_port, self.gcs_bind, self.gcs_port = map(
                     int, found.groups()
                 )
-                self.events.clear()
-                return
+                self._ready = True
+            else:
+                self.events.append(line)
+            self._changed.notify_all()
 
-    def wait_for_event(self, text: str, timeout_s: float = 30.0, *, after: int = 0) -> str:
-        """The first printed line that contains `text`, already printed (from line `after` on) or yet to come.
+    def _wait(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: condition() or self._ended, timeout_s)
+            if condition():
+                return
+            if self._ended:
+                code = self.process.wait()
+                raise RuntimeError(f"the simulator ended with code {code} before {what}: {self.events}")
+            raise TimeoutError(f"no {what} of the simulator in {timeout_s:g} s; it said {self.events}")
+
+    def wait_until_ready(self, timeout_s: float) -> None:
+        self._wait(lambda: self._ready, "ready line", timeout_s)
+
+    def wait_for_event(self, text: str, timeout_s: float = 30.0, since: int = 0) -> str:
+        """The first printed line that contains `text`, already printed or yet to come.
+
+        Args:
+            since: look only from this index of `events` on (`len(simulator.events)` for the future alone).
 
         Raises TimeoutError or, if the simulator ended, RuntimeError.
         """
-        for line in self.events[after:]:
-            if text in line:
-                return line
-        deadline = time.monotonic() + timeout_s
-        while text not in (line := self._next_line(deadline)):
-            pass
-        return line
+
+        def found() -> list[str]:
+            return [line for line in self.events[since:] if text in line]
+
+        self._wait(lambda: bool(found()), f"line with {text!r}", timeout_s)
+        return found()[0]
 
     def kill(self) -> None:
         """SIGKILL, as when the vehicle vanishes."""
