@@ -89,7 +89,7 @@ class OrbitBehaviour(Behaviour):
             outward, bearing = (north / distance, east / distance), math.atan2(-east, -north)
         radial = correction(self._radius_m - distance, self._speed_mps)
         along = self._turn * math.sqrt(max(0.0, self._speed_mps**2 - radial**2))
-        # The vehicle flies what was asked a moment ago: the centripetal acceleration of that moment is missing.
+        # The vehicle flies what was asked a moment ago; that lacks the centripetal acceleration since then.
         radial -= VELOCITY_DELAY_S * along**2 / max(distance, self._radius_m)
         wanted = (outward[0] * radial - outward[1] * along, outward[1] * radial + outward[0] * along)
         north_mps, east_mps = pressed(wanted, situation.state, SPEED_MARGIN * self._speed_mps)
