@@ -205,7 +205,7 @@ class Service:
             stopped.cancel()
 
     async def _leave(self) -> None:
-        """Take no more commands, and hand the vehicle to the autopilot's own hold if it flies our setpoints."""
+        """Take no more commands; a vehicle that flies our setpoints goes to the autopilot's own hold."""
         self._ending = True
         flying = self.streamer.state is not StreamState.SILENT
         self.pilot.close("the service ends")
