@@ -158,12 +158,26 @@ def _free_place(
     box_left, box_top, box_right, box_bottom = box
     left = min(max(box_left - 1, 0), max(image_width - width, 0))
     end = min(max(box_right - width + 1, 0), max(image_width - width, 0))
-    tops = (box_top - height, box_top, box_bottom, box_bottom - height)
+    tops = (
+        box_top - height,
+        box_top,
+        box_bottom,
+        box_bottom - height,
+        box_top - 2 * height,
+        box_bottom + height,
+    )
     places = [(x, y) for y in tops for x in (left, end) if 0 <= y <= image_height - height]
     if not places:
         places = [(left, min(max(box_top - height, 0), max(image_height - height, 0)))]
     rectangles = [(x, y, x + width, y + height) for x, y in places]
-    return min(rectangles, key=lambda plate: sum(_overlap(plate, other) for other in taken))
+    # A plate that hides its own small object is nearly as bad as one that hides another plate.
+    small = (box_right - box_left) * (box_bottom - box_top) < 3 * width * height
+    return min(
+        rectangles,
+        key=lambda plate: (
+            sum(_overlap(plate, other) for other in taken) + (_overlap(plate, box) // 2 if small else 0)
+        ),
+    )
 
 
 def _overlap(one: Rectangle, other: Rectangle) -> int:

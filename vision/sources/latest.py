@@ -81,6 +81,8 @@ class LatestSource(Source):
         self.close()
         if isinstance(end, EndOfStream):
             raise SourceError(f"{self.uri}: ended before its first frame{f': {end}' if str(end) else ''}")
+        if isinstance(end, SourceError) and not str(end).startswith(self.uri):
+            raise SourceError(f"{self.uri}: {end}") from end
         if end is not None:
             raise end
         raise SourceError(

@@ -8,9 +8,12 @@ import stat
 from collections.abc import Callable
 from pathlib import Path
 
+from vision.sources.camera import CameraFeed, camera_device, check_camera
 from vision.sources.feed import Feed, LoopingFeed
+from vision.sources.http_stream import open_http
 from vision.sources.images import ImagesFeed, images_in, is_image
 from vision.sources.latest import LatestSource
+from vision.sources.network import UdpStream, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
 from vision.sources.pipe import Fifo, PipeFeed, check_pipe_settings
 from vision.sources.sequential import SequentialSource
@@ -30,6 +33,12 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     | `photo.jpg` | one image | one |
     | `-` | standard input: raw, YUV4MPEG2 or MJPEG | the newest; every one if it is a file or asked for |
     | `/run/camera.fifo` | a FIFO with the same | the newest; every one if asked for |
+    | `/dev/video0`, `0`, `/dev/v4l/by-id/…` | a camera | the newest |
+    | `rtsp://camera/stream` | RTSP | the newest |
+    | `http://camera/video.mjpg` | Motion JPEG by HTTP, or what FFmpeg reads | the newest |
+    | `udp://:5600`, `udp://239.1.2.3:5600` | MPEG-TS | the newest |
+    | `udp://:5600?format=rtp-h264` | RTP: `rtp-h264`, `rtp-h265` or `rtp-jpeg` | the newest |
+    | `shm://NAME` | shared memory of this host (`vision.shared_frame`), with depth | the newest |
 
     Args:
         uri: the address.
@@ -41,8 +50,40 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     quiet_opencv()
     if uri == "-":
         return _open_standard_input(settings)
-    path = Path(uri.removeprefix("file://")).expanduser()
-    return _open_path(path, settings)
+    if (device := camera_device(uri)) is not None:
+        check_camera(device, settings)
+        return LatestSource(str(device), lambda: CameraFeed(device, settings), settings)
+    scheme, separator, rest = uri.partition("://")
+    if not separator:
+        return _open_path(Path(uri).expanduser(), settings)
+    if scheme == "file":
+        return _open_path(Path(rest), settings)
+    return _open_address(uri, scheme, rest, settings)
+
+
+def _open_address(uri: str, scheme: str, rest: str, settings: SourceSettings) -> Source:
+    name = without_password(uri)
+    if scheme in ("rtsp", "rtsps"):
+        return LatestSource(name, lambda: open_rtsp(uri, settings), settings, advice="is the camera on?")
+    if scheme in ("http", "https"):
+        # What FFmpeg reads by HTTP may come faster than it is to be shown: a recording, or HLS's first
+        # pieces.
+        return LatestSource(
+            name, lambda: open_http(uri, settings), settings, paced=True, advice="is the server running?"
+        )
+    if scheme == "udp":
+        stream = UdpStream(uri, settings)
+        return LatestSource(name, stream.open_feed, settings, advice="is the sender sending here?")
+    if scheme == "shm":
+        if not rest:
+            raise SourceError(f"{uri}: expected shm://NAME")
+        from vision.sources.shared import SharedFrameFeed
+
+        return LatestSource(name, lambda: SharedFrameFeed(rest), settings, advice="is its writer running?")
+    raise SourceError(
+        f"{name}: sources have no {scheme}://; there are file, rtsp, rtsps, http, https, udp and shm, "
+        f"cameras (/dev/video0), files, folders, FIFOs and - for standard input"
+    )
 
 
 def _open_path(path: Path, settings: SourceSettings) -> Source:
@@ -93,7 +134,7 @@ def _open_standard_input(settings: SourceSettings) -> Source:
         every_frame = is_file and not settings.realtime
     if every_frame:
         return SequentialSource(name, open_feed, settings)
-    return LatestSource(name, open_feed, settings, reopen=False, paced=settings.realtime)
+    return LatestSource(name, open_feed, settings, reopen=False, paced=settings.realtime and is_file)
 
 
 def _open_fifo(path: Path, settings: SourceSettings) -> Source:
@@ -105,7 +146,6 @@ def _open_fifo(path: Path, settings: SourceSettings) -> Source:
             str(path),
             fifo.open_feed,
             settings,
-            paced=settings.realtime,
             advice="start its writer",
             on_close=fifo.close,
         )

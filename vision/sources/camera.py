@@ -1,0 +1,142 @@
+"""A camera of Video4Linux, `/dev/video0` or `0`.
+
+A name under `/dev/v4l/by-id/` stays the same camera after it was unplugged and plugged in again; a number
+may not.
+
+No camera was at hand when this was written: it follows OpenCV's V4L2 back end as documented, and is tested
+    with a
+stand-in for `cv2.VideoCapture`, the lowest layer there is.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import stat
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.opencv import quiet_opencv
+from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings
+
+logger = logging.getLogger(__name__)
+
+_OLDEST_STAMP_NS = 1_000_000_000  # a driver's stamp further back than this is of another clock
+
+
+def camera_device(uri: str) -> Path | None:
+    """The device an address means: an index, or a character device under /dev; None if neither."""
+    if uri.isascii() and uri.isdecimal():
+        return Path(f"/dev/video{int(uri)}")
+    path = Path(uri)
+    if not uri.startswith("/dev/") or uri.startswith("/dev/std"):
+        return None
+    if path.name.startswith("video") or uri.startswith("/dev/v4l/"):
+        return path
+    try:
+        return path if stat.S_ISCHR(path.stat().st_mode) else None
+    except OSError:
+        return None
+
+
+def check_camera(device: Path, settings: SourceSettings) -> None:
+    """Find what would keep a camera from opening, in words.
+
+    Raises:
+        SourceError: no such device, no permission, or a pixel format that no camera has.
+    """
+    if settings.pixel_format in PIPE_PIXEL_FORMATS:
+        raise SourceError(
+            f"{device}: pixel_format {settings.pixel_format!r} is for pipes; a camera's is four letters, "
+            f"such as MJPG or YUYV"
+        )
+    if not device.exists():
+        others = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
+        raise SourceError(
+            f"{device}: no such camera; {f'there are {others}' if others else 'no camera is connected'}"
+        )
+    if not os.access(device, os.R_OK | os.W_OK):
+        raise SourceError(
+            f"{device}: no permission; add the user to the group video (sudo usermod -aG video USER) "
+            f"and log in again"
+        )
+
+
+class CameraFeed(Feed):
+    """Frames of a V4L2 camera, stamped by its driver where it stamps with the monotonic clock.
+
+    Raises:
+        SourceError: it cannot be opened, for a reason found.
+        FeedLost: it did not open; another program may have it.
+    """
+
+    def __init__(self, device: Path, settings: SourceSettings) -> None:
+        check_camera(device, settings)
+        quiet_opencv()
+        self._device = device
+        # OpenCV waits this long, in whole seconds, for a frame; it reads the variable when it first needs it.
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(settings.read_timeout_s)))
+        self._capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
+        if not self._capture.isOpened():
+            self._capture.release()
+            raise FeedLost(
+                "it does not open as a camera; another program may be using it, or it is a camera's second "
+                "device (metadata)"
+            )
+        self._ask_for(settings)
+
+    def _ask_for(self, settings: SourceSettings) -> None:
+        capture = self._capture
+        # The pixel format first: it decides which sizes and rates the driver offers.
+        if settings.pixel_format is not None:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.pixel_format))
+        if settings.width is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, settings.width)
+        if settings.height is not None:
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
+        if settings.rate_hz is not None:
+            capture.set(cv2.CAP_PROP_FPS, settings.rate_hz)
+        width = round(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        rate_hz = capture.get(cv2.CAP_PROP_FPS)
+        pixel_format = fourcc_text(int(capture.get(cv2.CAP_PROP_FOURCC)))
+        refused = [
+            f"{name} {asked}"
+            for name, asked, given in (
+                ("width", settings.width, width),
+                ("height", settings.height, height),
+                ("pixel_format", settings.pixel_format, pixel_format),
+            )
+            if asked is not None and asked != given
+        ]
+        if settings.rate_hz is not None and abs(settings.rate_hz - rate_hz) > 0.5:
+            refused.append(f"rate_hz {settings.rate_hz:g}")
+        given_text = f"{width}x{height} {pixel_format} at {rate_hz:g} Hz"
+        if refused:
+            logger.warning("%s: gives %s; asked for %s", self._device, given_text, ", ".join(refused))
+        else:
+            logger.info("%s: gives %s", self._device, given_text)
+
+    def read(self, timeout_s: float) -> Picture | None:
+        ok, image = self._capture.read()
+        now_ns = time.monotonic_ns()
+        if not ok or image is None:
+            gone = "" if self._device.exists() else "; it was unplugged"
+            raise FeedLost(f"the camera gave no frame{gone}")
+        driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        captured_ns = driver_ns if 0 <= now_ns - driver_ns < _OLDEST_STAMP_NS else now_ns
+        return Picture(np.ascontiguousarray(image, dtype=np.uint8), captured_ns)
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def fourcc_text(code: int) -> str:
+    """The four letters of a FOURCC; a number in hexadecimal where they cannot be printed."""
+    letters = code.to_bytes(4, "little", signed=code < 0)
+    return letters.decode("ascii") if all(32 <= letter < 127 for letter in letters) else f"0x{code:08x}"

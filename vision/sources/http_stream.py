@@ -1,0 +1,112 @@
+"""Motion JPEG by HTTP, as web cameras send it (`multipart/x-mixed-replace`).
+
+The images are found by their own markers, not by the parts' headers: the boundary and Content-Length that
+cameras send are wrong often enough. A stream of any other type is left to FFmpeg.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import os
+import socket
+import time
+import urllib.error
+import urllib.request
+from collections import deque
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.mjpeg import MjpegParser
+from vision.sources.network import StreamFeed, network_error
+from vision.sources.source import SourceError, SourceSettings
+
+_JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
+_REFUSALS = {
+    401: "asks for a user and password",
+    403: "forbids it",
+    404: "has nothing there",
+    410: "has no more",
+}
+
+
+def open_http(uri: str, settings: SourceSettings) -> Feed:
+    """Ask the server for the stream.
+
+    Raises:
+        SourceError: it says no (401, 403, 404, 410).
+        FeedLost: it does not answer, or with an error that may pass.
+    """
+    parts = urlsplit(uri)
+    bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+    try:
+        timeout_s = min(settings.open_timeout_s, settings.read_timeout_s)
+        response = _opener(uri).open(bare, timeout=timeout_s)
+    except urllib.error.HTTPError as error:
+        with error:
+            text = f"the server {_REFUSALS.get(error.code, 'refuses')} (HTTP {error.code} {error.reason})"
+        if error.code == 401:
+            text += f"; put the right ones into the address: {parts.scheme}://USER:PASSWORD@{parts.hostname}…"
+        if error.code in _REFUSALS:
+            raise SourceError(text) from error
+        raise FeedLost(text) from error
+    except urllib.error.URLError as error:
+        cause = error.reason if isinstance(error.reason, OSError) else OSError(str(error.reason))
+        raise FeedLost(f"{parts.hostname}:{parts.port or parts.scheme} {network_error(cause)}") from error
+    except (OSError, http.client.HTTPException) as error:
+        raise FeedLost(f"no answer in HTTP: {error!r}") from error
+    if response.headers.get_content_type() in _JPEG_TYPES:
+        return HttpMjpegFeed(response)
+    kind = response.headers.get_content_type()
+    response.close()
+    return StreamFeed(uri, settings, {}, f"the server sends {kind}, and no video that FFmpeg can read")
+
+
+def _opener(uri: str) -> urllib.request.OpenerDirector:
+    parts = urlsplit(uri)
+    if parts.username is None:
+        return urllib.request.build_opener()
+    passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+    root = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}/"
+    passwords.add_password(None, root, unquote(parts.username), unquote(parts.password or ""))
+    return urllib.request.build_opener(
+        urllib.request.HTTPDigestAuthHandler(passwords), urllib.request.HTTPBasicAuthHandler(passwords)
+    )
+
+
+class HttpMjpegFeed(Feed):
+    """The images of an HTTP response that does not end."""
+
+    def __init__(self, response: http.client.HTTPResponse) -> None:
+        self._response = response
+        self._parser = MjpegParser()
+        self._ready: deque[tuple[NDArray[np.uint8], int]] = deque()
+        # A second handle on the same connection, to end a read from another thread.
+        self._socket = socket.socket(fileno=os.dup(response.fileno()))
+
+    def read(self, timeout_s: float) -> Picture | None:
+        while not self._ready:
+            try:
+                data = self._response.read1(1 << 16)
+            except TimeoutError as error:
+                raise FeedLost("nothing came any more") from error
+            except (OSError, http.client.HTTPException) as error:
+                raise FeedLost(f"the connection broke: {error}") from error
+            if not data:
+                raise FeedLost("the server closed the connection")
+            captured_ns = time.monotonic_ns()
+            self._ready.extend((image, captured_ns) for image in self._parser.push(data))
+            self.unreadable = self._parser.unreadable
+        image, captured_ns = self._ready.popleft()
+        return Picture(image, captured_ns)
+
+    def interrupt(self) -> None:
+        with contextlib.suppress(OSError):  # it is closed already
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._socket.close()
+        self._response.close()
