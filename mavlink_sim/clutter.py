@@ -25,7 +25,11 @@ def tree(rng: np.random.Generator) -> Body:
     body.tube((0, 0, 0), (0, 0, tall * 0.55), 0.17, "bark", 6, 0.1)
     for _ in range(int(rng.integers(3, 6))):
         radius = tall * _between(rng, 0.16, 0.25)
-        centre = (_between(rng, -0.16, 0.16) * tall, _between(rng, -0.16, 0.16) * tall, tall * _between(rng, 0.55, 0.8))
+        centre = (
+            _between(rng, -0.16, 0.16) * tall,
+            _between(rng, -0.16, 0.16) * tall,
+            tall * _between(rng, 0.55, 0.8),
+        )
         body.ellipsoid(centre, (radius, radius, radius * 0.8), "leaves", 7, 4, rng, 0.16, 0.16)
     return body
 
@@ -71,7 +75,9 @@ def crate(rng: np.random.Generator) -> Body:
     body.box((0, 0, size[2] / 2), size, "wood", top_slot="lid")
     if rng.random() < 0.4:
         small = _between(rng, 0.3, 0.5)
-        body.box((_between(rng, -0.2, 0.2), 0, size[2] + small / 2), (small, small, small), "wood", 0.4, "lid")
+        body.box(
+            (_between(rng, -0.2, 0.2), 0, size[2] + small / 2), (small, small, small), "wood", 0.4, "lid"
+        )
     return body
 
 
@@ -97,7 +103,12 @@ def shed(rng: np.random.Generator) -> Body:
         body.box((0, 0, 1.3), (length, 2.4, 2.6), "wall", top_slot="wall")
         for side in (-1.0, 1.0):
             for x in np.arange(-length / 2 + 0.4, length / 2, 0.6):
-                rib = [(x, side * 1.2, 0.1), (x + 0.12, side * 1.2, 0.1), (x + 0.12, side * 1.2, 2.5), (x, side * 1.2, 2.5)]
+                rib = [
+                    (x, side * 1.2, 0.1),
+                    (x + 0.12, side * 1.2, 0.1),
+                    (x + 0.12, side * 1.2, 2.5),
+                    (x, side * 1.2, 2.5),
+                ]
                 body.add_decal(np.array(rib), "dark", (0, side, 0))
         return body
     length, width, wall = _between(rng, 2.5, 6.0), _between(rng, 2.2, 4.5), _between(rng, 2.1, 2.6)

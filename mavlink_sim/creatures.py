@@ -98,13 +98,17 @@ def dog(rng: np.random.Generator) -> Body:
         for side in (-1.0, 1.0):
             hip = np.array([x, side * 0.07 * size * stocky, back - 0.04])
             knee = _swing(hip, back * 0.45, side * forwards * stride + (0.2 if x < 0 else -0.1))
-            foot = np.array([knee[0] - 0.04 * (1 if x < 0 else 0) + side * forwards * stride * 0.08, knee[1], 0.035])
+            foot = np.array(
+                [knee[0] - 0.04 * (1 if x < 0 else 0) + side * forwards * stride * 0.08, knee[1], 0.035]
+            )
             body.tube(hip, knee, 0.06 * size * stocky, "coat", 5, 0.038 * size)
             body.tube(knee, foot, 0.034 * size, "legs", 5, 0.028 * size)
             body.box((float(foot[0]) + 0.02, float(foot[1]), 0.025), (0.1 * size, 0.06 * size, 0.05), "legs")
     head = np.array([front + 0.2 * size, 0.0, back + 0.22 * size])
     body.tube((front, 0, back + 0.05), head - (0.03, 0, 0), 0.085 * size * stocky, "coat", 6, 0.07 * size)
-    body.ellipsoid((float(head[0]), 0, float(head[2])), (0.11 * size, 0.085 * size, 0.09 * size), "coat", 7, 4)
+    body.ellipsoid(
+        (float(head[0]), 0, float(head[2])), (0.11 * size, 0.085 * size, 0.09 * size), "coat", 7, 4
+    )
     nose = head + (0.2 * size, 0, -0.045 * size)
     body.tube(head + (0.06, 0, -0.02), nose, 0.055 * size, "muzzle", 6, 0.036 * size)
     body.ellipsoid((float(nose[0]), 0, float(nose[2]) + 0.01), (0.025, 0.025, 0.022), "nose", 5, 3)
@@ -119,7 +123,9 @@ def dog(rng: np.random.Generator) -> Body:
     body.tube(tail, middle, 0.032 * size, "coat", 5, 0.026 * size)
     body.tube(middle, middle + (-0.1 * size, 0.02, raised), 0.026 * size, "coat", 5, 0.012)
     if rng.random() < 0.5:
-        body.tube((front + 0.06, 0, back + 0.1), (front + 0.09, 0, back + 0.13), 0.1 * size * stocky, "collar", 7)
+        body.tube(
+            (front + 0.06, 0, back + 0.1), (front + 0.09, 0, back + 0.13), 0.1 * size * stocky, "collar", 7
+        )
     return body
 
 
@@ -158,8 +164,16 @@ def chair(rng: np.random.Generator) -> Body:
     for side in (-1.0, 1.0):
         y = side * (width / 2 - 0.025)
         splay = 0.04 if style == "garden" else 0.015
-        body.tube((depth / 2 - 0.03, y, seat), (depth / 2 + splay - 0.03, y + side * splay, 0), thick * 0.7, "frame", 4)
-        body.tube((-depth / 2 + 0.02, y, seat), (-depth / 2 - splay, y + side * splay, 0), thick * 0.7, "frame", 4)
+        body.tube(
+            (depth / 2 - 0.03, y, seat),
+            (depth / 2 + splay - 0.03, y + side * splay, 0),
+            thick * 0.7,
+            "frame",
+            4,
+        )
+        body.tube(
+            (-depth / 2 + 0.02, y, seat), (-depth / 2 - splay, y + side * splay, 0), thick * 0.7, "frame", 4
+        )
         body.tube((-depth / 2 + 0.02, y, seat), (-depth / 2 + 0.02 - lean, y, top), thick * 0.65, "frame", 4)
     if rng.random() < 0.5:
         body.loft(low * (1, 0.92), low * (1, 0.88) - (lean, 0), seat + 0.12, top, "fabric")

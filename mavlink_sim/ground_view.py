@@ -8,7 +8,7 @@ follows the area of a pixel's footprint on the ground.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -80,11 +80,15 @@ class Buffers:
         self.dither = np.exp2(rng.uniform(-DITHER, DITHER, shape)).astype(np.float32)
 
 
-@lru_cache(maxsize=16)
 def ground_atlas(ground: Ground) -> MipAtlas:
     """The ground's tile, with its patches, road and pad painted in."""
     if not (ground.patches or ground.pad or ground.road_east_m is not None):
         return mixed_tile(ground.kinds, ground.seed, ground.tile_texels)
+    return _painted_tile(replace(ground, gain=(1.0, 1.0, 1.0)))
+
+
+@lru_cache(maxsize=12)
+def _painted_tile(ground: Ground) -> MipAtlas:
     size, texel = ground.tile_texels, ground.texel_m
     rng = np.random.default_rng((ground.seed, 8))
     colours = paint(ground.kinds[0], ground.seed, size)

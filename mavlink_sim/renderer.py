@@ -66,7 +66,7 @@ class Rendered:
 
 
 class Renderer:
-    """Draws one world through one camera.
+    """Draws one world through one camera; `rng` draws the sensor's noise if there are effects.
 
     Raises ValueError if the camera has lens distortion, which is not drawn yet.
     """
@@ -78,6 +78,7 @@ class Renderer:
         mount: CameraMount = DEFAULT_MOUNT,
         effects: ImageEffects | None = None,
         buffers: Buffers | None = None,
+        rng: np.random.Generator | None = None,
     ) -> None:
         if any(camera.distortion):
             raise ValueError(
@@ -87,7 +88,7 @@ class Renderer:
         self.world, self.camera, self.mount, self.effects = world, camera, mount, effects
         self._buffers = buffers or Buffers(camera.width, camera.height)
         self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
-        self._rng = np.random.default_rng(0)
+        self._rng = rng or np.random.default_rng(0)
 
     def render(self, position_ned_m: Sequence[float], ned_from_body: NDArray[np.float64]) -> Rendered:
         """The frame seen when the body is at `position_ned_m` (3,) with attitude `ned_from_body` (3, 3)."""
@@ -160,7 +161,11 @@ class Renderer:
         seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane, labels: NDArray[np.int32]
     ) -> list[tuple[PlacedObject, Sighting, int]]:
         sightings: list[tuple[PlacedObject, Sighting, int]] = []
-        flat_depth, flat_labels, flat_image = inverse_depth.reshape(-1), labels.reshape(-1), image.reshape(-1, 3)
+        flat_depth, flat_labels, flat_image = (
+            inverse_depth.reshape(-1),
+            labels.reshape(-1),
+            image.reshape(-1, 3),
+        )
         for placed in seen:
             sighting = placed.draw(view)
             if sighting is None:

@@ -251,9 +251,7 @@ def _water(rng: np.random.Generator, size: int) -> Plane:
 def _leaves(rng: np.random.Generator, size: int) -> Plane:
     """A forest's floor: leaves and needles, strong contrast at small scale."""
     litter = fractal_noise(rng, size, size // 10, 3, 0.9)
-    colours = mix(
-        0.5 + 0.25 * litter + 0.15 * fractal_noise(rng, size, 5, 4), (28, 48, 66), (62, 112, 150)
-    )
+    colours = mix(0.5 + 0.25 * litter + 0.15 * fractal_noise(rng, size, 5, 4), (28, 48, 66), (62, 112, 150))
     return shade(colours, 1.0 + 0.12 * grain(rng, size))
 
 

@@ -51,7 +51,9 @@ def car(rng: np.random.Generator) -> Body:
             (rear + 0.02, clear + 0.16),
         ]
     )
-    body.extrude(shoulders, width / 2, "paint", slots=["under"] + ["paint"] * 8, top_half_width=width / 2 - 0.05)
+    body.extrude(
+        shoulders, width / 2, "paint", slots=["under"] + ["paint"] * 8, top_half_width=width / 2 - 0.05
+    )
 
     base_front = hood_start + 0.18
     base_rear = rear + {"saloon": length * 0.19, "hatchback": 0.12, "estate": 0.1, "tall": 0.1}[style]
@@ -78,7 +80,9 @@ def car(rng: np.random.Generator) -> Body:
         y = outwards * (width / 2 - 0.01)
         seam = 0.25 * base_rear + 0.75 * base_front - 0.25
         for x in (seam, seam - 1.05):
-            line = np.array([(x, y, clear + 0.14), (x + 0.03, y, clear + 0.14), (x + 0.03, y, belt), (x, y, belt)])
+            line = np.array(
+                [(x, y, clear + 0.14), (x + 0.03, y, clear + 0.14), (x + 0.03, y, belt), (x, y, belt)]
+            )
             body.add_decal(line, "under", (0, outwards, 0))
         body.box((base_front - 0.3, outwards * (width / 2 + 0.06), belt + 0.08), (0.16, 0.18, 0.13), "paint")
 
@@ -143,7 +147,9 @@ def truck(rng: np.random.Generator) -> Body:
     middle, run = (start + end) / 2, end - start
     if style == "tank":
         radius = min(width, height - deck) / 2 - 0.06
-        body.tube((start, 0, deck + radius), (end, 0, deck + radius), radius, "cargo", 12, cap_slot="cargo_end")
+        body.tube(
+            (start, 0, deck + radius), (end, 0, deck + radius), radius, "cargo", 12, cap_slot="cargo_end"
+        )
         body.box((middle, 0, deck + 2 * radius + 0.05), (run * 0.7, 0.4, 0.1), "under")
     elif style == "flat":
         body.box((middle, 0, deck + 0.05), (run, width, 0.14), "deck")
@@ -158,11 +164,15 @@ def truck(rng: np.random.Generator) -> Body:
         body.box((middle, 0, (deck + height) / 2), (run, width, height - deck), "cargo", top_slot="cargo_top")
         for side in (-1.0, 1.0):
             y = side * width / 2
-            band = np.array([(start + 0.1, y, 1.7), (end - 0.1, y, 1.7), (end - 0.1, y, 2.2), (start + 0.1, y, 2.2)])
+            band = np.array(
+                [(start + 0.1, y, 1.7), (end - 0.1, y, 1.7), (end - 0.1, y, 2.2), (start + 0.1, y, 2.2)]
+            )
             body.add_decal(band, "stripe", (0, side, 0))
             if style == "tarpaulin":
                 for x in np.arange(start + 0.5, end, 0.75):
-                    fold = np.array([(x, y, deck), (x + 0.05, y, deck), (x + 0.05, y, height), (x, y, height)])
+                    fold = np.array(
+                        [(x, y, deck), (x + 0.05, y, deck), (x + 0.05, y, height), (x, y, height)]
+                    )
                     body.add_decal(fold, "under", (0, side, 0))
         for y in (-width / 4, width / 4):
             door = np.array([(start, y - width / 4 + 0.06, deck + 0.08), (start, y + width / 4 - 0.06, deck + 0.08),
@@ -239,7 +249,12 @@ def _spoked_wheel(body: Body, x: float, radius: float, sides: int = 14) -> None:
     for angle in np.arange(4) * math.pi / 4 + 0.3:
         ray = np.array([math.cos(angle), 0.0, math.sin(angle)])
         turn = np.array([-ray[2], 0.0, ray[0]]) * 0.004
-        spoke = [hub - ray * inner - turn, hub + ray * inner - turn, hub + ray * inner + turn, hub - ray * inner + turn]
+        spoke = [
+            hub - ray * inner - turn,
+            hub + ray * inner - turn,
+            hub + ray * inner + turn,
+            hub - ray * inner + turn,
+        ]
         body.add_sheet(np.array(spoke), "hub")
     body.tube(hub - (0, 0.045, 0), hub + (0, 0.045, 0), 0.03, "trim", 5)
 
@@ -291,11 +306,14 @@ def boat(rng: np.random.Generator) -> Body:
         boom_end = (-0.38 * length, 0.0, high + 0.75)
         body.tube((mast, 0, high + 0.75), boom_end, 0.045, "trim", 4)
         if rng.random() < 0.65:
-            main = np.array([(mast - 0.06, 0, high + 0.85), (boom_end[0], 0, high + 0.85), (mast - 0.06, 0, tall - 0.1)])
+            main = np.array(
+                [(mast - 0.06, 0, high + 0.85), (boom_end[0], 0, high + 0.85), (mast - 0.06, 0, tall - 0.1)]
+            )
             body.add_sheet(main, "sail")
-            jib = np.array([(mast + 0.08, 0, tall - 0.6), (mast + 0.15, 0, high + 0.5), (length * 0.47, 0, high + 0.1)])
+            jib = np.array(
+                [(mast + 0.08, 0, tall - 0.6), (mast + 0.15, 0, high + 0.5), (length * 0.47, 0, high + 0.1)]
+            )
             body.add_sheet(jib, "sail")
         else:
             body.tube((mast, 0, high + 0.85), (boom_end[0], 0, high + 0.85), 0.12, "sail", 6)
     return body
-

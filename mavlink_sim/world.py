@@ -172,13 +172,14 @@ def range_to(world_object: WorldObject, position_ned_m: Sequence[float]) -> floa
     return math.hypot(along, across)
 
 
-def _clear_of(
-    placed: list[WorldObject], north: float, east: float, radius_m: float, gap_m: float
-) -> bool:
+def _clear_of(placed: list[WorldObject], north: float, east: float, radius_m: float, gap_m: float) -> bool:
     for item in placed:
         rear, front, left, right = item.footprint_m
         reach = math.hypot(max(-rear, front), max(-left, right))
-        if math.hypot(item.position_ned_m[0] - north, item.position_ned_m[1] - east) < reach + radius_m + gap_m:
+        if (
+            math.hypot(item.position_ned_m[0] - north, item.position_ned_m[1] - east)
+            < reach + radius_m + gap_m
+        ):
             return False
     return True
 
@@ -250,6 +251,8 @@ def demo_world(seed: int = 0) -> World:
         for _ in range(count):
             put(class_name, 26.0, 75.0, 1.8)
     road_east = (18.0 if rng.random() < 0.5 else -18.0) * float(rng.uniform(0.9, 1.2))
-    ground = Ground(("meadow", "grass"), seed, 2048, 0.08, patches=tuple(patches), road_east_m=road_east, pad=True)
+    ground = Ground(
+        ("meadow", "grass"), seed, 2048, 0.08, patches=tuple(patches), road_east_m=road_east, pad=True
+    )
     light = Light(sun_azimuth_rad=float(rng.uniform(-math.pi, math.pi)))
     return World(tuple(placed), ground, light, Sky(seed=seed))
