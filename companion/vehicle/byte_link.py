@@ -84,6 +84,11 @@ async def _open_udp(url: LinkUrl, received: Received) -> _UdpLink:
         raise LinkError(_why_not_bound(url, error)) from error
 
 
+def _reason(error: OSError) -> str:
+    """The system's own words; asyncio puts others in their place."""
+    return os.strerror(error.errno) if error.errno is not None and error.errno > 0 else str(error)
+
+
 def _why_not_bound(url: LinkUrl, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         return (
@@ -94,7 +99,7 @@ def _why_not_bound(url: LinkUrl, error: OSError) -> str:
         return (
             f"{url}: no interface of this computer has the address {url.address[0]}; 0.0.0.0 listens on all"
         )
-    return f"{url}: the port cannot be opened: {error.strerror or error}"
+    return f"{url}: the port cannot be opened: {_reason(error)}"
 
 
 class _UdpLink:
@@ -133,7 +138,7 @@ class _UdpLink:
         except OSError as error:
             self.dropped_count += 1
             if not self._in_trouble:
-                logger.warning("%s: sending to %s fails: %s", self._url, self._peer, error.strerror or error)
+                logger.warning("%s: sending to %s fails: %s", self._url, self._peer, _reason(error))
             self._in_trouble = True
         else:
             self._in_trouble = False
@@ -176,7 +181,7 @@ class _StreamLink:
         except BlockingIOError:
             return
         except OSError as error:
-            self._lost(error.strerror or str(error))
+            self._lost(_reason(error))
             return
         if data:
             self._received(data, None)
@@ -196,7 +201,7 @@ class _StreamLink:
             written = 0
         except OSError as error:
             self.dropped_count += 1
-            self._lost(error.strerror or str(error))
+            self._lost(_reason(error))
             return
         if written == 0 and not self._unsent:
             self.dropped_count += 1
@@ -248,7 +253,7 @@ async def _open_tcp(url: LinkUrl) -> int:
         await asyncio.get_running_loop().sock_connect(endpoint, address)
         return endpoint.detach()
     except OSError as error:
-        reason = error.strerror or error
+        reason = _reason(error)
         raise LinkError(
             f"{url}: cannot connect: {reason}; is a vehicle or a router listening there?"
         ) from error
@@ -265,7 +270,9 @@ async def _open_serial(url: LinkUrl) -> int:
     descriptor = -1
     try:
         descriptor = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        fcntl.ioctl(descriptor, termios.TIOCEXCL)  # a second reader would steal bytes from us
+        # A second reader would steal bytes: TIOCEXCL stops who opens it after us, flock who asks as we do.
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
         tty.setraw(descriptor)
         settings = termios.tcgetattr(descriptor)
         settings[2] = (settings[2] | termios.CLOCAL | termios.CREAD) & ~termios.CRTSCTS
@@ -288,7 +295,7 @@ def _why_no_serial(url: LinkUrl, error: Exception) -> str:
         return (
             f"{url}: no permission to open {device}; add the user to the group that owns it (often dialout)"
         )
-    if number == errno.EBUSY:
+    if number in (errno.EBUSY, errno.EWOULDBLOCK):
         return f"{url}: another program has {device} open; stop it"
     if number == errno.ENOTTY:
         return f"{url}: {device} is not a serial device"

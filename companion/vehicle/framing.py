@@ -14,7 +14,6 @@ from pymavlink.dialects.v20 import common as mavlink
 MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
 _HEADER_V1, _HEADER_V2, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
 _FLAG_SIGNED = 0x01
-LONGEST_FRAME = _HEADER_V2 + 255 + _CHECKSUM + _SIGNATURE
 
 # MAVLink common, 436, sent by PX4 >= 1.15. Not in pymavlink 2.4.50's "common".
 CURRENT_MODE_ID = 436

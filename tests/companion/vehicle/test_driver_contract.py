@@ -100,7 +100,7 @@ async def test_on_the_ground_state_parameters_modes_and_arming_work(kind: str) -
 
 
 async def test_a_flight_by_setpoints_ends_in_the_failsafe_when_they_end(kind: str) -> None:
-    with running_simulator(speed=4.0, parameters=FLIGHT) as simulator:
+    with running_simulator(speed=6.0, parameters=FLIGHT) as simulator:
         async with connected(kind, simulator) as driver:
             await state_shows(driver, complete)
             await driver.takeoff(3.0)
@@ -140,6 +140,10 @@ async def test_a_vehicle_that_restarts_is_flown_on_without_a_new_driver(kind: st
                 await state_shows(driver, complete)
                 await driver.arm()
                 await driver.disarm()
+    lines = [
+        r.getMessage() for r in caplog.records if "is silent" in r.getMessage() or "is back" in r.getMessage()
+    ]
+    assert len(lines) == 2
 
 
 async def test_two_vehicles_are_flown_side_by_side(kind: str) -> None:

@@ -1,0 +1,210 @@
+"""Links on real endpoints: UDP and TCP sockets, a pseudo-terminal for the serial line."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import pty
+import socket
+
+import pytest
+from fake_autopilot import free_port, wait_until
+
+from companion.vehicle.byte_link import open_link
+from companion.vehicle.driver import LinkError
+from companion.vehicle.link_url import parse_link_url
+
+
+class Ear:
+    """Keeps what comes."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.source = None
+
+    def __call__(self, data: bytes, source) -> None:
+        self.data += data
+        self.source = source
+
+
+def udp_peer() -> socket.socket:
+    peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    peer.bind(("127.0.0.1", 0))
+    peer.setblocking(False)
+    return peer
+
+
+async def test_a_listening_udp_link_answers_whom_it_is_told_to(port) -> None:
+    ear = Ear()
+    link = await open_link(parse_link_url(f"udpin://127.0.0.1:{port}"), ear)
+    with udp_peer() as first, udp_peer() as second:
+        link.send(b"to nobody")
+        assert link.dropped_count == 1
+        for peer, text in ((first, b"one"), (second, b"two")):
+            peer.sendto(text, ("127.0.0.1", port))
+            await wait_until(lambda text=text: ear.data.endswith(text), 5.0)
+            link.answer_to(ear.source)
+            link.send(b"answer to " + text)
+            assert await asyncio.get_running_loop().sock_recv(peer, 100) == b"answer to " + text
+    await link.close()
+    await link.close()
+    link.send(b"after the end")
+    assert link.dropped_count == 2
+
+
+async def test_an_outgoing_udp_link_keeps_its_address_and_outlives_an_absent_listener(port) -> None:
+    ear = Ear()
+    link = await open_link(parse_link_url(f"udpout://localhost:{port}"), ear)
+    for _ in range(3):
+        link.send(b"anybody?")
+        await asyncio.sleep(0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", port))
+        peer.setblocking(False)
+        link.answer_to(("127.0.0.1", 9))
+        link.send(b"hello")
+        data, source = await asyncio.get_running_loop().sock_recvfrom(peer, 100)
+        assert data == b"hello"
+        peer.sendto(b"hello yourself", source)
+        await wait_until(lambda: ear.data == b"hello yourself", 5.0)
+    await link.close()
+
+
+async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog) -> None:
+    caplog.set_level(logging.INFO)
+    ear, arrived, writers, served = Ear(), bytearray(), [], []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writers.append(writer)
+        writer.write(b"welcome %d" % len(writers))
+        served.append(asyncio.current_task())
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(100):
+                arrived.extend(data)
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{port}"), ear)
+    await wait_until(lambda: ear.data == b"welcome 1", 5.0)
+    assert ear.source is None
+    link.send(b"first")
+    await wait_until(lambda: bytes(arrived) == b"first", 5.0)
+    writers[0].transport.abort()
+    await wait_until(lambda: ear.data == b"welcome 1welcome 2", 10.0)
+    link.send(b" second")
+    await wait_until(lambda: bytes(arrived) == b"first second", 5.0)
+    await wait_until(lambda: "open again" in caplog.text, 5.0)
+    await link.close()
+    await link.close()
+    await asyncio.gather(*served)
+    server.close()
+    await server.wait_closed()
+
+
+async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_one() -> None:
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    listener.bind(("127.0.0.1", 0))
+    listener.listen()
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{listener.getsockname()[1]}"), Ear())
+    peer, _ = listener.accept()
+    sent = 0
+    while link.dropped_count < 10:
+        link.send(sent.to_bytes(4, "big") * 250)
+        sent += 1
+    peer.setblocking(False)
+    received = b""
+    while True:
+        try:
+            received += peer.recv(1 << 20)
+        except BlockingIOError:
+            if len(received) == (sent - link.dropped_count) * 1000:
+                break
+            await asyncio.sleep(0.01)
+    messages = [received[at : at + 1000] for at in range(0, len(received), 1000)]
+    assert all(message == message[:4] * 250 for message in messages)
+    await link.close()
+    peer.close()
+    listener.close()
+
+
+async def test_closing_ends_the_attempts_to_reopen() -> None:
+    server = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"), Ear())
+    server.close()
+    await server.wait_closed()
+    await link.close()
+    await link.close()
+
+
+async def test_a_serial_line_is_raw_both_ways() -> None:
+    ear = Ear()
+    master, slave = pty.openpty()
+    name = os.ttyname(slave)
+    os.close(slave)
+    link = await open_link(parse_link_url(f"serial://{name}:57600"), ear)
+    everything = bytes(range(256))
+    os.write(master, everything)
+    await wait_until(lambda: ear.data == everything, 5.0)
+    link.send(everything)
+    os.set_blocking(master, False)
+    echoed = b""
+    while len(echoed) < 256:
+        try:
+            echoed += os.read(master, 1000)
+        except BlockingIOError:
+            await asyncio.sleep(0.01)
+    assert echoed == everything
+    await link.close()
+    await link.close()
+    os.close(master)
+
+
+async def test_a_serial_line_that_hangs_up_is_said_and_tried_again(caplog) -> None:
+    master, slave = pty.openpty()
+    name = os.ttyname(slave)
+    os.close(slave)
+    link = await open_link(parse_link_url(f"serial://{name}:57600"), Ear())
+    os.close(master)
+    await wait_until(lambda: f"serial://{name}:57600: lost" in caplog.text, 5.0)
+    link.send(b"into nothing")
+    assert link.dropped_count == 1
+    await link.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("serial:///dev/no-such-device:57600", "there is no device /dev/no-such-device; is it plugged in"),
+        ("serial:///dev/null:57600", "/dev/null is not a serial device"),
+        ("serial:///dev/null:12345", r"no baud rate 12345; it has \[.*57600"),
+        ("udpin://192.0.2.1:14540", r"no interface of this computer has the address 192\.0\.2\.1"),
+        ("udpin://host.invalid:14540", "the host cannot be resolved"),
+    ],
+)
+async def test_an_endpoint_that_cannot_be_opened_is_said_in_one_line(url, message) -> None:
+    with pytest.raises(LinkError, match=message) as caught:
+        await open_link(parse_link_url(url), Ear())
+    assert str(caught.value).startswith(url)
+    assert "\n" not in str(caught.value)
+
+
+async def test_a_tcp_port_nobody_listens_on_is_said() -> None:
+    with pytest.raises(
+        LinkError, match="cannot connect: Connection refused; is a vehicle or a router listening"
+    ):
+        await open_link(parse_link_url(f"tcp://127.0.0.1:{free_port()}"), Ear())
+
+
+async def test_a_serial_device_another_program_holds_is_said() -> None:
+    master, slave = pty.openpty()
+    url = parse_link_url(f"serial://{os.ttyname(slave)}:57600")
+    link = await open_link(url, Ear())
+    with pytest.raises(LinkError, match="another program has"):
+        await open_link(url, Ear())
+    await link.close()
+    os.close(master)
+    os.close(slave)

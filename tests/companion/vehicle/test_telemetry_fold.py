@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.px4_modes import custom_mode_of_mode
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+
+HEARTBEAT = {"custom_mode": 0x03040000, "base_mode": 29, "system_status": 3}
+
+
+@pytest.mark.parametrize(
+    ("base_mode", "system_status", "armed", "failsafe"),
+    [
+        pytest.param(29, 3, False, False, id="standing by"),
+        pytest.param(157, 4, True, False, id="flying"),
+        pytest.param(145, 5, True, True, id="critical"),
+        pytest.param(145, 6, True, True, id="emergency"),
+        pytest.param(1, 0, False, False, id="uninitialised"),
+    ],
+)
+def test_the_heartbeat_tells_armed_and_failsafe(base_mode, system_status, armed, failsafe) -> None:
+    fields = {"custom_mode": 0x00060000, "base_mode": base_mode, "system_status": system_status}
+    state = fold(VehicleState(), "HEARTBEAT", fields, 77)
+    assert (state.armed, state.failsafe, state.heartbeat_ns) == (armed, failsafe, 77)
+    assert state.mode is FlightMode.OFFBOARD
+
+
+def test_a_message_that_says_nothing_new_returns_the_same_object() -> None:
+    state = fold(VehicleState(), "HEARTBEAT", HEARTBEAT, 1)
+    assert fold(state, "VFR_HUD", {"airspeed": 1.0}, 2) is state
+    assert fold(state, "CURRENT_MODE", {"custom_mode": 0x03040000}, 2) is state
+    assert fold(state, "BATTERY_STATUS", {"id": 0, "battery_remaining": -1}, 2) is state
+    assert fold(state, "BATTERY_STATUS", {"id": 1, "battery_remaining": 50}, 2) is state
+
+
+def test_current_mode_leads_and_a_mode_without_a_name_does_not() -> None:
+    state = fold(VehicleState(), "HEARTBEAT", HEARTBEAT, 1)
+    state = fold(state, "CURRENT_MODE", {"custom_mode": custom_mode_of_mode(FlightMode.LAND)}, 2)
+    assert state.mode is FlightMode.LAND
+    assert fold(state, "CURRENT_MODE", {"custom_mode": 0}, 3).mode is FlightMode.LAND
+
+
+@pytest.mark.parametrize(
+    ("number", "landed"),
+    [
+        (0, LandedState.UNKNOWN),
+        (1, LandedState.ON_GROUND),
+        (2, LandedState.IN_AIR),
+        (3, LandedState.TAKING_OFF),
+        (4, LandedState.LANDING),
+        (99, LandedState.UNKNOWN),
+    ],
+)
+def test_the_landed_state_is_named(number, landed) -> None:
+    state = fold(VehicleState(), "EXTENDED_SYS_STATE", {"landed_state": number}, 5)
+    assert (state.landed, state.landed_ns) == (landed, 5)
+
+
+@pytest.mark.parametrize("bad", [None, math.nan, math.inf])
+@pytest.mark.parametrize("field", ["x", "y", "z", "vx", "vy", "vz"])
+def test_a_position_with_a_hole_is_not_taken_and_does_not_look_fresh(field, bad) -> None:
+    """NaN by pymavlink; null in MAVSDK's JSON."""
+    whole = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 1.0)
+    before = fold(VehicleState(), "LOCAL_POSITION_NED", whole, 5)
+    assert fold(before, "LOCAL_POSITION_NED", whole | {field: bad}, 9) is before
+
+
+def test_an_attitude_is_normalised_and_one_that_is_none_is_not_taken() -> None:
+    rates = {"rollspeed": 0.1, "pitchspeed": 0.2, "yawspeed": 0.3}
+    state = fold(VehicleState(), "ATTITUDE_QUATERNION", {"q1": 1.01, "q2": 0, "q3": 0, "q4": 0, **rates}, 5)
+    assert state.attitude == (1.0, 0.0, 0.0, 0.0)
+    assert state.angular_velocity_frd_radps == (0.1, 0.2, 0.3)
+    for w in (0.0, None, math.nan, 50.0):
+        assert fold(state, "ATTITUDE_QUATERNION", {"q1": w, "q2": 0, "q3": 0, "q4": 0, **rates}, 9) is state
+
+
+def test_home_is_known_by_its_altitude_even_without_a_local_position() -> None:
+    fields = {"altitude": 488_123, "x": None, "y": None, "z": None}
+    state = fold(VehicleState(), "HOME_POSITION", fields, 5)
+    assert state.home_altitude_amsl_m == pytest.approx(488.123)
+    assert state.home_position_ned_m is None
+    moved = fold(state, "HOME_POSITION", {"altitude": 488_123, "x": 1.0, "y": 2.0, "z": -0.5}, 6)
+    assert moved.home_position_ned_m == (1.0, 2.0, -0.5)
+
+
+@pytest.mark.parametrize(
+    ("health", "remaining", "ready", "fraction"),
+    [(0x1000_0000, 80, True, 0.8), (0x0FFF_FFFF, 0, False, 0.0), (0, -1, False, None), (0, 120, False, 1.0)],
+)
+def test_sys_status_tells_readiness_and_battery(health, remaining, ready, fraction) -> None:
+    fields = {"onboard_control_sensors_health": health, "battery_remaining": remaining}
+    state = fold(VehicleState(), "SYS_STATUS", fields, 5)
+    assert (state.ready_to_arm, state.battery_fraction) == (ready, fraction)
+
+
+@given(name=st.sampled_from(sorted(FOLDED_MESSAGES - {"CURRENT_MODE"})), payload=st.binary(max_size=60))
+def test_no_content_of_a_message_breaks_the_fold(name, payload) -> None:
+    definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
+    size = definition.unpacker.size
+    values = definition.unpacker.unpack(payload[:size].ljust(size, b"\0"))
+    ordered = (
+        [values[index] for index in definition.orders]
+        if sum(definition.lengths) == len(definition.lengths)
+        else None
+    )
+    if ordered is None:  # arrays: none of their elements is folded
+        fields = dict.fromkeys(definition.fieldnames, 0)
+    else:
+        fields = dict(zip(definition.fieldnames, ordered, strict=True))
+    state = fold(VehicleState(), name, fields, 5)
+    for vector in (state.position_ned_m, state.velocity_ned_mps, state.attitude, state.home_position_ned_m):
+        assert vector is None or all(math.isfinite(value) for value in vector)
