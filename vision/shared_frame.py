@@ -1,0 +1,348 @@
+"""Frames between two processes of one host through shared memory: a ring of slots, the newest frame wins.
+
+A segment is a file in /dev/shm, mapped by both sides. The writer makes it under another name and then moves it
+into place, so a reader sees either none or a whole one. The writer holds a lock (`flock`) on it for life: the
+kernel frees that when the writer dies, however it dies, and the next writer of the name may take its place.
+Readers notice that by the file's identity and map the new one. (`multiprocessing.shared_memory` is not used:
+its resource tracker on Python 3.11 removes a segment when any reader exits.)
+
+Layout, in 64-bit words of the host's byte order; the slots begin at the second page:
+
+| word | header | slot |
+|---|---|---|
+| 0 | magic | lock: 2 n + 1 while frame n is being written, 2 n + 2 when it is whole |
+| 1 | version | the frame's sequence |
+| 2, 3 | width, height | the frame's captured_ns |
+| 4 | 1 if there is depth | |
+| 5, 6 | slots, bytes of a slot | |
+| 7 | frames written so far | |
+| 8 | heartbeat: monotonic nanoseconds of the last write | |
+| 9 | 1 when the writer has closed | |
+| 10 | the writer's process number | |
+
+A slot's image starts 64 bytes into it, its depth after the image, at a multiple of 64. The slot's lock is a sequence lock
+(Lameter 2005, "Effective synchronization on Linux/NUMA systems"): a reader copies and then looks whether it
+has changed. With several slots it changes only for a reader that is more than `slots - 1` frames late.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import mmap
+import os
+import secrets
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.frame import Frame
+
+SHARED_MEMORY_DIRECTORY = Path("/dev/shm")
+MAGIC = 0x4D43_4652_414D_4531
+VERSION = 1
+PAGE = 4096
+SLOT_HEADER_BYTES = 64
+MAX_ATTEMPTS = 50
+LOOK_FOR_SUCCESSOR_NS = 100_000_000
+
+_MAGIC, _VERSION, _WIDTH, _HEIGHT, _DEPTH, _SLOTS, _SLOT_BYTES, _WRITTEN, _HEARTBEAT, _CLOSED, _PID = range(
+    11
+)
+_LOCK, _SEQUENCE, _CAPTURED = range(3)
+
+Words = NDArray[np.uint64]
+
+
+def segment_path(name: str) -> Path:
+    """The file of a segment. Raises ValueError for a name that is no plain file name."""
+    if not name or name in (".", "..") or "/" in name or "\0" in name or len(name) > 200:
+        raise ValueError(f"a shared memory's name must be a plain file name, got {name!r}")
+    if not SHARED_MEMORY_DIRECTORY.is_dir():
+        raise FileNotFoundError(
+            f"{SHARED_MEMORY_DIRECTORY} does not exist; shared frames need Linux's tmpfs there"
+        )
+    return SHARED_MEMORY_DIRECTORY / name
+
+
+def _up(size: int, step: int) -> int:
+    return -(-size // step) * step
+
+
+class _Slots:
+    """Views into a mapped segment: its header, and each slot's header, image and depth."""
+
+    def __init__(self, memory: mmap.mmap, width: int, height: int, depth: bool, slots: int) -> None:
+        self.header: Words = np.frombuffer(memory, np.uint64, PAGE // 8)
+        stride = slot_bytes(width, height, depth)
+        self.words: list[Words] = []
+        self.images: list[NDArray[np.uint8]] = []
+        self.depths: list[NDArray[np.float32] | None] = []
+        for index in range(slots):
+            start = PAGE + index * stride
+            image_at = start + SLOT_HEADER_BYTES
+            depth_at = image_at + _up(width * height * 3, 64)
+            self.words.append(np.frombuffer(memory, np.uint64, SLOT_HEADER_BYTES // 8, start))
+            image = np.frombuffer(memory, np.uint8, width * height * 3, image_at)
+            self.images.append(image.reshape(height, width, 3))
+            plane = np.frombuffer(memory, np.float32, width * height, depth_at) if depth else None
+            self.depths.append(None if plane is None else plane.reshape(height, width))
+
+
+def slot_bytes(width: int, height: int, depth: bool) -> int:
+    """Bytes of one slot, header included, whole pages."""
+    pixels = width * height
+    return _up(SLOT_HEADER_BYTES + _up(3 * pixels, 64) + (4 * pixels if depth else 0), PAGE)
+
+
+class SharedFrameWriter:
+    """Writes frames of one size under a name. One writer a name; the last one's leavings are taken over.
+
+    Raises:
+        FileExistsError: another writer of that name is alive.
+        ValueError: the name or a size cannot be.
+    """
+
+    def __init__(self, name: str, width: int, height: int, depth: bool, slots: int = 4) -> None:
+        if width <= 0 or height <= 0:
+            raise ValueError(f"shared frames need a positive size, got {width}x{height}")
+        if slots < 2:
+            raise ValueError(f"a ring of shared frames needs 2 slots or more, got {slots}")
+        self.name, self.width, self.height, self.depth = name, width, height, depth
+        self._path = segment_path(name)
+        stride = slot_bytes(width, height, depth)
+        size = PAGE + slots * stride
+        draft = self._path.with_name(f".{name}.{secrets.token_hex(6)}")
+        self._file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Memory is taken now: a full /dev/shm is an error here, not a SIGBUS in the middle of a frame.
+            os.posix_fallocate(self._file, 0, size)
+            self._memory = mmap.mmap(self._file, size)
+            self._views: _Slots | None = _Slots(self._memory, width, height, depth, slots)
+            header = self._views.header
+            header[[_VERSION, _WIDTH, _HEIGHT, _DEPTH]] = (VERSION, width, height, int(depth))
+            header[[_SLOTS, _SLOT_BYTES, _PID]] = (slots, stride, os.getpid())
+            header[_HEARTBEAT] = time.monotonic_ns()
+            header[_MAGIC] = MAGIC
+            _move_into_place(draft, self._path)
+        except BaseException:
+            with contextlib.suppress(FileNotFoundError):
+                draft.unlink()
+            os.close(self._file)
+            raise
+
+    def write(self, frame: Frame) -> None:
+        """Copy a frame in. Raises ValueError if its size, or its having depth, is not the segment's."""
+        if self._views is None:
+            raise ValueError(f"the writer of shared memory {self.name!r} is closed")
+        if (frame.width, frame.height) != (self.width, self.height):
+            raise ValueError(
+                f"shared memory {self.name!r} holds {self.width}x{self.height} frames, "
+                f"got {frame.width}x{frame.height}"
+            )
+        if (frame.depth_m is not None) != self.depth:
+            raise ValueError(
+                f"shared memory {self.name!r} was made {'with' if self.depth else 'without'} depth, "
+                f"the frame comes {'without' if self.depth else 'with'} it"
+            )
+        header = self._views.header
+        count = int(header[_WRITTEN])
+        index = count % len(self._views.words)
+        words = self._views.words[index]
+        words[_LOCK] = 2 * count + 1
+        words[_SEQUENCE] = frame.sequence
+        words[_CAPTURED] = frame.captured_ns
+        self._views.images[index][:] = frame.image
+        depth = self._views.depths[index]
+        if depth is not None:
+            depth[:] = frame.depth_m
+        words[_LOCK] = 2 * count + 2
+        header[_WRITTEN] = count + 1
+        header[_HEARTBEAT] = time.monotonic_ns()
+
+    def close(self) -> None:
+        """Say that no more comes, and remove the segment's name. Readers keep what they have mapped."""
+        if self._views is None:
+            return
+        self._views.header[_CLOSED] = 1
+        self._views = None
+        if _same_file(self._path, self._file):
+            self._path.unlink()
+        self._memory.close()
+        os.close(self._file)
+
+    def __enter__(self) -> SharedFrameWriter:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def _move_into_place(draft: Path, path: Path) -> None:
+    """Give the draft its name, over a dead writer's segment if there is one."""
+    while True:
+        try:
+            os.link(draft, path)
+        except FileExistsError:
+            if not _replace_dead(draft, path):
+                continue
+        else:
+            draft.unlink()
+        return
+
+
+def _replace_dead(draft: Path, path: Path) -> bool:
+    """Move the draft over `path` if its writer is dead; False if the file went away meanwhile."""
+    try:
+        old = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not _same_file(path, old):
+            return False
+        os.replace(draft, path)
+    except BlockingIOError as error:
+        raise FileExistsError(
+            f"shared memory {path.name!r} is being written by another process; stop it or choose another name"
+        ) from error
+    finally:
+        os.close(old)
+    return True
+
+
+def _same_file(path: Path, descriptor: int) -> bool:
+    try:
+        named = os.stat(path)
+    except FileNotFoundError:
+        return False
+    opened = os.fstat(descriptor)
+    return (named.st_dev, named.st_ino) == (opened.st_dev, opened.st_ino)
+
+
+class SharedFrameReader:
+    """Reads the newest frame that a writer of that name has put there. Any number of readers.
+
+    Raises:
+        FileNotFoundError: nobody has written under that name (yet).
+        ValueError: the file is no segment of this version.
+
+    Attributes:
+        torn_reads: copies thrown away because the writer overtook them.
+        reopened: how often a new writer's segment was taken up.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.torn_reads = 0
+        self.reopened = 0
+        self._path = segment_path(name)
+        self._views: _Slots | None = None
+        self._looked_ns = 0
+        self._new_writer = False
+        self._open()
+
+    def _open(self) -> None:
+        file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        try:
+            size = os.fstat(file).st_size
+            if size < PAGE:
+                raise ValueError(f"{self._path} is no segment of shared frames: only {size} bytes")
+            memory = mmap.mmap(file, size, prot=mmap.PROT_READ)
+            header: list[int] = np.frombuffer(memory, np.uint64, PAGE // 8)[: _PID + 1].tolist()
+            if header[_MAGIC] != MAGIC or header[_VERSION] != VERSION:
+                raise ValueError(
+                    f"{self._path} is no segment of shared frames of version {VERSION} "
+                    f"(magic {header[_MAGIC]:#x}, version {header[_VERSION]})"
+                )
+            width, height, depth, slots = (
+                header[_WIDTH],
+                header[_HEIGHT],
+                bool(header[_DEPTH]),
+                header[_SLOTS],
+            )
+            stride = slot_bytes(width, height, depth)
+            if stride != header[_SLOT_BYTES] or size < PAGE + slots * stride:
+                raise ValueError(
+                    f"{self._path} is damaged: {size} bytes do not hold {slots} slots of {stride}"
+                )
+            self._views = _Slots(memory, width, height, depth, slots)
+        except BaseException:
+            os.close(file)
+            raise
+        self._file, self._memory = file, memory
+        self.width, self.height, self.depth = width, height, depth
+
+    def _release(self) -> None:
+        if self._views is not None:
+            self._views = None
+            self._memory.close()
+            os.close(self._file)
+
+    def latest(self, after_sequence: int | None = None) -> Frame | None:
+        """A copy of the newest frame if its sequence is above `after_sequence`, else None.
+
+        A writer that was started anew counts from its own beginning: its first frame is given whatever
+        `after_sequence` says.
+        """
+        self._follow_writer()
+        if self._views is None:
+            return None
+        for _ in range(MAX_ATTEMPTS):
+            views = self._views
+            count = int(views.header[_WRITTEN])
+            if count == 0:
+                return None
+            index = (count - 1) % len(views.words)
+            words = views.words[index]
+            before = int(words[_LOCK])
+            sequence, captured_ns = int(words[_SEQUENCE]), int(words[_CAPTURED])
+            if before == 2 * count:
+                if after_sequence is not None and sequence <= after_sequence and not self._new_writer:
+                    return None
+                image = views.images[index].copy()
+                depth = views.depths[index]
+                depth_m = None if depth is None else depth.copy()
+                if int(words[_LOCK]) == before:
+                    self._new_writer = False
+                    return Frame(image, captured_ns, sequence, depth_m)
+            self.torn_reads += 1
+        return None
+
+    def _follow_writer(self) -> None:
+        """Take up the segment of a newer writer, looking for one every now and then."""
+        now = time.monotonic_ns()
+        closed = self._views is None or bool(self._views.header[_CLOSED])
+        if not closed and now - self._looked_ns < LOOK_FOR_SUCCESSOR_NS:
+            return
+        self._looked_ns = now
+        if self._views is not None and _same_file(self._path, self._file):
+            return
+        if not self._path.exists():
+            return
+        self._release()
+        with contextlib.suppress(FileNotFoundError):
+            self._open()
+            self.reopened += 1
+            self._new_writer = True
+
+    @property
+    def writer_heartbeat_ns(self) -> int | None:
+        """CLOCK_MONOTONIC nanoseconds of the writer's last sign of life; None if it has closed or gone."""
+        if self._views is None or bool(self._views.header[_CLOSED]):
+            return None
+        return int(self._views.header[_HEARTBEAT])
+
+    def close(self) -> None:
+        """Unmap. The segment stays: it is the writer's."""
+        self._release()
+        self._path = Path(os.devnull) / "closed"
+
+    def __enter__(self) -> SharedFrameReader:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
