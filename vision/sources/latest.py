@@ -18,7 +18,7 @@ from vision.sources.source import EndOfStream, Source, SourceError, SourceSettin
 logger = logging.getLogger(__name__)
 
 _POLL_S = 0.2  # how soon the reading thread notices `close` while nothing arrives
-_OPENING_GRACE_S = 1.0  # for a decoder that keeps to the same deadline, a little late
+_OPENING_GRACE_S = 1.0  # beyond the deadline, for a driver that is still inside a call
 
 
 class LatestSource(Source):
@@ -65,17 +65,19 @@ class LatestSource(Source):
         self._unreadable_before = 0
         self._lost_since_s: float | None = None
         self._pace_origin_s: float | None = None
+        self._advice = advice
+        self._open_deadline_s = time.monotonic() + settings.open_timeout_s
         self._thread = threading.Thread(target=self._run, name=f"source {uri}", daemon=True)
         self._thread.start()
-        self._wait_for_first_frame(advice)
+        self._wait_for_first_frame()
 
-    def _wait_for_first_frame(self, advice: str) -> None:
+    def _wait_for_first_frame(self) -> None:
         timeout_s = self._settings.open_timeout_s
         with self._changed:
             self._changed.wait_for(
                 lambda: self._opened or self._end is not None, timeout_s + _OPENING_GRACE_S
             )
-            opened, end, reason = self._opened, self._end, self._last_reason
+            opened, end = self._opened, self._end or self._never_opened()
         if opened:
             return
         self.close()
@@ -83,10 +85,12 @@ class LatestSource(Source):
             raise SourceError(f"{self.uri}: ended before its first frame{f': {end}' if str(end) else ''}")
         if isinstance(end, SourceError) and not str(end).startswith(self.uri):
             raise SourceError(f"{self.uri}: {end}") from end
-        if end is not None:
-            raise end
-        raise SourceError(
-            f"{self.uri}: no frame within {timeout_s:g} s: {reason}{f'; {advice}' if advice else ''}"
+        raise end
+
+    def _never_opened(self) -> SourceError:
+        advice = f"; {self._advice}" if self._advice else ""
+        return SourceError(
+            f"{self.uri}: no frame within {self._settings.open_timeout_s:g} s: {self._last_reason}{advice}"
         )
 
     # --- the reader's side
@@ -175,7 +179,10 @@ class LatestSource(Source):
                 self._say_lost(str(error))
             if came_back:
                 pause_s = self._settings.retry_min_s
-            self._stop.wait(pause_s)
+            left_s = self._open_deadline_s - time.monotonic()
+            if not self._opened and left_s <= 0.0:
+                raise self._never_opened()
+            self._stop.wait(pause_s if self._opened else min(pause_s, left_s))
             pause_s = min(pause_s * 2, self._settings.retry_max_s)
 
     def _say_lost(self, reason: str) -> None:
@@ -217,6 +224,8 @@ class LatestSource(Source):
                 self._hold_back(picture)
                 self._publish(picture, feed)
                 heard_s = time.monotonic()
+            elif not self._opened and time.monotonic() > self._open_deadline_s:
+                raise self._never_opened()
             elif silent_s > settings.read_timeout_s:
                 if feed.silence_is_loss:
                     raise FeedLost(f"nothing came for {silent_s:.1f} s")

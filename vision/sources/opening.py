@@ -17,6 +17,7 @@ from vision.sources.network import UdpStream, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
 from vision.sources.pipe import Fifo, PipeFeed, check_pipe_settings
 from vision.sources.sequential import SequentialSource
+from vision.sources.shared import SharedFrameFeed, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
 from vision.sources.video_file import VideoFileFeed
 
@@ -75,11 +76,10 @@ def _open_address(uri: str, scheme: str, rest: str, settings: SourceSettings) ->
         stream = UdpStream(uri, settings)
         return LatestSource(name, stream.open_feed, settings, advice="is the sender sending here?")
     if scheme == "shm":
-        if not rest:
-            raise SourceError(f"{uri}: expected shm://NAME")
-        from vision.sources.shared import SharedFrameFeed
-
-        return LatestSource(name, lambda: SharedFrameFeed(rest), settings, advice="is its writer running?")
+        check_name(rest)
+        return LatestSource(
+            name, lambda: SharedFrameFeed(rest, settings), settings, advice="is its writer running?"
+        )
     raise SourceError(
         f"{name}: sources have no {scheme}://; there are file, rtsp, rtsps, http, https, udp and shm, "
         f"cameras (/dev/video0), files, folders, FIFOs and - for standard input"

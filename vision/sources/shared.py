@@ -4,30 +4,45 @@ from __future__ import annotations
 
 import time
 
-from vision.shared_frame import SharedFrameReader
+from vision.frame import Frame
+from vision.shared_frame import SharedFrameReader, segment_path
 from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.source import SourceError, SourceSettings
 
 _LOOK_EVERY_S = 0.001  # shared memory wakes nobody; a look costs some microseconds
+
+
+def check_name(name: str) -> None:
+    """Raises SourceError for a name that no shared memory can have."""
+    try:
+        segment_path(name)
+    except (OSError, ValueError) as error:
+        raise SourceError(f"shm://{name}: {error}") from error
 
 
 class SharedFrameFeed(Feed):
     """The newest frame of a shared memory, each once.
 
     Raises:
-        FeedLost: nobody has made it (yet).
+        FeedLost: nobody has made it (yet), or something else is there.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, settings: SourceSettings) -> None:
         try:
             self._reader = SharedFrameReader(name)
         except (OSError, ValueError) as error:
             raise FeedLost(f"no frames in the shared memory {name!r} ({error})") from error
+        self._stale_ns = round(settings.read_timeout_s * 1e9)
         self._after: int | None = None
 
     def read(self, timeout_s: float) -> Picture | None:
         deadline_s = time.monotonic() + timeout_s
         while True:
             frame = self._reader.latest(self._after)
+            if frame is not None and self._after is None and self._is_stale(frame):
+                # What a dead writer left behind is no sign of life.
+                self._after = frame.sequence
+                frame = None
             if frame is not None:
                 break
             if time.monotonic() >= deadline_s:
@@ -36,6 +51,9 @@ class SharedFrameFeed(Feed):
         before, self._after = self._after, frame.sequence
         skipped = 0 if before is None else max(frame.sequence - before - 1, 0)
         return Picture(frame.image, frame.captured_ns, frame.depth_m, skipped=skipped)
+
+    def _is_stale(self, frame: Frame) -> bool:
+        return time.monotonic_ns() - frame.captured_ns > self._stale_ns
 
     def close(self) -> None:
         self._reader.close()

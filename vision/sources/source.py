@@ -35,7 +35,8 @@ class SourceSettings:
             (these need width and height), `y4m`, `mjpeg`. None: the driver's choice, or y4m/mjpeg recognised
             by the pipe's first bytes.
         loop: start a file over at its end.
-        realtime: pace a file by its own timestamps, newest frame wins: a file standing for a camera.
+        realtime: pace a file by its own timestamps, newest frame wins: a file standing for a camera. A pipe
+            has its writer's pace.
         every_frame: pipes only. True: every frame in order, the writer waits for the reader, and the writer's
             end is the end. False: newest frame wins. None: newest wins, but a regular file redirected into
             standard input is read whole. Files give every frame unless `realtime`; cameras, networks and
