@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from vision.yolo.augmentation import NO_AUGMENTATION, Augmentation, augment
 from vision.yolo.evaluation import evaluate
-from vision.yolo.scene_batches import SceneKey, collate, draw_scene
+from vision.yolo.scene_batches import SceneKey, collate, draw_scene, scene_batches
 from vision.yolo.training import Progress, Stage, TrainingSettings, load_average, train
 
 COLOURS = ((40, 40, 220), (60, 200, 60))
@@ -211,15 +211,42 @@ def test_augmented_boxes_still_hold_their_objects(seed):
 
 
 def test_the_same_key_draws_the_same_picture():
-    key = SceneKey(3, 4, 5, 96, 64)
-    first, second = (draw_scene(rectangles, key, 2, Augmentation()) for _ in range(2))
+    key = SceneKey(3, 4, 96, 64)
+    first, second = (draw_scene(rectangles, key, 2) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
-    other = draw_scene(rectangles, SceneKey(3, 4, 6, 96, 64), 2, Augmentation())
-    assert not np.array_equal(first[0], other[0])
+    assert not np.array_equal(first[0], draw_scene(rectangles, replace(key, scene=5), 2)[0])
+
+
+def test_returning_scenes_are_drawn_once_and_seen_differently_each_time(tmp_path: Path):
+    plan = [[SceneKey(0, scene, 64, 64, view) for scene in range(2)] for view in range(3)]
+    calls = []
+
+    def counted(rng, width, height):
+        calls.append(1)
+        return rectangles(rng, width, height)
+
+    batches = list(scene_batches(counted, plan, class_count=2, augmentation=Augmentation(), workers=0))
+    assert len(calls) == 2
+    assert not torch.equal(batches[0][0], batches[1][0])
+    alone = list(scene_batches(counted, plan[2:], class_count=2, augmentation=Augmentation(), workers=0))
+    assert torch.equal(batches[2][0], alone[0][0])
+
+
+def test_a_longer_stage_begins_like_a_shorter_one():
+    settings = replace(SMALL, stages=(Stage(64, 64, 2, 3, scenes=4),))
+    seen: list[float] = []
+    train(settings, rectangles, lambda progress: seen.append(progress.box_loss))
+    longer: list[float] = []
+    train(
+        replace(settings, stages=(Stage(64, 64, 2, 5, scenes=4),), decay_steps=1),
+        rectangles,
+        lambda progress: longer.append(progress.box_loss),
+    )
+    assert longer[:2] == seen[:2]
 
 
 def test_a_batch_pads_its_labels_and_turns_colours_to_rgb():
-    full = draw_scene(rectangles, SceneKey(0, 0, 0, 64, 64), 2)
+    full = draw_scene(rectangles, SceneKey(0, 0, 64, 64), 2)
     empty = nothing(None, 64, 64)
     images, truth = collate([full, empty])
     assert images.shape == (2, 64, 64, 3)

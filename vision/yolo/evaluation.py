@@ -40,7 +40,7 @@ def evaluate(
     model.eval()
     results = []
     for index in range(count):
-        scene = draw_scene(scenes, SceneKey(seed, 0, index, width, height), len(model.class_names))
+        scene = draw_scene(scenes, SceneKey(seed, index, width, height), len(model.class_names))
         images, _ = collate([scene])
         found = select_boxes(model, model(network_input(images)), confidence=confidence, iou=iou)
         results.append(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,27 +22,32 @@ All randomness must come from `rng`. With workers it must be picklable: a functi
 `functools.partial` of one.
 """
 
+KEPT_BYTES = 3 << 30
+"""How much of returning scenes each drawing process keeps; beyond that it draws them anew."""
+
 
 @dataclass(frozen=True, slots=True)
 class SceneKey:
-    """Names one training picture; its random numbers follow from `(seed, step, index)` alone."""
+    """Names one training picture: scene number `scene` of `seed`, seen with augmentation number `view`.
+
+    Its random numbers follow from these alone: never from the process that draws it, nor from what it drew
+    before.
+    """
 
     seed: int
-    step: int
-    index: int
+    scene: int
     width: int
     height: int
+    view: int = 0
 
 
-def draw_scene(
-    scenes: SceneSource, key: SceneKey, class_count: int, augmentation: Augmentation | None = None
-) -> LabelledImage:
-    """Draw, check and augment the picture a key names.
+def draw_scene(scenes: SceneSource, key: SceneKey, class_count: int) -> LabelledImage:
+    """Draw and check the scene a key names, not augmented.
 
     Raises:
         ValueError: the source gave an image of another size or type, or labels that do not fit together.
     """
-    rng = np.random.default_rng([key.seed, key.step, key.index])
+    rng = np.random.default_rng([key.seed, key.scene])
     image, boxes, class_ids = scenes(rng, key.width, key.height)
     if image.shape != (key.height, key.width, 3) or image.dtype != np.uint8:
         raise ValueError(
@@ -54,11 +60,7 @@ def draw_scene(
         raise ValueError(f"a scene has {len(boxes)} boxes but {len(class_ids)} class ids")
     if len(class_ids) and not (0 <= class_ids.min() and class_ids.max() < class_count):
         raise ValueError(f"class ids must be 0..{class_count - 1}, the source gave {np.unique(class_ids)}")
-    return (
-        (image, boxes, class_ids)
-        if augmentation is None
-        else augment(rng, (image, boxes, class_ids), augmentation)
-    )
+    return image, boxes, class_ids
 
 
 def collate(scenes: Sequence[LabelledImage]) -> tuple[Tensor, Truth]:
@@ -84,11 +86,35 @@ def network_input(images: Tensor) -> Tensor:
 class _Scenes(Dataset[LabelledImage]):
     """Map-style data set whose index is a `SceneKey`."""
 
-    def __init__(self, scenes: SceneSource, class_count: int, augmentation: Augmentation) -> None:
+    def __init__(
+        self,
+        scenes: SceneSource,
+        class_count: int,
+        augmentation: Augmentation,
+        returning: frozenset[SceneKey],
+    ) -> None:
         self.scenes, self.class_count, self.augmentation = scenes, class_count, augmentation
+        self.returning = returning
+        self.drawn: dict[SceneKey, LabelledImage] = {}
+        self.room = KEPT_BYTES
 
     def __getitem__(self, key: SceneKey) -> LabelledImage:
-        return draw_scene(self.scenes, key, self.class_count, self.augmentation)
+        plain = replace(key, view=0)
+        scene = self.drawn.get(plain)
+        if scene is None:
+            scene = draw_scene(self.scenes, plain, self.class_count)
+            # No eviction: scenes come round in turn, so the oldest is the one needed next.
+            if plain in self.returning and scene[0].nbytes <= self.room:
+                self.drawn[plain] = scene
+                self.room -= scene[0].nbytes
+        rng = np.random.default_rng([key.seed, key.scene, key.view])
+        return augment(rng, scene, self.augmentation)
+
+
+def _returning(plan: Sequence[Sequence[SceneKey]]) -> frozenset[SceneKey]:
+    """The scenes that are needed more than once."""
+    times = Counter(replace(key, view=0) for keys in plan for key in keys)
+    return frozenset(scene for scene, count in times.items() if count > 1)
 
 
 def _single_threaded(_worker: int) -> None:
@@ -115,7 +141,7 @@ def scene_batches(
     if not plan:
         return
     loader = DataLoader(
-        _Scenes(scenes, class_count, augmentation),
+        _Scenes(scenes, class_count, augmentation, _returning(plan)),
         batch_sampler=[list(keys) for keys in plan],
         num_workers=workers,
         collate_fn=collate,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import logging
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -26,20 +28,25 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A stretch of training at one picture size. Width and height in pixels, multiples of 32."""
+    """A stretch of training at one picture size. Width and height in pixels, multiples of 32.
+
+    `scenes` is how many different scenes are drawn; they come round, shuffled and augmented anew each time.
+    None: every picture is a new scene.
+    """
 
     width: int
     height: int
     batch_size: int
     steps: int
+    scenes: int | None = None
 
     def __post_init__(self) -> None:
         if self.width % 32 or self.height % 32 or self.width <= 0 or self.height <= 0:
             raise ValueError(
                 f"training pictures must be multiples of 32 pixels, got {self.width}x{self.height}"
             )
-        if self.batch_size < 1 or self.steps < 1:
-            raise ValueError(f"a stage needs a batch size and steps of 1 or more, got {self}")
+        if self.batch_size < 1 or self.steps < 1 or (self.scenes is not None and self.scenes < 1):
+            raise ValueError(f"a stage needs a batch size, steps and scenes of 1 or more, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,11 +302,30 @@ def _optimiser(model: nn.Module, settings: TrainingSettings) -> torch.optim.Opti
 
 
 def _plan(settings: TrainingSettings) -> list[list[SceneKey]]:
-    sizes = [stage for stage in settings.stages for _ in range(stage.steps)]
-    return [
-        [SceneKey(settings.seed, step, i, stage.width, stage.height) for i in range(stage.batch_size)]
-        for step, stage in enumerate(sizes)
-    ]
+    """The pictures of every batch. A stage's beginning does not depend on how long it lasts."""
+    plan: list[list[SceneKey]] = []
+    for number, stage in enumerate(settings.stages):
+        # Each stage numbers its scenes from its own thousand million, so that none repeats another's.
+        first = number * 1_000_000_000
+        order = _scene_order(np.random.default_rng([settings.seed, number]), stage)
+        for _ in range(stage.steps):
+            batch = [next(order) for _ in range(stage.batch_size)]
+            plan.append(
+                [
+                    SceneKey(settings.seed, first + scene, stage.width, stage.height, view)
+                    for scene, view in batch
+                ]
+            )
+    return plan
+
+
+def _scene_order(rng: np.random.Generator, stage: Stage) -> Iterator[tuple[int, int]]:
+    """(scene, how many times it was shown before), for ever."""
+    if stage.scenes is None:
+        yield from ((scene, 0) for scene in itertools.count())
+        return
+    for view in itertools.count():
+        yield from ((int(scene), view) for scene in rng.permutation(stage.scenes))
 
 
 def _progress(
