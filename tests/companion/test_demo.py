@@ -1,0 +1,47 @@
+"""The demonstration, flown whole: the way a newcomer first meets this project."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+
+@pytest.mark.alone
+@pytest.mark.timeout(240)
+def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path) -> None:
+    output = tmp_path / "demo"
+    done = subprocess.run(
+        [sys.executable, "-m", "companion.cli", "demo", "--output", str(output), "--duration", "150"],
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = json.loads((output / "summary.json").read_text())
+    assert summary["success"]
+    assert summary["found"]
+    assert summary["reached"]
+    assert summary["landed"]
+    assert summary["failure"] is None
+    assert abs(summary["final_range_m"] - 5.0) <= 1.0
+    # The subscriber joins when the service is ready; it may miss the first frames and nothing after.
+    assert 0 < summary["detections_received"] <= summary["detections_published"]
+    # The truth is the simulator's: it was in the air, under our setpoints, and is on the ground now.
+    lines = (output / "truth.jsonl").read_text().splitlines()
+    truth = [json.loads(line) for line in lines if line.endswith("}")]
+    assert any(row["mode"] == "OFFBOARD" and row["armed"] for row in truth)
+    assert max(-row["position_ned_m"][2] for row in truth) > 3.0
+    assert not truth[-1]["armed"]
+    video = cv2.VideoCapture(str(output / summary["video"]))
+    assert int(video.get(cv2.CAP_PROP_FRAME_WIDTH)) == 640
+    pictures = 0
+    while video.grab():
+        pictures += 1
+    assert pictures > 100

@@ -1,0 +1,44 @@
+"""Training as `companion train` does it, a few steps of it: what is written can be used at once."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import companion.train
+from companion.train import train_default
+from vision.detector import Detector
+from vision.yolo.recipe import DEFAULT_RECIPE
+from vision.yolo.training import Stage
+
+
+def test_a_training_run_leaves_a_model_with_licence_and_score(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The recipe's own pictures are too large for a test; everything else is as it is.
+    small = replace(
+        DEFAULT_RECIPE, stages=(Stage(96, 96, 2, 2),), width_multiple=0.0625, workers=0, threads=1
+    )
+    monkeypatch.setattr(companion.train, "DEFAULT_RECIPE", small)
+    monkeypatch.setattr(companion.train, "HELD_OUT_SIZE", (96, 96))
+    output = tmp_path / "out" / "model.pt"
+    score = train_default(output, held_out=2)
+    assert 0.0 <= score.map50 <= 1.0
+    written = json.loads(output.with_suffix(".json").read_text())
+    assert written["licence"] == "Apache-2.0"
+    assert written["score"]["held_out_scenes"] == 2
+    assert written["steps_done"] == 2
+    detector = Detector(output, image_size=96)
+    assert detector.metadata["licence"] == "Apache-2.0"
+    detector.detect(np.zeros((96, 96, 3), np.uint8))
+    # The state is there, and going on from it has nothing left to do.
+    assert train_default(output, held_out=2, resume=True).map50 == pytest.approx(score.map50)
+
+
+def test_going_on_without_a_state_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        train_default(tmp_path / "model.pt", resume=True)
