@@ -17,6 +17,7 @@ NOTHING: Vector = (NAN, NAN, NAN)
 ANTI_WINDUP = 0.5
 # Far above what any vehicle can do: keeps absurd setpoints and gains, which PX4 accepts, within arithmetic.
 MAX_DEMAND_MPS2 = 1000.0
+MAX_TILT_DEG = 80.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,7 @@ class PositionController:
         self._max_xy = value("MPC_XY_VEL_MAX")
         self._max_up = value("MPC_Z_VEL_MAX_UP")
         self._max_down = value("MPC_Z_VEL_MAX_DN")
-        self._max_tilt_tan = math.tan(math.radians(value("MPC_TILTMAX_AIR")))
+        self._max_tilt_tan = math.tan(math.radians(min(positive("MPC_TILTMAX_AIR"), MAX_TILT_DEG)))
         self._yaw_p = value("MC_YAW_P")
 
     def reset(self, yaw_rad: float) -> None:

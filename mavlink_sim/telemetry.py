@@ -369,7 +369,8 @@ def _time_estimate(vehicle: Vehicle) -> Any:
     away = math.hypot(position[0] - home[0], position[1] - home[1])
     positive = vehicle.parameters.positive
     seconds = away / positive("MPC_XY_CRUISE") + (home[2] - position[2]) / positive("MPC_LAND_SPEED")
-    return time_estimate_to_target(round(seconds * vehicle.parameters.number("RTL_TIME_FACTOR")), -1)
+    seconds *= vehicle.parameters.number("RTL_TIME_FACTOR")
+    return time_estimate_to_target(round(min(max(seconds, 0.0), 86400.0)), -1)
 
 
 def _current_event_sequence(vehicle: Vehicle) -> Any:

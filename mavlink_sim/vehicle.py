@@ -29,6 +29,7 @@ STEP_US = 4000
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
+MAX_WIND_MPS = 40.0  # a hurricane; a client may set any number
 # Measured: "Connection to mission computer lost" comes 7 s after the last heartbeat; COM_OBC_LOSS_T is 5 s.
 COMPANION_LOSS_MARGIN_S = 2.0
 
@@ -114,7 +115,7 @@ class Vehicle:
     def battery_remaining(self) -> float:
         """0..1. Half of it goes in SIM_BAT_DRAIN seconds of armed time; never below SIM_BAT_MIN_PCT."""
         lowest = self.parameters.number("SIM_BAT_MIN_PCT") / 100.0
-        return max(0.99 - self._used_charge, lowest)
+        return min(max(0.99 - self._used_charge, lowest, 0.0), 1.0)
 
     @property
     def battery_volts(self) -> float:
@@ -194,8 +195,11 @@ class Vehicle:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self._wind_revision = self.parameters.revision
-            value = self.parameters.number
-            self.airframe.wind = (value("SIH_WIND_N"), value("SIH_WIND_E"), 0.0)
+            north, east = (
+                min(max(self.parameters.number(name), -MAX_WIND_MPS), MAX_WIND_MPS)
+                for name in ("SIH_WIND_N", "SIH_WIND_E")
+            )
+            self.airframe.wind = (north, east, 0.0)
         self.autopilot.update(STEP_S)
         if self.autopilot.sensors_ready and not self._origin_told:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
