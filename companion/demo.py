@@ -183,7 +183,7 @@ def _range_at(truth_path: Path, stamp_ns: int) -> float | None:
 
 def _landed(truth_path: Path) -> bool:
     rows = _rows(truth_path)
-    return bool(rows) and not rows[-1]["armed"] and rows[-1]["landed"] == "on_ground"
+    return bool(rows) and not rows[-1]["armed"] and bool(rows[-1]["landed"])
 
 
 def _rows(truth_path: Path) -> list[dict[str, Any]]:

@@ -128,6 +128,8 @@ def rehearsal_settings(
         "camera.mount_right_m": str(DEFAULT_MOUNT.right_m),
         "camera.mount_down_m": str(DEFAULT_MOUNT.down_m),
         "detector.threads": "1",
+        # A laptop draws the world, looks at it and films it all at once: frames may come late.
+        "guidance.perception_max_age_s": "1.0",
         "zenoh.listen": f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",
     }
     if video is not None:
