@@ -169,8 +169,14 @@ def tarpaulin(rng: np.random.Generator) -> Body:
     if rng.random() < 0.5:
         tilt = _between(rng, 0.15, 0.5)
         drop = math.sin(tilt) * width / 2
-        corners = np.array([(-length / 2, -width / 2, 0.7 + drop), (length / 2, -width / 2, 0.7 + drop),
-                            (length / 2, width / 2, 0.7 - drop), (-length / 2, width / 2, 0.7 - drop)])  # fmt: skip
+        corners = np.array(
+            [
+                (-length / 2, -width / 2, 0.7 + drop),
+                (length / 2, -width / 2, 0.7 + drop),
+                (length / 2, width / 2, 0.7 - drop),
+                (-length / 2, width / 2, 0.7 - drop),
+            ]
+        )
         body.add_sheet(corners, "panel", "metal")
         for x in (-length / 2 + 0.1, length / 2 - 0.1):
             body.tube((x, 0, 0), (x, 0, 0.68), 0.04, "metal", 4)

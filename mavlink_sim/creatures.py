@@ -16,7 +16,8 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 def _swing(pivot: Points, length: float, forward_rad: float, outward: float = 0.0) -> Points:
     """The end of a limb that hangs from a pivot, swung forward and held `outward` metres to the side."""
     drop = math.sqrt(max(length**2 - outward**2, 0.01))
-    return pivot + (drop * math.sin(forward_rad), outward, -drop * math.cos(forward_rad))
+    end: Points = pivot + np.array((drop * math.sin(forward_rad), outward, -drop * math.cos(forward_rad)))
+    return end
 
 
 def person(rng: np.random.Generator) -> Body:
@@ -41,10 +42,11 @@ def person(rng: np.random.Generator) -> Body:
         body.box((ankle[0] + 0.06, ankle[1], max(ankle[2] - 0.03, 0.045)), (0.27, 0.1, 0.09), "shoes")
     shoulder_z = tall * 0.82
     lean = {"run": 0.12, "walk": 0.03}.get(pose, 0.0)
+    leaned = np.array((lean, 0.0))
     hips, chest = rectangle(0.22 * build, 0.33 * build), rectangle(0.25 * build, 0.44 * build)
     body.loft(hips, chest * 0.92, hip_z + 0.03, hip_z + tall * 0.14, "shirt")
-    body.loft(chest * 0.92, chest + (lean, 0), hip_z + tall * 0.14, shoulder_z - 0.06, "shirt")
-    body.loft(chest + (lean, 0), chest * 0.6 + (lean, 0), shoulder_z - 0.06, shoulder_z + 0.02, "shirt")
+    body.loft(chest * 0.92, chest + leaned, hip_z + tall * 0.14, shoulder_z - 0.06, "shirt")
+    body.loft(chest + leaned, chest * 0.6 + leaned, shoulder_z - 0.06, shoulder_z + 0.02, "shirt")
     belt = rectangle(0.235 * build, 0.345 * build)
     if skirt:
         body.loft(belt * 1.75, belt, hip_z - tall * 0.2, hip_z + 0.04, "trousers")
@@ -67,12 +69,12 @@ def person(rng: np.random.Generator) -> Body:
         body.tube(elbow, hand, 0.044 * build, "shirt" if sleeve else "skin", 5, 0.034 * build)
         body.ellipsoid((float(hand[0]), float(hand[1]), float(hand[2])), (0.05, 0.04, 0.055), "skin", 5, 3)
     neck = np.array([lean, 0.0, shoulder_z])
-    body.tube(neck, neck + (0.01, 0, 0.09), 0.055, "skin", 6)
+    body.tube(neck, neck + np.array((0.01, 0, 0.09)), 0.055, "skin", 6)
     head_z = tall - 0.125
     body.ellipsoid((lean + 0.03, 0, head_z), (0.1, 0.082, 0.125), "skin", 8, 5)
     if rng.random() < 0.2:
         body.tube((lean + 0.02, 0, head_z + 0.05), (lean + 0.02, 0, head_z + 0.12), 0.115, "hat", 8, 0.09)
-        brim = rectangle(0.14, 0.17) + (lean + 0.15, 0)
+        brim = rectangle(0.14, 0.17) + np.array((lean + 0.15, 0))
         body.loft(brim, brim, head_z + 0.045, head_z + 0.06, "hat")
     else:
         body.ellipsoid((lean - 0.005, 0, head_z + 0.035), (0.112, 0.096, 0.105), "hair", 8, 4)
@@ -109,19 +111,19 @@ def dog(rng: np.random.Generator) -> Body:
     body.ellipsoid(
         (float(head[0]), 0, float(head[2])), (0.11 * size, 0.085 * size, 0.09 * size), "coat", 7, 4
     )
-    nose = head + (0.2 * size, 0, -0.045 * size)
-    body.tube(head + (0.06, 0, -0.02), nose, 0.055 * size, "muzzle", 6, 0.036 * size)
+    nose = head + np.array((0.2 * size, 0, -0.045 * size))
+    body.tube(head + np.array((0.06, 0, -0.02)), nose, 0.055 * size, "muzzle", 6, 0.036 * size)
     body.ellipsoid((float(nose[0]), 0, float(nose[2]) + 0.01), (0.025, 0.025, 0.022), "nose", 5, 3)
     pricked = rng.random() < 0.5
     for side in (-1.0, 1.0):
-        root = head + (-0.02 * size, side * 0.06 * size, 0.06 * size)
+        root = head + np.array((-0.02 * size, side * 0.06 * size, 0.06 * size))
         tip = root + ((-0.01, side * 0.015, 0.1 * size) if pricked else (0.0, side * 0.05, -0.11 * size))
         body.tube(root, tip, 0.035 * size, "ears", 4, 0.012)
     raised = _between(rng, -0.15, 0.3) * size
     tail = np.array([rear - 0.02, 0.0, back + 0.06 * size])
-    middle = tail + (-0.14 * size, 0, raised * 0.4)
+    middle = tail + np.array((-0.14 * size, 0, raised * 0.4))
     body.tube(tail, middle, 0.032 * size, "coat", 5, 0.026 * size)
-    body.tube(middle, middle + (-0.1 * size, 0.02, raised), 0.026 * size, "coat", 5, 0.012)
+    body.tube(middle, middle + np.array((-0.1 * size, 0.02, raised)), 0.026 * size, "coat", 5, 0.012)
     if rng.random() < 0.5:
         body.tube(
             (front + 0.06, 0, back + 0.1), (front + 0.09, 0, back + 0.13), 0.1 * size * stocky, "collar", 7
@@ -147,8 +149,14 @@ def chair(rng: np.random.Generator) -> Body:
         return body
     body.box((0, 0, seat), (depth, width, 0.05 if style != "office" else 0.09), "fabric")
     lean = _between(rng, 0.04, 0.12)
-    low = np.array([(-depth / 2, -width / 2), (-depth / 2 + 0.035, -width / 2),
-                    (-depth / 2 + 0.035, width / 2), (-depth / 2, width / 2)])  # fmt: skip
+    low = np.array(
+        [
+            (-depth / 2, -width / 2),
+            (-depth / 2 + 0.035, -width / 2),
+            (-depth / 2 + 0.035, width / 2),
+            (-depth / 2, width / 2),
+        ]
+    )
     if style == "office":
         body.loft(low * (1, 0.95), low * (1, 0.85) - (lean, 0), seat + 0.14, top + 0.08, "fabric")
         body.box((-depth / 2 + 0.03, 0, seat + 0.1), (0.05, 0.08, 0.24), "frame")

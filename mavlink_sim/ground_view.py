@@ -1,8 +1,8 @@
 """The ground and the sky as a camera sees them, and how far the ground is.
 
-Over level ground the reciprocal of the depth is linear in the pixel: 1/depth = (a·u + b·v + c) / height, and the
-point seen is eye + depth · ray. So every pixel's texel comes from a few passes over whole arrays. The mip level
-follows the area of a pixel's footprint on the ground.
+Over level ground the reciprocal of the depth is linear in the pixel: 1/depth = (a·u + b·v + c) / height, and
+the point seen is eye + depth · ray. So every pixel's texel comes from a few passes over whole arrays. The mip
+level follows the area of a pixel's footprint on the ground.
 """
 
 from __future__ import annotations
@@ -29,14 +29,16 @@ from mavlink_sim.textures import (
     paint,
     to_image,
 )
-from mavlink_sim.world import Ground, Light, Sky, World
+from mavlink_sim.world import Ground, Light, Patch, Sky, World
 
 Matrix = NDArray[np.float64]
 
 NEAREST_INVERSE = 1e-4
 """Reciprocal depth below which ground counts as the horizon: 10 km."""
-DETAIL_REACH_M = 12.0
+DETAIL_REACH_M = 6.0
 DITHER = 0.5
+HAZE_FROM = 0.03
+"""Share of the visibility up to which haze is too thin to be drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,52 +103,84 @@ def _painted_tile(ground: Ground) -> MipAtlas:
     north = (axis[:, None] + ground.origin_m[0] + period / 2) % period - period / 2
     east = (axis[None, :] + ground.origin_m[1] + period / 2) % period - period / 2
     for patch in ground.patches:
-        away = _wrapped_distance(north - patch.north_m, east - patch.east_m, period)
-        weight = np.clip((patch.radius_m - away) * 1.6 + 0.5 * rough, 0, 1)
-        colours = blend_by_mask(colours, paint(patch.kind, ground.seed + 2, size), weight)
+        _paint_patch(colours, patch, ground, north[:, 0], east[0], rough)
     if ground.road_east_m is not None:
-        colours = _road(colours, ground, north, east, rough)
+        _paint_road(colours, ground, ground.road_east_m, north, east[0], rough)
     if ground.pad:
         colours = _pad(colours, north, east)
     return mip_atlas(to_image(colours))
 
 
-def _wrapped_distance(north: Plane, east: Plane, period: float) -> Plane:
-    half = period / 2
-    distance: Plane = np.hypot((north + half) % period - half, (east + half) % period - half)
-    return distance
+LOCAL_TEXELS = 512
 
 
-def _road(colours: Plane, ground: Ground, north: Plane, east: Plane, rough: Plane) -> Plane:
+def _colour(*channels: float) -> Plane:
+    return np.array(channels, np.float32)
+
+
+def _local(kind: str, seed: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Plane:
+    """A kind of ground for some rows and columns of the tile, out of a small tile repeated."""
+    small = _local_tile(kind, seed)
+    repeated: Plane = small[np.ix_(rows % LOCAL_TEXELS, columns % LOCAL_TEXELS)]
+    return repeated
+
+
+@lru_cache(maxsize=8)
+def _local_tile(kind: str, seed: int) -> Plane:
+    return paint(kind, seed, LOCAL_TEXELS)
+
+
+def _paint_patch(
+    colours: Plane, patch: Patch, ground: Ground, north: Plane, east: Plane, rough: Plane
+) -> None:
+    """Paint a round spot into the tile, in place; it may run over the tile's edge."""
+    half = ground.tile_texels * ground.texel_m / 2
+    north_off = (north - patch.north_m + half) % (2 * half) - half
+    east_off = (east - patch.east_m + half) % (2 * half) - half
+    reach = patch.radius_m + 2.0
+    rows, columns = np.flatnonzero(np.abs(north_off) < reach), np.flatnonzero(np.abs(east_off) < reach)
+    where = np.ix_(rows, columns)
+    away = np.hypot(north_off[rows][:, None], east_off[columns][None, :])
+    weight = np.clip((patch.radius_m - away) * 1.6 + 0.5 * rough[where], 0, 1).astype(np.float32)
+    colours[where] = blend_by_mask(colours[where], _local(patch.kind, ground.seed + 2, rows, columns), weight)
+
+
+def _paint_road(
+    colours: Plane, ground: Ground, road_east_m: float, north: Plane, east: Plane, rough: Plane
+) -> None:
+    """Paint the winding road into the tile, in place: gravel verge, asphalt, edge lines, dashes."""
     period = ground.tile_texels * ground.texel_m
-    assert ground.road_east_m is not None
-    turn = 2 * math.pi / period
-    middle = ground.road_east_m + 5.0 * np.sin(turn * north) * math.copysign(1.0, ground.road_east_m)
-    beside = np.abs((east - middle + period / 2) % period - period / 2)
-    verge = np.clip((4.1 - beside) * 1.3 + 0.35 * rough, 0, 1).astype(np.float32)
-    size = ground.tile_texels
-    colours = blend_by_mask(colours, paint("gravel", ground.seed + 3, size), verge)
+    swing = 5.0 * math.copysign(1.0, road_east_m)
+    from_middle = (east - road_east_m + period / 2) % period - period / 2
+    columns = np.flatnonzero(np.abs(from_middle) < 11.0)
+    rows = np.arange(ground.tile_texels)
+    where = np.ix_(rows, columns)
+    beside = np.abs(from_middle[columns][None, :] - swing * np.sin(2 * math.pi / period * north))
+    uneven = rough[where]
+    part = colours[where]
+    verge = np.clip((4.1 - beside) * 1.3 + 0.35 * uneven, 0, 1).astype(np.float32)
+    part = blend_by_mask(part, _local("gravel", ground.seed + 3, rows, columns), verge)
     road = np.clip((3.2 - beside) * 6 + 0.5, 0, 1).astype(np.float32)
-    colours = blend_by_mask(colours, paint("asphalt", ground.seed + 4, size), road)
+    part = blend_by_mask(part, _local("asphalt", ground.seed + 4, rows, columns), road)
     soft = 1.0 / ground.texel_m
     edge = np.clip(0.5 + (0.075 - np.abs(beside - 2.9)) * soft, 0, 1)
-    dashes = np.broadcast_to((north % (period / 26)) < period / 56, beside.shape)
+    dashes = (north % (period / 26)) < period / 56
     centre = np.clip(0.5 + (0.075 - beside) * soft, 0, 1) * dashes
-    worn = np.clip(0.85 + 0.1 * rough, 0.3, 1)
+    worn = np.clip(0.85 + 0.1 * uneven, 0.3, 1)
     marks = (np.maximum(edge, centre) * worn).astype(np.float32)
-    return blend_by_mask(colours, np.float32((226, 230, 230)), marks)
+    colours[where] = blend_by_mask(part, _colour(226, 230, 230), marks)
 
 
 def _pad(colours: Plane, north: Plane, east: Plane) -> Plane:
     """A round concrete pad of 2.2 m radius with a white ring and an H."""
     away = np.hypot(north, east)
     pad = np.clip((2.2 - away) * 12, 0, 1).astype(np.float32)
-    colours = blend_by_mask(colours, np.float32((150, 152, 152)), pad)
+    colours = blend_by_mask(colours, _colour(150, 152, 152), pad)
     ring = np.abs(away - 1.85) < 0.14
     bars = (np.abs(np.abs(east) - 0.5) < 0.13) & (np.abs(north) < 0.85)
     cross = (np.abs(north) < 0.13) & (np.abs(east) < 0.5)
     marks = (ring | bars | cross).astype(np.float32)
-    return blend_by_mask(colours, np.float32((236, 238, 238)), marks)
+    return blend_by_mask(colours, _colour(236, 238, 238), marks)
 
 
 def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane) -> Image:
@@ -194,13 +228,13 @@ def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane
     scale *= 0.5
     buffers.map_y *= scale
     buffers.map_y += np.float32(GUTTER - 0.5)
-    image = cv2.remap(atlas.pixels, buffers.map_x, buffers.map_y, cv2.INTER_LINEAR)
+    image = np.asarray(cv2.remap(atlas.pixels, buffers.map_x, buffers.map_y, cv2.INTER_LINEAR), np.uint8)
     _add_detail(view, height_m, buffers, image)
     if ground.gain != (1.0, 1.0, 1.0):
-        steps = np.arange(256, dtype=np.float32)[:, None] * np.float32(ground.gain)
-        image = cv2.LUT(image, np.clip(steps, 0, 255).astype(np.uint8)[None])
+        steps = np.arange(256, dtype=np.float32)[:, None] * _colour(*ground.gain)
+        image = np.asarray(cv2.LUT(image, np.clip(steps, 0, 255).astype(np.uint8)[None]), np.uint8)
     np.copyto(inverse_depth, 0.0, where=inverse_depth <= NEAREST_INVERSE)
-    return np.asarray(image, np.uint8)
+    return image
 
 
 def _linear(row: Matrix, buffers: Buffers, out: Plane, top: int = 0) -> None:
@@ -264,11 +298,11 @@ def draw_sky(sky: Sky, light: Light, view: View, inverse_depth: Plane, image: Im
     length = np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2)
     rise = np.maximum(-rays[2] / length, 0.004)
     blend = 1.0 - np.exp(-rise * 4.5)
-    colours = np.float32(sky.horizon) + blend[..., None] * np.float32(np.subtract(sky.zenith, sky.horizon))
+    colours = _colour(*sky.horizon) + blend[..., None] * (_colour(*sky.zenith) - _colour(*sky.horizon))
     sun = light.towards_sun_ned
     towards = (rays[0] * sun[0] + rays[1] * sun[1] + rays[2] * sun[2]) / length
     glow = np.exp((np.clip(towards, -1, 1) - 1) * 14) * 55 + np.exp((np.clip(towards, -1, 1) - 1) * 900) * 160
-    colours += glow[..., None] * np.float32((0.75, 0.92, 1.0))
+    colours += glow[..., None] * _colour(0.75, 0.92, 1.0)
     if sky.clouds > 0.0:
         tile = cloud_tile(sky.seed)
         side = tile.shape[0]
@@ -280,21 +314,22 @@ def draw_sky(sky: Sky, light: Light, view: View, inverse_depth: Plane, image: Im
         dense = np.clip((cover - 1.6 + 2.6 * sky.clouds) * 0.75, 0, 1) * np.clip(rise * 7 - 0.25, 0, 1)
         dense *= 0.9
         tone = 244 - 26 * np.clip(cover - 0.4, 0, 2)
-        colours += (tone[..., None] * np.float32((1.0, 0.99, 0.975)) - colours) * dense[..., None]
+        colours += (tone[..., None] * _colour(1.0, 0.99, 0.975) - colours) * dense[..., None]
     # The first and last small rows lie on the first and last rows of the band.
     stretched = cv2.resize(to_image(colours), (view.width, bottom - top), interpolation=cv2.INTER_LINEAR)
     cv2.copyTo(stretched, empty[top:bottom], image[top:bottom])
 
 
 def add_haze(sky: Sky, inverse_depth: Plane, buffers: Buffers, image: Image) -> None:
-    """Fade everything that is not sky into the horizon's colour with distance, in place."""
-    share = np.maximum(inverse_depth, NEAREST_INVERSE, out=buffers.weight)
-    nearest = 1.0 / float(share.min())
-    if nearest < 0.03 * sky.visibility_m:
+    """Fade everything into the horizon's colour with distance, in place. The sky is to be painted after."""
+    farthest = np.flatnonzero(inverse_depth.min(axis=1) < 1.0 / (HAZE_FROM * sky.visibility_m))
+    if not len(farthest):
         return
+    rows = slice(int(farthest[0]), int(farthest[-1]) + 1)
+    share = np.maximum(inverse_depth[rows], NEAREST_INVERSE, out=buffers.weight[rows])
     np.divide(np.float32(-1.0 / sky.visibility_m), share, out=share)
-    np.exp(share, out=share)
-    share[inverse_depth <= 0.0] = 1.0
-    rest = np.subtract(1.0, share, out=buffers.work)
-    buffers.flat[:] = np.clip(sky.horizon, 0, 255)
-    cv2.blendLinear(image, buffers.flat, share, rest, dst=image)
+    cv2.exp(share, dst=share)
+    rest = np.subtract(1.0, share, out=buffers.work[rows])
+    flat, part = buffers.flat[rows], image[rows]
+    flat[:] = np.clip(sky.horizon, 0, 255)
+    cv2.blendLinear(part, flat, share, rest, dst=part)

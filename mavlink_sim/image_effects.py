@@ -76,16 +76,17 @@ def apply_effects(image: Image, effects: ImageEffects, rng: np.random.Generator)
         top = int(rng.integers(bank.shape[0] - height + 1))
         left = int(rng.integers(bank.shape[1] - width + 1))
         noise = bank[top : top + height, left : left + width]
-        scaled = cv2.multiply(noise, effects.noise_sigma / 64.0)
+        scaled = cv2.addWeighted(noise, effects.noise_sigma / 64.0, noise, 0.0, 0.0)
         image = np.asarray(cv2.add(image, scaled, dtype=cv2.CV_8U), np.uint8)
     return image
 
 
 def _smear(length_px: float, direction_rad: float) -> NDArray[np.float32]:
-    side = int(math.ceil(length_px)) | 1
+    side = math.ceil(length_px) | 1
     kernel = np.zeros((side, side), np.float32)
     middle, half = side // 2, length_px / 2
     reach = np.array([math.cos(direction_rad), math.sin(direction_rad)]) * half
     start, end = np.rint(middle - reach).astype(int), np.rint(middle + reach).astype(int)
     cv2.line(kernel, start.tolist(), end.tolist(), 1.0)
-    return kernel / kernel.sum()
+    smear: NDArray[np.float32] = kernel / kernel.sum()
+    return smear

@@ -79,7 +79,7 @@ class PlacedObject:
         self.sun = np.array(light.towards_sun_ned)
         self.normals_ned = self.shape.normals @ self.ned_from_object.T
         self.lit = self._lit()
-        self._shadow: list[NDArray[np.float64]] | None = None
+        self._shadow: tuple[NDArray[np.float64], list[int]] | None = None
 
     def _lit(self) -> Plane:
         """(F, 3) faces' colours under sun and sky, without mirroring."""
@@ -93,28 +93,15 @@ class PlacedObject:
         return np.asarray(albedo * strength, np.float32)
 
     @property
-    def shadow(self) -> list[NDArray[np.float64]]:
-        """(K, 3) NED outlines on the ground of the solids' shadows."""
+    def shadow(self) -> tuple[NDArray[np.float64], list[int]]:
+        """Outlines of the solids' shadows on the ground: (P, 3) NED corners, where each begins."""
         if self._shadow is None:
-            sun = self.sun @ self.ned_from_object
-            turn = self.ned_from_object[:2, :2].T * self.item.scale
-            self._shadow = [
-                np.column_stack([outline @ turn + self.origin[:2], np.zeros(len(outline))])
-                for outline in self.shape.shadow(sun)
-            ]
+            outlines = self.shape.shadow(self.sun @ self.ned_from_object)
+            flat = np.concatenate(outlines).astype(np.float64)
+            turned = flat @ self.ned_from_object[:2, :2].T * self.item.scale + self.origin[:2]
+            first = np.cumsum([0] + [len(outline) for outline in outlines]).tolist()
+            self._shadow = (np.column_stack([turned, np.zeros(len(turned))]), first)
         return self._shadow
-
-    def may_be_seen(self, view: View) -> bool:
-        """False if its bounding sphere is certainly outside the image."""
-        offset = self.middle - view.eye
-        u, v, depth = view.pixel_from_ned @ offset
-        if depth < NEAR_M - self.radius_m:
-            return False
-        if depth <= self.radius_m:
-            return True
-        reach = 1.5 * view.focal_px * self.radius_m / (depth - self.radius_m)
-        wide = abs(u / depth - view.width / 2) < view.width / 2 + reach * 1.5
-        return bool(wide and abs(v / depth - view.height / 2) < view.height / 2 + reach * 1.5)
 
     def draw(self, view: View) -> Sighting | None:
         """What is seen of it from `view` with nothing before it, or None."""
@@ -161,14 +148,17 @@ class PlacedObject:
         rays = self.ned_from_object.T @ view.ned_from_pixel / scale
         with np.errstate(divide="ignore", invalid="ignore"):
             planes = np.where(facing[:, None], shape.normals @ rays / -height[:, None], 0.0)
-        planes = planes.astype(np.float32)
+        slopes = planes.astype(np.float32)
         x, y = columns.astype(np.float32), rows.astype(np.float32)
-        inverse = planes[:, 0].take(faces) * x + planes[:, 1].take(faces) * y + planes[:, 2].take(faces)
+        inverse: Plane = slopes[:, 0].take(faces) * x
+        inverse += slopes[:, 1].take(faces) * y
+        inverse += slopes[:, 2].take(faces)
         np.clip(inverse, 1.0 / farthest, 1.0 / max(nearest, NEAR_M), out=inverse)
         colours = self._view_colours(view, facing).take(faces, axis=0)
         colours *= self._texture(view, x, y, inverse)[:, None]
         pixels = rows * view.width + columns
-        share = _inside_share(points, view) if left == 0 or top == 0 or right == view.width or bottom == view.height else 1.0  # fmt: skip
+        at_rim = left == 0 or top == 0 or right == view.width or bottom == view.height
+        share = _inside_share(points, view) if at_rim else 1.0
         return Sighting(left, top, right, bottom, pixels, faces, inverse, colours, share)
 
     def _texture(self, view: View, x: Plane, y: Plane, inverse: Plane) -> Plane:

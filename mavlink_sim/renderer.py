@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ DEFAULT_MOUNT = CameraMount(forward_m=0.12, pitch_rad=math.radians(-20.0))
 LOWEST_EYE_M = 0.05
 """A landed vehicle's camera would touch the ground; the picture is taken from no lower than this."""
 MAX_SHADOW_SOLIDS_AT_PX = 14.0
+"""A shadow smaller than this is drawn as one outline, not one for each solid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +90,10 @@ class Renderer:
         self.world, self.camera, self.mount, self.effects = world, camera, mount, effects
         self._buffers = buffers or Buffers(camera.width, camera.height)
         self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
+        self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
+        self._radii = np.array([placed.radius_m for placed in self._placed])
+        self._shadow_middles: NDArray[np.float64] | None = None
+        self._shadow_radii: NDArray[np.float64] | None = None
         self._rng = rng or np.random.default_rng(0)
 
     def render(self, position_ned_m: Sequence[float], ned_from_body: NDArray[np.float64]) -> Rendered:
@@ -96,13 +102,13 @@ class Renderer:
         buffers, world = self._buffers, self.world
         inverse_depth = np.empty((view.height, view.width), np.float32)
         image = draw_ground(world, view, buffers, inverse_depth)
-        seen = [placed for placed in self._placed if placed.may_be_seen(view)]
         self._cast_shadows(view, image)
-        draw_sky(world.sky, world.light, view, inverse_depth, image)
         labels = np.zeros((view.height, view.width), np.int32)
+        seen = _within_view(self._placed, self._middles, self._radii, view)
         sightings = self._draw_objects(seen, view, image, inverse_depth, labels)
-        _soften_edges(image, labels, sightings)
         add_haze(world.sky, inverse_depth, buffers, image)
+        draw_sky(world.sky, world.light, view, inverse_depth, image)
+        _soften_edges(image, labels, sightings)
         if self.effects is not None:
             image = apply_effects(image, self.effects, self._rng)
         objects = [_visible(placed, sighting, number, labels, view) for placed, sighting, number in sightings]
@@ -131,9 +137,13 @@ class Renderer:
         darkness = self.world.light.shadow
         if darkness <= 0.0:
             return
+        if self._shadow_middles is None or self._shadow_radii is None:
+            spans = [(placed.shadow[0].min(axis=0), placed.shadow[0].max(axis=0)) for placed in self._placed]
+            self._shadow_middles = np.array([(low + high) / 2 for low, high in spans]).reshape(-1, 3)
+            self._shadow_radii = np.array([float(np.linalg.norm(high - low)) / 2 for low, high in spans])
         mask: Image | None = None
         left, top, right, bottom = view.width, view.height, 0, 0
-        for placed in self._placed:
+        for placed in _within_view(self._placed, self._shadow_middles, self._shadow_radii, view):
             outlines = _shadows_in_view(placed, view)
             if not outlines:
                 continue
@@ -180,26 +190,45 @@ class Renderer:
         return sightings
 
 
+def _within_view(
+    placed: list[PlacedObject], middles: NDArray[np.float64], radii: NDArray[np.float64], view: View
+) -> list[PlacedObject]:
+    """Those whose bounding sphere is not certainly outside the image."""
+    if not placed:
+        return []
+    seen = (middles - view.eye) @ view.pixel_from_ned.T
+    depth = seen[:, 2]
+    near = np.maximum(depth - radii, 1e-3)
+    reach = 2.0 * view.focal_px * radii / near
+    safe = np.maximum(depth, 1e-3)
+    across = np.abs(seen[:, 0] / safe - view.width / 2) < view.width / 2 + reach
+    along = np.abs(seen[:, 1] / safe - view.height / 2) < view.height / 2 + reach
+    kept = (depth > NEAR_M - radii) & ((depth <= 1.5 * radii) | (across & along))
+    return [placed[index] for index in np.flatnonzero(kept)]
+
+
 def _shadows_in_view(placed: PlacedObject, view: View) -> list[NDArray[np.float64]]:
     """Projected shadow outlines (K, 2), cut at the near plane; one for all where it is small anyway."""
-    outlines = placed.shadow
-    joined = np.concatenate(outlines)
-    projected = (joined - view.eye) @ view.pixel_from_ned.T
+    corners, first = placed.shadow
+    projected = (corners - view.eye) @ view.pixel_from_ned.T
     depth = projected[:, 2]
     if float(depth.max()) < NEAR_M:
         return []
-    if float(depth.min()) >= NEAR_M:
+    whole = float(depth.min()) >= NEAR_M
+    if whole:
         points = projected[:, :2] / projected[:, 2:]
         low, high = points.min(axis=0), points.max(axis=0)
         if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
             return []
         if float((high - low).max()) < MAX_SHADOW_SOLIDS_AT_PX:
             return [cv2.convexHull(points.astype(np.float32)).reshape(-1, 2).astype(np.float64)]
-        return np.split(points, np.cumsum([len(outline) for outline in outlines])[:-1])
+        return [points[start:end] for start, end in pairwise(first)]
     forward = np.array([0.0, 0.0, 1.0])
     cut: list[NDArray[np.float64]] = []
-    for piece in np.split(projected, np.cumsum([len(outline) for outline in outlines])[:-1]):
-        kept = clip_polygon(piece, forward, NEAR_M)
+    for start, end in pairwise(first):
+        piece = projected[start:end]
+        nearest = float(piece[:, 2].min())
+        kept = piece if nearest >= NEAR_M else clip_polygon(piece, forward, NEAR_M)
         if len(kept) >= 3:
             cut.append(kept[:, :2] / kept[:, 2:])
     return cut

@@ -35,8 +35,14 @@ PAINTED_TILES = 6
 BEFORE_LENS_M = 1.2
 """Nothing is put nearer to the camera than this."""
 CLASS_WEIGHTS = {
-    "person": 1.5, "bicycle": 1.0, "car": 1.5, "truck": 0.9, "boat": 0.9, "dog": 1.0, "chair": 1.0
-}  # fmt: skip
+    "person": 1.5,
+    "bicycle": 1.0,
+    "car": 1.5,
+    "truck": 0.9,
+    "boat": 0.9,
+    "dog": 1.0,
+    "chair": 1.0,
+}
 NARROW_SIDE_M = np.array([0.5, 0.5, 1.5, 2.2, 1.7, 0.4, 0.5])
 """Of each class: how wide it looks at least, from most sides. Smaller than MIN_SIDE_PX is not tried."""
 
@@ -54,7 +60,7 @@ def random_scene(
         focal_px: least and greatest focal length; by default 0.6 to 1.7 times the width.
 
     Returns:
-        The image (height, width, 3) uint8 BGR; boxes (N, 4) float32 as left, top, right, bottom edges in pixels;
+        The image (height, width, 3) uint8 BGR; boxes (N, 4) float32, left, top, right, bottom edges, pixels;
         class ids (N,) int64, indices into CLASS_NAMES. Only things of which at least a third is seen
         (MIN_VISIBLE_FRACTION) and whose box is not tiny are truth.
     """
@@ -130,7 +136,7 @@ def _random_ground(rng: np.random.Generator) -> Ground:
 def _tile_recipe(seed: int) -> tuple[tuple[str, ...], int, float]:
     rng = np.random.default_rng((seed, 31))
     names = tuple(KINDS)
-    kinds = (names[seed % len(names)],)
+    kinds: tuple[str, ...] = (names[seed % len(names)],)
     if rng.random() < 0.4:
         kinds += (names[int(rng.integers(len(names)))],)
     return kinds, (512 if rng.random() < 0.7 else 1024), float(rng.uniform(0.04, 0.12))
@@ -148,19 +154,32 @@ def _painted(seed: int) -> Ground:
         )
         for _ in range(int(rng.integers(3, 9)))
     )
-    base = (("meadow", "grass"), ("grass",), ("grass", "soil"), ("sand",), ("snow",), ("soil", "grass"))[
-        seed % 6
-    ]
+    kinds: tuple[tuple[str, ...], ...] = (
+        ("meadow", "grass"),
+        ("grass",),
+        ("grass", "soil"),
+        ("sand",),
+        ("snow",),
+        ("soil", "grass"),
+    )
     road = None if seed == 4 else float(rng.uniform(-25, 25)) or 1.0
-    return Ground(base, seed, 1024, 0.1, patches=patches, road_east_m=road, pad=seed % 2 == 0)
+    return Ground(kinds[seed % 6], seed, 1024, 0.1, patches=patches, road_east_m=road, pad=seed % 2 == 0)
 
 
 def _painted_ground(seed: int, gain: tuple[float, float, float]) -> Ground:
     base = _painted(seed)
     return Ground(
-        base.kinds, base.seed, base.tile_texels, base.texel_m, 0.0, (0.0, 0.0), base.patches, base.road_east_m,
-        base.pad, gain,
-    )  # fmt: skip
+        base.kinds,
+        base.seed,
+        base.tile_texels,
+        base.texel_m,
+        0.0,
+        (0.0, 0.0),
+        base.patches,
+        base.road_east_m,
+        base.pad,
+        gain,
+    )
 
 
 def _random_light(rng: np.random.Generator) -> Light:

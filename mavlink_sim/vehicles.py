@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mavlink_sim.solids import Body, Points, disc, inset
+from mavlink_sim.solids import Body, Points, Triple, disc, inset
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -14,8 +14,10 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def wheel(body: Body, x: float, y: float, radius: float, clear: float, sides: int = 12) -> None:
-    """A wheel on the ground. Its outer disc stands just outside the vehicle's side at y, and under the vehicle
-    (below `clear`) is the rest of the tyre, so that nothing runs into the vehicle's body.
+    """A wheel on the ground.
+
+    Its outer disc stands just outside the vehicle's side at y, and under the vehicle (below `clear`) is the
+    rest of the tyre, so that nothing runs into the vehicle's body.
     """
     side = math.copysign(1.0, y)
     body.tube((x, y, radius), (x, y + side * 0.035, radius), radius, "tyre", sides)
@@ -66,17 +68,21 @@ def car(rng: np.random.Generator) -> Body:
         return np.array([(x0, -w / 2), (x1, -w / 2), (x1, w / 2), (x0, w / 2)])
 
     left, windscreen, right, back = body.loft(
-        plan(base_rear, base_front, cabin_w), plan(roof_rear, roof_front, roof_w), belt - 0.03, height, "paint",
+        plan(base_rear, base_front, cabin_w),
+        plan(roof_rear, roof_front, roof_w),
+        belt - 0.03,
+        height,
+        "paint",
         top_slot="roof",
-    )  # fmt: skip
+    )
     steep = (height - belt) or 1.0
     body.add_decal(inset(windscreen, 0.05, 0.95, 0.08, 0.93), "glass", (steep, 0, base_front - roof_front))
     body.add_decal(inset(back, 0.07, 0.93, 0.16, 0.9), "glass", (-steep, 0, roof_rear - base_rear))
-    for side, outwards in ((left, -1.0), (right, 1.0)):
+    for flank, outwards in ((left, -1.0), (right, 1.0)):
         tilt = (cabin_w - roof_w) / 2
         edges = ((0.06, 0.47), (0.51, 0.93)) if outwards < 0 else ((0.07, 0.49), (0.53, 0.94))
         for low, high in edges:
-            body.add_decal(inset(side, low, high, 0.12, 0.88), "glass", (0, outwards * steep, tilt))
+            body.add_decal(inset(flank, low, high, 0.12, 0.88), "glass", (0, outwards * steep, tilt))
         y = outwards * (width / 2 - 0.01)
         seam = 0.25 * base_rear + 0.75 * base_front - 0.25
         for x in (seam, seam - 1.05):
@@ -106,7 +112,7 @@ def car(rng: np.random.Generator) -> Body:
             rail = side * (roof_w / 2 - 0.08)
             body.box(((roof_front + roof_rear) / 2, rail, height + 0.03), (1.5, 0.05, 0.06), "trim")
     if rng.random() < 0.25:
-        glass = plan(-0.55, 0.15, 0.9) + ((roof_front + roof_rear) / 2 + 0.1, 0)
+        glass = plan(-0.55, 0.15, 0.9) + np.array(((roof_front + roof_rear) / 2 + 0.1, 0))
         body.add_decal(np.column_stack([glass, np.full(4, height)]), "glass", (0, 0, 1))
     return body
 
@@ -126,13 +132,25 @@ def truck(rng: np.random.Generator) -> Body:
     profile = np.array([(back, 0.5), (front, 0.5), (front, 1.35), (front - 0.28, cab_top), (back, cab_top)])
     body.extrude(profile, width / 2 - 0.04, "paint", top_half_width=width / 2 - 0.14)
     half = width / 2 - 0.3
-    screen = np.array([(front - 0.01, -half, 1.42), (front - 0.01, half, 1.42),
-                       (front - 0.24, half, cab_top - 0.2), (front - 0.24, -half, cab_top - 0.2)])  # fmt: skip
+    screen = np.array(
+        [
+            (front - 0.01, -half, 1.42),
+            (front - 0.01, half, 1.42),
+            (front - 0.24, half, cab_top - 0.2),
+            (front - 0.24, -half, cab_top - 0.2),
+        ]
+    )
     body.add_decal(screen, "glass", (1.0, 0, 0.2))
     for side in (-1.0, 1.0):
         y = side * (width / 2 - 0.05)
-        window = np.array([(back + 0.55, y, 1.5), (front - 0.28, y, 1.5),
-                           (front - 0.45, y - side * 0.06, cab_top - 0.28), (back + 0.55, y - side * 0.06, cab_top - 0.28)])  # fmt: skip
+        window = np.array(
+            [
+                (back + 0.55, y, 1.5),
+                (front - 0.28, y, 1.5),
+                (front - 0.45, y - side * 0.06, cab_top - 0.28),
+                (back + 0.55, y - side * 0.06, cab_top - 0.28),
+            ]
+        )
         body.add_decal(window, "glass", (0, side, 0.06))
         body.box((front + 0.02, side * (width / 2 - 0.4), 0.78), (0.05, 0.42, 0.2), "headlight")
         body.box((front - 0.18, side * (width / 2 + 0.14), 1.85), (0.12, 0.2, 0.42), "under")
@@ -158,8 +176,11 @@ def truck(rng: np.random.Generator) -> Body:
             body.box((middle, side * (width / 2 - 0.03), deck + 0.3), (run, 0.06, 0.42), "cargo")
         for index in range(int(rng.integers(0, 4))):
             size = _between(rng, 0.7, 1.2)
-            body.box((start + 0.8 + index * 1.35, _between(rng, -0.4, 0.4), deck + 0.12 + size / 2),
-                     (size, size, size), "load")  # fmt: skip
+            body.box(
+                (start + 0.8 + index * 1.35, _between(rng, -0.4, 0.4), deck + 0.12 + size / 2),
+                (size, size, size),
+                "load",
+            )
     else:
         body.box((middle, 0, (deck + height) / 2), (run, width, height - deck), "cargo", top_slot="cargo_top")
         for side in (-1.0, 1.0):
@@ -175,8 +196,14 @@ def truck(rng: np.random.Generator) -> Body:
                     )
                     body.add_decal(fold, "under", (0, side, 0))
         for y in (-width / 4, width / 4):
-            door = np.array([(start, y - width / 4 + 0.06, deck + 0.08), (start, y + width / 4 - 0.06, deck + 0.08),
-                             (start, y + width / 4 - 0.06, height - 0.1), (start, y - width / 4 + 0.06, height - 0.1)])  # fmt: skip
+            door = np.array(
+                [
+                    (start, y - width / 4 + 0.06, deck + 0.08),
+                    (start, y + width / 4 - 0.06, deck + 0.08),
+                    (start, y + width / 4 - 0.06, height - 0.1),
+                    (start, y - width / 4 + 0.06, height - 0.1),
+                ]
+            )
             body.add_decal(door, "cargo_end", (-1, 0, 0))
 
     radius = 0.48
@@ -213,8 +240,11 @@ def bicycle(rng: np.random.Generator) -> Body:
     body.loft(
         np.array([(-0.14, -0.08), (0.14, -0.025), (0.14, 0.025), (-0.14, 0.08)]),
         np.array([(-0.14, -0.08), (0.14, -0.025), (0.14, 0.025), (-0.14, 0.08)]),
-        0.95, 1.0, "tyre", offset=(seat_top[0] - 0.05, 0.0),
-    )  # fmt: skip
+        0.95,
+        1.0,
+        "tyre",
+        offset=(seat_top[0] - 0.05, 0.0),
+    )
     bar = (head_high[0] - 0.03, 0.0, 1.0)
     reach = _between(rng, 0.26, 0.31)
     for side in (-1.0, 1.0):
@@ -243,9 +273,15 @@ def _spoked_wheel(body: Body, x: float, radius: float, sides: int = 14) -> None:
         j = (i + 1) % sides
         a, b = hub + rim[i] * radius, hub + rim[j] * radius
         c, d = hub + rim[j] * inner, hub + rim[i] * inner
-        body.add_solid([np.array([a, b, c, d]) - across, np.array([a, b, c, d]) + across,
-                        np.array([a - across, b - across, b + across, a + across]),
-                        np.array([c - across, d - across, d + across, c + across])], "tyre")  # fmt: skip
+        body.add_solid(
+            [
+                np.array([a, b, c, d]) - across,
+                np.array([a, b, c, d]) + across,
+                np.array([a - across, b - across, b + across, a + across]),
+                np.array([c - across, d - across, d + across, c + across]),
+            ],
+            "tyre",
+        )
     for angle in np.arange(4) * math.pi / 4 + 0.3:
         ray = np.array([math.cos(angle), 0.0, math.sin(angle)])
         turn = np.array([-ray[2], 0.0, ray[0]]) * 0.004
@@ -256,7 +292,8 @@ def _spoked_wheel(body: Body, x: float, radius: float, sides: int = 14) -> None:
             hub - ray * inner + turn,
         ]
         body.add_sheet(np.array(spoke), "hub")
-    body.tube(hub - (0, 0.045, 0), hub + (0, 0.045, 0), 0.03, "trim", 5)
+    axle = np.array((0.0, 0.045, 0.0))
+    body.tube(hub - axle, hub + axle, 0.03, "trim", 5)
 
 
 def boat(rng: np.random.Generator) -> Body:
@@ -266,8 +303,19 @@ def boat(rng: np.random.Generator) -> Body:
     if style == "open":
         length, width = length * 0.8, width * 0.8
     high = _between(rng, 0.72, 0.95) if style != "open" else _between(rng, 0.5, 0.62)
-    outline = np.array([(-0.5, -0.40), (-0.2, -0.49), (0.15, -0.46), (0.36, -0.27), (0.5, 0.0),
-                        (0.36, 0.27), (0.15, 0.46), (-0.2, 0.49), (-0.5, 0.40)])  # fmt: skip
+    outline = np.array(
+        [
+            (-0.5, -0.40),
+            (-0.2, -0.49),
+            (0.15, -0.46),
+            (0.36, -0.27),
+            (0.5, 0.0),
+            (0.36, 0.27),
+            (0.15, 0.46),
+            (-0.2, 0.49),
+            (-0.5, 0.40),
+        ]
+    )
     deck = outline * (length, width)
     keel = outline * (length * 0.86, width * 0.5) + (-length * 0.04, 0)
     waist = outline * (length * 0.965, width * 0.9) + (-length * 0.008, 0)
@@ -291,16 +339,17 @@ def boat(rng: np.random.Generator) -> Body:
         roof = np.array([(-0.15, -0.28), (0.07, -0.25), (0.07, 0.25), (-0.15, 0.28)]) * (length, width)
         top = high + _between(rng, 0.7, 0.95)
         sides = body.loft(cabin, roof, high, top, "cabin", top_slot="cabin_top")
-        for side, outwards in zip(sides, ((0, -1, 0.1), (1, 0, 0.9), (0, 1, 0.1), (-1, 0, 0)), strict=True):
-            body.add_decal(inset(side, 0.08, 0.92, 0.3, 0.86), "glass", outwards)
+        looks: list[Triple] = [(0, -1, 0.1), (1, 0, 0.9), (0, 1, 0.1), (-1, 0, 0)]
+        for wall, look in zip(sides, looks, strict=True):
+            body.add_decal(inset(wall, 0.08, 0.92, 0.3, 0.86), "glass", look)
         body.box((-0.3 * length, 0, high + 0.2), (0.4, width * 0.6, 0.35), "seat")
         body.box((-length / 2 - 0.12, 0, high * 0.8), (0.36, 0.38, 0.75), "motor")
         body.tube((0.3 * length, 0, high), (0.46 * length, 0, high + 0.35), 0.02, "trim", 4)
     else:
         cabin = np.array([(-0.12, -0.26), (0.22, -0.16), (0.22, 0.16), (-0.12, 0.26)]) * (length, width)
         sides = body.loft(cabin, cabin * 0.88, high, high + 0.42, "cabin", top_slot="cabin_top")
-        for side, outwards in ((sides[0], (0.1, -1, 0.1)), (sides[2], (0.1, 1, 0.1))):
-            body.add_decal(inset(side, 0.15, 0.85, 0.3, 0.75), "glass", outwards)
+        for wall, across in ((sides[0], -1.0), (sides[2], 1.0)):
+            body.add_decal(inset(wall, 0.15, 0.85, 0.3, 0.75), "glass", (0.1, across, 0.1))
         mast, tall = 0.12 * length, high + _between(rng, 4.2, 5.4)
         body.tube((mast, 0, high), (mast, 0, tall), 0.055, "trim", 5)
         boom_end = (-0.38 * length, 0.0, high + 0.75)

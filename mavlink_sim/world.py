@@ -219,6 +219,8 @@ def demo_world(seed: int = 0) -> World:
                     continue
             if not _clear_of(placed, north, east, radius_m, 1.5):
                 continue
+            if any(math.hypot(north - p.north_m, east - p.east_m) < p.radius_m + radius_m for p in patches):
+                continue
             if class_name != "car" and _hides(cars, north, east, radius_m):
                 continue
             item = WorldObject(len(placed), class_name, (north, east, 0.0), yaw, 1.0, appearance)

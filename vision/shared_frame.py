@@ -1,8 +1,8 @@
 """Frames between two processes of one host through shared memory: a ring of slots, the newest frame wins.
 
-A segment is a file in /dev/shm, mapped by both sides. The writer makes it under another name and then moves it
-into place, so a reader sees either none or a whole one. The writer holds a lock (`flock`) on it for life: the
-kernel frees that when the writer dies, however it dies, and the next writer of the name may take its place.
+A segment is a file in /dev/shm, mapped by both sides. The writer makes it under another name and then moves
+it into place, so a reader sees either none or a whole one. The writer holds a lock (`flock`) on it for life:
+the kernel frees that when the writer dies, however it dies, and the next writer of the name takes its place.
 Readers notice that by the file's identity and map the new one. (`multiprocessing.shared_memory` is not used:
 its resource tracker on Python 3.11 removes a segment when any reader exits.)
 
@@ -20,9 +20,10 @@ Layout, in 64-bit words of the host's byte order; the slots begin at the second 
 | 9 | 1 when the writer has closed | |
 | 10 | the writer's process number | |
 
-A slot's image starts 64 bytes into it, its depth after the image, at a multiple of 64. The slot's lock is a sequence lock
-(Lameter 2005, "Effective synchronization on Linux/NUMA systems"): a reader copies and then looks whether it
-has changed. With several slots it changes only for a reader that is more than `slots - 1` frames late.
+A slot's image starts 64 bytes into it, its depth after the image, at a multiple of 64. The slot's lock is a
+sequence lock (Lameter 2005, "Effective synchronization on Linux/NUMA systems"): a reader copies and then
+looks whether it has changed. With several slots it changes only for a reader more than `slots - 1` frames
+late.
 """
 
 from __future__ import annotations
