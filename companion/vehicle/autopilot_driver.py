@@ -145,7 +145,11 @@ class AutopilotDriver(ABC):
             raise LinkError(f"{self.url}: this driver is connected already")
         self._reset()
         deadline = time.monotonic() + timeout_s
-        self._link = await open_link(self.url, self._received)
+        try:
+            async with asyncio.timeout(timeout_s):
+                self._link = await open_link(self.url, self._received)
+        except TimeoutError as error:
+            raise LinkError(f"{self.url}: no answer to opening it within {timeout_s:g} s") from error
         try:
             await self._first_heartbeat(timeout_s)
             if self._autopilot_kind != _AUTOPILOT_PX4:

@@ -66,7 +66,8 @@ async def _resolve(url: LinkUrl, kind: socket.SocketKind) -> tuple[int, Any]:
         found = await asyncio.get_running_loop().getaddrinfo(*url.address, type=kind)
     except OSError as error:
         raise LinkError(f"{url}: the host cannot be resolved: {error.strerror or error}") from error
-    family, _, _, _, address = found[0]
+    # Autopilots and simulators listen on IPv4; "localhost" may name both.
+    family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return family, address
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pymavlink.dialects.v20 import common as mavlink
 
 MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
+_MAGICS = (MAGIC_V1, MAGIC_V2)
 _HEADER_V1, _HEADER_V2, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
 _FLAG_SIGNED = 0x01
 
@@ -65,7 +66,9 @@ class Framer:
                     break
                 length = 0
             frame = _read_frame(buffer[position : position + length]) if length else None
-            if frame is None:
+            # Without a checksum to go by, noise that looks like a header must not swallow what follows it.
+            following = buffer[position + length : position + length + 1]
+            if frame is None or not (frame.checked or not following or following[0] in _MAGICS):
                 self.skipped_bytes += 1
                 position += 1
                 continue
@@ -100,7 +103,7 @@ def frames_of(data: bytes) -> Iterator[Frame]:
 def _frame_length(buffer: bytes, position: int) -> int | None:
     """Length of the frame that starts here; 0: none starts here; None: not enough bytes yet."""
     magic = buffer[position]
-    if magic not in (MAGIC_V1, MAGIC_V2):
+    if magic not in _MAGICS:
         return 0
     if len(buffer) - position < 3:
         return None

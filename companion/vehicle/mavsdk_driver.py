@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -29,6 +30,7 @@ from mavsdk.plugins.param import Param, ParamError, ParamResult
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, LinkError
 from companion.vehicle.framing import Frame, frames_of, with_sequence
+from companion.vehicle.setpoint import DEFAULT_LIFETIME_S
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES
 
 logger = logging.getLogger(__name__)
@@ -36,6 +38,8 @@ _library_logger = logging.getLogger("mavsdk")
 
 _T = TypeVar("_T")
 _SUBSCRIBED = sorted(FOLDED_MESSAGES - {"HEARTBEAT"} | {"COMMAND_ACK"})
+# After a hang of the loop: neither a setpoint nor a repeated command may arrive late.
+_STALE_NS = round(DEFAULT_LIFETIME_S * 1e9)
 _PARAM_REASONS = {
     ParamResult.DOES_NOT_EXIST: "there is no such parameter",
     ParamResult.TIMEOUT: "the vehicle does not answer: no such parameter, or the link is down",
@@ -93,9 +97,12 @@ class MavsdkDriver(AutopilotDriver):
             logger.debug("%s: dropped a call of MAVSDK after the loop had closed", self.url)
 
     def _library_sends(self, data: bytes) -> None:
-        self._hop(self._transmit_for_library, data)
+        self._hop(self._transmit_for_library, data, time.monotonic_ns())
 
-    def _transmit_for_library(self, data: bytes) -> None:
+    def _transmit_for_library(self, data: bytes, handed_over_ns: int) -> None:
+        if time.monotonic_ns() - handed_over_ns > _STALE_NS:
+            logger.warning("%s: the loop hung; what MAVSDK wanted to send meanwhile is dropped", self.url)
+            return
         for frame in frames_of(data):
             # Renumbered without the dropped ones, so that the vehicle does not count them as lost.
             if frame.message_id != HEARTBEAT_ID:

@@ -11,14 +11,14 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import Driver
-from companion.vehicle.framing import Framer, frames_of
+from companion.vehicle.framing import frames_of
 from companion.vehicle.state import VehicleState
 
 HOLD, OFFBOARD, MISSION = 0x03040000, 0x00060000, 0x04040000
 
 
 class FakeAutopilot:
-    """Speaks first to `port` on loopback, as PX4's onboard link does. Answers through `answers`.
+    """Speaks to `port` on loopback, as PX4's onboard link does, and to whoever spoke to it.
 
     Attributes:
         heard: (decoded message, raw frame) in the order of arrival.
@@ -35,7 +35,6 @@ class FakeAutopilot:
         self.beating = True
         self._port = port
         self._codec = mavlink.MAVLink(None, system_id, component_id)
-        self._framer = Framer()
         self._task: asyncio.Task[None] | None = None
         self.open()
 
@@ -70,9 +69,10 @@ class FakeAutopilot:
         """Take in what has come, now."""
         while True:
             try:
-                data = self.socket.recv(2048)
+                data, source = self.socket.recvfrom(2048)
             except BlockingIOError:
                 return
+            self._port = source[1]
             for frame in frames_of(data):
                 message = self._codec.decode(bytearray(frame.raw))
                 self.heard.append((message, frame.raw))
