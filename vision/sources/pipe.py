@@ -48,6 +48,7 @@ class PipeFeed(Feed):
         self._head = b""
         self._ready: deque[tuple[NDArray[np.uint8], int]] = deque()
         self._delivered = 0
+        self._heard = False
         with contextlib.suppress(OSError):  # not a pipe, or above the user's limit: the default size does
             fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
@@ -55,6 +56,7 @@ class PipeFeed(Feed):
         deadline_s = time.monotonic() + timeout_s
         while not self._ready:
             if not self._poll.poll(max(deadline_s - time.monotonic(), 0.0) * 1000.0):
+                self._look_for_a_quiet_end()
                 return None
             data = os.read(self._descriptor, _PIPE_BYTES)
             if not data:
@@ -66,8 +68,18 @@ class PipeFeed(Feed):
         self._delivered += 1
         return Picture(image, None if self._is_file else captured_ns, media_s=media_s)
 
+    def _look_for_a_quiet_end(self) -> None:
+        # A writer of a FIFO that had gone before we opened raises no POLLHUP; a read tells that it has gone.
+        if self._heard and not os.get_blocking(self._descriptor):
+            with contextlib.suppress(BlockingIOError):
+                data = os.read(self._descriptor, _PIPE_BYTES)
+                if not data:
+                    self._end()
+                self._take(data)
+
     def _take(self, data: bytes) -> None:
         captured_ns = time.monotonic_ns()
+        self._heard = True
         if self._parser is None:
             self._head += data
             if len(self._head) < len(MAGIC):
