@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.geography import geographic, local
-from mavlink_sim.messages import dialect
+from mavlink_sim.messages import dialect, protocol_version
 from mavlink_sim.modes import CUSTOM_MODE_ENABLED, mode_of
 from mavlink_sim.telemetry import MESSAGE_IDS
 
@@ -158,6 +158,11 @@ def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int
     return ACCEPTED
 
 
+def _request_protocol_version(vehicle: Vehicle, link: Link, command: Command) -> int:
+    link.send(protocol_version())
+    return ACCEPTED
+
+
 def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     interval = command.parameters[1]
@@ -195,7 +200,7 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     GET_MESSAGE_INTERVAL: _get_message_interval,
     SET_MESSAGE_INTERVAL: _set_message_interval,
     REQUEST_MESSAGE: _request_message,
-    519: _accept,  # REQUEST_PROTOCOL_VERSION: PX4 answers with a message no client decodes any more
+    519: _request_protocol_version,  # REQUEST_PROTOCOL_VERSION
     520: _request_capabilities,  # REQUEST_AUTOPILOT_CAPABILITIES
 }
 

@@ -22,12 +22,14 @@ __all__ = [
     "event",
     "link_node_status",
     "parser",
+    "protocol_version",
     "time_estimate_to_target",
 ]
 
 _NODE_STATUS = struct.Struct("<QIIIIIHHHBB")
 _TIME_ESTIMATE = struct.Struct("<5i")
 _EVENT = struct.Struct("<IIHBBB40s")
+_PROTOCOL_VERSION = struct.Struct("<HHH8s8s")
 _EVENT_SEQUENCE = struct.Struct("<HB")
 
 
@@ -110,6 +112,19 @@ def current_event_sequence(sequence: int) -> Any:
     """CURRENT_EVENT_SEQUENCE (411): the newest event's number."""
     return _PackedMessage(
         411, "CURRENT_EVENT_SEQUENCE", 106, _EVENT_SEQUENCE.pack(sequence, 0), sequence=sequence, flags=0
+    )
+
+
+def protocol_version() -> Any:
+    """PROTOCOL_VERSION (300): MAVLink 2, 1 understood."""
+    return _PackedMessage(
+        300,
+        "PROTOCOL_VERSION",
+        217,
+        _PROTOCOL_VERSION.pack(200, 100, 200, b"", b""),
+        version=200,
+        min_version=100,
+        max_version=200,
     )
 
 

@@ -14,18 +14,24 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
 from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.vehicle import STEP_S, Vehicle
+from vision.shared_frame import segment_path
+
+if TYPE_CHECKING:
+    from mavlink_sim.camera_process import CameraProcess
+    from mavlink_sim.physics import Vector
+    from mavlink_sim.world import World
 
 logger = logging.getLogger(__name__)
 
 TRUTH_RATE_HZ = 20.0
 # After a stall longer than this the simulation does not race to catch up, it lets the time go.
 MAX_BACKLOG_S = 0.25
-CAMERA_STARTUP_S = 60.0
+CAMERA_CHECK_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -80,8 +86,11 @@ class Simulation:
         self._simulated_s = 0.0
         self._next_truth_s = 0.0
         self._next_frame_s = 0.0
-        self._camera: Any = None
-        self._world: Any = None
+        self._on_event = on_event
+        self._camera: CameraProcess | None = None
+        self._camera_seen = False
+        self._next_camera_check_s = 0.0
+        self._world: World | None = None
         self._truth: IO[str] | None = None
         self._resources = ExitStack()
         try:
@@ -115,10 +124,10 @@ class Simulation:
         if self.options.camera is None:
             return
         from mavlink_sim.camera_process import CameraProcess
-        from mavlink_sim.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
 
+        segment_path(self.options.camera)  # raises for a name that cannot be
         self._camera = CameraProcess(
-            self._world, DEFAULT_CAMERA, DEFAULT_MOUNT, self.options.camera_rate_hz, self.options.camera
+            self._world, rate_hz=self.options.camera_rate_hz, shared_name=self.options.camera
         )
         self._resources.callback(self._camera.stop)
         self._camera.start()
@@ -182,18 +191,27 @@ class Simulation:
 
     def _show(self) -> None:
         """The pose to the camera and the truth to its file, each at its rate."""
-        if self._camera is not None and self._simulated_s >= self._next_frame_s:
-            self._next_frame_s = max(
-                self._next_frame_s + 1.0 / self.options.camera_rate_hz,
-                self._simulated_s,
-            )
-            self._camera.send_pose(
-                self.vehicle.airframe.position, self.vehicle.quaternion, time.monotonic_ns()
-            )
+        camera = self._camera
+        if camera is not None and self._simulated_s >= self._next_frame_s:
+            period_s = self.options.speed / self.options.camera_rate_hz  # the rate is one of real time
+            self._next_frame_s = max(self._next_frame_s + period_s, self._simulated_s)
+            camera.send_pose(self.vehicle.airframe.position, self.vehicle.quaternion, time.monotonic_ns())
+            if self._simulated_s >= self._next_camera_check_s:
+                self._next_camera_check_s = self._simulated_s + CAMERA_CHECK_S
+                self._check_camera(camera)
         if self._truth is not None and self._simulated_s >= self._next_truth_s:
             self._next_truth_s += 1.0 / TRUTH_RATE_HZ
             self._truth.write(json.dumps(self.truth()) + "\n")
             self._truth.flush()
+
+    def _check_camera(self, camera: CameraProcess) -> None:
+        """Say when the camera begins and when it is lost; the vehicle flies on without it."""
+        if not camera.alive:
+            self._camera = None
+            self._on_event(f"camera {camera.shared_name} is lost: its process ended")
+        elif not self._camera_seen and segment_path(camera.shared_name).exists():
+            self._camera_seen = True
+            self._on_event(f"camera {camera.shared_name} is on")
 
     def truth(self) -> dict[str, Any]:
         """What is really so now: pose, mode, and the range to every object of the world."""
@@ -206,18 +224,19 @@ class Simulation:
             "mode": autopilot.mode.name,
             "armed": autopilot.armed,
             "landed": autopilot.landed,
-            "objects": [] if self._world is None else self._object_truth(),
+            "objects": [] if self._world is None else _object_truth(self._world, airframe.position),
         }
 
-    def _object_truth(self) -> list[dict[str, Any]]:
-        from mavlink_sim.world import range_to
 
-        return [
-            {
-                "identifier": thing.identifier,
-                "class_name": thing.class_name,
-                "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
-                "range_m": round(float(range_to(thing, self.vehicle.airframe.position)), 3),
-            }
-            for thing in self._world.objects
-        ]
+def _object_truth(world: World, position_ned_m: Vector) -> list[dict[str, Any]]:
+    from mavlink_sim.world import range_to
+
+    return [
+        {
+            "identifier": thing.identifier,
+            "class_name": thing.class_name,
+            "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
+            "range_m": round(float(range_to(thing, position_ned_m)), 3),
+        }
+        for thing in world.objects
+    ]

@@ -49,6 +49,13 @@ def test_command_zero_is_not_answered(cockpit: Any) -> None:
     assert cockpit.command(0) == []
 
 
+def test_the_protocol_version_is_sent_on_request(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(519, 1) == [0]
+    version = cockpit.received("PROTOCOL_VERSION")[0]
+    assert (version.version, version.min_version, version.max_version) == (200, 100, 200)
+
+
 def test_another_system_id_is_answered_under_it(make_cockpit: Any) -> None:
     cockpit = make_cockpit(system_id=7)
     cockpit.fly(0.1)

@@ -1,6 +1,7 @@
 """`mavlink-sim` as a process: its options, its ports, its words, its end."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -11,9 +12,11 @@ from pathlib import Path
 import pytest
 from pymavlink import mavutil
 
+from mavlink_sim.cli import main
 from mavlink_sim.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.messages import Outgoing, dialect, parser
 from mavlink_sim.testing import free_udp_ports, running_simulator
+from vision.shared_frame import SharedFrameReader
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -33,25 +36,39 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--speed", "nan"], ["--speed", "0.05 to 20"]),
         (["--speed", "fast"], ["--speed", "valid number"]),
         (["--bogus"], ["--bogus"]),
+        (["--camera", "a/b"], ["'a/b'"]),
         (["--wind", "-3"], ["--wind", "0 to 20"]),
         (["--onboard-port", "0"], ["--onboard-port", "1 to 65535"]),
         (["--gcs-bind", "70000"], ["--gcs-bind", "0 to 65535"]),
         (["--system-id", "256"], ["--system-id", "1 to 255"]),
         (["--host", "not.a.host.invalid"], ["not.a.host.invalid"]),
         (["--truth", "/nonexistent/folder/truth.jsonl"], ["truth.jsonl"]),
-        (["--ready-file", "/nonexistent/folder/ready"], ["ready"]),
     ],
     ids=lambda value: "_".join(value) if isinstance(value, list) else str(value),
 )
-def test_a_bad_value_gives_one_clear_line_and_code_two(arguments: list[str], words: list[str]) -> None:
-    finished = run("--onboard-bind", "0", "--gcs-bind", "0", *arguments)
-    assert finished.returncode == 2
-    lines = finished.stderr.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("mavlink-sim: ")
+def test_a_bad_value_gives_one_clear_line_and_code_two(
+    arguments: list[str],
+    words: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", "--onboard-bind", "0", "--gcs-bind", "0", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.strip().splitlines()
+    assert line.startswith("mavlink-sim: ")
     for word in words:
-        assert word in lines[0]
-    assert finished.stdout == ""
+        assert word in line
+
+
+def test_a_ready_file_that_cannot_be_written_gives_one_clear_line_and_code_two() -> None:
+    finished = run("--onboard-bind", "0", "--gcs-bind", "0", "--ready-file", "/nonexistent/folder/ready")
+    assert finished.returncode == 2
+    assert len(finished.stderr.strip().splitlines()) == 1
+    assert "--ready-file" in finished.stderr
 
 
 def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
@@ -110,7 +127,6 @@ def test_the_clock_runs_as_fast_as_asked() -> None:
 
 def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
     truth = tmp_path / "truth.jsonl"
-    pytest.importorskip("mavlink_sim.world")
     with running_simulator(truth=truth, speed=4.0) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < 3000:
@@ -134,6 +150,34 @@ def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
     assert last["objects"]
     assert set(last["objects"][0]) == {"identifier", "class_name", "position_ned_m", "range_m"}
     assert 0 <= time.monotonic_ns() - last["stamp_ns"] < 60e9
+
+
+def camera_process(pid: int) -> int:
+    """The process that draws for a simulator."""
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+            return int(child)
+    raise AssertionError("the simulator has no camera process")
+
+
+def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tmp_path: Path) -> None:
+    name = f"camera-{tmp_path.parent.name}-{tmp_path.name}-{os.getpid()}"
+    with running_simulator(camera=name, camera_rate=10.0) as simulator:
+        simulator.wait_for_event(f"camera {name} is on", 60.0)
+        with SharedFrameReader(name) as reader:
+            frame = reader.latest()
+            deadline = time.monotonic() + 20.0
+            while frame is None and time.monotonic() < deadline:
+                frame = reader.latest()
+        assert frame is not None
+        assert frame.image.shape == (480, 640, 3)
+        assert frame.image.std() > 5.0  # a picture, not a blank
+        assert 0 <= time.monotonic_ns() - frame.captured_ns < 60e9
+        os.kill(camera_process(simulator.pid), signal.SIGKILL)
+        simulator.wait_for_event(f"camera {name} is lost", 20.0)
+        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
+        assert link.wait_heartbeat(timeout=20) is not None
+        link.close()
 
 
 # ---- the endpoint itself
