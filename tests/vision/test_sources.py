@@ -1,0 +1,254 @@
+"""Files, folders and images: every frame in order, and what is said about those that cannot be opened."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
+from vision.sources.images import natural_key
+from vision.sources.source import SourceStatistics
+
+DATA = Path(
+    os.environ.get("COMPANION_TEST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
+)
+
+
+def write_image(path: Path, value: int, width: int = 32, height: int = 24) -> None:
+    assert cv2.imwrite(str(path), np.full((height, width, 3), value, np.uint8))
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """20 frames at 50 Hz, each of its own grey; MJPEG in AVI, whose frames stand alone."""
+    path = tmp_path_factory.mktemp("film") / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 50.0, (64, 48))
+    for index in range(20):
+        writer.write(np.full((48, 64, 3), index * 10, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_video_gives_every_frame_in_order_with_rising_stamps(film: Path) -> None:
+    with open_source(str(film)) as source:
+        assert not source.live
+        assert source.total_frames == 20
+        frames = list(source)
+        assert source.statistics == SourceStatistics(delivered=20)
+        with pytest.raises(EndOfStream):
+            source.read()
+    assert [round(float(frame.image.mean()) / 10) for frame in frames] == list(range(20))
+    assert [frame.sequence for frame in frames] == list(range(20))
+    stamps = [frame.captured_ns for frame in frames]
+    assert stamps == sorted(stamps)
+    assert stamps[-1] <= time.monotonic_ns()
+
+
+def test_a_file_address_is_a_file(film: Path) -> None:
+    with open_source(f"file://{film}") as source:
+        assert len(list(source)) == 20
+
+
+def test_a_video_in_a_loop_goes_on_after_its_end(film: Path) -> None:
+    with open_source(str(film), SourceSettings(loop=True)) as source:
+        frames = [source.read() for _ in range(45)]
+    assert [frame.sequence for frame in frames if frame] == list(range(45))
+    assert frames[44] is not None
+    assert round(float(frames[44].image.mean()) / 10) == 4
+
+
+def test_a_video_in_real_time_keeps_its_own_pace_and_ends(film: Path) -> None:
+    began_s = time.monotonic()
+    with open_source(str(film), SourceSettings(realtime=True)) as source:
+        assert source.live
+        frames = list(source)
+        statistics = source.statistics
+    # Twenty frames at 50 Hz: the last is due 0.38 s after the first, on however slow a machine.
+    assert time.monotonic() - began_s >= 0.37
+    assert frames[-1].sequence == 19
+    assert statistics.delivered + statistics.dropped == 20
+    assert (
+        frames[-1].captured_ns - frames[0].captured_ns >= (frames[-1].sequence - frames[0].sequence - 1) * 2e7
+    )
+
+
+def test_a_slow_reader_of_a_video_in_real_time_gets_the_newest_and_the_rest_are_counted(film: Path) -> None:
+    with open_source(str(film), SourceSettings(realtime=True, loop=True)) as source:
+        first = source.read()
+        assert first is not None
+        deadline_s = time.monotonic() + 20
+        while source.statistics.dropped < 8 and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        second = source.read()
+        assert second is not None
+        statistics = source.statistics
+        assert second.sequence - first.sequence >= 8
+        assert statistics.delivered + statistics.dropped >= second.sequence + 1
+
+
+def test_after_close_there_are_no_frames(film: Path) -> None:
+    for settings in (SourceSettings(), SourceSettings(realtime=True)):
+        source = open_source(str(film), settings)
+        source.close()
+        source.close()
+        with pytest.raises(EndOfStream):
+            source.read()
+
+
+def test_a_video_cut_short_gives_what_is_there_and_says_so(
+    film: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = film.read_bytes()
+    short = tmp_path / "short.avi"
+    pictures = data.index(b"movi")
+    short.write_bytes(data[: (pictures + len(data)) // 2])
+    with open_source(str(short)) as source:
+        frames = list(source)
+    assert 0 < len(frames) < 20
+    assert f"short.avi: ended after {len(frames)} frames: the file promises 20" in caplog.text
+
+
+def test_a_folder_gives_its_images_in_natural_order_of_any_size(tmp_path: Path) -> None:
+    for index in (10, 2, 1):
+        write_image(tmp_path / f"image{index}.png", index * 20, width=16 + index)
+    (tmp_path / "image1.txt").write_text("a label, no image")
+    (tmp_path / "folder.png").mkdir()
+    with open_source(str(tmp_path)) as source:
+        assert source.total_frames == 3
+        frames = list(source)
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [20, 40, 200]
+    assert [frame.width for frame in frames] == [17, 18, 26]
+
+
+def test_an_unreadable_image_is_named_counted_and_leaves_a_gap(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_image(tmp_path / "a.png", 10)
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:40])
+    (tmp_path / "c.jpg").write_bytes(b"")
+    write_image(tmp_path / "d.png", 30)
+    with open_source(str(tmp_path)) as source:
+        frames = list(source)
+        assert source.statistics == SourceStatistics(delivered=2, unreadable=2)
+    assert [frame.sequence for frame in frames] == [0, 3]
+    assert "b.png: passed over" in caplog.text
+    assert "c.jpg: passed over" in caplog.text
+
+
+def test_names_sort_as_people_count() -> None:
+    names = ["b2.png", "B10.png", "b1.png", "10.png", "9.png", "a.png", "01.png"]
+    ordered = sorted((Path(name) for name in names), key=natural_key)
+    assert [path.name for path in ordered] == [
+        "01.png",
+        "9.png",
+        "10.png",
+        "a.png",
+        "b1.png",
+        "b2.png",
+        "B10.png",
+    ]
+
+
+def test_one_image_is_one_frame_and_grey_or_transparent_ones_become_colour(tmp_path: Path) -> None:
+    for name, shape in (("grey.png", (8, 9)), ("alpha.png", (8, 9, 4)), ("deep.png", (8, 9))):
+        kind = np.uint16 if name == "deep.png" else np.uint8
+        cv2.imwrite(str(tmp_path / name), np.full(shape, 200 if kind is np.uint8 else 51200, kind))
+        with open_source(str(tmp_path / name)) as source:
+            (frame,) = list(source)
+        assert frame.image.shape == (8, 9, 3)
+        assert frame.image.flags.c_contiguous
+        assert int(frame.image[0, 0, 0]) == 200
+
+
+def test_a_raw_file_is_read_with_the_format_and_size_given(tmp_path: Path) -> None:
+    path = tmp_path / "film.rgb"
+    path.write_bytes(bytes([1, 2, 3]) * 12 * 2)
+    with open_source(str(path), SourceSettings(width=4, height=3, pixel_format="rgb24")) as source:
+        frames = list(source)
+    assert len(frames) == 2
+    assert frames[0].image[0, 0].tolist() == [3, 2, 1]
+
+
+def missing_file(path: Path) -> str:
+    (path / "bikes.mp4").write_bytes(b"")
+    return str(path / "bike.mp4")
+
+
+def empty_file(path: Path) -> str:
+    (path / "empty.mp4").write_bytes(b"")
+    return str(path / "empty.mp4")
+
+
+def text_file(path: Path) -> str:
+    (path / "text.mp4").write_text("no video " * 100)
+    return str(path / "text.mp4")
+
+
+def empty_folder(path: Path) -> str:
+    return str(path)
+
+
+def broken_images(path: Path) -> str:
+    (path / "a.png").write_text("not an image")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        pytest.param(
+            missing_file, r"bike\.mp4: no such file.*did you mean .*bikes\.mp4", id="missing, with a hint"
+        ),
+        pytest.param(
+            lambda path: str(path / "no/where.mp4"), "the folder .* does not exist either", id="no folder"
+        ),
+        pytest.param(empty_file, "the file is empty", id="empty"),
+        pytest.param(text_file, r"text\.mp4: no video that FFmpeg can read", id="not a video"),
+        pytest.param(empty_folder, "no images in this folder", id="folder without images"),
+        pytest.param(broken_images, "none of the 1 images could be read", id="only broken images"),
+        pytest.param(lambda path: "gopher://x/y", "have no gopher://", id="unknown scheme"),
+        pytest.param(lambda path: "udp://127.0.0.1", "with a port from 1 to 65535", id="no port"),
+        pytest.param(
+            lambda path: "udp://127.0.0.1:1?format=vp9", "format must be mpegts, rtp-h264", id="RTP format"
+        ),
+        pytest.param(lambda path: "shm://a/b", "plain file name", id="shared memory's name"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_clear_line(
+    tmp_path: Path, make: object, words: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    uri = make(tmp_path)  # type: ignore[operator]
+    with pytest.raises(SourceError, match=words) as caught:
+        open_source(uri)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg adds its own
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"width": 0}, "width must be 1..32768"),
+        ({"rate_hz": 0.0}, "rate_hz must be above 0"),
+        ({"rate_hz": float("nan")}, "rate_hz must be above 0"),
+        ({"open_timeout_s": 0.0}, "open_timeout_s must be above 0"),
+        ({"retry_min_s": 5.0, "retry_max_s": 1.0}, "retry_max_s must be from retry_min_s"),
+        ({"pixel_format": "yuv"}, "pixel_format must be a camera's four letters"),
+    ],
+)
+def test_settings_out_of_range_name_themselves(values: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        SourceSettings(**values)  # type: ignore[arg-type]
+
+
+def test_a_real_street_is_read_whole() -> None:
+    path = DATA / "video" / "bikes.mp4"
+    if not path.exists():
+        pytest.skip(f"{path} is not there: test data that is not part of the product")
+    with open_source(str(path)) as source:
+        frames = sum(1 for _ in source)
+        assert frames == source.total_frames == 250

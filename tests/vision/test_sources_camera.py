@@ -1,0 +1,172 @@
+"""A V4L2 camera, with a stand-in for `cv2.VideoCapture`, the lowest layer: no camera is needed."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.sources import SourceError, SourceSettings, open_source
+from vision.sources.camera import camera_device, fourcc_text
+
+
+class FakeCamera:
+    """A driver that gives 640x480 YUYV at 30 Hz whatever is asked, but takes MJPG."""
+
+    opened: list[FakeCamera] = []  # noqa: RUF012 - a record across instances, emptied by the fixture
+    frames_before_unplugged = 1 << 30
+    stamp_ms = -1.0
+
+    def __init__(self, device: str, backend: int) -> None:
+        assert backend == cv2.CAP_V4L2
+        self.device = device
+        self.asked: list[tuple[int, float]] = []
+        self.values = {
+            cv2.CAP_PROP_FRAME_WIDTH: 640.0,
+            cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
+            cv2.CAP_PROP_FPS: 30.0,
+            cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
+        }
+        self.reads = 0
+        self.released = False
+        FakeCamera.opened.append(self)
+
+    def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+        return True
+
+    def set(self, name: int, value: float) -> bool:
+        self.asked.append((name, value))
+        if name == cv2.CAP_PROP_FOURCC:
+            self.values[name] = value
+        return True
+
+    def get(self, name: int) -> float:
+        return self.stamp_ms if name == cv2.CAP_PROP_POS_MSEC else self.values[name]
+
+    def read(self) -> tuple[bool, Any]:
+        time.sleep(0.005)
+        self.reads += 1
+        if self is FakeCamera.opened[0] and self.reads > self.frames_before_unplugged:
+            return False, None
+        return True, np.full((480, 640, 3), 50, np.uint8)
+
+    def release(self) -> None:
+        self.released = True
+
+
+@pytest.fixture
+def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    FakeCamera.opened.clear()
+    monkeypatch.setattr(FakeCamera, "frames_before_unplugged", 1 << 30)
+    monkeypatch.setattr(FakeCamera, "stamp_ms", -1.0)
+    monkeypatch.setattr("vision.sources.camera.cv2.VideoCapture", FakeCamera)
+    path = tmp_path / "video0"
+    path.touch()
+    monkeypatch.setattr("vision.sources.opening.camera_device", lambda uri: path)
+    return path
+
+
+def test_what_is_asked_goes_to_the_driver_pixel_format_first(
+    device: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    wanted = SourceSettings(width=640, height=480, rate_hz=30.0, pixel_format="MJPG")
+    with open_source("0", wanted) as source:
+        assert source.live
+        frame = source.read(20.0)
+        assert frame is not None
+        assert (frame.width, frame.height) == (640, 480)
+    (camera,) = FakeCamera.opened
+    assert camera.device == str(device)
+    assert [name for name, _ in camera.asked] == [
+        cv2.CAP_PROP_FOURCC,
+        cv2.CAP_PROP_FRAME_WIDTH,
+        cv2.CAP_PROP_FRAME_HEIGHT,
+        cv2.CAP_PROP_FPS,
+    ]
+    assert "gives 640x480 MJPG at 30 Hz" in caplog.text
+    assert camera.released
+
+
+def test_what_the_driver_gave_instead_is_said(device: Path, caplog: pytest.LogCaptureFixture) -> None:
+    open_source("0", SourceSettings(width=1280, height=720, rate_hz=60.0)).close()
+    assert "gives 640x480 YUYV at 30 Hz; asked for width 1280, height 720, rate_hz 60" in caplog.text
+
+
+def test_an_unplugged_camera_is_opened_again(
+    device: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(FakeCamera, "frames_before_unplugged", 3)
+    with open_source("0", SourceSettings(retry_min_s=0.01)) as source:
+        deadline_s = time.monotonic() + 20
+        while source.statistics.reopened < 1 and time.monotonic() < deadline_s:
+            source.read(0.1)
+        assert source.statistics.reopened == 1
+    assert len(FakeCamera.opened) == 2
+    assert all(camera.released for camera in FakeCamera.opened)
+    assert "lost: the camera gave no frame" in caplog.text
+    assert "back after" in caplog.text
+
+
+def test_the_driver_s_own_monotonic_stamp_is_taken(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stamp_ns = time.monotonic_ns() - 20_000_000
+    monkeypatch.setattr(FakeCamera, "stamp_ms", stamp_ns / 1e6)
+    with open_source("0") as source:
+        frame = source.read(20.0)
+    assert frame is not None
+    assert abs(frame.captured_ns - stamp_ns) < 1000
+
+
+def test_a_stamp_of_another_clock_is_not_taken(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeCamera, "stamp_ms", time.time() * 1000)
+    before_ns = time.monotonic_ns()
+    with open_source("0") as source:
+        frame = source.read(20.0)
+    assert frame is not None
+    assert before_ns <= frame.captured_ns <= time.monotonic_ns()
+
+
+def test_a_camera_without_permission_names_the_group(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vision.sources.camera.os.access", lambda path, mode: False)
+    with pytest.raises(SourceError, match="group video"):
+        open_source("0")
+
+
+def test_a_pipe_s_pixel_format_is_no_camera_s(device: Path) -> None:
+    with pytest.raises(SourceError, match="four letters, such as MJPG"):
+        open_source("0", SourceSettings(pixel_format="bgr24", width=4, height=4))
+
+
+def test_a_camera_that_is_not_there_is_one_clear_line() -> None:
+    with pytest.raises(SourceError, match=r"/dev/video98765: no such camera"):
+        open_source("98765")
+
+
+@pytest.mark.parametrize(
+    ("uri", "device"),
+    [
+        ("0", "/dev/video0"),
+        ("12", "/dev/video12"),
+        ("/dev/video3", "/dev/video3"),
+        ("/dev/v4l/by-id/usb-cam-index0", "/dev/v4l/by-id/usb-cam-index0"),
+        ("/dev/null", "/dev/null"),
+        ("/dev/stdin", None),
+        ("/dev/shm", None),
+        ("video0", None),
+        ("-", None),
+        ("rtsp://camera/0", None),
+        ("²", None),
+    ],
+)
+def test_what_is_a_camera_s_address(uri: str, device: str | None) -> None:
+    assert camera_device(uri) == (None if device is None else Path(device))
+
+
+def test_a_fourcc_is_letters_where_it_can_be() -> None:
+    assert fourcc_text(cv2.VideoWriter.fourcc(*"MJPG")) == "MJPG"
+    assert fourcc_text(0) == "0x00000000"
+    assert fourcc_text(-1) == "0x-0000001"

@@ -1,0 +1,187 @@
+"""A live source: the newest wins, a lost one is opened again, and everything is told once."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vision.frame import Frame
+from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.latest import LatestSource
+from vision.sources.source import EndOfStream, SourceError, SourceSettings
+
+QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.2, retry_min_s=0.01, retry_max_s=0.04)
+
+
+class ScriptedFeed(Feed):
+    """Gives what its script says: a number (that grey), an exception, None (silence)."""
+
+    def __init__(self, script: list[int | Exception | None], gate: threading.Event | None = None) -> None:
+        self.script = script
+        self.gate = gate
+        self.closed = 0
+
+    def read(self, timeout_s: float) -> Picture | None:
+        if not self.script:
+            time.sleep(min(timeout_s, 0.02))
+            return None
+        step = self.script.pop(0)
+        if isinstance(step, Exception):
+            if self.gate is not None:
+                self.gate.wait(30)
+            raise step
+        if step is None:
+            time.sleep(min(timeout_s, 0.02))
+            return None
+        return Picture(np.full((2, 2, 3), step, np.uint8))
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def opener(*feeds: Feed | Exception) -> Callable[[], Feed]:
+    remaining = list(feeds)
+
+    def open_feed() -> Feed:
+        feed = remaining.pop(0) if remaining else FeedLost("nobody there")
+        if isinstance(feed, Exception):
+            raise feed
+        return feed
+
+    return open_feed
+
+
+def frame_of(source: LatestSource, value: int) -> Frame:
+    deadline_s = time.monotonic() + 20
+    while time.monotonic() < deadline_s:
+        frame = source.read(0.2)
+        if frame is not None and int(frame.image[0, 0, 0]) == value:
+            return frame
+    raise AssertionError(f"frame {value} never came")
+
+
+def test_a_lost_feed_is_opened_again_and_both_are_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("WARNING")
+    gate = threading.Event()
+    first = ScriptedFeed([1, FeedLost("unplugged")], gate)
+    second = ScriptedFeed([2])
+    with LatestSource("camera", opener(first, FeedLost("no"), FeedLost("no"), second), QUICK) as source:
+        frame_of(source, 1)
+        gate.set()
+        frame = frame_of(source, 2)
+        assert frame.sequence == 1
+        assert source.statistics.reopened == 1
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines[0] == "camera: lost: unplugged; opening it again"
+    assert lines[1].startswith("camera: back after ")
+    assert len(lines) == 2
+    assert first.closed == second.closed == 1
+
+
+def test_silence_is_a_loss(caplog: pytest.LogCaptureFixture) -> None:
+    with LatestSource("camera", opener(ScriptedFeed([1]), ScriptedFeed([2])), QUICK) as source:
+        frame_of(source, 1)
+        frame_of(source, 2)
+    assert "lost: nothing came for 0." in caplog.text
+
+
+def test_the_pause_between_attempts_doubles_up_to_its_cap(monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+    enough = threading.Event()
+
+    class Watched(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            if timeout is not None and not self.is_set():
+                pauses.append(timeout)
+                if len(pauses) >= 6:
+                    enough.set()
+            return super().wait(0.001)
+
+    gate = threading.Event()
+    settings = SourceSettings(retry_min_s=1.0, retry_max_s=5.0)
+    source = LatestSource("camera", opener(ScriptedFeed([1, FeedLost("gone")], gate)), settings)
+    source._stop = Watched()
+    gate.set()
+    assert enough.wait(20)
+    source.close()
+    assert pauses[:5] == [1.0, 2.0, 4.0, 5.0, 5.0]
+
+
+def test_one_that_never_opens_says_why_and_what_to_do() -> None:
+    settings = SourceSettings(open_timeout_s=0.2, retry_min_s=0.02)
+    with pytest.raises(SourceError) as caught:
+        LatestSource("camera", opener(), settings, advice="is it on?")
+    assert str(caught.value) == "camera: no frame within 0.2 s: nobody there; is it on?"
+
+
+def test_an_error_no_attempt_can_mend_is_raised_at_once() -> None:
+    with pytest.raises(SourceError, match="camera: no permission"):
+        LatestSource("camera", opener(SourceError("no permission")), SourceSettings(open_timeout_s=600.0))
+
+
+def test_an_unexpected_error_reaches_the_reader_and_not_only_a_thread() -> None:
+    gate = threading.Event()
+    source = LatestSource("camera", opener(ScriptedFeed([1, ZeroDivisionError("a bug")], gate)), QUICK)
+    with source:
+        frame_of(source, 1)
+        gate.set()
+        with pytest.raises(ZeroDivisionError, match="a bug"):
+            frame_of(source, 2)
+
+
+def test_without_reopening_the_end_comes_after_the_last_frame() -> None:
+    feed = ScriptedFeed([1, 2, EndOfStream()])
+    with LatestSource("pipe", opener(feed), QUICK, reopen=False) as source:
+        assert frame_of(source, 2).sequence == 1
+        with pytest.raises(EndOfStream):
+            source.read(20.0)
+        with pytest.raises(EndOfStream):
+            source.read(20.0)
+
+
+def test_without_reopening_a_loss_is_an_error() -> None:
+    gate = threading.Event()
+    feed = ScriptedFeed([1, FeedLost("a broken frame")], gate)
+    with LatestSource("pipe", opener(feed), QUICK, reopen=False) as source:
+        frame_of(source, 1)
+        gate.set()
+        with pytest.raises(SourceError, match="pipe: a broken frame"):
+            source.read(20.0)
+
+
+def test_each_frame_is_given_once_and_waiting_ends_with_none() -> None:
+    settings = SourceSettings(read_timeout_s=60.0)
+    with LatestSource("camera", opener(ScriptedFeed([7])), settings) as source:
+        assert source.read(20.0) is not None
+        assert source.read(0.01) is None
+
+
+def test_close_wakes_a_reader_that_waits() -> None:
+    source = LatestSource("camera", opener(ScriptedFeed([7])), SourceSettings(read_timeout_s=60.0))
+    source.read(20.0)
+    ended = threading.Event()
+
+    def wait() -> None:
+        with pytest.raises(EndOfStream):
+            source.read(60.0)
+        ended.set()
+
+    reader = threading.Thread(target=wait, daemon=True)
+    reader.start()
+    source.close()
+    assert ended.wait(20)
+
+
+def test_what_the_writer_overwrote_counts_as_dropped() -> None:
+    class Skipping(ScriptedFeed):
+        def read(self, timeout_s: float) -> Picture | None:
+            picture = super().read(timeout_s)
+            return None if picture is None else Picture(picture.image, skipped=4)
+
+    with LatestSource("shared", opener(Skipping([1])), QUICK) as source:
+        assert frame_of(source, 1).sequence == 4
+        assert source.statistics.dropped == 4
