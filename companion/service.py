@@ -160,7 +160,7 @@ class Service:
     async def _outcome_of(self, command: grammar.Command) -> Outcome:
         behaviour = behaviour_for(command)
         ended = self.pilot.command(behaviour)
-        if ended.done() or not _endless(command):
+        if ended.done() or not command.endless:
             return await asyncio.shield(ended)
         under_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._awaited = (behaviour, under_way)
@@ -389,16 +389,6 @@ class Service:
         self.bus.publish(topics.EVENTS, asdict(event))
         if self._on_event is not None:
             self._on_event(event)
-
-
-def _endless(command: grammar.Command) -> bool:
-    """It goes on until another command comes."""
-    match command:
-        case grammar.Hold(duration_s=duration_s):
-            return duration_s == 0.0
-        case grammar.Orbit(laps=laps):
-            return laps == 0.0
-    return False
 
 
 def _limits(settings: Settings) -> Limits:

@@ -69,6 +69,11 @@ class Command:
         for field, argument in _arguments(type(self)):
             _check(self.word, argument, getattr(self, field.name), _default(field))
 
+    @property
+    def endless(self) -> bool:
+        """It goes on until another command comes."""
+        return False
+
     def __str__(self) -> str:
         words = [self.word]
         for field, argument in _arguments(type(self)):
@@ -116,6 +121,10 @@ class Hold(Command):
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
 
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
 
 @dataclass(frozen=True, slots=True)
 class Orbit(Command):
@@ -129,6 +138,10 @@ class Orbit(Command):
     direction: Annotated[str, Choice("direction", ("clockwise", "counterclockwise"), "seen from above")] = (
         "clockwise"
     )
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
 
     def __post_init__(self) -> None:
         super(Orbit, self).__post_init__()

@@ -171,3 +171,11 @@ def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text):
 def test_every_field_of_every_command_has_its_place_in_the_grammar():
     for kind in COMMANDS.values():
         assert len(grammar._arguments(kind)) == len(fields(kind))
+
+
+@pytest.mark.parametrize(
+    ("text", "endless"),
+    [("hold", True), ("hold 5", False), ("orbit", True), ("orbit laps=2", False), ("land", False)],
+)
+def test_a_command_says_whether_it_ends_by_itself(text, endless):
+    assert parse(text).endless is endless
