@@ -15,7 +15,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mavlink_sim.training_scenes import CLASS_NAMES, random_scene
+from mavlink_sim.shapes import CLASS_NAMES
+from mavlink_sim.training_scenes import random_scene
 from vision.yolo.checkpoint import save_checkpoint
 from vision.yolo.evaluation import evaluate
 from vision.yolo.metrics import Score
