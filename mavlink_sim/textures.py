@@ -228,7 +228,7 @@ def _sand(rng: np.random.Generator, size: int) -> Plane:
     wide = fractal_noise(rng, size, 4, 4)
     y = np.arange(size, dtype=np.float32)[:, None] / size
     phase = 2 * np.pi * (size // 20) * y + 2.5 * fractal_noise(rng, size, 6, 3)
-    ripples = np.sin(phase).astype(np.float32)
+    ripples: Plane = np.sin(phase).astype(np.float32)
     colours = mix(0.5 + 0.2 * wide, (118, 160, 186), (160, 202, 224))
     return shade(colours, (1.0 + 0.035 * ripples + 0.04 * grain(rng, size)).astype(np.float32))
 
@@ -249,9 +249,8 @@ def _snow(rng: np.random.Generator, size: int) -> Plane:
 
 
 def _water(rng: np.random.Generator, size: int) -> Plane:
-    swell = value_noise(rng, size, size // 40, size // 14) + 0.7 * value_noise(
-        rng, size, size // 20, size // 8
-    )
+    swell = value_noise(rng, size, size // 40, size // 14)
+    swell += 0.7 * value_noise(rng, size, size // 20, size // 8)
     wide = fractal_noise(rng, size, 3, 4)
     green = float(rng.uniform(0, 1))
     colours = mix(0.45 + 0.22 * wide, (96 - 30 * green, 74, 42), (142 - 30 * green, 118, 72))

@@ -1,0 +1,269 @@
+"""Pictures: depth against geometry, boxes against projection, who stands before whom."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink_sim.image_effects import ImageEffects
+from mavlink_sim.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered, Renderer, VisibleObject
+from mavlink_sim.shapes import CLASS_NAMES
+from mavlink_sim.world import Ground, Light, Sky, World, WorldObject, demo_world
+from vision.camera_model import CameraModel, CameraMount
+from vision.geolocation import point_at_depth, point_on_ground
+from vision.rotation import matrix_from_euler
+
+GROUND = Ground(("concrete",), 0, 256, 0.05)
+CAMERA = CameraModel.from_horizontal_fov(160, 120, math.radians(70.0))
+LEVEL = np.eye(3)
+
+
+def world_of(*objects: WorldObject) -> World:
+    return World(objects, GROUND)
+
+
+def thing(number: int, class_name: str, north: float, east: float = 0.0, yaw: float = 0.0) -> WorldObject:
+    return WorldObject(number, class_name, (north, east, 0.0), yaw, 1.0, 0)
+
+
+def seen(rendered: Rendered, number: int) -> VisibleObject:
+    return next(item for item in rendered.objects if item.world_object.identifier == number)
+
+
+poses = st.tuples(
+    st.floats(-200.0, 200.0), st.floats(-200.0, 200.0), st.floats(-60.0, -0.3),
+    st.floats(-0.6, 0.6), st.floats(-math.pi / 2, math.pi / 2), st.floats(-math.pi, math.pi),
+)  # fmt: skip
+
+
+@settings(max_examples=40, deadline=None)
+@given(poses)
+def test_the_depth_of_the_ground_is_the_analytic_depth(pose: tuple[float, ...]) -> None:
+    position, attitude = pose[:3], matrix_from_euler(*pose[3:])
+    rendered = Renderer(world_of(), CAMERA, DEFAULT_MOUNT).render(position, attitude)
+    rows, columns = np.mgrid[0:120:7, 0:160:7]
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    eye_height = -position[2] - float((attitude @ DEFAULT_MOUNT.position_frd_m)[2])
+    if eye_height < 0.06:
+        return
+    ground = point_on_ground(CAMERA, DEFAULT_MOUNT, attitude, pixels, -position[2], 0.002)
+    depth = rendered.depth_m[rows.ravel(), columns.ravel()]
+    met = np.isfinite(ground[:, 0]) & np.isfinite(depth)
+    again = point_at_depth(CAMERA, DEFAULT_MOUNT, attitude, pixels[met], depth[met])
+    # A float32 reciprocal loses relative accuracy in proportion to how far the ground is.
+    span = np.linalg.norm(ground[met], axis=1)
+    assert np.all(np.linalg.norm(again - ground[met], axis=1) <= 1e-4 * span * (1 + span / eye_height))
+    upwards = (CAMERA.rays(pixels) @ (attitude @ DEFAULT_MOUNT.body_from_optical).T)[:, 2] < -1e-6
+    assert np.isnan(depth[upwards]).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    bearing=st.floats(-0.4, 0.4),
+    distance=st.floats(6.0, 60.0),
+    height=st.floats(0.5, 40.0),
+    yaw=st.floats(-math.pi, math.pi),
+    class_name=st.sampled_from(CLASS_NAMES),
+)
+def test_a_box_holds_the_object_and_no_more_than_its_bounding_box(
+    bearing: float, distance: float, height: float, yaw: float, class_name: str
+) -> None:
+    item = thing(0, class_name, distance * math.cos(bearing), distance * math.sin(bearing), yaw)
+    pitch = -math.atan2(height - 0.5, distance)
+    camera = CameraModel.from_horizontal_fov(320, 240, math.radians(90.0))
+    renderer = Renderer(world_of(item), camera, CameraMount())
+    attitude = matrix_from_euler(0.0, pitch, 0.0)
+    rendered = renderer.render((0.0, 0.0, -height), attitude)
+    corners = _corners(item)
+    view = renderer.view((0.0, 0.0, -height), attitude)
+    projected = (corners - view.eye) @ view.pixel_from_ned.T
+    points = projected[:, :2] / projected[:, 2:]
+    low, high = np.clip(points.min(axis=0), 0, (320, 240)), np.clip(points.max(axis=0), 0, (320, 240))
+    if (high - low).min() < 4.0:
+        return
+    box = np.array(seen(rendered, 0).xyxy)
+    assert np.all(box[:2] >= low - 1.5)
+    assert np.all(box[2:] <= high + 2.5)
+    middle = (corners.mean(axis=0) - view.eye) @ view.pixel_from_ned.T
+    centre = middle[:2] / middle[2]
+    if 0 < centre[0] < 320 and 0 < centre[1] < 240:
+        assert np.all(box[:2] <= centre + 1)
+        assert np.all(box[2:] >= centre - 1)
+
+
+def _corners(item: WorldObject) -> np.ndarray:
+    rear, front, left, right = item.footprint_m
+    c, s = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
+    points = [
+        (c * x - s * y, s * x + c * y, z)
+        for x in (rear, front)
+        for y in (left, right)
+        for z in (0.0, -item.height_m)
+    ]
+    return np.array(points) + item.position_ned_m
+
+
+def test_the_depth_on_a_box_is_that_of_its_front() -> None:
+    item = thing(0, "crate", 9.0)
+    rendered = Renderer(world_of(item), CAMERA, CameraMount()).render((0.0, 0.0, -0.3), LEVEL)
+    rear, *_ = item.footprint_m
+    assert rendered.depth_m[59, 80] == pytest.approx(9.0 + rear, abs=0.01)
+
+
+def test_the_nearer_thing_hides_the_farther_whatever_their_order() -> None:
+    near, far = thing(0, "truck", 8.0, yaw=math.pi / 2), thing(1, "chair", 18.0)
+    for objects in ((near, far), (far, near)):
+        rendered = Renderer(world_of(*objects), CAMERA, CameraMount()).render((0.0, 0.0, -1.5), LEVEL)
+        assert [item.world_object.identifier for item in rendered.objects] == [0]
+        assert seen(rendered, 0).visible_fraction > 0.9
+
+
+def test_a_thing_half_hidden_is_half_visible() -> None:
+    wall, car = thing(0, "truck", 10.0, 4.0, math.pi / 2), thing(1, "car", 20.0, 0.0, math.pi / 2)
+    free = Renderer(world_of(car), CAMERA, CameraMount()).render((0.0, 0.0, -1.5), LEVEL)
+    hidden = Renderer(world_of(wall, car), CAMERA, CameraMount()).render((0.0, 0.0, -1.5), LEVEL)
+    whole, part = seen(free, 1), seen(hidden, 1)
+    assert whole.visible_fraction > 0.9
+    assert part.visible_fraction == pytest.approx(
+        part.pixel_count / whole.pixel_count * whole.visible_fraction, abs=0.02
+    )
+    assert 0.15 < part.visible_fraction < 0.85
+
+
+def test_a_thing_cut_by_the_edge_of_the_image_counts_what_is_outside_as_hidden() -> None:
+    half_width = math.tan(math.radians(35.0)) * 15.0
+    rendered = Renderer(world_of(thing(0, "crate", 15.0, half_width)), CAMERA, CameraMount()).render(
+        (0.0, 0.0, -1.0), LEVEL
+    )
+    item = seen(rendered, 0)
+    assert item.xyxy[2] == 160.0
+    assert 0.3 < item.visible_fraction < 0.7
+
+
+def test_nothing_behind_the_camera_is_drawn() -> None:
+    items = [thing(n, name, -3.0 - 4 * n) for n, name in enumerate(CLASS_NAMES)]
+    rendered = Renderer(world_of(*items), CAMERA, CameraMount()).render((0.0, 0.0, -1.5), LEVEL)
+    assert rendered.objects == []
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.6, 1.5, 2.4])
+def test_a_camera_inside_or_beside_a_thing_still_draws(distance: float) -> None:
+    renderer = Renderer(world_of(thing(0, "truck", 0.0)), CAMERA, CameraMount())
+    for yaw in np.linspace(-math.pi, math.pi, 9):
+        rendered = renderer.render((distance, 0.3, -1.4), matrix_from_euler(0.1, -0.2, float(yaw)))
+        assert np.nanmin(rendered.depth_m) > 0.0
+
+
+def test_looking_straight_down_a_car_is_seen_from_above_at_its_size() -> None:
+    car = thing(0, "car", 0.0)
+    height = 20.0
+    down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
+    rendered = Renderer(world_of(car), CAMERA, CameraMount()).render((0.0, 0.0, -height), down)
+    left, top, right, bottom = seen(rendered, 0).xyxy
+    rear, front, *_ = car.footprint_m
+    assert bottom - top == pytest.approx((front - rear) * CAMERA.fy / (height - 0.7), rel=0.12)
+    assert bottom - top > 1.6 * (right - left)
+    assert not np.isnan(rendered.depth_m).any()
+    assert rendered.depth_m[0, 0] == pytest.approx(height, rel=1e-3)
+    assert np.nanmin(rendered.depth_m) == pytest.approx(height - car.height_m, abs=0.05)
+
+
+def test_a_wheel_on_the_far_side_does_not_show_through() -> None:
+    """From above one side, the pixels of a car are one piece with its own depth range."""
+    car = thing(0, "car", 12.0, 0.0, math.pi / 2)
+    rendered = Renderer(world_of(car), DEFAULT_CAMERA, CameraMount()).render((0.0, 0.0, -1.5), LEVEL)
+    box = [int(value) for value in seen(rendered, 0).xyxy]
+    depth = rendered.depth_m[box[1] + 8 : box[3] - 12, box[0] + 30 : box[2] - 30]
+    assert np.nanmin(depth) > 12.0 - 1.2
+    assert np.median(depth) < 12.0
+
+
+def test_the_range_is_measured_from_the_camera_to_the_footprint() -> None:
+    car = thing(0, "car", 20.0)
+    mount = CameraMount(forward_m=0.5)
+    rendered = Renderer(world_of(car), CAMERA, mount).render((0.0, 0.0, -1.5), LEVEL)
+    assert seen(rendered, 0).range_m == pytest.approx(19.5 + car.footprint_m[0])
+
+
+def test_the_sky_has_no_depth_and_is_brighter_than_the_ground() -> None:
+    rendered = Renderer(World((), Ground(("asphalt",), 0, 256, 0.05)), CAMERA, CameraMount()).render(
+        (0.0, 0.0, -5.0), LEVEL
+    )
+    assert np.isnan(rendered.depth_m[:58]).all()
+    assert not np.isnan(rendered.depth_m[62:]).any()
+    assert rendered.image[:50].mean() > rendered.image[70:].mean() + 40
+
+
+def test_haze_takes_the_colour_of_what_is_far() -> None:
+    ground = Ground(("asphalt",), 0, 256, 0.05)
+    clear = World((), ground, Light(), Sky(visibility_m=1e6))
+    hazy = World((), ground, Light(), Sky(visibility_m=100.0))
+    pictures = [
+        Renderer(world, CAMERA, CameraMount()).render((0.0, 0.0, -3.0), LEVEL).image.astype(float)
+        for world in (clear, hazy)
+    ]
+    change = np.abs(pictures[1] - pictures[0]).mean(axis=(1, 2))
+    assert change[63] > 40
+    assert change[119] < 10
+
+
+def test_a_thing_casts_its_shadow_away_from_the_sun() -> None:
+    light = Light(sun_azimuth_rad=0.0, sun_elevation_rad=math.radians(35))
+    down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
+
+    def picture(*objects: WorldObject) -> np.ndarray:
+        world = World(objects, GROUND, light)
+        return Renderer(world, CAMERA, CameraMount()).render((0.0, 0.0, -15.0), down).image.astype(float)
+
+    darker = picture() - picture(thing(0, "crate", 0.0))
+    rendered = Renderer(World((thing(0, "crate", 0.0),), GROUND, light), CAMERA, CameraMount()).render(
+        (0.0, 0.0, -15.0), down
+    )
+    left, top, right, bottom = (int(value) for value in seen(rendered, 0).xyxy)
+    middle = (left + right) // 2
+    # North is up in the picture, the sun is in the north.
+    assert darker[bottom + 2, middle].mean() > 20
+    assert abs(darker[top - 4, middle].mean()) < 3
+
+
+def test_what_a_renderer_drew_before_does_not_show() -> None:
+    small = Ground(("meadow",), 0, 256, 0.1, pad=True, road_east_m=8.0)
+    renderer = Renderer(replace(demo_world(2), ground=small), CAMERA, DEFAULT_MOUNT)
+    first = renderer.render((0.0, 0.0, -4.0), LEVEL)
+    renderer.render((5.0, -9.0, -14.0), matrix_from_euler(0.2, -0.9, 2.0))
+    again = renderer.render((0.0, 0.0, -4.0), LEVEL)
+    assert np.array_equal(first.image, again.image)
+    assert np.array_equal(first.depth_m, again.depth_m, equal_nan=True)
+    assert first.image is not again.image
+
+
+def test_a_landed_camera_still_sees() -> None:
+    rendered = Renderer(world_of(), CAMERA, DEFAULT_MOUNT).render((0.0, 0.0, 0.3), LEVEL)
+    assert 0.0 < np.nanmin(rendered.depth_m) < 0.5
+
+
+def test_a_distorting_lens_is_refused() -> None:
+    lens = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5, (0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="draws no lens distortion"):
+        Renderer(world_of(), lens)
+
+
+def test_effects_change_the_picture_as_named() -> None:
+    def picture(effects: ImageEffects | None) -> np.ndarray:
+        rendered = Renderer(world_of(), CAMERA, DEFAULT_MOUNT, effects).render((0.0, 0.0, -4.0), LEVEL)
+        return rendered.image.astype(float)
+
+    plain = picture(None)
+    assert picture(ImageEffects(exposure=0.5)).mean() == pytest.approx(plain.mean() / 2, abs=1.0)
+    assert (picture(ImageEffects(noise_sigma=5.0)) - plain)[70:].std() == pytest.approx(5.0, rel=0.15)
+    assert (
+        np.abs(np.diff(picture(ImageEffects(blur_sigma_px=2.0))[80:], axis=1)).mean()
+        < 0.7 * np.abs(np.diff(plain[80:], axis=1)).mean()
+    )
+    grey = picture(ImageEffects(grey=1.0))
+    assert np.ptp(grey, axis=2).max() <= 1.0

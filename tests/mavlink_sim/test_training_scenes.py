@@ -1,0 +1,76 @@
+"""Labelled pictures: the same again from the same seed, labels that can be seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mavlink_sim.training_scenes import (
+    CLASS_NAMES,
+    MIN_AREA_PX,
+    MIN_SIDE_PX,
+    random_scene,
+    render_dataset,
+)
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    return list(render_dataset(24, 7, 256, 256))
+
+
+def test_a_scene_follows_from_its_generator_alone() -> None:
+    first = random_scene(np.random.default_rng(5), 192, 160)
+    random_scene(np.random.default_rng(6), 256, 192)
+    again = random_scene(np.random.default_rng(5), 192, 160)
+    for one, other in zip(first, again, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_picture_i_is_the_same_whatever_the_count() -> None:
+    short = list(render_dataset(2, 3, 128, 128))
+    long = list(render_dataset(3, 3, 128, 128))
+    assert np.array_equal(short[1][0], long[1][0])
+    assert not np.array_equal(short[0][0], short[1][0])
+
+
+def test_scenes_have_the_size_and_types_they_promise(scenes: list) -> None:
+    for image, boxes, ids in scenes:
+        assert image.shape == (256, 256, 3)
+        assert image.dtype == np.uint8
+        assert image.flags.c_contiguous
+        assert boxes.dtype == np.float32
+        assert boxes.shape == (len(ids), 4)
+        assert ids.dtype == np.int64
+
+
+def test_every_label_is_inside_the_picture_and_large_enough(scenes: list) -> None:
+    for _, boxes, ids in scenes:
+        sides = boxes[:, 2:] - boxes[:, :2]
+        assert (boxes >= 0).all()
+        assert (boxes <= 256).all()
+        assert (sides >= MIN_SIDE_PX).all()
+        assert (sides.prod(axis=1) >= MIN_AREA_PX).all()
+        assert ((ids >= 0) & (ids < len(CLASS_NAMES))).all()
+
+
+def test_most_pictures_show_several_things_and_some_show_none(scenes: list) -> None:
+    counts = np.array([len(ids) for _, _, ids in scenes])
+    assert 3.0 < counts.mean() < 10.0
+    assert counts.max() <= 14
+    assert {int(name) for _, _, ids in scenes for name in ids} == set(range(len(CLASS_NAMES)))
+    empties = [len(random_scene(np.random.default_rng((1, n)), 64, 64)[2]) == 0 for n in range(40)]
+    assert any(empties)
+
+
+def test_the_focal_length_is_within_what_was_asked() -> None:
+    """A longer lens makes things larger: with only long lenses the boxes grow."""
+
+    def mean_side(focal_px: tuple[float, float]) -> float:
+        sides: list[float] = []
+        for n in range(12):
+            _, boxes, _ = random_scene(np.random.default_rng((2, n)), 256, 256, focal_px)
+            sides += np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)).tolist()
+        return float(np.median(sides))
+
+    assert mean_side((500.0, 600.0)) > mean_side((120.0, 150.0))
