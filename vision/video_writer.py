@@ -21,6 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.sources.opencv import quiet_opencv
+
 _FOURCC = cv2.VideoWriter.fourcc(*"VP80")
 _HARMLESS = b"is not supported with codec id"  # said of every WebM, which has no such tags at all
 _standard_error_lock = threading.Lock()
@@ -68,6 +70,7 @@ class VideoWriter:
             raise VideoWriterError(f"{self.path}: VP8 takes 1..16383 pixels a side, got {width}x{height}")
         if not 0.1 <= rate_hz <= 240.0:
             raise VideoWriterError(f"{self.path}: rate_hz must be 0.1..240, got {rate_hz}")
+        quiet_opencv()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("wb"):

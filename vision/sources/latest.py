@@ -200,6 +200,7 @@ class LatestSource(Source):
 
     def _read_one_feed(self) -> None:
         feed = self._open_feed()
+        self._pace_origin_s = None
         with self._changed:
             self._feed = feed
         try:

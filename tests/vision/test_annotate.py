@@ -1,0 +1,140 @@
+"""Drawing: what must be on the picture, and what must not change."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from vision.annotate import annotate, class_colour
+from vision.detections import Detections
+
+NAMES = ("person", "bicycle", "car")
+
+
+def seen(
+    boxes: list[list[float]], class_ids: list[int] | None = None, ranges_m: list[float] | None = None
+) -> Detections:
+    count = len(boxes)
+    return Detections(
+        np.array(boxes, np.float32).reshape(-1, 4),
+        np.linspace(0.9, 0.4, count, dtype=np.float32),
+        np.array(class_ids or [2] * count, np.int64),
+        NAMES,
+        np.array(ranges_m or [np.nan] * count, np.float32),
+    )
+
+
+def picture(width: int = 640, height: int = 480, value: int = 90) -> np.ndarray:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of everything that changed."""
+    rows, columns = np.nonzero((before != after).any(axis=2))
+    return int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())
+
+
+def test_the_given_picture_stays_as_it_was() -> None:
+    image = picture()
+    before = image.copy()
+    drawn = annotate(image, seen([[100, 100, 300, 200]]), lines=["hello"], highlight=0)
+    np.testing.assert_array_equal(image, before)
+    assert drawn.shape == image.shape
+    assert drawn.dtype == np.uint8
+    assert (drawn != image).any()
+
+
+def test_nothing_seen_and_nothing_said_draws_nothing() -> None:
+    image = picture()
+    np.testing.assert_array_equal(annotate(image, Detections.empty(NAMES)), image)
+
+
+def test_a_box_is_in_its_class_s_colour_where_it_was_seen() -> None:
+    drawn = annotate(picture(), seen([[100, 150, 300, 250]]))
+    for x, y in ((100, 200), (300, 200), (200, 250)):
+        assert tuple(int(value) for value in drawn[y, x]) == class_colour(2)
+    assert tuple(drawn[200, 200]) == (90, 90, 90)
+
+
+def test_the_range_makes_the_label_longer() -> None:
+    box = [[100.0, 150.0, 120.0, 170.0]]
+    without = changed(picture(), annotate(picture(), seen(box)))
+    with_range = changed(picture(), annotate(picture(), seen(box, ranges_m=[12.3])))
+    assert with_range[2] > without[2]
+
+
+def test_lines_make_a_panel_that_lets_the_picture_through() -> None:
+    image = picture(value=200)
+    drawn = annotate(image, Detections.empty(NAMES), lines=["OFFBOARD", "1.5 m/s"])
+    left, top, right, bottom = changed(image, drawn)
+    assert right < 320
+    assert bottom < 240
+    backdrop = drawn[top + 1, left + 1]
+    assert (backdrop > 60).all()
+    assert (backdrop < 130).all()
+    assert (drawn[top:bottom, left:right] > 220).any()  # letters
+
+
+def test_a_line_too_long_is_set_smaller_and_not_cut() -> None:
+    image = picture(320, 240)
+    drawn = annotate(image, Detections.empty(NAMES), lines=["a very long line " * 6])
+    left, _, right, _ = changed(image, drawn)
+    assert left > 0
+    assert right < 319
+
+
+def test_letters_and_lines_grow_with_the_picture() -> None:
+    small, large = picture(320, 240), picture(1920, 1440)
+    _, top, _, bottom = changed(small, annotate(small, Detections.empty(NAMES), lines=["x"]))
+    _, large_top, _, large_bottom = changed(large, annotate(large, Detections.empty(NAMES), lines=["x"]))
+    assert large_bottom - large_top > 3 * (bottom - top)
+
+
+def test_the_one_that_matters_looks_different() -> None:
+    image = picture()
+    boxes = seen([[100, 150, 200, 250], [300, 150, 400, 250]])
+    plain, marked = annotate(image, boxes), annotate(image, boxes, highlight=1)
+    assert (plain[200, 350] != marked[200, 350]).any()
+    np.testing.assert_array_equal(plain[200, 150], marked[200, 150])
+
+
+def test_labels_of_neighbours_do_not_hide_each_other() -> None:
+    image = picture()
+    boxes = [[200.0, 200.0, 240.0, 260.0], [215.0, 200.0, 255.0, 260.0]]
+    alone = [annotate(image, seen([box])) for box in boxes]
+    colour = np.array(class_colour(2))
+    areas = [int((drawn == colour).all(axis=2).sum()) for drawn in alone]
+    together = int((annotate(image, seen(boxes)) == colour).all(axis=2).sum())
+    assert together > 0.9 * sum(areas)
+
+
+@pytest.mark.parametrize("highlight", [-1, 1])
+def test_a_highlight_that_is_not_there_is_refused(highlight: int) -> None:
+    with pytest.raises(IndexError, match="highlight must be"):
+        annotate(picture(), seen([[1, 1, 5, 5]]), highlight=highlight)
+
+
+def test_neighbouring_classes_have_colours_far_apart() -> None:
+    colours = np.array([class_colour(index) for index in range(12)], float)
+    for one, other in itertools.pairwise(colours):
+        assert np.abs(one - other).max() > 80
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.integers(1, 200),
+    st.integers(1, 200),
+    arrays.arrays(np.float32, (3, 4), elements=st.floats(-300, 500, width=32)),
+    st.lists(st.text(max_size=30), max_size=4),
+    st.sampled_from([None, 0, 2]),
+)
+def test_any_box_on_any_picture_with_any_text_is_drawn(
+    width: int, height: int, boxes: np.ndarray, lines: list[str], highlight: int | None
+) -> None:
+    drawn = annotate(picture(width, height), seen(boxes.tolist()), lines=lines, highlight=highlight)
+    assert drawn.shape == (height, width, 3)

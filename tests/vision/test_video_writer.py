@@ -1,0 +1,190 @@
+"""Films: real time kept, errors told, and a browser that plays them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from vision.video_writer import VideoWriter, VideoWriterError
+
+SECOND = 1_000_000_000
+
+
+def picture(value: int, width: int = 64, height: int = 48) -> np.ndarray:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def frames_of(path: Path) -> list[float]:
+    """The mean grey of each frame."""
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    greys = []
+    while True:
+        ok, image = capture.read()
+        if not ok:
+            return greys
+        greys.append(float(image.mean()))
+
+
+def test_a_film_at_its_own_rate_holds_every_image_once(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "new" / "film.webm"
+    with VideoWriter(path, 64, 48, 20.0) as writer:
+        for index in range(20):
+            assert writer.write(picture(index * 12), 5 * SECOND + index * SECOND // 20) == 1
+        assert writer.duration_s == 1.0
+    assert (writer.frames, writer.repeated, writer.dropped) == (20, 0, 0)
+    greys = frames_of(path)
+    np.testing.assert_allclose(greys, [index * 12 for index in range(20)], atol=4)
+    assert capfd.readouterr().err == ""  # the harmless line about tags is kept off
+
+
+def test_a_pause_is_filled_with_the_image_before_it(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    with VideoWriter(path, 64, 48, 10.0) as writer:
+        assert writer.write(picture(40), 0) == 1
+        assert writer.write(picture(200), SECOND) == 10
+    assert (writer.frames, writer.repeated) == (11, 9)
+    greys = frames_of(path)
+    np.testing.assert_allclose(greys, [40] * 10 + [200], atol=4)
+
+
+def test_images_that_come_too_fast_are_dropped_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    with VideoWriter(path, 64, 48, 10.0) as writer:
+        for index in range(100):
+            writer.write(picture(100), index * SECOND // 100)
+    assert writer.frames + writer.dropped == 100
+    assert writer.frames in (10, 11)
+    assert len(frames_of(path)) == writer.frames
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.floats(1.0, 60.0), st.lists(st.integers(-SECOND // 2, SECOND // 2), min_size=1, max_size=40))
+def test_playing_time_is_real_time_whatever_the_stamps(
+    tmp_path: Path, rate_hz: float, steps: list[int]
+) -> None:
+    stamps = np.cumsum(steps)
+    with VideoWriter(tmp_path / "film.webm", 16, 16, rate_hz) as writer:
+        for stamp in stamps:
+            writer.write(picture(10, 16, 16), int(stamp))
+        newest_s = max(float(stamps.max() - stamps[0]) / SECOND, 0.0)
+        assert abs(writer.duration_s - newest_s) <= 1.51 / rate_hz
+    assert writer.frames - writer.repeated + writer.dropped == len(stamps)
+
+
+def test_the_image_may_be_drawn_on_after_it_was_given(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    image = picture(40)
+    with VideoWriter(path, 64, 48, 10.0) as writer:
+        writer.write(image, 0)
+        image[:] = 250
+        writer.write(picture(40), SECOND // 2)
+    np.testing.assert_allclose(frames_of(path), [40] * 6, atol=4)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "rate_hz", "words"),
+    [
+        ("film.mp4", (64, 48), 10.0, "must end in .webm"),
+        ("film.webm", (0, 48), 10.0, "VP8 takes 1..16383 pixels"),
+        ("film.webm", (64, 48), 0.0, "rate_hz must be 0.1..240"),
+        ("file/film.webm", (64, 48), 10.0, "cannot be written: "),
+        ("taken.webm", (64, 48), 10.0, "cannot be written: Is a directory"),
+    ],
+)
+def test_what_cannot_be_written_is_one_clear_line(
+    tmp_path: Path, name: str, size: tuple[int, int], rate_hz: float, words: str
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "taken.webm").mkdir()
+    with pytest.raises(VideoWriterError, match=re.escape(words)) as caught:
+        VideoWriter(tmp_path / name, *size, rate_hz)
+    assert str(tmp_path / name) in str(caught.value)
+
+
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full to stand for a full disk")
+    path = tmp_path / "film.webm"
+    path.symlink_to("/dev/full")
+    writer = VideoWriter(path, 64, 48, 10.0)
+    for index in range(20):
+        writer.write(picture(index * 12), index * SECOND // 10)
+    with pytest.raises(VideoWriterError, match=r"holds 0 of 20 frames; is the disk full\?"):
+        writer.close()
+
+
+def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "film.webm", 64, 48, 10.0) as writer:
+        with pytest.raises(ValueError, match=re.escape("must be (48, 64, 3) uint8, got (48, 60, 3)")):
+            writer.write(picture(1, 60), 0)
+        writer.write(picture(1), 0)
+    with pytest.raises(ValueError, match="after close"):
+        writer.write(picture(1), SECOND)
+
+
+def test_an_odd_size_can_be_written(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    with VideoWriter(path, 63, 47, 10.0) as writer:
+        for index in range(5):
+            writer.write(picture(90, 63, 47), index * SECOND // 10)
+    assert len(frames_of(path)) == 5
+
+
+PAGE = """<!doctype html><title>waiting</title><video id="film" muted src="film.webm"></video><script>
+const film = document.getElementById("film");
+function tell(what) {
+  document.title = JSON.stringify({what, width: film.videoWidth, height: film.videoHeight,
+    duration: film.duration, time: film.currentTime, error: film.error && film.error.message});
+}
+film.onerror = () => tell("error");
+film.onended = () => tell("ended");
+film.play().catch(error => tell(String(error)));
+</script>"""
+
+
+def test_a_browser_plays_the_film_to_its_end(tmp_path: Path) -> None:
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no Chromium is installed to play the film in")
+    with VideoWriter(tmp_path / "film.webm", 320, 240, 20.0) as writer:
+        for index in range(30):
+            image = picture(60, 320, 240)
+            cv2.circle(image, (20 + index * 9, 120), 15, (40, 60, 230), cv2.FILLED)
+            writer.write(image, index * SECOND // 20)
+    page = tmp_path / "page.html"
+    page.write_text(PAGE)
+    switches = (
+        "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync --disable-extensions --disable-dev-shm-usage "
+        "--autoplay-policy=no-user-gesture-required --timeout=20000 --virtual-time-budget=8000 --dump-dom"
+    )
+    told: dict[str, object] = {}
+    deadline_s = time.monotonic() + 50
+    attempt = 0
+    while told.get("what") != "ended" and time.monotonic() < deadline_s:
+        attempt += 1
+        done = subprocess.run(
+            [browser, *switches.split(), f"--user-data-dir={tmp_path / f'profile{attempt}'}", page.as_uri()],
+            capture_output=True,
+            timeout=60,
+            check=False,
+        )
+        title = re.search(r"<title>(.*?)</title>", done.stdout.decode())
+        told = json.loads(title[1]) if title and title[1].startswith("{") else {}
+        assert told.get("what") != "error", told
+    assert told["what"] == "ended"
+    assert (told["width"], told["height"], told["error"]) == (320, 240, None)
+    assert told["duration"] == pytest.approx(1.5, abs=0.1)
+    assert told["time"] == pytest.approx(1.5, abs=0.1)
