@@ -56,7 +56,7 @@ class Trajectory:
         """Advance by `dt_s` and return the setpoint."""
         value = self._parameters.number
         lag = math.dist(self.position, self._airframe.position)
-        pace = dt_s * max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
+        pace = max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
         braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
         dx, dy, dz = (goal[axis] - self.position[axis] for axis in range(3))
         far = math.hypot(dx, dy)
@@ -78,12 +78,14 @@ class Trajectory:
         vx, vy, vz = vx + change_x, vy + change_y, vz + min(max(wanted_z - vz, -allowed_z), allowed_z)
         self.velocity = (vx, vy, vz)
         x, y, z = self.position
-        self.position = (x + vx * pace, y + vy * pace, z + vz * pace)
+        # a point that waits for the vehicle must not urge it on either, or the two never meet
+        flown = (vx * pace, vy * pace, vz * pace)
+        self.position = (x + flown[0] * dt_s, y + flown[1] * dt_s, z + flown[2] * dt_s)
         if yaw_rad == yaw_rad:
             turn = math.radians(value("MPC_YAWRAUTO_MAX")) * dt_s
             error = math.remainder(yaw_rad - self.yaw_rad, math.tau)
             self.yaw_rad = math.remainder(self.yaw_rad + min(max(error, -turn), turn), math.tau)
-        return TrajectorySetpoint(self.position, self.velocity, NOTHING, self.yaw_rad)
+        return TrajectorySetpoint(self.position, flown, NOTHING, self.yaw_rad)
 
 
 class Task:

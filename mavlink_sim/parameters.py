@@ -121,7 +121,7 @@ class Parameters:
         return changed
 
     def hash(self) -> int:
-        """PX4's _HASH_CHECK: CRC-32 without inversions over every name and value in order."""
+        """_HASH_CHECK by PX4's recipe: CRC-32 without inversions over names and values, in order."""
         crc = 0xFFFFFFFF
         for parameter in self:
             packed = struct.pack("<i" if parameter.kind == INT32 else "<f", parameter.value)

@@ -37,7 +37,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--speed", "fast"], ["--speed", "valid number"]),
         (["--bogus"], ["--bogus"]),
         (["--camera", "a/b"], ["'a/b'"]),
-        (["--wind", "-3"], ["--wind", "0 to 20"]),
+        (["--wind", "-3"], ["--wind", "0 to 8"]),
         (["--onboard-port", "0"], ["--onboard-port", "1 to 65535"]),
         (["--gcs-bind", "70000"], ["--gcs-bind", "0 to 65535"]),
         (["--system-id", "256"], ["--system-id", "1 to 255"]),

@@ -135,6 +135,19 @@ def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(make_c
     assert abs(math.degrees(cockpit.vehicle.airframe.yaw_rad)) > 150.0  # it flew nose first
 
 
+@pytest.mark.parametrize(("seed", "wind_mps"), [(0, 0.0), (1, 0.0), (2, 5.0)])
+def test_return_in_moving_air_ends_at_home_too(
+    make_cockpit: Any, velocity_setpoint: Any, seed: int, wind_mps: float
+) -> None:
+    cockpit = make_cockpit(gusts_mps=None, seed=seed, wind_mps=wind_mps)
+    cockpit.take_off(6.0)
+    away = velocity_setpoint(3, 0, 0)
+    cockpit.offboard(away)
+    cockpit.fly(6.0, away)  # and then nothing: the failsafe returns
+    cockpit.until(lambda: not cockpit.armed, 90.0)
+    assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 2.5
+
+
 def test_reposition_flies_there_and_turns_to_the_given_heading(cockpit: Any) -> None:
     cockpit.take_off(5.0)
     assert cockpit.command_int(192, (-1, 1, 0, math.pi / 2), 473978330, 85455942, 497.4) == [0]
