@@ -59,7 +59,7 @@ def fly_through(cockpit: Any, datagrams: list[bytes]) -> None:
             assert item.pack(codec)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.lists(packets(HANDLED), min_size=1, max_size=12))
 def test_messages_it_handles(make_cockpit: Any, datagrams: list[bytes]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0)
@@ -67,7 +67,7 @@ def test_messages_it_handles(make_cockpit: Any, datagrams: list[bytes]) -> None:
     fly_through(cockpit, datagrams)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.lists(packets(OTHERS), min_size=1, max_size=12))
 def test_messages_it_does_not_handle(make_cockpit: Any, datagrams: list[bytes]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0)
@@ -101,7 +101,7 @@ PARAMETERS = [
 ]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.dictionaries(st.sampled_from(PARAMETERS), finite, min_size=1, max_size=5))
 def test_parameters_out_of_every_range(make_cockpit: Any, values: dict[str, float]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0)

@@ -112,7 +112,7 @@ any_number = st.one_of(st.just(math.nan), st.floats(-1e30, 1e30))
 vectors = st.tuples(any_number, any_number, any_number)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(vectors, vectors, vectors, any_number, any_number)
 def test_no_setpoint_however_absurd_makes_the_motion_a_nonsense(
     position: tuple[float, float, float],

@@ -180,7 +180,7 @@ numbers = st.one_of(
 COMMANDS = [16, 20, 21, 22, 176, 178, 179, 185, 192, 193, 245, 300, 400, 401, 510, 511, 512, 519, 520]
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     st.lists(
         st.tuples(st.sampled_from(COMMANDS), st.lists(numbers, min_size=7, max_size=7)),
