@@ -24,6 +24,9 @@ def quiet_opencv() -> None:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
+quiet_opencv()  # on import too: FFmpeg's level is looked at once, when anybody first uses it through OpenCV
+
+
 @contextmanager
 def environment(name: str, value: str) -> Iterator[None]:
     """Set one environment variable for a while, one thread at a time."""
