@@ -52,6 +52,8 @@ async def simulator(
         "0",
     ]
     arguments += ["--camera", camera, "--truth", str(truth_path), "--seed", str(seed)]
+    # The open field of the built-in world needs no 30 m on the way home (PX4's default).
+    arguments += ["--param", "RTL_RETURN_ALT=8"]
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",
@@ -128,6 +130,8 @@ def rehearsal_settings(
         "camera.mount_right_m": str(DEFAULT_MOUNT.right_m),
         "camera.mount_down_m": str(DEFAULT_MOUNT.down_m),
         "detector.threads": "1",
+        # The size at which the bundled model was trained; see docs/models.md.
+        "detector.image_size": "320",
         # A laptop draws the world, looks at it and films it all at once: frames may come late.
         "guidance.perception_max_age_s": "1.0",
         "zenoh.listen": f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",
