@@ -59,15 +59,15 @@ class RawParser:
         self._buffer += data
         size = self._frame_bytes
         count = len(self._buffer) // size
-        pictures = [self._picture(bytes(self._buffer[i * size : (i + 1) * size])) for i in range(count)]
+        pictures = [self._picture(self._buffer[i * size : (i + 1) * size]) for i in range(count)]
         if count:
             del self._buffer[: count * size]
         return pictures
 
-    def _picture(self, data: bytes) -> NDArray[np.uint8]:
+    def _picture(self, data: bytearray) -> NDArray[np.uint8]:
         pixels = np.frombuffer(data, np.uint8).reshape(self._height, self._width, self._channels)
         if self._format == "bgr24":
-            return pixels.copy()  # frames are the reader's own, to write on
+            return pixels  # the slice was a copy, the reader's own to write on
         code = cv2.COLOR_RGB2BGR if self._format == "rgb24" else cv2.COLOR_GRAY2BGR
         return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
 
