@@ -138,6 +138,7 @@ def rehearsal_settings(
     }
     if video is not None:
         overrides["recording.video"] = str(video)
+        overrides["recording.rate_hz"] = "8"
     return load_settings(Path(os.devnull), overrides, environment={})
 
 
