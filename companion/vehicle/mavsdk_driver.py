@@ -80,9 +80,10 @@ class MavsdkDriver(AutopilotDriver):
         if library is None:
             return
         for future in list(self._awaited):  # MAVSDK forgets them when it is destroyed
-            future.set_exception(
-                CommandRefusedError(f"{self.url}: the link was closed before an answer came")
-            )
+            if not future.done():
+                future.set_exception(
+                    CommandRefusedError(f"{self.url}: the link was closed before an answer came")
+                )
         # A parameter request that is under way holds the one thread; destroying waits its turn behind it.
         await self._loop.run_in_executor(self._blocking, library.destroy)
         self._blocking.shutdown(wait=False)

@@ -149,7 +149,7 @@ def test_a_service_that_is_ended_in_flight_lets_the_autopilot_hold(
         offboard = simulator.events.index("mode OFFBOARD")
         service.signal(number)
         assert service.process.wait(20) == 0
-        simulator.wait_for_event("mode HOLD", after=offboard)
+        simulator.wait_for_event("mode HOLD", since=offboard)
 
 
 def test_frames_from_standard_input(small_model: Path, tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 IOU_THRESHOLDS: NDArray[np.float64] = np.linspace(0.5, 0.95, 10)
-RECALL_POINTS: NDArray[np.float64] = np.linspace(0.0, 1.0, 101)
+# k / 100 rounds as a recall of found / objects does; multiples of a step would not, and miss by one bit.
+RECALL_POINTS = np.arange(101) / 100
 DETECTIONS_PER_IMAGE = 100
 
 
