@@ -6,6 +6,7 @@ A task is made when its mode begins and asked for a `TrajectorySetpoint` at ever
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 from mavlink_sim.control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.parameters import Parameters
@@ -88,15 +89,16 @@ class Trajectory:
         return TrajectorySetpoint(self.position, flown, NOTHING, self.yaw_rad)
 
 
-class Task:
+class Task(ABC):
     """The common face of the flight tasks. `landing` and `finished` are read after each `update`."""
 
     landing = False  # on the final descent
     finished = False
     goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
 
+    @abstractmethod
     def update(self, dt_s: float) -> TrajectorySetpoint:
-        raise NotImplementedError
+        """Where to be and how to move after another `dt_s` seconds."""
 
 
 class Hold(Task):
