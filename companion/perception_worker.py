@@ -182,8 +182,13 @@ def _load(settings: Settings) -> Detector:
         iou=wanted.iou,
         image_size=wanted.image_size,
         precision=wanted.precision,
-        threads=wanted.threads,
+        threads=wanted.threads or _spare_threads(),
     )
+
+
+def _spare_threads() -> int:
+    """All processors but one: the service, and whoever talks to it, must not wait for the network."""
+    return max(1, len(os.sched_getaffinity(0)) - 1)
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

@@ -196,7 +196,7 @@ class DetectorSection(Section):
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
-    """processor threads of the network; unset: as many as torch takes by itself"""
+    """processor threads of the network; unset: one for every processor but one"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """look at every N-th frame only"""
 
