@@ -8,8 +8,11 @@ from companion.guidance.behaviour import Behaviour, Requirement, Situation
 from companion.vehicle.state import LandedState
 
 PERCEPTION_GAP_S = 1.5
-"""A detector that was heard within this is at work. It may be late for a moment: a small computer that starts the
-very program that sends the command is busy. Steering asks more (`perception_fresh`); until then behaviours brake."""
+"""A detector that was heard within this is at work.
+
+It may be late for a moment: a small computer that starts the very program that sends the command is busy.
+Steering asks more (`perception_fresh`); until then behaviours brake.
+"""
 
 AIRBORNE = (LandedState.IN_AIR, LandedState.TAKING_OFF, LandedState.LANDING)
 

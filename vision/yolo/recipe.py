@@ -15,8 +15,8 @@ DEFAULT_RECIPE = TrainingSettings(
     depth_multiple=1 / 3,
     width_multiple=0.125,
     max_channels=1024,
-    # First smaller than the frames it is for, with the same field of view: a step costs a quarter, and objects
-    # have about half the pixels. Then the frames' own size. Every scene comes round several times, augmented anew.
+    # First smaller than the frames it is for, with the same field of view: a step costs a quarter, and
+    # objects have about half the pixels. Then the frames' own size. Scenes come round, augmented anew.
     stages=(Stage(320, 256, 16, 9000, scenes=12_000), Stage(640, 480, 8, 2200, scenes=4_000)),
     learning_rate=3e-3,
     decay_steps=6000,
