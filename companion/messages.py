@@ -14,10 +14,13 @@ from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
 
 
-def detections_message(result: PerceptionResult, vehicle: str, published_ns: int) -> dict[str, Any]:
+def detections_message(
+    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+) -> dict[str, Any]:
     """One frame's detections, with the three stamps: captured, inferred, published."""
     return {
         "vehicle": vehicle,
+        "view": view,
         "sequence": result.sequence,
         "captured_ns": result.captured_ns,
         "inferred_ns": result.inferred_ns,

@@ -35,6 +35,7 @@ from companion.settings import Settings
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
+from vision.sources.sharing import SharingSource
 from vision.video_writer import VideoWriterError
 
 if TYPE_CHECKING:
@@ -163,7 +164,10 @@ def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
         stack.callback(recording.close)
     detector = _load(settings) if settings.detector.enabled else None
-    source = stack.enter_context(open_source(settings.source.uri, settings.source.opening()))
+    source = open_source(settings.source.uri, settings.source.opening())
+    if settings.source.share is not None:
+        source = SharingSource(source, settings.source.share)
+    stack.enter_context(source)
     if recording is not None:
         # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)
@@ -182,13 +186,8 @@ def _load(settings: Settings) -> Detector:
         iou=wanted.iou,
         image_size=wanted.image_size,
         precision=wanted.precision,
-        threads=wanted.threads or _spare_threads(),
+        threads=wanted.threads,
     )
-
-
-def _spare_threads() -> int:
-    """All processors but one: the service, and whoever talks to it, must not wait for the network."""
-    return max(1, len(os.sched_getaffinity(0)) - 1)
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

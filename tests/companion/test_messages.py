@@ -39,6 +39,7 @@ def one_car(range_m: float) -> Detections:
 def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
     message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000))
     assert message == {
+        "view": None,
         "vehicle": "alpha",
         "sequence": 7,
         "captured_ns": 1_000,
