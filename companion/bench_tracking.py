@@ -1,0 +1,117 @@
+"""What tracking is worth: the same detections with and without it, on rendered sequences with known truth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.bench_scenes import (
+    CAMERA,
+    LEAST_VISIBLE,
+    MOTIONS,
+    MOUNT,
+    DrawnDetector,
+    Motion,
+    SceneFrame,
+    scene_frames,
+    without_image,
+)
+from vision.detections import NO_TRACK, Detections
+from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings
+from vision.tracking.association import overlaps
+from vision.tracking.clear_mot import Labelled, MotScore, clear_mot
+
+ATTITUDE_RATE_HZ = 50.0
+# Of the attitudes, one sigma: an autopilot's estimate against the picture of a camera that is well mounted.
+ATTITUDE_NOISE_RAD = 0.002
+SAME_IOU = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """One frame's truth and what a detector made of it."""
+
+    frame: SceneFrame
+    detections: Detections
+
+
+def no_tracking(sequence: Iterable[Seen], confidence: float) -> list[tuple[Labelled, Labelled]]:
+    """The truth, and identities as they come without a tracker.
+
+    A box takes the identity of the box of its class in the frame before that it overlaps most, else a new one.
+    """
+    labelled = []
+    next_identity = 1
+    identities: list[int] = []
+    before: Detections | None = None
+    for seen in sequence:
+        detections = seen.detections[seen.detections.confidence >= confidence]
+        identities, known = [0] * len(detections), identities
+        if before is not None and len(before) and len(detections):
+            iou = overlaps(before.xyxy, detections.xyxy)
+            iou[before.class_id[:, None] != detections.class_id[None, :]] = 0.0
+            while iou.max() >= SAME_IOU:
+                row, column = np.unravel_index(int(iou.argmax()), iou.shape)
+                identities[column] = known[row]
+                iou[row, :] = iou[:, column] = 0.0
+        for index, identity in enumerate(identities):
+            if not identity:
+                identities[index] = next_identity
+                next_identity += 1
+        before = detections
+        labelled.append(_against_truth(seen.frame, identities, detections))
+    return labelled
+
+
+def tracked(
+    sequence: Iterable[Seen],
+    settings: TrackerSettings,
+    attitudes: AttitudeHistory | None,
+    timing_ms: list[float] | None = None,
+) -> list[tuple[Labelled, Labelled]]:
+    """The truth, and the tracks that count as true."""
+    tracker = Tracker(settings)
+    labelled = []
+    for seen in sequence:
+        view = None
+        if attitudes is not None:
+            ned_from_body = attitudes.at(seen.frame.captured_ns)
+            if ned_from_body is not None:
+                view = CameraView(CAMERA, ned_from_body @ MOUNT.body_from_optical)
+        started_s = time.perf_counter()
+        detections = tracker.update(seen.detections, seen.frame.captured_ns, view).detections
+        if timing_ms is not None:
+            timing_ms.append((time.perf_counter() - started_s) * 1e3)
+        assert detections.track_id is not None
+        assert detections.track_confirmed is not None
+        shown = detections[detections.track_confirmed & (detections.track_id != NO_TRACK)]
+        assert shown.track_id is not None
+        labelled.append(_against_truth(seen.frame, shown.track_id.tolist(), shown))
+    return labelled
+
+
+def attitudes_of(motion: Motion, seconds: float, seed: int = 0) -> AttitudeHistory:
+    """What the autopilot tells of its attitude during a sequence, with noise."""
+    rng = np.random.default_rng((seed, 14))
+    history = AttitudeHistory(keep_s=seconds + 2.0)
+    for index in range(round(-0.5 * ATTITUDE_RATE_HZ), round((seconds + 0.5) * ATTITUDE_RATE_HZ)):
+        time_s = index / ATTITUDE_RATE_HZ
+        noise = rng.normal(0.0, ATTITUDE_NOISE_RAD / 2, 3)
+        w, x, y, z = np.array(motion.attitude_wxyz(time_s)) + np.array([0.0, *noise])
+        history.add(1_000_000_000 + round(time_s * 1e9), (float(w), float(x), float(y), float(z)))
+    return history
+
+
+def _against_truth(
+    frame: SceneFrame, identities: Sequence[int], detections: Detections
+) -> tuple[Labelled, Labelled]:
+    """The frame's truth and its tracked boxes; a box on an object that need not be seen counts as neither."""
+    truth = Labelled(frame.identity[frame.counts].tolist(), frame.xyxy[frame.counts])
+    needless = overlaps(detections.xyxy, frame.xyxy[~frame.counts]).max(axis=1, initial=0.0) >= 0.5
+    needed = overlaps(detections.xyxy, truth.xyxy).max(axis=1, initial=0.0) >= 0.5
+    kept = ~needless | needed
+    shown = [identity for identity, keep in zip(identities, kept, strict=True) if keep]
+    return truth, Labelled(shown, detections.xyxy[kept])
