@@ -1,4 +1,4 @@
-"""Rendered sequences with known truth: people and cars on their ways, seen from a vehicle that sways and turns."""
+"""Rendered sequences with known truth: people and cars, seen from a vehicle that sways and turns."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _gusts(time_s: float) -> tuple[float, float, float]:
 
 
 def _turning(time_s: float) -> tuple[float, float, float]:
-    """Looking from side to side: 25° to the left and right at 60° a second at most, and as a quadrotor does."""
+    """Looking from side to side, 25° to the left and right, at 60° a second at most."""
     return (
         math.radians(1.5 * math.sin(3.0 * time_s)),
         math.radians(1.5 * math.sin(2.3 * time_s)),
@@ -115,7 +115,12 @@ def walkers(seed: int = 0, people: int = 7) -> tuple[Walker, ...]:
     for north, speed in ((27.0, 5.0), (32.0, 4.0)):
         found.append(
             Walker(
-                "car", (north, -12.0), (north, 12.0), speed, int(rng.integers(2**31)), float(rng.uniform(0, 6))
+                "car",
+                (north, -12.0),
+                (north, 12.0),
+                speed,
+                int(rng.integers(2**31)),
+                float(rng.uniform(0, 6)),
             )
         )
     return tuple(found)
@@ -199,8 +204,8 @@ def scene_frames(
 class DrawnDetector:
     """Detections made of the truth, with a detector's faults, so that only the tracker is on trial.
 
-    Boxes are off by 4 % of their size; what is half hidden is seen with less confidence and missed more often;
-    now and then there is something that is not there, and a bush passes for a person most of the time.
+    Boxes are off by 4 % of their size; what is half hidden is seen with less confidence and missed more
+    often; now and then there is something that is not there.
     """
 
     def __init__(self, seed: int = 0) -> None:

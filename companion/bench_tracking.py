@@ -41,7 +41,7 @@ class Seen:
 def no_tracking(sequence: Iterable[Seen], confidence: float) -> list[tuple[Labelled, Labelled]]:
     """The truth, and identities as they come without a tracker.
 
-    A box takes the identity of the box of its class in the frame before that it overlaps most, else a new one.
+    A box takes the identity of the box of its class in the frame before that it overlaps most.
     """
     labelled = []
     next_identity = 1

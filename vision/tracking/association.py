@@ -31,6 +31,16 @@ def _area(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     return area
 
 
+def grown(boxes: NDArray[np.floating], share: float) -> NDArray[np.float64]:
+    """(N, 4) boxes xyxy, larger by `share` of their size (the geometric mean of the sides) on every side."""
+    corners = np.asarray(boxes, np.float64)
+    if not share:
+        return corners
+    margin = share * np.sqrt(_area(corners))[:, None]
+    larger: NDArray[np.float64] = np.concatenate([corners[:, :2] - margin, corners[:, 2:] + margin], axis=1)
+    return larger
+
+
 def match(similarity: NDArray[np.float64], least: float) -> Pairs:
     """The pairs (row, column) with the largest sum of `similarity - least`, each row and column used once.
 
@@ -47,6 +57,8 @@ def match(similarity: NDArray[np.float64], least: float) -> Pairs:
     alone = possible & (possible.sum(axis=1) == 1)[:, None] & (possible.sum(axis=0) == 1)[None, :]
     pairs = [(int(row), int(column)) for row, column in np.argwhere(alone)]
     disputed = possible & ~alone
+    if not disputed.any():
+        return pairs
     for rows, columns in _connected_parts(disputed):
         part = gain[np.ix_(rows, columns)].clip(0.0)
         pairs += [(rows[row], columns[column]) for row, column in assign(-part) if part[row, column] > 0.0]

@@ -1,8 +1,8 @@
 """How well tracks keep to the truth: CLEAR MOT and IDF1.
 
 K. Bernardin, R. Stiefelhagen, "Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics",
-EURASIP J. Image and Video Processing, 2008; fragmentations as in Y. Li et al., CVPR 2009; IDF1: E. Ristani et al.,
-arXiv 1609.01775.
+EURASIP J. Image and Video Processing, 2008; fragmentations as in Y. Li et al., CVPR 2009; IDF1 as in E.
+Ristani et al., arXiv 1609.01775.
 """
 
 from __future__ import annotations

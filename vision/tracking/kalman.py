@@ -17,9 +17,10 @@ Array = NDArray[np.float64]
 # One sigma of a detected box's middle and sides, in box sizes.
 MEASURED = 0.05
 # Where a box goes by itself: a random walk (sizes / √s) and changes of its speed (sizes / s / √s). At 30
-# frames a second these are the 1/20 and 1/160 a frame of ByteTrack's own filter.
+# frames a second 0.27 and 1.0 are the 1/20 and 1/160 a frame of ByteTrack's own filter; the vehicle's motion,
+# where it is not known, asks for quicker changes of speed (tuned on rendered sequences, flat from 1 to 3).
 WALK = 0.27
-ACCELERATION = 1.0
+ACCELERATION = 2.0
 # What may be the speed of a box that was seen once, sizes / s.
 FIRST_SPEED = 2.0
 # No box is smaller than this, pixels: sizes must stay positive.

@@ -107,8 +107,8 @@ class TrackerSettings:
         keep_confidence: a weaker detection is left out of the result if it belongs to no track.
         true_score: a track counts as true when its median confidence reaches this,
         true_frames: and it was seen in so many frames.
-        min_iou: a strong detection is a track's if it overlaps its prediction by at least this,
-        min_iou_weak: and a weak one by at least this.
+        min_iou: a strong detection can be a track's if it overlaps its prediction by more than this,
+        min_iou_weak: and a weak one by more than this.
         lost_s: unseen for so long, a track is lost.
         end_s: unseen for so long, it has ended.
     """
@@ -119,7 +119,7 @@ class TrackerSettings:
     true_score: float = 0.4
     true_frames: int = 3
     min_iou: float = 0.2
-    min_iou_weak: float = 0.4
+    min_iou_weak: float = 0.5
     lost_s: float = 0.5
     end_s: float = 2.0
 
