@@ -23,7 +23,13 @@ from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
-from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
+from companion.messages import (
+    detections_message,
+    labels_message,
+    setpoint_message,
+    tracks_message,
+    vehicle_message,
+)
 from companion.operator.console import run_console, terminal_is_free
 from companion.perception import PerceptionKeeper, PerceptionState
 from companion.settings import Settings
@@ -108,7 +114,7 @@ class Service:
         Raises:
             LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
         """
-        unsubscribe = self.driver.subscribe(self._history.add)
+        unsubscribe = self.driver.subscribe(self._take_state)
         tasks: list[asyncio.Task[None]] = []
         try:
             await self._start()
@@ -343,11 +349,19 @@ class Service:
             logger.exception("a detection message could not be used")
             self._targets, self._unplaced = (), f"{type(error).__name__}: {error}"
 
+    def _take_state(self, state: VehicleState) -> None:
+        """Remember where the vehicle was; the tracker wants to know where the camera looked."""
+        self._history.add(state)
+        if state.attitude is not None:
+            self.perception.send_attitude(state.attitude_ns, state.attitude)
+
     def _use(self, result: PerceptionResult) -> None:
         """Publish it, and work out where what it shows is."""
         name = self.settings.vehicle.name
         self.bus.publish(topics.DETECTIONS, detections_message(result, name, time.monotonic_ns()))
         self.bus.publish(topics.LABELS, labels_message(result))
+        if result.track_events:
+            self.bus.publish(topics.TRACKS, tracks_message(result, name, time.monotonic_ns()))
         try:
             self._targets = targets_from_detections(
                 result.detections.records(),

@@ -60,7 +60,8 @@ def annotate(
 
     Args:
         image: (height, width, 3) uint8, BGR. Lines and letters scale with its size.
-        detections: each gets a box of its class's colour and a plate: name, track, confidence, range where known.
+        detections: each gets a box of its class's colour and a plate: name, track and range where
+            known, confidence.
         lines: text for a panel at the top left.
         highlight: index of the detection that matters now: drawn last, tinted, with bracketed corners.
 

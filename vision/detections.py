@@ -31,6 +31,8 @@ class DetectionRecord(_TrackRecord):
     range_m: float | None
 
 
+TRACK_NONE, TRACK_TENTATIVE, TRACK_CONFIRMED = "none", "tentative", "confirmed"
+"""A record's `track_state`: no track, one that may be a mistake, one that counts as true."""
 NO_TRACK = -1
 """In `Detections.track_id`: belongs to no track."""
 
@@ -140,9 +142,9 @@ class Detections:
         if self.track_id is None or self.track_score is None or self.track_confirmed is None:
             return {"track_id": None, "track_score": None, "track_state": None}
         if self.track_id[index] == NO_TRACK:
-            return {"track_id": None, "track_score": None, "track_state": "none"}
+            return {"track_id": None, "track_score": None, "track_state": TRACK_NONE}
         return {
             "track_id": int(self.track_id[index]),
             "track_score": round(float(self.track_score[index]), 4),
-            "track_state": "confirmed" if self.track_confirmed[index] else "tentative",
+            "track_state": TRACK_CONFIRMED if self.track_confirmed[index] else TRACK_TENTATIVE,
         }

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.camera_model import CameraModel, CameraMount
-from vision.detections import DetectionRecord
+from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import direction_ned, point_at_depth, point_on_ground
 from vision.rotation import matrix_from_quaternion, slerp
 
@@ -140,6 +140,9 @@ def _target(
         range_source=source,
         position_ned_m=(north, east, down) if known else None,
         box_xyxy=(left, top, right, bottom),
+        track_id=detection.get("track_id"),
+        track_score=detection.get("track_score"),
+        trusted=detection.get("track_state") in (None, TRACK_CONFIRMED),
     )
 
 

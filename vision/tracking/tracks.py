@@ -7,15 +7,17 @@ from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
 
+from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
+
 XYXY = tuple[float, float, float, float]
 
 
 class TrackState(StrEnum):
     """Whether a track counts as true."""
 
-    TENTATIVE = "tentative"
+    TENTATIVE = TRACK_TENTATIVE
     """too short, or its median confidence is too low: it may be a mistake of the detector"""
-    CONFIRMED = "confirmed"
+    CONFIRMED = TRACK_CONFIRMED
     """it counts as true, once and for all"""
 
 
