@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from rich.table import Table
 
+from companion.bench import percentiles
 from companion.bench_scenes import (
     CAMERA,
-    LEAST_VISIBLE,
     MOTIONS,
     MOUNT,
     DrawnDetector,
@@ -36,6 +37,62 @@ class Seen:
 
     frame: SceneFrame
     detections: Detections
+
+
+def measure_tracking(
+    seconds: float, *, rate_hz: float, model: str | None, seed: int = 0, drop: float = 0.1
+) -> dict[str, object]:
+    """Every motion's sequence, without tracking, with it, and with the camera's turning removed.
+
+    Args:
+        rate_hz: of the camera; `drop` of its frames are missing.
+        model: a checkpoint that looks at the rendered pictures; None: boxes made of the truth, with faults.
+
+    Raises:
+        CheckpointError: the model cannot be read.
+    """
+    detect = _looking(model) if model is not None else DrawnDetector(seed).detect
+    settings = TrackerSettings()
+    timing_ms: list[float] = []
+    figures: dict[str, object] = {"detector": model or "drawn", "rate_hz": rate_hz, "dropped_share": drop}
+    for motion in MOTIONS:
+        sequence = [
+            Seen(without_image(frame), detect(frame))
+            for frame in scene_frames(motion, seconds=seconds, rate_hz=rate_hz, seed=seed, drop=drop)
+        ]
+        attitudes = attitudes_of(motion, seconds, seed)
+        ways = {
+            "no tracking": no_tracking(sequence, settings.keep_confidence),
+            "tracking": tracked(sequence, settings, None),
+            "tracking, attitude known": tracked(sequence, settings, attitudes, timing_ms),
+        }
+        for way, labelled in ways.items():
+            figures[f"{motion.name}, {way}"] = _rounded(clear_mot(labelled))
+    figures["tracker_ms"] = percentiles(timing_ms)
+    return figures
+
+
+def _looking(model: str) -> Callable[[SceneFrame], Detections]:
+    from vision.detector import Detector  # only here: it brings torch
+
+    detector = Detector(model, confidence=TrackerSettings().low_confidence)
+    return lambda frame: detector.detect(frame.image)
+
+
+def _rounded(score: MotScore) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in score.as_dict().items()}
+
+
+def tracking_table(figures: dict[str, object]) -> Table:
+    """The same for people."""
+    table = Table(title=f"detector: {figures['detector']}, {figures['rate_hz']:g} frames a second")
+    names = ("mota", "switches", "fragmentations", "misses", "false_positives", "idf1")
+    for heading in ("camera, identities", *(name.replace("_", " ") for name in names)):
+        table.add_column(heading, justify="left" if "," in heading else "right")
+    for way, score in figures.items():
+        if isinstance(score, dict) and "mota" in score:
+            table.add_row(way, *(f"{score[name]:g}" for name in names))
+    return table
 
 
 def no_tracking(sequence: Iterable[Seen], confidence: float) -> list[tuple[Labelled, Labelled]]:

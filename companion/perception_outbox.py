@@ -1,7 +1,7 @@
 """The worker's way out: a thread that sends, so that the loop never waits for a service that reads slowly.
 
 Of results and heartbeats only the newest waits; an older one is replaced and counted, but what it told of
-tracks that began, got lost or ended goes with the newer. Everything else waits in a queue that is bounded too.
+tracks that began, got lost or ended goes with the newer. Everything else waits in a queue, bounded too.
 """
 
 from __future__ import annotations

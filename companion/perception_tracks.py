@@ -1,4 +1,4 @@
-"""The tracks of one worker after another: no number comes twice, and what a dead worker followed has ended."""
+"""The tracks of one worker after another: no number comes twice, and what a dead one followed has ended."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ class ObjectTrack:
         return True
 
     def _same_identity(self, targets: list[Target]) -> list[Target]:
-        """Those that can be this object by their identities: the one that bears its own, or else strangers."""
+        """Those that can be this object: the one that bears its identity, or else strangers."""
         own = [t for t in targets if t.track_id is not None and t.track_id == self._track_id]
         if own:
             self._others |= {t.track_id for t in targets if t.track_id not in (None, self._track_id)}

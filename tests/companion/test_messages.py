@@ -56,6 +56,9 @@ def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
                 "xyxy": [10.0, 20.0, 30.0, 60.0],
                 "center": [20.0, 40.0],
                 "range_m": 11.5,
+                "track_id": None,
+                "track_score": None,
+                "track_state": None,
             }
         ],
     }
