@@ -62,12 +62,12 @@ def measure_tracking(
         ]
         attitudes = attitudes_of(motion, seconds, seed)
         ways = {
-            "no tracking": no_tracking(sequence, settings.keep_confidence),
-            "tracking": tracked(sequence, settings, None),
-            "tracking, attitude known": tracked(sequence, settings, attitudes, timing_ms),
+            "last frame": no_tracking(sequence, settings.keep_confidence),
+            "tracker": tracked(sequence, settings, None),
+            "tracker, attitude": tracked(sequence, settings, attitudes, timing_ms),
         }
         for way, labelled in ways.items():
-            figures[f"{motion.name}, {way}"] = _rounded(clear_mot(labelled))
+            figures[f"{motion.name}: {way}"] = _rounded(clear_mot(labelled))
     figures["tracker_ms"] = percentiles(timing_ms)
     return figures
 
@@ -86,12 +86,21 @@ def _rounded(score: MotScore) -> dict[str, float]:
 def tracking_table(figures: dict[str, object]) -> Table:
     """The same for people."""
     table = Table(title=f"detector: {figures['detector']}, {figures['rate_hz']:g} frames a second")
-    names = ("mota", "switches", "fragmentations", "misses", "false_positives", "idf1")
-    for heading in ("camera, identities", *(name.replace("_", " ") for name in names)):
-        table.add_column(heading, justify="left" if "," in heading else "right")
-    for way, score in figures.items():
+    columns = {
+        "MOTA": "mota",
+        "switches": "switches",
+        "fragments": "fragmentations",
+        "misses": "misses",
+        "false": "false_positives",
+        "IDF1": "idf1",
+    }
+    table.add_column("camera")
+    table.add_column("identities")
+    for heading in columns:
+        table.add_column(heading, justify="right")
+    for name, score in figures.items():
         if isinstance(score, dict) and "mota" in score:
-            table.add_row(way, *(f"{score[name]:g}" for name in names))
+            table.add_row(*name.split(": "), *(f"{score[value]:g}" for value in columns.values()))
     return table
 
 

@@ -45,7 +45,7 @@ BASE_TIMEOUT_S = 45.0
 class ApproachBehaviour(Behaviour):
     """Keeps its height, turns its nose to the object and stops `distance_m` before its nearest surface.
 
-    It begins with the object of the class nearest to the nose, of those that count as true, and stays with it.
+    It begins with the object of the class nearest to the nose, among the true ones, and stays with it.
     Lost, it brakes and looks for `lost_timeout_s` before it gives up.
     """
 
