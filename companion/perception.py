@@ -180,7 +180,10 @@ class PerceptionKeeper:
         early_ns = self._attitude_due_ns - stamp_ns
         if not wanted or self._process is None or early_ns > ATTITUDE_JITTER_S * 1e9:
             return
-        self._attitude_due_ns = max(self._attitude_due_ns, stamp_ns) + round(ATTITUDE_PERIOD_S * 1e9)
+        self._attitude_due_ns = max(
+            self._attitude_due_ns + round(ATTITUDE_PERIOD_S * 1e9),
+            stamp_ns + round(2 * ATTITUDE_JITTER_S * 1e9),
+        )
         self._process.turn(Attitude(stamp_ns, attitude))
 
     @property

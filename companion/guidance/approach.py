@@ -157,11 +157,13 @@ class ApproachBehaviour(Behaviour):
         north, east = lost.position_ned_m[0] - position[0], lost.position_ned_m[1] - position[1]
         bearing, range_m = math.atan2(east, north), math.hypot(north, east)
         for target in sorted(fitting, key=lambda target: target.track_id != lost.track_id):
-            if target.captured_ns <= self._seen_ns or target.position_ned_m is None or not target.trusted:
+            if target.captured_ns <= self._seen_ns or target.position_ned_m is None:
+                continue
+            if not target.trusted or lost.is_another(target):
                 continue
             off = abs(wrap_angle(target.bearing_rad - bearing))
             if off < SAME_BEARING_RAD and 0.5 * range_m < target.range_m < 2.0 * range_m:
-                self._track, self._seen_ns = ObjectTrack(target, position), target.captured_ns
+                self._track, self._seen_ns = lost.anew(target, position), target.captured_ns
                 return
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:

@@ -61,6 +61,16 @@ class ObjectTrack:
         """Local NED; down is that of the newest measured place."""
         return (float(self._place[0]), float(self._place[1]), self._down_m)
 
+    def is_another(self, target: Target) -> bool:
+        """Whether this was seen beside the object, so that it cannot be the object."""
+        return target.track_id in self._others
+
+    def anew(self, target: Target, vehicle: Vector3) -> ObjectTrack:
+        """The same object begun again at a target that is taken for it."""
+        track = ObjectTrack(target, vehicle)
+        track._others = self._others
+        return track
+
     def update(self, targets: Sequence[Target], vehicle: Vector3) -> bool:
         """Take the detection that is this object, if any. True: there was a new one.
 
@@ -103,7 +113,7 @@ class ObjectTrack:
         if own:
             self._others |= {t.track_id for t in targets if t.track_id not in (None, self._track_id)}
             return own
-        return [t for t in targets if t.track_id is None or t.track_id not in self._others]
+        return [t for t in targets if not self.is_another(t)]
 
     def _innovation(
         self, target: Target, vehicle: Vector3
