@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from companion.bench import percentiles
@@ -21,9 +22,10 @@ from companion.bench_scenes import (
     without_image,
 )
 from vision.detections import NO_TRACK, Detections
-from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings
+from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings, TrackState
 from vision.tracking.association import overlaps
 from vision.tracking.clear_mot import Labelled, MotScore, clear_mot
+from vision.tracking.tracks import XYXY
 
 ATTITUDE_RATE_HZ = 50.0
 # Of the attitudes, one sigma: an autopilot's estimate against the picture of a camera that is well mounted.
@@ -65,6 +67,7 @@ def measure_tracking(
             "last frame": no_tracking(sequence, settings.keep_confidence),
             "tracker": tracked(sequence, settings, None),
             "tracker, attitude": tracked(sequence, settings, attitudes, timing_ms),
+            "tracks, attitude": believed(sequence, settings, attitudes),
         }
         for way, labelled in ways.items():
             figures[f"{motion.name}: {way}"] = _rounded(clear_mot(labelled))
@@ -128,7 +131,7 @@ def no_tracking(sequence: Iterable[Seen], confidence: float) -> list[tuple[Label
                 identities[index] = next_identity
                 next_identity += 1
         before = detections
-        labelled.append(_against_truth(seen.frame, identities, detections))
+        labelled.append(_against_truth(seen.frame, identities, detections.xyxy))
     return labelled
 
 
@@ -142,11 +145,7 @@ def tracked(
     tracker = Tracker(settings)
     labelled = []
     for seen in sequence:
-        view = None
-        if attitudes is not None:
-            ned_from_body = attitudes.at(seen.frame.captured_ns)
-            if ned_from_body is not None:
-                view = CameraView(CAMERA, ned_from_body @ MOUNT.body_from_optical)
+        view = _view(attitudes, seen.frame.captured_ns)
         started_s = time.perf_counter()
         detections = tracker.update(seen.detections, seen.frame.captured_ns, view).detections
         if timing_ms is not None:
@@ -155,7 +154,28 @@ def tracked(
         assert detections.track_confirmed is not None
         shown = detections[detections.track_confirmed & (detections.track_id != NO_TRACK)]
         assert shown.track_id is not None
-        labelled.append(_against_truth(seen.frame, shown.track_id.tolist(), shown))
+        labelled.append(_against_truth(seen.frame, shown.track_id.tolist(), shown.xyxy))
+    return labelled
+
+
+def believed(
+    sequence: Iterable[Seen], settings: TrackerSettings, attitudes: AttitudeHistory | None
+) -> list[tuple[Labelled, Labelled]]:
+    """The truth, and where the tracks that count as true are believed to be until they are lost."""
+    tracker = Tracker(settings)
+    labelled = []
+    for seen in sequence:
+        stamp_ns = seen.frame.captured_ns
+        tracker.update(seen.detections, stamp_ns, _view(attitudes, stamp_ns))
+        tracks = [
+            track
+            for track in tracker.tracks
+            if track.state is TrackState.CONFIRMED
+            and stamp_ns - track.last_ns < settings.lost_s * 1e9
+            and _in_picture(track.xyxy)
+        ]
+        boxes = np.array([track.xyxy for track in tracks]).reshape(-1, 4)
+        labelled.append(_against_truth(seen.frame, [track.track_id for track in tracks], boxes))
     return labelled
 
 
@@ -171,13 +191,23 @@ def attitudes_of(motion: Motion, seconds: float, seed: int = 0) -> AttitudeHisto
     return history
 
 
+def _in_picture(xyxy: XYXY) -> bool:
+    left, top, right, bottom = xyxy
+    return 0 <= (left + right) / 2 < CAMERA.width and 0 <= (top + bottom) / 2 < CAMERA.height
+
+
+def _view(attitudes: AttitudeHistory | None, stamp_ns: int) -> CameraView | None:
+    ned_from_body = None if attitudes is None else attitudes.at(stamp_ns)
+    return None if ned_from_body is None else CameraView(CAMERA, ned_from_body @ MOUNT.body_from_optical)
+
+
 def _against_truth(
-    frame: SceneFrame, identities: Sequence[int], detections: Detections
+    frame: SceneFrame, identities: Sequence[int], xyxy: NDArray[np.floating]
 ) -> tuple[Labelled, Labelled]:
     """The frame's truth and its tracked boxes; a box on an object that need not be seen counts as neither."""
     truth = Labelled(frame.identity[frame.counts].tolist(), frame.xyxy[frame.counts])
-    needless = overlaps(detections.xyxy, frame.xyxy[~frame.counts]).max(axis=1, initial=0.0) >= 0.5
-    needed = overlaps(detections.xyxy, truth.xyxy).max(axis=1, initial=0.0) >= 0.5
+    needless = overlaps(xyxy, frame.xyxy[~frame.counts]).max(axis=1, initial=0.0) >= 0.5
+    needed = overlaps(xyxy, truth.xyxy).max(axis=1, initial=0.0) >= 0.5
     kept = ~needless | needed
     shown = [identity for identity, keep in zip(identities, kept, strict=True) if keep]
-    return truth, Labelled(shown, detections.xyxy[kept])
+    return truth, Labelled(shown, xyxy[kept])

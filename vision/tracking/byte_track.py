@@ -12,6 +12,7 @@ and a track counts as true only past a second threshold, on the median of its co
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -119,15 +120,16 @@ class Tracker:
         boxes: list[list[float]] = detections.xyxy.tolist()
         track_of = np.full(len(detections), -1)
         self._associate(detections, captured_ns, track_of)
+        lives: dict[int, _Life] = {}
         chosen = np.flatnonzero(track_of >= 0)
         tracks = track_of[chosen]
         if len(chosen):
             seen = kalman.corrected(self._states[tracks], detections.xyxy[chosen])
             self._states.mean[tracks], self._states.covariance[tracks] = seen.mean, seen.covariance
             for index, track in zip(chosen.tolist(), tracks.tolist(), strict=True):
-                self._lives[track].see(float(confidence[index]), captured_ns)
-                self._tell_seen(self._lives[track], boxes[index], captured_ns, events)
-        lives = {int(index): self._lives[track] for index, track in zip(chosen, tracks, strict=True)}
+                lives[index] = life = self._lives[track]
+                life.see(float(confidence[index]), captured_ns)
+                self._tell_seen(life, boxes[index], captured_ns, events)
         self._forget_unseen(captured_ns, events)
         begun = np.flatnonzero((track_of < 0) & (confidence >= self.settings.high_confidence))
         for index in begun.tolist():
@@ -243,14 +245,10 @@ class Tracker:
         )
 
     def _labelled(self, detections: Detections, lives: dict[int, _Life]) -> Detections:
-        count = len(detections)
-        track_id = np.full(count, NO_TRACK, np.int64)
-        score = np.full(count, np.nan, np.float32)
-        confirmed = np.zeros(count, np.bool_)
-        for index, life in lives.items():
-            track_id[index] = life.track_id
-            score[index] = life.scores.median
-            confirmed[index] = life.confirmed
+        of_each = [lives.get(index) for index in range(len(detections))]
+        track_id = np.array([NO_TRACK if life is None else life.track_id for life in of_each], np.int64)
+        score = np.array([math.nan if life is None else life.scores.median for life in of_each], np.float32)
+        confirmed = np.array([life is not None and life.confirmed for life in of_each], np.bool_)
         labelled = replace(detections, track_id=track_id, track_score=score, track_confirmed=confirmed)
         kept = (track_id != NO_TRACK) | (detections.confidence >= self.settings.keep_confidence)
         return labelled if kept.all() else labelled[kept]
