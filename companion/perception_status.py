@@ -37,6 +37,7 @@ class PerceptionStatus:
         dropped: frames lost before they were looked at, and results replaced by newer ones before they left.
         stuck_after_s: the silence after which the worker counts as stuck.
         class_names: what the model knows; empty before the start and without a detector.
+        tracks: objects that are followed now and count as true.
         problem: the last thing that went wrong, empty if nothing did.
     """
 
@@ -52,6 +53,7 @@ class PerceptionStatus:
     dropped: int = 0
     stuck_after_s: float | None = None
     class_names: tuple[str, ...] = ()
+    tracks: int = 0
     problem: str = ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -69,5 +71,6 @@ class PerceptionStatus:
             "dropped": self.dropped,
             "stuck_after_s": self.stuck_after_s,
             "class_names": list(self.class_names),
+            "tracks": self.tracks,
             "problem": self.problem,
         }

@@ -22,7 +22,13 @@ from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
 from companion.guidance.targets import StateHistory
-from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
+from companion.messages import (
+    detections_message,
+    labels_message,
+    setpoint_message,
+    tracks_message,
+    vehicle_message,
+)
 from companion.operator.console import run_console, terminal_is_free
 from companion.perception import PerceptionKeeper, PerceptionStartError
 from companion.settings import Settings
@@ -113,7 +119,7 @@ class Service:
         Raises:
             LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
         """
-        unsubscribe = self.driver.subscribe(self._history.add)
+        unsubscribe = self.driver.subscribe(self._take_state)
         tasks: list[asyncio.Task[None]] = []
         try:
             await self._start()
@@ -335,12 +341,20 @@ class Service:
             else:
                 self._event("error", "the autopilot is not heard any more")
 
+    def _take_state(self, state: VehicleState) -> None:
+        """Remember where the vehicle was; the trackers want to know where their cameras looked."""
+        self._history.add(state)
+        if state.attitude is not None:
+            for view in self.views:
+                view.keeper.send_attitude(state.attitude_ns, state.attitude)
+
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Publish what a view saw; work out where it is, if that view steers."""
-        name = self.settings.vehicle.name
-        message = detections_message(result, name, time.monotonic_ns(), view.name)
-        self.bus.publish(topics.DETECTIONS, message, view.name)
+        name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
+        self.bus.publish(topics.DETECTIONS, detections_message(result, name, now_ns, view.name), view.name)
         self.bus.publish(topics.LABELS, labels_message(result), view.name)
+        if result.track_events:
+            self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
         if view is self.steering:
             view.place(result, self._history)
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 
 from vision.camera_model import CameraModel, CameraMount
 from vision.sources.source import SourceSettings
+from vision.tracking.tracks import TrackerSettings
 
 # What `vision.detector` calls the bundled model. Named here too, as importing that module would load torch.
 DEFAULT_MODEL = "default"
@@ -208,6 +209,38 @@ class DetectorSection(Section):
     """look at every N-th frame only"""
 
 
+class TrackerSection(Section):
+    """Which detection is which object from frame to frame, and which objects count as true."""
+
+    enabled: bool = True
+    """give every object an identity; false: every frame stands for itself, and all that is seen counts"""
+    high_confidence: Annotated[float, Field(ge=0, le=1)] = 0.35
+    """a detection this sure can begin a track (never less than detector.confidence)"""
+    low_confidence: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """a detection this sure can continue a track, and is then kept in spite of detector.confidence"""
+    true_score: Annotated[float, Field(ge=0, le=1)] = 0.4
+    """a track counts as true when the median of its confidences reaches this; only such can be flown to"""
+    true_frames: Annotated[int, Field(ge=1, le=1000)] = 3
+    """and when it was seen in so many frames"""
+    lost_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    """unseen for so long, a track is lost, seconds"""
+    end_s: Annotated[float, Field(gt=0, le=600)] = 2.0
+    """unseen for so long, a track has ended: what comes then is another, seconds"""
+    camera_motion: bool = True
+    """remove the camera's turning by the vehicle's attitude; false for recorded films and gimbals"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        self.following(0.0)
+        return self
+
+    def following(self, confidence: float) -> TrackerSettings:
+        """The same, as `vision.tracking` takes it, beside a detector with this `confidence`."""
+        values = self.model_dump(exclude={"enabled", "camera_motion"})
+        values["high_confidence"] = max(self.high_confidence, confidence)
+        return TrackerSettings(keep_confidence=confidence, **values)
+
+
 class GuidanceSection(Section):
     """How the vehicle may be moved, and when what we know is too old to move by."""
 
@@ -302,6 +335,7 @@ class ViewSections(Section):
     source: SourceSection = SourceSection()
     camera: CameraSection = CameraSection()
     detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
     recording: RecordingSection = RecordingSection()
 
 
@@ -312,6 +346,7 @@ class Settings(Section):
     source: SourceSection = SourceSection()
     camera: CameraSection = CameraSection()
     detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
     guidance: GuidanceSection = GuidanceSection()
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()

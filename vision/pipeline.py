@@ -1,4 +1,4 @@
-"""The perception worker's one loop: a frame, what is in it, how far that is, and the result on its way."""
+"""The perception worker's one loop: a frame, what is in it, which object that is, how far, and on its way."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from vision.depth import range_of_boxes
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.sources import Source
+from vision.tracking import CameraView, Tracker, TrackEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +26,12 @@ class PerceptionResult:
         captured_ns: CLOCK_MONOTONIC nanoseconds of the frame's capture.
         inferred_ns: of the moment when the detections were known.
         width, height: the frame's size, pixels.
-        detections: in the frame's pixels, with ranges where the frame has depth.
-        timing_ms: stage → milliseconds: `preprocess`, `inference`, `postprocess`, `range`, and `total`.
+        detections: in the frame's pixels, with tracks if there is a tracker, and with ranges where the frame
+            has depth.
+        timing_ms: stage → milliseconds: `preprocess`, `inference`, `postprocess`, `track`, `range`, and
+            `total`.
         dropped: frames lost so far, between the source and here; those left out on purpose do not count.
+        track_events: what happened to tracks, the oldest first; all since the result before.
     """
 
     sequence: int
@@ -38,6 +42,7 @@ class PerceptionResult:
     detections: Detections
     timing_ms: dict[str, float]
     dropped: int
+    track_events: tuple[TrackEvent, ...] = ()
 
 
 class Timing(Protocol):
@@ -68,7 +73,7 @@ class FrameRecorder(Protocol):
 
 
 class Pipeline:
-    """Source → detector → range → result, one frame a step.
+    """Source → detector → tracker → range → result, one frame a step.
 
     Attributes:
         frames: frames read so far.
@@ -82,6 +87,8 @@ class Pipeline:
         *,
         every: int = 1,
         recorder: FrameRecorder | None = None,
+        tracker: Tracker | None = None,
+        view_at: Callable[[Frame], CameraView | None] = lambda _: None,
     ) -> None:
         """
         Args:
@@ -89,6 +96,9 @@ class Pipeline:
             detector: None: nothing is looked for, and every result is empty.
             every: look at every N-th frame that was read. The others are only recorded.
             recorder: is given every frame with the newest detections, after the result has left.
+            tracker: is given the detections of every frame that is looked at.
+            view_at: tells where the camera looked when it took a frame, None where that is not known. Asked
+                after the detection, when what the vehicle told of that moment has come.
         """
         if every < 1:
             raise ValueError(f"every must be at least 1, got {every}")
@@ -96,6 +106,8 @@ class Pipeline:
         self._detector = detector
         self._every = every
         self._recorder = recorder
+        self._tracker = tracker if detector is not None else None
+        self._view_at = view_at
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self.frames = 0
@@ -138,10 +150,16 @@ class Pipeline:
                 timing_ms["inference"] = timing.inference_ms
                 timing_ms["postprocess"] = timing.postprocess_ms
         detected_ns = time.perf_counter_ns()
+        events: tuple[TrackEvent, ...] = ()
+        if self._tracker is not None:
+            tracked = self._tracker.update(detections, frame.captured_ns, self._view_at(frame))
+            detections, events = tracked.detections, tracked.events
+        tracked_ns = time.perf_counter_ns()
+        timing_ms["track"] = (tracked_ns - detected_ns) / 1e6
         if frame.depth_m is not None:
             detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
         done_ns = time.perf_counter_ns()
-        timing_ms["range"] = (done_ns - detected_ns) / 1e6
+        timing_ms["range"] = (done_ns - tracked_ns) / 1e6
         timing_ms["total"] = (done_ns - started_ns) / 1e6
         return PerceptionResult(
             sequence=frame.sequence,
@@ -152,4 +170,5 @@ class Pipeline:
             detections=detections,
             timing_ms=timing_ms,
             dropped=self.dropped,
+            track_events=events,
         )

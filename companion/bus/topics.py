@@ -58,6 +58,15 @@ LABELS: Final = Topic(
     False,
     "the class names of one frame, comma separated",
 )
+TRACKS: Final = Topic(
+    "tracks",
+    None,
+    None,
+    _JSON,
+    _DATA,
+    False,
+    "what happened to tracks at one frame: new, update, lost, end",
+)
 VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
 SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
 STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
@@ -72,9 +81,9 @@ EVENTS: Final = Topic(
 )
 
 # What every view publishes of its own.
-VIEW_TOPICS: Final = (DETECTIONS, LABELS)
+VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS)
 
-TOPICS: Final = (DETECTIONS, LABELS, VEHICLE, SETPOINT, STATUS, EVENTS)
+TOPICS: Final = (DETECTIONS, LABELS, TRACKS, VEHICLE, SETPOINT, STATUS, EVENTS)
 
 # The last name of the queryable that takes a command and answers with its outcome.
 COMMAND: Final = "command"
