@@ -15,10 +15,13 @@ from vision.pipeline import PerceptionResult
 from vision.tracking import TrackEvent
 
 
-def detections_message(result: PerceptionResult, vehicle: str, published_ns: int) -> dict[str, Any]:
+def detections_message(
+    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+) -> dict[str, Any]:
     """One frame's detections, with the three stamps: captured, inferred, published."""
     return {
         "vehicle": vehicle,
+        "view": view,
         "sequence": result.sequence,
         "captured_ns": result.captured_ns,
         "inferred_ns": result.inferred_ns,
@@ -31,10 +34,13 @@ def detections_message(result: PerceptionResult, vehicle: str, published_ns: int
     }
 
 
-def tracks_message(result: PerceptionResult, vehicle: str, published_ns: int) -> dict[str, Any]:
+def tracks_message(
+    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+) -> dict[str, Any]:
     """What happened to tracks at one frame; every track in it counts as true, or did so until now."""
     return {
         "vehicle": vehicle,
+        "view": view,
         "sequence": result.sequence,
         "captured_ns": result.captured_ns,
         "published_ns": published_ns,

@@ -28,7 +28,11 @@ class Section(BaseModel):
 
 
 # One word of a zenoh key expression: no `/`, and none of its wildcards and separators `* $ ? # @`.
-KeyWord = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+_KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
+KeyWord = Annotated[str, _KEY_WORD]
+# The same without a dot, as `views.NAME.source` is a key.
+_VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
+ViewName = Annotated[str, _VIEW_NAME]
 VehicleUrl = Annotated[
     str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
 ]
@@ -40,6 +44,7 @@ ZenohEndpoint = Annotated[
 # What a pattern means, in words, for a person whose value did not match it.
 PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
+    r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
     ),
@@ -87,6 +92,8 @@ class SourceSection(Section):
     """how long the first frame may take at start, seconds"""
     read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
     """a live source that is silent for so long is opened again, seconds"""
+    share: Annotated[str | None, _KEY_WORD] = None
+    """also offer the frames to other programs of this computer, and to other views, as shm://NAME"""
 
     @model_validator(mode="after")
     def _can_be_opened(self) -> Self:
@@ -95,7 +102,7 @@ class SourceSection(Section):
 
     def opening(self) -> SourceSettings:
         """The same, as `vision.sources.open_source` takes it. Raises ValueError for a bad pixel format."""
-        return SourceSettings(**self.model_dump(exclude={"uri"}))
+        return SourceSettings(**self.model_dump(exclude={"uri", "share"}))
 
 
 class CameraSection(Section):
@@ -197,7 +204,7 @@ class DetectorSection(Section):
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
-    """processor threads of the network; unset: as many as torch takes by itself"""
+    """processor threads of the network; unset: one for every processor but one"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """look at every N-th frame only"""
 
@@ -263,6 +270,8 @@ class GuidanceSection(Section):
     """after that a brake is sent for so long, then nothing, and the autopilot's failsafe acts; seconds"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """detections older than this do not steer, seconds from capture"""
+    view: Annotated[str | None, _VIEW_NAME] = None
+    """the view that steers; unset: the one of the sections source, camera and detector"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -320,6 +329,16 @@ class LogSection(Section):
     """the least severe lines that are printed"""
 
 
+class ViewSections(Section):
+    """A further camera or model, with a process of its own, published as views/NAME."""
+
+    source: SourceSection = SourceSection()
+    camera: CameraSection = CameraSection()
+    detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
+    recording: RecordingSection = RecordingSection()
+
+
 class Settings(Section):
     """Everything that can be set."""
 
@@ -332,3 +351,37 @@ class Settings(Section):
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()
     log: LogSection = LogSection()
+    views: dict[ViewName, ViewSections] = {}
+
+    @model_validator(mode="after")
+    def _views_fit_together(self) -> Self:
+        if self.guidance.view is not None and self.guidance.view not in self.views:
+            known = ", ".join(self.views) or "none"
+            raise ValueError(f"guidance.view: there is no view {self.guidance.view!r} (views: {known})")
+        openers: dict[str, str] = {}
+        for key, source in self.sources().items():
+            if source.uri in openers and _opens_once(source.uri):
+                raise ValueError(
+                    f"{key}.uri and {openers[source.uri]}.uri are both {source.uri}, which can be "
+                    f'opened once: give one of them share = "NAME" and the other uri = "shm://NAME"'
+                )
+            openers[source.uri] = key
+        return self
+
+    def sources(self) -> dict[str, SourceSection]:
+        """Key of the section → where that view's frames come from, the first view first."""
+        return {"source": self.source} | {
+            f"views.{name}.source": sections.source for name, sections in self.views.items()
+        }
+
+    def of_view(self, name: str | None) -> Settings:
+        """What the worker of one view goes by: the same, with that view's own sections. None: the first."""
+        if name is None:
+            return self.model_copy(update={"views": {}})
+        sections = self.views[name]
+        own = {section: getattr(sections, section) for section in ViewSections.model_fields}
+        return self.model_copy(update={"views": {}, **own})
+
+
+def _opens_once(uri: str) -> bool:
+    return uri == "-" or uri.isdecimal() or uri.startswith("/dev/")

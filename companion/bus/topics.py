@@ -33,9 +33,13 @@ class Topic:
     express: bool
     description: str
 
-    def key(self, vehicle: str) -> str:
-        """The zenoh key of one vehicle's stream."""
-        return f"{ROOT}/{vehicle}/{self.name}"
+    def key(self, vehicle: str, view: str | None = None) -> str:
+        """The zenoh key of one vehicle's stream; of a view other than the first, under that view's name."""
+        return f"{ROOT}/{vehicle}/{self.path(view)}"
+
+    def path(self, view: str | None = None) -> str:
+        """The key behind the vehicle's name."""
+        return self.name if view is None else f"views/{view}/{self.name}"
 
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
@@ -75,6 +79,9 @@ EVENTS: Final = Topic(
     False,
     "what happened: modes, behaviours, parts lost and found",
 )
+
+# What every view publishes of its own.
+VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS)
 
 TOPICS: Final = (DETECTIONS, LABELS, TRACKS, VEHICLE, SETPOINT, STATUS, EVENTS)
 
