@@ -13,7 +13,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from companion.perception_messages import (
@@ -33,6 +33,7 @@ from companion.perception_pulse import Pulse
 from companion.perception_status import PerceptionState, PerceptionStatus
 from companion.perception_tracks import LiveTracks
 from companion.settings import Settings
+from companion.stage_timing import StageTimes
 from companion.standard_input import STANDARD_INPUT, StandardInput
 from vision.pipeline import PerceptionResult
 from vision.rotation import Quaternion
@@ -67,10 +68,12 @@ class _End:
 class _Counts:
     frames: int = 0
     dropped: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def add(self, other: _Counts) -> None:
         self.frames += other.frames
         self.dropped += other.dropped
+        self.left_out = _sum(self.left_out, other.left_out)
 
 
 class PerceptionKeeper:
@@ -110,6 +113,7 @@ class PerceptionKeeper:
         self._results = 0
         self._arrivals_s: deque[float] = deque()
         self._before, self._now = _Counts(), _Counts()
+        self._times = StageTimes()
         self._first_sequence = 0
         self._tracks = LiveTracks()
         self._attitude_due_ns = 0
@@ -205,7 +209,10 @@ class PerceptionKeeper:
             newest=newest,
             age_s=None if newest is None else (time.monotonic_ns() - newest.captured_ns) / 1e9,
             timing_ms={} if newest is None else newest.timing_ms,
+            timing_p50_ms=self._times.quantile_ms(0.5),
+            timing_p99_ms=self._times.quantile_ms(0.99),
             dropped=self._before.dropped + self._now.dropped,
+            left_out=_sum(self._before.left_out, self._now.left_out),
             stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
             class_names=self.class_names,
             tracks=len(self._tracks),
@@ -388,11 +395,15 @@ class PerceptionKeeper:
         )
         self._now.frames = report.frames
         self._now.dropped = result.dropped + report.replaced
+        self._now.left_out = {**result.left_out, "unsent": report.replaced}
         self._newest = result
         self._results += 1
         self._arrivals_s.append(time.monotonic())
         self._rate_hz()
         self._on_result(result)
+        # Whoever is called back publishes; what lies between is the way here and that.
+        publish_ms = (time.monotonic_ns() - result.inferred_ns) / 1e6
+        self._times.add({**result.timing_ms, "publish": publish_ms})
 
     def _note(self, message: Message) -> None:
         if isinstance(message, Heartbeat):
@@ -404,3 +415,7 @@ class PerceptionKeeper:
                 self._on_event(level, message.text)
             else:
                 logging.getLogger(message.logger).log(message.level, "%s", message.text)
+
+
+def _sum(one: dict[str, int], other: dict[str, int]) -> dict[str, int]:
+    return {reason: one.get(reason, 0) + other.get(reason, 0) for reason in {**one, **other}}

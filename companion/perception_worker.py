@@ -151,7 +151,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
         pipeline = Pipeline(
             perception.source,
             perception.detector,
-            every=settings.detector.every,
+            selection=settings.detector.selection(),
             recorder=perception.recording,
             tracker=_tracker(begin),
             view_at=_view_at(settings, orders.attitudes),

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from vision.camera_model import CameraModel, CameraMount
+from vision.frame_selection import Selection
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
 
@@ -207,6 +208,14 @@ class DetectorSection(Section):
     """processor threads of the network; unset: one for every processor but one"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """look at every N-th frame only"""
+    rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
+    """look at no more than so many frames a second; unset: at all that come"""
+    max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
+    """do not look at a frame that was captured longer ago, seconds; unset: look at all"""
+
+    def selection(self) -> Selection:
+        """Which frames are looked at."""
+        return Selection(self.every, self.rate_hz, self.max_age_s)
 
 
 class TrackerSection(Section):

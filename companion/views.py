@@ -17,7 +17,7 @@ from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
 
-# A view that is slower than this on purpose (`every`) is not unwell for it.
+# A view is unwell when its newest result is older than this, and than its own rate allows.
 _SEEING_S = 1.0
 
 
@@ -62,8 +62,9 @@ class View:
         """Results come as they should, or none are to be expected."""
         if not self.settings.detector.enabled or self.keeper.status.state is PerceptionState.FINISHED:
             return True
-        age_s = self.age_s(now_ns)
-        return age_s is not None and age_s <= max(_SEEING_S, self.settings.guidance.perception_max_age_s)
+        age_s, rate_hz = self.age_s(now_ns), self.settings.detector.rate_hz
+        allowed_s = max(_SEEING_S, self.settings.guidance.perception_max_age_s)
+        return age_s is not None and age_s <= allowed_s + (1 / rate_hz if rate_hz else 0.0)
 
     def place(self, result: PerceptionResult, history: StateHistory) -> None:
         """Work out where what a result shows is."""

@@ -11,6 +11,7 @@ import pytest
 
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.frame_selection import Selection
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.sources import EndOfStream, Source, SourceSettings, SourceStatistics, open_source
 from vision.tracking import Tracker
@@ -106,15 +107,39 @@ def test_depth_gives_every_detection_its_range() -> None:
 
 
 def test_only_every_nth_frame_is_looked_at() -> None:
-    pipeline = Pipeline(Frames(*(frame_of(number) for number in range(7))), BrightSpot(), every=3)
+    pipeline = Pipeline(
+        Frames(*(frame_of(number) for number in range(7))), BrightSpot(), selection=Selection(every=3)
+    )
     assert [result.sequence for result in run(pipeline)] == [0, 3, 6]
     assert pipeline.frames == 7
     assert pipeline.dropped == 0
+    assert pipeline.left_out == {"replaced": 0, "unreadable": 0, "every": 4, "rate": 0, "too_old": 0}
 
 
 def test_frames_that_the_source_lost_are_counted() -> None:
     pipeline = Pipeline(Frames(frame_of(1), frame_of(2), frame_of(6)), BrightSpot())
-    assert [result.dropped for result in run(pipeline)] == [1, 1, 4]
+    results = run(pipeline)
+    assert [result.dropped for result in results] == [1, 1, 4]
+    assert [result.left_out["replaced"] for result in results] == [1, 1, 4]
+
+
+def test_a_frame_that_is_too_old_is_counted_as_lost_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    # The frames' stamps are from long ago.
+    pipeline = Pipeline(Frames(frame_of(0), frame_of(1)), BrightSpot(), selection=Selection(max_age_s=0.5))
+    assert run(pipeline) == []
+    assert pipeline.dropped == pipeline.left_out["too_old"] == 2
+    (line,) = caplog.messages
+    assert line.startswith("frames: a frame is ")
+
+
+def test_arrival_decoding_and_waiting_are_told_apart() -> None:
+    now_ns = time.monotonic_ns()
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    frame = Frame(image, now_ns - 50_000_000, 0, ready_ns=now_ns - 30_000_000, decode_ms=5.0)
+    (result,) = run(Pipeline(Frames(frame), BrightSpot()))
+    assert result.timing_ms["capture"] == pytest.approx(15.0)
+    assert result.timing_ms["decode"] == 5.0
+    assert result.timing_ms["wait"] >= 30.0
 
 
 def test_a_time_without_a_frame_is_told_and_is_no_end() -> None:
@@ -142,7 +167,7 @@ def test_a_result_is_small_and_survives_pickling() -> None:
 
 def test_every_must_be_a_count() -> None:
     with pytest.raises(ValueError, match="every must be at least 1, got 0"):
-        Pipeline(Frames(), BrightSpot(), every=0)
+        Selection(every=0)
 
 
 class Flickering:
@@ -222,5 +247,5 @@ def test_every_frame_is_recorded_with_the_newest_detections() -> None:
     dark = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic_ns(), 3)
     recorder = Kept()
     frames = [frame_of(0), frame_of(1), frame_of(2), dark]
-    run(Pipeline(Frames(*frames), BrightSpot(), every=3, recorder=recorder))
+    run(Pipeline(Frames(*frames), BrightSpot(), selection=Selection(every=3), recorder=recorder))
     assert recorder.kept == [(0, 1), (1, 1), (2, 1), (3, 0)]
