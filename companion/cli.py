@@ -169,7 +169,9 @@ def parse_classes(text: str | None) -> list[str | int] | None:
 
 @app.command()
 def train(
-    output: Annotated[Path, typer.Option(help="the checkpoint to write")] = Path("runs/model.pt"),
+    output: Annotated[Path, typer.Option(help="what to write: NAME.safetensors and NAME.yaml")] = Path(
+        "runs/model.safetensors"
+    ),
     seed: Annotated[int | None, typer.Option(min=0, help="of weights and scenes; else the recipe's")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="a shorter or longer course")] = None,
     hours: Annotated[float | None, typer.Option(min=0.001, help="stop after so long")] = None,
@@ -194,7 +196,8 @@ def train(
             held_out=held_out,
         )
     typer.echo(
-        f"{output}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} on {held_out} held-out scenes"
+        f"{output.with_suffix('.safetensors')}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} "
+        f"on {held_out} held-out scenes"
     )
 
 

@@ -1,7 +1,7 @@
-"""Checkpoints: our own format, and the ordinary Ultralytics `.pt`, both read without running them.
+"""Checkpoints: our own pair of files, and the ordinary Ultralytics `.pt`, both read without running them.
 
-Our own is a dictionary that `torch.load(weights_only=True)` reads too:
-`{"format", "description", "state_dict" (float16), "metadata"}`.
+Our own is `NAME.safetensors` with `NAME.yaml` (`checkpoint_pair`). The first version's was a dictionary that
+`torch.load(weights_only=True)` reads too, `{"format", "description", "state_dict" (float16), "metadata"}`.
 An Ultralytics checkpoint is a pickled `DetectionModel`; its description, class names and tensors are taken
 from the inert records that `torch_archive` makes of it.
 """
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.architecture import STRIDES, ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
 from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line
 from vision.yolo.torch_archive import read_archive
 
@@ -59,6 +60,7 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
     """Write `model` at `path`, weights as float16 (those beyond its range as float32), in one step.
 
     Args:
+        path: `NAME.safetensors` (its description goes to `NAME.yaml` beside it), or `.pt`.
         metadata: plain values only (dicts, lists, texts, numbers, booleans, None), else `TypeError`.
     """
     path = Path(path)
@@ -66,10 +68,15 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
         plain_metadata = _plain(dict(metadata))
     except CheckpointError as error:
         raise TypeError(f"metadata must be plain values: {error}") from None
+    description = model.description.to_plain()
+    weights = {name: _compact(tensor) for name, tensor in model.state_dict().items()}
+    if path.suffix == WEIGHTS_SUFFIX:
+        write_pair(path, description, weights, plain_metadata)
+        return
     content = {
         "format": FORMAT,
-        "description": model.description.to_plain(),
-        "state_dict": {name: _compact(tensor) for name, tensor in model.state_dict().items()},
+        "description": description,
+        "state_dict": weights,
         "metadata": plain_metadata,
     }
     # A reader, or the next start after a power cut, sees the old file or the new one.
@@ -79,15 +86,16 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
 
 
 def load_checkpoint(path: str | Path) -> LoadedModel:
-    """Read our own checkpoint or an Ultralytics YOLOv8 detection checkpoint.
+    """Read our own checkpoint (either file of a pair, or a `.pt`) or an Ultralytics detection checkpoint.
 
     Raises:
         UnsafeCheckpointError: the file asks for code to be run, named in the message.
         CheckpointError: missing, damaged, of another kind, or weights that do not fit the description.
     """
-    content = read_archive(path)
+    pair = is_pair(Path(path))
+    content = read_pair(Path(path)) if pair else read_archive(path)
     try:
-        return _interpret(content)
+        return _described(content) if pair else _interpret(content)
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
         raise kind(one_line(f"{path}: {error}")) from None
@@ -110,6 +118,11 @@ def _interpret(content: Any) -> LoadedModel:
 def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
     if content["format"] != FORMAT:
         raise CheckpointError(f"has format {content['format']!r:.100}, this version reads {FORMAT!r}")
+    return _described(content)
+
+
+def _described(content: dict[Any, Any]) -> LoadedModel:
+    """A network from `description`, `state_dict` and `metadata`."""
     description = ModelDescription.from_plain(_plain_dictionary(content, "description"))
     weights = content.get("state_dict")
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
