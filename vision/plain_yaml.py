@@ -1,7 +1,7 @@
 """YAML as data and nothing more: the core schema of YAML 1.2, without tags, anchors or duplicate keys.
 
-`no`, `on` and `1:30` stay the texts that they are (YAML 1.1 makes other things of them, and they are real class
-names), and what a small file can make large is refused before it is built.
+`no`, `on` and `1:30` stay the texts that they are (YAML 1.1 makes other things of them, and they are class
+names too), and what a small file can make large is refused before it is built.
 """
 
 from __future__ import annotations

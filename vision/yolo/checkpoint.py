@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from vision.yolo.architecture import STRIDES, ArchitectureError, ModelDescription, YoloModel
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
-from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line
+from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line, shown
 from vision.yolo.torch_archive import read_archive
 
 __all__ = [
@@ -35,8 +35,12 @@ __all__ = [
 FORMAT = "mavlink-companion.yolo.v1"
 _DETECTION_MODEL = "ultralytics.nn.tasks.DetectionModel"
 _DEEPEST = 16
-_MOST_NODES = 200_000
+_MOST_NODES = 100_000
+_MOST_MODULES = 20_000
+_LONGEST_NAME = 500
 _LONGEST_TEXT = 100_000
+# Of all layers together: the largest published networks have some eighty.
+_MOST_REPEATS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,8 @@ def load_checkpoint(path: str | Path) -> LoadedModel:
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
         raise kind(one_line(f"{path}: {error}")) from None
+    except RecursionError:
+        raise CheckpointError(one_line(f"{path}: its values are nested too deeply")) from None
 
 
 def _interpret(content: Any) -> LoadedModel:
@@ -117,7 +123,7 @@ def _interpret(content: Any) -> LoadedModel:
 
 def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
     if content["format"] != FORMAT:
-        raise CheckpointError(f"has format {content['format']!r:.100}, this version reads {FORMAT!r}")
+        raise CheckpointError(f"has format {shown(content['format'])}, this version reads {FORMAT!r}")
     return _described(content)
 
 
@@ -145,7 +151,7 @@ def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedMode
         if isinstance(module, nn.BatchNorm2d) and trained is not None:
             epsilon = trained.state.get("eps", module.eps)
             if type(epsilon) is not float or not 0 < epsilon < 1:
-                raise CheckpointError(f"{name} has the epsilon {epsilon!r:.100}, expected a small number")
+                raise CheckpointError(f"{name} has the epsilon {shown(epsilon)}, expected a small number")
             module.eps = epsilon
     metadata = {"origin": f"Ultralytics {_note(content, 'version')}".strip()}
     for key, source in (("licence", "license"), ("date", "date")):
@@ -179,9 +185,13 @@ def _as_trained(
     heads = [module for module in modules.values() if module.name.endswith(".head.Detect")]
     for head in heads:
         stride = head.state.get("stride")
-        if isinstance(stride, Tensor) and stride.flatten().tolist() != list(STRIDES):
-            raise CheckpointError(f"its head has strides {stride.flatten().tolist()!r:.100}, not {STRIDES}")
+        if isinstance(stride, Tensor) and stride[:9].flatten().tolist() != list(STRIDES):
+            raise CheckpointError(
+                f"its head has strides {stride[:9].flatten().tolist()!r:.100}, not {STRIDES}"
+            )
         bins = head.state.get("reg_max", description.reg_max)
+        if type(bins) is not int:
+            raise CheckpointError(f"its head has the reg_max {shown(bins)}, expected a whole number")
         description = dataclasses.replace(description, reg_max=bins)
     activations = {
         module.name.rpartition(".")[2]
@@ -202,8 +212,10 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
     while waiting:
         name, module, depth = waiting.pop()
         seen += 1
-        if depth > _DEEPEST or seen > _MOST_NODES:
-            raise CheckpointError("its modules contain each other")
+        if depth > _DEEPEST or seen > _MOST_MODULES or len(waiting) > _MOST_MODULES:
+            raise CheckpointError("its modules contain each other, or are too many")
+        if len(name) > _LONGEST_NAME:
+            raise CheckpointError(f"it has a module whose name has {len(name)} characters")
         yield name, module
         children = module.state.get("_modules", {})
         if not isinstance(children, dict):
@@ -216,13 +228,15 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
 
 
 def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
+    """Each tensor with its dotted name, taken out of its module: who gets it holds it alone."""
     for name, module in modules.items():
         passing = module.state.get("_non_persistent_buffers_set", frozenset())
         for kind in ("_parameters", "_buffers"):
             tensors = module.state.get(kind, {})
             if not isinstance(tensors, dict):
                 raise CheckpointError(f"{name}'s {kind} are not a dictionary")
-            for key, tensor in tensors.items():
+            for key in list(tensors):
+                tensor = tensors.pop(key)
                 if tensor is None or (isinstance(passing, frozenset) and key in passing):
                     continue
                 if not isinstance(tensor, Tensor):
@@ -231,7 +245,11 @@ def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
 
 
 def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
-    """The described network with exactly these weights; every name of either side accounted for."""
+    """The described network with exactly these weights; every name of either side accounted for.
+
+    Empties `weights`, so that a number is not held twice for longer than its layer needs.
+    """
+    _check_sizes(description, weights)
     # Shapes only: a description that promises more than the file holds must not cost memory.
     with torch.device("meta"):
         model = YoloModel(description)
@@ -253,12 +271,21 @@ def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> 
             raise CheckpointError(f"{name} should be {expected[name].dtype}, it is {tensor.dtype}")
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise CheckpointError(f"{name} has numbers that are not finite")
-    model.load_state_dict(
-        {name: tensor.to(expected[name].dtype, copy=True).contiguous() for name, tensor in weights.items()},
-        strict=True,
-        assign=True,
-    )
+    converted = {}
+    for name, meant in expected.items():
+        converted[name] = weights.pop(name).to(meant.dtype, copy=True).contiguous()
+    model.load_state_dict(converted, strict=True, assign=True)
     return model.eval()
+
+
+def _check_sizes(description: ModelDescription, weights: dict[str, Tensor]) -> None:
+    """What a file makes large: layers repeated, and the same numbers used for many weights."""
+    repeats = sum(max(1, round(row.repeats * description.depth_multiple)) for row in description.rows)
+    if repeats > _MOST_REPEATS:
+        raise CheckpointError(f"describes {repeats} layers, at most {_MOST_REPEATS} make sense")
+    storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage() for tensor in weights.values()}
+    if sum(tensor.nbytes for tensor in weights.values()) > sum(map(len, storages.values())):
+        raise CheckpointError("uses the same numbers for several weights; it is not a checkpoint")
 
 
 def _compact(tensor: Tensor) -> Tensor:
