@@ -1,4 +1,4 @@
-"""The command line: `companion run|demo|detect|send|echo|config|train|bench`.
+"""The command line: `companion run|demo|detect|models|evaluate|send|echo|config|train|bench`.
 
 Heavy parts are imported when their command runs, so that `companion send` starts at once.
 What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
@@ -13,14 +13,14 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli_flags import with_settings
+from companion.cli_flags import EXIT_BAD_INPUT, plain_errors, with_settings
+from companion.cli_models import models
 from companion.settings import Settings
 
 if TYPE_CHECKING:
@@ -35,19 +35,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+app.add_typer(models, name="models")
+
 EXIT_FAILED = 1
-EXIT_BAD_INPUT = 2
-
-
-@contextmanager
-def plain_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Errors of these kinds are for the person at the keyboard: the message, and exit code 2."""
-    try:
-        yield
-    except expected as error:
-        for line in str(error).splitlines():
-            typer.echo(f"companion: {line}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
 @app.command()
