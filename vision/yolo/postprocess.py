@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vision.yolo.architecture import YoloModel, decode_boxes
+from vision.yolo.end_to_end import best_pairs
 
 MOST_BOXES = 300
 
@@ -46,8 +47,12 @@ def select_boxes(
     """One image's maps, (1, 4 · reg_max + classes, H, W) a level → its boxes.
 
     A cell speaks for its most probable class. Cells of other classes than `class_ids`, and those not above
-    `confidence`, are dropped before anything is decoded; then each class suppresses its own overlaps.
+    `confidence`, are dropped before anything is decoded; then each class suppresses its own overlaps. The
+    boxes of an end-to-end head are selected instead (`best_pairs`); `iou` is of no consequence to it.
     """
+    if model.end_to_end:
+        xyxy, scores, classes = best_pairs(model, maps, confidence=confidence, class_ids=class_ids, most=most)
+        return Boxes(xyxy.cpu().numpy(), scores.cpu().numpy(), classes.cpu().numpy())
     candidates = _candidates(model, maps, confidence, class_ids)
     kept = suppress(candidates.xyxy, candidates.confidence, candidates.class_id, iou, most)
     return Boxes(candidates.xyxy[kept], candidates.confidence[kept], candidates.class_id[kept])
