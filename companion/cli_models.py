@@ -18,9 +18,7 @@ models = typer.Typer(
 _JSON = Annotated[bool, typer.Option("--json", help="as JSON")]
 _FOLDER = Annotated[
     Path | None,
-    typer.Option(
-        help="the models folder; else $COMPANION_MODELS_FOLDER, else ~/.local/share/mavlink-companion/models"
-    ),
+    typer.Option(help="the models folder; else $COMPANION_MODELS_FOLDER, else one in your data folder"),
 ]
 
 
@@ -40,7 +38,8 @@ def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
     for row in rows:
         size = "       " if row["size_bytes"] is None else f"{row['size_bytes'] / 1e6:5.1f} MB"
         typer.echo(
-            f"{row['name']:<{width}}  {row['state']:<13}  {size:>8}  {row['licence'] or '':<10}  {row['about']}"
+            f"{row['name']:<{width}}  {row['state']:<13}  {size:>8}  {row['licence'] or '':<10}  "
+            f"{row['about']}"
         )
 
 

@@ -1,8 +1,8 @@
 """The official models that can be had by name, each with what its file must be.
 
-Size and SHA-256 are those that GitHub records for the assets of Ultralytics' release v8.4.0 (public since 2025 in
-the release's own API), taken from published tables of them; every digest was found in at least two that do not
-copy each other. A model whose digest was not published stands here without one, and `pull` asks for it.
+Size and SHA-256 are those that GitHub records for the assets of Ultralytics' release v8.4.0, taken from
+published tables of them; every digest was found in at least two independent ones. A model whose digest was
+not found stands here without one, and `pull` asks for it.
 """
 
 from __future__ import annotations

@@ -106,7 +106,9 @@ def info_lines(info: ModelInfo) -> list[str]:
 
 
 def list_rows(folder: Path) -> list[dict[str, Any]]:
-    """Every model there is to name: bundled, kept in `folder`, and known by address; with `state` for each."""
+    """Every model there is to name: bundled, kept in `folder`, and known by address; with `state` for
+    each.
+    """
     kept = {path.name: path for path in kept_models(folder)}
     rows: list[dict[str, Any]] = [
         {

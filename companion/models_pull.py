@@ -1,6 +1,8 @@
-"""`companion models pull`: one official file, fetched by its address and kept only if it is the one that was meant.
+"""`companion models pull`: one official file, fetched by its address, kept only if it is the one that was
+meant.
 
-What has come stays in `FILE.partial` when the line breaks, and the next attempt asks for the rest (RFC 9110, 14.2).
+What has come stays in `FILE.partial` when the line breaks, and the next attempt asks for the rest (RFC 9110,
+14.2).
 """
 
 from __future__ import annotations
@@ -75,9 +77,9 @@ def pull(
         if expected is not None and found != expected:
             partial.unlink()
             raise PullError(
-                f"{model.url} is not the file that was meant: it has the SHA-256 {found}, expected {expected}. "
-                "It was deleted. If an earlier attempt had been interrupted, pull once more; if this comes again, "
-                "the file was changed, or somebody is between you and the server"
+                f"{model.url} is not the file that was meant: it has the SHA-256 {found}, expected "
+                f"{expected}. It was deleted. If an earlier attempt had been interrupted, pull once more; "
+                "if this comes again, the file was changed, or somebody is between you and the server"
             )
         os.replace(partial, target)
         if expected is None:
@@ -112,9 +114,9 @@ def _expected(model: KnownModel, target: Path, given: str | None, trust_first: b
     expected = model.sha256 or given or noted
     if expected is None and not trust_first:
         raise PullError(
-            f"{model.name}: no published SHA-256 of this file is known here, so it cannot be checked. Give the "
-            "one it must have with --sha256, or take what comes with --trust-first: its SHA-256 is then noted "
-            "beside it, and a later pull must match"
+            f"{model.name}: no published SHA-256 of this file is known here, so it cannot be checked. Give "
+            "the one it must have with --sha256, or take what comes with --trust-first: its SHA-256 is "
+            "then noted beside it, and a later pull must match"
         )
     return expected
 
@@ -125,8 +127,8 @@ def _already_there(target: Path, expected: str | None, *, trust_first: bool) -> 
         _note_path(target).write_text(f"{found}  {target.name}\n")
     elif found != expected:
         raise PullError(
-            f"{target} is there with the SHA-256 {found}, expected {expected}: it is another file, or damaged. "
-            "Move it away and pull again"
+            f"{target} is there with the SHA-256 {found}, expected {expected}: it is another file, or "
+            "damaged. Move it away and pull again"
         )
     return Pulled(target, found, fetched=False)
 
@@ -165,7 +167,8 @@ def _fetch_all(
                 partial.unlink()
                 continue
             raise PullError(
-                f"{model.url}: the server says {error.code} {error.reason}. {by_hand(model, target, expected)}"
+                f"{model.url}: the server says {error.code} {error.reason}. "
+                f"{by_hand(model, target, expected)}"
             ) from None
         except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
             reason = getattr(error, "reason", error)
@@ -181,8 +184,8 @@ def _fetch_all(
     have = partial.stat().st_size if partial.exists() else 0
     whole = "" if model.size_bytes is None else f" of {model.size_bytes}"
     raise PullError(
-        f"{model.url}: interrupted after {have}{whole} bytes ({failure}). They are kept: pull again to go on. "
-        f"{by_hand(model, target, expected)}"
+        f"{model.url}: interrupted after {have}{whole} bytes ({failure}). They are kept: pull again to go "
+        f"on. {by_hand(model, target, expected)}"
     )
 
 

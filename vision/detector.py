@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vision.detections import Detections
 from vision.letterbox import Letterbox, fit, to_tensor
+from vision.model_files import find_model
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.architecture import YoloModel
 from vision.yolo.checkpoint import CheckpointError, load_checkpoint
@@ -217,7 +218,7 @@ def _ready(model: YoloModel) -> YoloModel:
 
 def _model_path(model: str | Path) -> Path:
     if str(model) != DEFAULT_MODEL:
-        return Path(model).expanduser()
+        return find_model(model)
     if not DEFAULT_WEIGHTS.is_file():
         raise CheckpointError(
             f"{DEFAULT_WEIGHTS}: the bundled model is missing from this installation; "

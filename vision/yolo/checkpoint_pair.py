@@ -1,7 +1,8 @@
 """A checkpoint as two plain files: `NAME.safetensors`, the numbers, and `NAME.yaml`, what they are.
 
 The YAML file says `format`, `weights` (file name, size, SHA-256 of the other), `architecture` (class
-names, the rows of the network) and whatever else there is to tell: licence, training, score. Neither can hold a program.
+names, the rows of the network) and whatever else there is to tell: licence, training, score. Neither can
+hold a program.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ up in the caller's table of admitted names, "calling" it makes an `Inert` record
 function, and setting state fills a record's dictionary. No import, no attribute of a real object, no class of
 the file's choosing. The opcodes are those of pickle protocol 2 (PEP 307); any other is refused.
 
-What the values would take is counted as they are made, and a pickle that makes much of little is refused: a list
-is one byte in the file and sixty in memory, and a filled dictionary can be copied by five more.
+What the values would take is counted as they are made, and a pickle that makes much of little is refused: a
+list is one byte in the file and sixty in memory, and a filled dictionary can be copied by five more.
 """
 
 from __future__ import annotations
