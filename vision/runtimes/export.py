@@ -66,7 +66,7 @@ def export(
         class_names=loaded.class_names,
         strides=tuple(model.strides),
         reg_max=model.reg_max,
-        end_to_end=bool(getattr(model, "end_to_end", False)),  # PENDING MERGE
+        end_to_end=model.end_to_end,
         image_size=image_size,
         source_sha256=file_sha256(model_path),
         generation=generation,

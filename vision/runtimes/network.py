@@ -11,7 +11,7 @@ Three changes, none of which changes the results beyond rounding:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +58,7 @@ class Network(nn.Module):
         """Compute in `dtype`, but for the last class convolutions, which decide, in place."""
         self.dtype = dtype
         self.body.to(dtype)
-        for branch in _class_branches(self.body.detect):
+        for branch in _branches(self.body.detect.class_branches):
             branch[-1].float()
         return self
 
@@ -90,7 +90,8 @@ class _SplitHead(Detect):
 
     def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
         found: list[Tensor] = []
-        for x, boxes, classes in zip(maps, _box_branches(self), _class_branches(self), strict=True):
+        branches = zip(_branches(self.box_branches), _branches(self.class_branches), strict=True)
+        for x, (boxes, classes) in zip(maps, branches, strict=True):
             sides = boxes(x)
             features = classes[:-1](x).float()
             found += [sides.float(), classes[-1](features)]
@@ -99,13 +100,8 @@ class _SplitHead(Detect):
         return found
 
 
-# PENDING MERGE
-def _box_branches(head: Any) -> Any:
-    return getattr(head, "box_branches", None) or head.cv2
-
-
-def _class_branches(head: Any) -> Any:
-    return getattr(head, "class_branches", None) or head.cv3
+def _branches(branches: nn.ModuleList) -> list[nn.Sequential]:
+    return [cast(nn.Sequential, branch) for branch in branches]
 
 
 def _sliced(head: Head, detect: Detect, class_ids: Sequence[int] | None) -> Head:
@@ -114,8 +110,9 @@ def _sliced(head: Head, detect: Detect, class_ids: Sequence[int] | None) -> Head
         return head
     rows = []
     index = torch.tensor(list(class_ids))
-    for branch in _class_branches(detect):
-        last = branch[-1]
+    for branch in _branches(detect.class_branches):
+        last = cast(nn.Conv2d, branch[-1])
+        assert last.bias is not None
         weight, bias = last.weight.detach().float(), last.bias.detach().float()
         rows.append(ClassRows.distinct(weight.flatten(1).numpy(), bias.numpy()))
         last.weight.data = weight[index].clone()
@@ -135,7 +132,7 @@ def _fold_pixels(model: YoloModel) -> bool:
     """
     first = getattr(model.model[0], "conv", None)
     readers = [index for index, sources in enumerate(model._sources) if -1 in sources]
-    if readers != [0] or not isinstance(first, nn.Conv2d):
+    if readers != [0] or not isinstance(first, nn.Conv2d) or first.groups != 1:
         return False
     first.weight.data = first.weight.data.double().flip(1).div(255).float()
     return True

@@ -1,4 +1,4 @@
-"""The default runtime: torch on the processor, a frozen traced graph for each size of input."""
+"""The default runtime: torch on the processor, the network as a frozen traced graph."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ from vision.yolo.maps import Head, LevelMaps
 logger = logging.getLogger(__name__)
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-# A camera has one size of frame; a folder of photographs has a few. Each graph holds its own weights.
+# Where a graph is good for one size alone. A camera has one; a folder of photographs has a few.
 _MOST_GRAPHS = 4
+# What the tracer is shown, and what its graph is then tried on; in strides, high and wide.
+_TRACED, _TRIED = (2, 4), (4, 6)
 # Enough to tell two precisions apart, little enough not to delay the start.
 _TRIAL_RUNS = 5
 _TRIAL_SIDE = 320
@@ -65,6 +67,7 @@ class TorchRuntime:
         self._graphs: collections.OrderedDict[tuple[int, int], torch.jit.ScriptModule] = (
             collections.OrderedDict()
         )
+        self._graph = self._any_size()
 
     @property
     def threads(self) -> int:
@@ -79,11 +82,30 @@ class TorchRuntime:
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
         pixels = torch.from_numpy(image_bgr).unsqueeze(0)
         with torch.inference_mode():
-            maps = [level[0].numpy() for level in self._graph(pixels)(pixels)]
+            graph = self._graph or self._graph_of_size(pixels)
+            maps = [level[0].numpy() for level in graph(pixels)]
         step = 3 if self._network.features else 2
         return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
 
-    def _graph(self, pixels: Tensor) -> torch.jit.ScriptModule:
+    def _any_size(self) -> torch.jit.ScriptModule | None:
+        """One graph for inputs of every size; None if the tracer took a size for a constant of the network."""
+        stride = max(self.head.strides)
+        traced, tried = (
+            torch.full((1, high * stride, wide * stride, 3), 100, dtype=torch.uint8)
+            for high, wide in (_TRACED, _TRIED)
+        )
+        graph = frozen(self._network, traced)
+        with torch.inference_mode():
+            expected = self._network(tried)
+            try:
+                found = graph(tried)
+            except RuntimeError as error:
+                logger.debug("the graph is good for one size of input alone: %s", error)
+                return None
+        same = all(a.shape == b.shape and torch.allclose(a, b, 0.01, 0.01) for a, b in zip(expected, found))
+        return graph if same else None
+
+    def _graph_of_size(self, pixels: Tensor) -> torch.jit.ScriptModule:
         size = (pixels.shape[1], pixels.shape[2])
         graph = self._graphs.get(size)
         if graph is None:
@@ -123,9 +145,9 @@ class TorchRuntime:
 
 
 def frozen(network: Network, pixels: Tensor) -> torch.jit.ScriptModule:
-    """The network's graph for inputs like `pixels`, (1, H, W, 3) uint8, with its weights as constants."""
+    """The network's graph, traced on `pixels`, (1, H, W, 3) uint8, with its weights as constants."""
     with torch.no_grad(), warnings.catch_warnings():
-        # The tracer warns of sizes that become constants; a graph per size is what is wanted.
+        # The tracer warns of sizes that become constants, right or wrong; the graph is tried instead.
         warnings.simplefilter("ignore")
         trace: Any = torch.jit.trace
         graph: torch.jit.ScriptModule = torch.jit.freeze(trace(network, pixels, check_trace=False))

@@ -8,7 +8,6 @@ from the inert records that `torch_archive` makes of it.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,7 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vision.yolo.architecture import STRIDES, ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.pickled_layers import as_trained
 from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line
 from vision.yolo.torch_archive import read_archive
 
@@ -32,7 +32,10 @@ __all__ = [
 ]
 
 FORMAT = "mavlink-companion.yolo.v1"
-_DETECTION_MODEL = "ultralytics.nn.tasks.DetectionModel"
+_DETECTION_MODELS = (
+    "ultralytics.nn.tasks.DetectionModel",
+    "ultralytics.nn.tasks.YOLOv10DetectionModel",  # As the authors of YOLOv10 published it.
+)
 _DEEPEST = 16
 _MOST_NODES = 200_000
 _LONGEST_TEXT = 100_000
@@ -79,7 +82,7 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
 
 
 def load_checkpoint(path: str | Path) -> LoadedModel:
-    """Read our own checkpoint or an Ultralytics YOLOv8 detection checkpoint.
+    """Read our own checkpoint or an Ultralytics detection checkpoint (YOLOv5u, v8, v10, 11, 12, 26).
 
     Raises:
         UnsafeCheckpointError: the file asks for code to be run, named in the message.
@@ -119,14 +122,20 @@ def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
 
 
 def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedModel:
-    if record.name != _DETECTION_MODEL:
+    if record.name not in _DETECTION_MODELS:
         raise CheckpointError(f"holds a {record.name.rpartition('.')[2]}; only detection models can be used")
     table = _plain_dictionary(record.state, "yaml")
     modules = dict(_modules(record))
     description = ModelDescription.from_plain(table, _class_names(record, table))
-    description = _as_trained(description, table, modules)
+    description = as_trained(description, modules)
     weights = dict(_weights(modules))
+    if not description.end_to_end:
+        # A checkpoint of two heads whose user chose the one with NMS: the other is not part of this network.
+        weights = {name: tensor for name, tensor in weights.items() if ".one2one_" not in name}
     model = _with_weights(description, weights)
+    stride = modules[f"model.{len(description.rows) - 1}"].state.get("stride")
+    if isinstance(stride, Tensor) and tuple(stride.flatten().tolist()) != model.strides:
+        raise CheckpointError(f"its head has strides {stride.flatten().tolist()!r:.100}, not {model.strides}")
     for name, module in model.named_modules():
         trained = modules.get(name)
         if isinstance(module, nn.BatchNorm2d) and trained is not None:
@@ -157,29 +166,6 @@ def _class_names(record: Inert, table: dict[Any, Any]) -> list[str]:
     if table.get("nc") != len(names):
         raise CheckpointError(f"names {len(names)} classes, its network has {table.get('nc')!r:.100}")
     return names
-
-
-def _as_trained(
-    description: ModelDescription, table: dict[Any, Any], modules: dict[str, Inert]
-) -> ModelDescription:
-    """What the pickled layers know and the table may not say: activation, bins, unscaled channel counts."""
-    heads = [module for module in modules.values() if module.name.endswith(".head.Detect")]
-    for head in heads:
-        stride = head.state.get("stride")
-        if isinstance(stride, Tensor) and stride.flatten().tolist() != list(STRIDES):
-            raise CheckpointError(f"its head has strides {stride.flatten().tolist()!r:.100}, not {STRIDES}")
-        bins = head.state.get("reg_max", description.reg_max)
-        description = dataclasses.replace(description, reg_max=bins)
-    activations = {
-        module.name.rpartition(".")[2]
-        for name, module in modules.items()
-        if name.endswith(".act") and ".activation." in module.name
-    }
-    if len(activations) > 1:
-        raise CheckpointError(f"mixes the activations {', '.join(sorted(activations))}")
-    for activation in activations:
-        description = dataclasses.replace(description, activation=activation)
-    return dataclasses.replace(description, unscaled_channels=(len(description.class_names),))
 
 
 def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:

@@ -62,9 +62,7 @@ def select_boxes(
 def head_of(model: YoloModel) -> Head:
     """How to read the maps of a whole model."""
     classes = len(model.class_names)
-    # PENDING MERGE
-    end_to_end = bool(getattr(model, "end_to_end", False))
-    return Head(tuple(model.strides), model.reg_max, end_to_end, classes, tuple(range(classes)))
+    return Head(tuple(model.strides), model.reg_max, model.end_to_end, classes, tuple(range(classes)))
 
 
 def boxes_of(
@@ -80,8 +78,11 @@ def boxes_of(
 
     A cell speaks for its most probable class, of all that the model knows. Cells of other classes than
     `class_ids`, and those not above `confidence`, are dropped before anything is decoded; then each class
-    suppresses its own overlaps. The cells of an end-to-end head speak for every class above `confidence`, and
-    nothing is suppressed.
+    suppresses its own overlaps.
+
+    The one-to-one head (YOLOv10, Wang et al., 2024; YOLO26) has learnt to speak once an object: overlapping
+    boxes are different objects. Its cells speak for every class above `confidence`, the `most` best pairs of
+    cell and class are kept, and `iou` is of no consequence.
 
     Args:
         class_ids: None: all. Where the maps hold some classes alone, those must be among them.

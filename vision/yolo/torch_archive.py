@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vision.yolo.admitted_names import INERT
 from vision.yolo.safe_pickle import Admitted, CheckpointError, UnsafeCheckpointError, one_line, unpickle
 
 _STORAGES: dict[str, torch.dtype] = {
@@ -30,73 +31,6 @@ _STORAGES: dict[str, torch.dtype] = {
     "torch.BoolStorage": torch.bool,
 }
 
-# Layers and values that detection checkpoints hold. Each becomes an inert record; that a name stands here
-# lets the file be read, so that the builder can name the layer it does not know.
-_INERT = (
-    *(
-        f"torch.nn.modules.{name}"
-        for name in (
-            "activation.GELU",
-            "activation.Hardswish",
-            "activation.LeakyReLU",
-            "activation.ReLU",
-            "activation.ReLU6",
-            "activation.SiLU",
-            "activation.Sigmoid",
-            "batchnorm.BatchNorm2d",
-            "container.ModuleList",
-            "container.Sequential",
-            "conv.Conv2d",
-            "conv.ConvTranspose2d",
-            "dropout.Dropout",
-            "linear.Identity",
-            "linear.Linear",
-            "module.Module",
-            "pooling.AdaptiveAvgPool2d",
-            "pooling.MaxPool2d",
-            "upsampling.Upsample",
-        )
-    ),
-    *(
-        f"ultralytics.nn.modules.{name}"
-        for name in (
-            "block.Attention",
-            "block.Bottleneck",
-            "block.C2PSA",
-            "block.C2f",
-            "block.C3",
-            "block.C3k",
-            "block.C3k2",
-            "block.DFL",
-            "block.PSABlock",
-            "block.Proto",
-            "block.SPPF",
-            "conv.Concat",
-            "conv.Conv",
-            "conv.DWConv",
-            "head.Classify",
-            "head.Detect",
-            "head.OBB",
-            "head.Pose",
-            "head.Segment",
-        )
-    ),
-    "ultralytics.nn.tasks.ClassificationModel",
-    "ultralytics.nn.tasks.DetectionModel",
-    "ultralytics.nn.tasks.OBBModel",
-    "ultralytics.nn.tasks.PoseModel",
-    "ultralytics.nn.tasks.SegmentationModel",
-    "ultralytics.utils.IterableSimpleNamespace",
-    "ultralytics.yolo.utils.IterableSimpleNamespace",
-    "numpy.core.multiarray.scalar",
-    "numpy._core.multiarray.scalar",
-    "numpy.dtype",
-    "pathlib.PosixPath",
-    "pathlib.PurePosixPath",
-    "pathlib.WindowsPath",
-    "_codecs.encode",
-    "torch.device",
-)
 _LARGEST_PICKLE_BYTES = 64 << 20
 _MOST_MEMBERS = 100_000
 _MOST_DIMENSIONS = 8
@@ -205,7 +139,7 @@ class _Archive:
             "builtins.set": _set,
         }
         return (
-            {name: Admitted(name) for name in (*_INERT, *_STORAGES)}
+            {name: Admitted(name) for name in (*INERT, *_STORAGES)}
             | {name: Admitted(name, make) for name, make in calls.items()}
         )  # fmt: skip
 
