@@ -100,32 +100,6 @@ def test_bfloat16_sees_the_same(model_path: Path, frame: np.ndarray[Any, Any]) -
     np.testing.assert_allclose(sorted(a.xyxy.tolist()), sorted(b.xyxy.tolist()), atol=1.0)
 
 
-def test_without_native_bfloat16_auto_is_float32(model_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "")
-    detector = Detector(model_path, image_size=64)
-    assert detector.precision == "float32"
-    assert "does not compute in bfloat16" in detector.precision_reason
-
-
-@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (9.0, "float32")])
-def test_with_native_bfloat16_auto_takes_the_faster(
-    model_path: Path, monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
-) -> None:
-    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "amx_bf16")
-    times = {torch.float32: 5.0, torch.bfloat16: half_ms}
-    monkeypatch.setattr(Detector, "_measure_ms", lambda self, dtype: times[dtype])
-    detector = Detector(model_path, image_size=64)
-    assert detector.precision == chosen
-    assert "5.0 ms in float32" in detector.precision_reason
-
-
-def test_auto_measures_both_where_it_must(model_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "amx_bf16")
-    detector = Detector(model_path, image_size=64)
-    assert detector.precision in ("float32", "bfloat16")
-    assert detector.precision_reason.startswith("measured")
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -140,7 +114,8 @@ def test_auto_measures_both_where_it_must(model_path: Path, monkeypatch: pytest.
         pytest.param({"confidence": float("nan")}, r"confidence must be in 0\.\.1", id="not a number"),
         pytest.param({"iou": -0.1}, r"iou must be in 0\.\.1, got -0.1", id="iou"),
         pytest.param({"image_size": 100}, "multiple of 32", id="image size"),
-        pytest.param({"precision": "float8"}, "precision must be auto, float32 or bfloat16", id="precision"),
+        pytest.param({"precision": "float8"}, "must be auto, float32, bfloat16, float16", id="precision"),
+        pytest.param({"runtime": "tflite"}, "runtime must be auto, torch, onnxruntime", id="runtime"),
         pytest.param({"threads": 0}, "threads must be at least 1", id="threads"),
     ],
 )

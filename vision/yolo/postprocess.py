@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vision.yolo.architecture import YoloModel, decode_boxes
-from vision.yolo.end_to_end import best_pairs
+from vision.yolo.architecture import YoloModel
+from vision.yolo.maps import Head, LevelMaps
 
 MOST_BOXES = 300
+# Up to so many boxes all pairs are compared at once; beyond, the table of pairs costs more than it saves.
+_MOST_PAIRED = 512
+# Below the threshold by this much a cell is still looked at: rounding must not decide in logit space.
+_LOGIT_MARGIN = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +38,10 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.xyxy)
 
+    def at(self, index: NDArray[np.int64]) -> Boxes:
+        """Those at `index`, in its order."""
+        return Boxes(self.xyxy[index], self.confidence[index], self.class_id[index])
+
 
 def select_boxes(
     model: YoloModel,
@@ -44,50 +52,116 @@ def select_boxes(
     class_ids: Sequence[int] | None = None,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """One image's maps, (1, 4 · reg_max + classes, H, W) a level → its boxes.
+    """One image's maps as the model gives them, (1, 4 · reg_max + classes, H, W) a level → its boxes."""
+    sides = 4 * model.reg_max
+    arrays = [level[0].detach().float().cpu().numpy() for level in maps]
+    levels = [LevelMaps(array[:sides], array[sides:]) for array in arrays]
+    return boxes_of(head_of(model), levels, confidence=confidence, iou=iou, class_ids=class_ids, most=most)
 
-    A cell speaks for its most probable class. Cells of other classes than `class_ids`, and those not above
-    `confidence`, are dropped before anything is decoded; then each class suppresses its own overlaps. The
-    boxes of an end-to-end head are selected instead (`best_pairs`); `iou` is of no consequence to it.
+
+def head_of(model: YoloModel) -> Head:
+    """How to read the maps of a whole model."""
+    classes = len(model.class_names)
+    return Head(tuple(model.strides), model.reg_max, model.end_to_end, classes, tuple(range(classes)))
+
+
+def boxes_of(
+    head: Head,
+    levels: Sequence[LevelMaps],
+    *,
+    confidence: float = 0.25,
+    iou: float = 0.7,
+    class_ids: Sequence[int] | None = None,
+    most: int = MOST_BOXES,
+) -> Boxes:
+    """One image's maps → its boxes.
+
+    A cell speaks for its most probable class, of all that the model knows. Cells of other classes than
+    `class_ids`, and those not above `confidence`, are dropped before anything is decoded; then each class
+    suppresses its own overlaps.
+
+    The one-to-one head (YOLOv10, Wang et al., 2024; YOLO26) has learnt to speak once an object: overlapping
+    boxes are different objects. Its cells speak for every class above `confidence`, the `most` best pairs of
+    cell and class are kept, and `iou` is of no consequence.
+
+    Args:
+        class_ids: None: all. Where the maps hold some classes alone, those must be among them.
     """
-    if model.end_to_end:
-        xyxy, scores, classes = best_pairs(model, maps, confidence=confidence, class_ids=class_ids, most=most)
-        return Boxes(xyxy.cpu().numpy(), scores.cpu().numpy(), classes.cpu().numpy())
-    candidates = _candidates(model, maps, confidence, class_ids)
-    kept = suppress(candidates.xyxy, candidates.confidence, candidates.class_id, iou, most)
-    return Boxes(candidates.xyxy[kept], candidates.confidence[kept], candidates.class_id[kept])
+    candidates = _candidates(head, levels, confidence, class_ids)
+    if head.end_to_end:
+        order = np.argsort(-candidates.confidence, kind="stable")[:most]
+        return candidates.at(order)
+    return candidates.at(suppress(candidates.xyxy, candidates.confidence, candidates.class_id, iou, most))
 
 
 def _candidates(
-    model: YoloModel, maps: Sequence[Tensor], confidence: float, class_ids: Sequence[int] | None
+    head: Head, levels: Sequence[LevelMaps], confidence: float, class_ids: Sequence[int] | None
 ) -> Boxes:
-    side_channels = 4 * model.reg_max
-    sides, centres, strides, scores, classes = [], [], [], [], []
+    floor = _logit(confidence) - _LOGIT_MARGIN
+    ids = np.asarray(head.class_ids, np.int64)
     wanted = None
     if class_ids is not None:
-        wanted = torch.zeros(len(model.class_names), dtype=torch.bool, device=maps[0].device)
+        wanted = np.zeros(head.class_count, np.bool_)
         wanted[list(class_ids)] = True
-    for level, stride in zip(maps, model.strides, strict=True):
-        width = level.shape[3]
-        cells = level[0].flatten(1)
-        best, best_class = cells[side_channels:].max(dim=0)
-        score = best.float().sigmoid_()
-        above = score > confidence
+    boxes, scores, classes = [], [], []
+    for number, (level, stride) in enumerate(zip(levels, head.strides, strict=True)):
+        logits = level.classes.reshape(len(ids), -1)
+        if head.end_to_end:
+            cells, channel = _pairs_above(logits, floor)
+        else:
+            cells, channel = _best_above(logits, floor)
+        if not len(cells):
+            continue
+        found = ids[channel]
+        score = 1 / (1 + np.exp(-logits[channel, cells], dtype=np.float32))
+        kept = score > confidence
         if wanted is not None:
-            above &= wanted[best_class]
-        index = above.nonzero().squeeze(1)
-        # Most cells are background: only the few that remain are decoded.
-        sides.append(cells[:side_channels, index].float().T)
-        centres.append(torch.stack((index % width, index // width), dim=1) + 0.5)
-        strides.append(torch.full((len(index), 1), float(stride), device=level.device))
-        scores.append(score[index])
-        classes.append(best_class[index])
-    xyxy = decode_boxes(model.detect.dfl(torch.cat(sides)), torch.cat(centres), torch.cat(strides))
-    return Boxes(
-        xyxy.cpu().numpy().astype(np.float32, copy=False),
-        torch.cat(scores).cpu().numpy(),
-        torch.cat(classes).cpu().numpy().astype(np.int64, copy=False),
-    )
+            kept &= wanted[found]
+        if head.rows is not None and level.features is not None and not head.end_to_end:
+            # A class that nobody asked for may be the better one, and then the cell speaks for that.
+            features = level.features.reshape(len(level.features), -1)[:, cells]
+            kept &= np.isin(head.rows[number].best_class(features), ids)
+        cells = cells[kept]
+        boxes.append(_decode(level, cells, head.reg_max, stride))
+        scores.append(score[kept])
+        classes.append(found[kept])
+    if not boxes:
+        return Boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64))
+    return Boxes(np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes))
+
+
+def _logit(probability: float) -> float:
+    if probability <= 0:
+        return -math.inf
+    return math.inf if probability >= 1 else math.log(probability / (1 - probability))
+
+
+def _best_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(K, N) logits → the cells whose largest is above `floor`, and which that is."""
+    cells = np.flatnonzero(logits.max(axis=0) > floor)
+    return cells, logits[:, cells].argmax(axis=0)
+
+
+def _pairs_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(K, N) logits → every cell and channel above `floor`, cell by cell."""
+    cells = np.flatnonzero(logits.max(axis=0) > floor)
+    place, channel = (logits[:, cells].T > floor).nonzero()
+    return cells[place], channel
+
+
+def _decode(level: LevelMaps, cells: NDArray[np.int64], reg_max: int, stride: int) -> NDArray[np.float32]:
+    """The boxes of some cells of a level → (N, 4) float32 xyxy in pixels of the input."""
+    sides = level.sides.reshape(4 * reg_max, -1)[:, cells]
+    if reg_max > 1:
+        # The expected value of the distribution over the distances 0 … reg_max - 1 (Li et al., 2020).
+        weights = sides.reshape(4, reg_max, -1)
+        weights = np.exp(weights - weights.max(axis=1, keepdims=True))
+        bins = np.arange(reg_max, dtype=np.float32)
+        sides = np.einsum("sbn,b->sn", weights, bins) / weights.sum(axis=1)
+    row, column = np.divmod(cells, level.sides.shape[2])
+    x, y = column.astype(np.float32) + 0.5, row.astype(np.float32) + 0.5
+    xyxy = np.stack((x - sides[0], y - sides[1], x + sides[2], y + sides[3]), axis=1)
+    return (xyxy * np.float32(stride)).astype(np.float32, copy=False)
 
 
 def suppress(
@@ -110,10 +184,34 @@ def suppress(
         Indices of the kept boxes, the most confident first; of equals, the earlier.
     """
     order = np.argsort(-confidence, kind="stable")
-    left, top, right, bottom = (np.asarray(side, np.float64)[order] for side in xyxy.T)
-    area = (right - left).clip(0) * (bottom - top).clip(0)
-    classes = class_id[order]
-    waiting = np.arange(len(order))
+    sides = np.asarray(xyxy, np.float64)[order].T
+    area = (sides[2] - sides[0]).clip(0) * (sides[3] - sides[1]).clip(0)
+    walk = _kept_by_pairs if len(order) <= _MOST_PAIRED else _kept_one_by_one
+    return order[walk(sides, area, class_id[order], iou, most)]
+
+
+def _kept_by_pairs(
+    sides: NDArray[np.float64], area: NDArray[np.float64], classes: NDArray[Any], iou: float, most: int
+) -> NDArray[np.int64]:
+    left, top, right, bottom = sides
+    width = np.minimum(right[:, None], right) - np.maximum(left[:, None], left)
+    height = np.minimum(bottom[:, None], bottom) - np.maximum(top[:, None], top)
+    common = width.clip(0) * height.clip(0)
+    overlaps = common > iou * (area[:, None] + area - common)
+    overlaps &= classes[:, None] == classes
+    alive = np.ones(len(area), np.bool_)
+    # Only a box that overlaps a later one can change anything.
+    for index in np.flatnonzero(np.triu(overlaps, 1).any(axis=1)):
+        if alive[index]:
+            alive[index + 1 :] &= ~overlaps[index, index + 1 :]
+    return np.flatnonzero(alive)[:most]
+
+
+def _kept_one_by_one(
+    sides: NDArray[np.float64], area: NDArray[np.float64], classes: NDArray[Any], iou: float, most: int
+) -> NDArray[np.int64]:
+    left, top, right, bottom = sides
+    waiting = np.arange(len(area))
     kept: list[int] = []
     while len(waiting) and len(kept) < most:
         first, rest = waiting[0], waiting[1:]
@@ -123,4 +221,4 @@ def suppress(
         common = width.clip(0) * height.clip(0)
         overlaps = common > iou * (area[first] + area[rest] - common)
         waiting = rest[~(overlaps & (classes[rest] == classes[first]))]
-    return order[np.array(kept, dtype=np.int64)]
+    return np.array(kept, dtype=np.int64)
