@@ -110,6 +110,11 @@ def detect(
     threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
     every: Annotated[int, typer.Option(min=1, help="look at every N-th frame")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, help="end after so many frames")] = None,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="look at large frames in tiles too: small objects, much slower")
+    ] = False,
+    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the frame")] = 640,
+    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
     save: Annotated[Path | None, typer.Option(help="folder for inputs and annotated images")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object a frame")] = False,
     width: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
@@ -120,7 +125,9 @@ def detect(
     """Detect objects in every frame of a source; one line a frame on standard output."""
     from companion.detect import detect_source
     from vision.detector import Detector
+    from vision.pipeline import FrameDetector
     from vision.sources import SourceError, SourceSettings, open_source
+    from vision.tiling import TiledDetector
     from vision.yolo.checkpoint import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
@@ -136,13 +143,16 @@ def detect(
             precision=precision,  # type: ignore[arg-type]
             threads=threads,
         )
+        looking: FrameDetector = detector
+        if tiles:
+            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
         settings = SourceSettings(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         looked_at = detect_source(
-            frames, detector, every=every, limit=limit, save=save, as_json=as_json, write=write
+            frames, looking, every=every, limit=limit, save=save, as_json=as_json, write=write
         )
     if not looked_at:
         typer.echo(f"companion: {source} had no frames", err=True)

@@ -32,7 +32,7 @@ from companion.perception_messages import (
 )
 from companion.perception_outbox import Outbox, OutboxHandler
 from companion.settings import Settings
-from vision.pipeline import PerceptionResult, Pipeline
+from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.video_writer import VideoWriterError
@@ -140,7 +140,7 @@ def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFa
         outbox.put(_ready(settings, perception))
         pipeline = Pipeline(
             perception.source,
-            perception.detector,
+            _looking(settings, perception.detector),
             every=settings.detector.every,
             recorder=perception.recording,
         )
@@ -168,6 +168,16 @@ def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
         # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)
     return Perception(source, detector, recording)
+
+
+def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | None:
+    """The detector as the pipeline uses it."""
+    wanted = settings.detector
+    if detector is None or not wanted.tiles:
+        return detector
+    from vision.tiling import TiledDetector
+
+    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
 
 
 def _load(settings: Settings) -> Detector:

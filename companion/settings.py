@@ -199,6 +199,12 @@ class DetectorSection(Section):
     """processor threads of the network; unset: as many as torch takes by itself"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """look at every N-th frame only"""
+    tiles: bool = False
+    """look at large frames in overlapping tiles too, for small objects; 1080p takes some 14 times as long"""
+    tile_size: Annotated[int, Field(ge=64, le=4096)] = 640
+    """side of a tile, pixels of the frame; best as large as image_size"""
+    tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
+    """of neighbouring tiles, share of a tile"""
 
 
 class GuidanceSection(Section):

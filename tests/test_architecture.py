@@ -39,7 +39,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.rotation",
     "vision.shared_frame",
 }
-MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench"}
+MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench", "models"}
 
 
 def modules() -> dict[str, Path]:
