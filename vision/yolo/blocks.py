@@ -97,6 +97,33 @@ class C2f(GrowingBlock):
         super().__init__(inputs, outputs, stage, repeats, hidden, activation=activation)
 
 
+class C2(nn.Module):
+    """Half of the channels pass `repeats` bottlenecks, the other half goes around them (YOLOv8-P6)."""
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        repeats: int = 1,
+        shortcut: bool = True,
+        *,
+        expansion: float = 0.5,
+        activation: str = "SiLU",
+    ) -> None:
+        super().__init__()
+        hidden = int(outputs * expansion)
+        self.cv1 = Conv(inputs, 2 * hidden, activation=activation)
+        self.cv2 = Conv(2 * hidden, outputs, activation=activation)
+        self.m = nn.Sequential(
+            *(Bottleneck(hidden, hidden, shortcut, activation=activation) for _ in range(repeats))
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        through, around = self.cv1(x).chunk(2, dim=1)
+        y: Tensor = self.cv2(torch.cat((self.m(through), around), dim=1))
+        return y
+
+
 class SplitBlock(nn.Module):
     """Cross-stage partial block of three convolutions: two branches, one of them through `stages`."""
 

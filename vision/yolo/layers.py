@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from vision.yolo.attention import C2PSA, PSA, ABlock, AreaAttention, Attention, PSABlock
 from vision.yolo.blocks import (
+    C2,
     C3,
     CIB,
     SPPF,
@@ -21,6 +22,7 @@ from vision.yolo.heads import DFL, Detect
 
 __all__ = [
     "ACTIVATIONS",
+    "C2",
     "C2PSA",
     "C3",
     "CIB",

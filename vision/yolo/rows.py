@@ -11,6 +11,7 @@ from torch import nn
 from vision.yolo.attention import CHANNELS_PER_AREA_HEAD, CHANNELS_PER_HEAD
 from vision.yolo.description import ArchitectureError, LayerRow, ModelDescription
 from vision.yolo.layers import (
+    C2,
     C2PSA,
     C3,
     PSA,
@@ -160,26 +161,24 @@ def _scdown(row: _Row) -> Made:
     return Made(module, channels, reduction=stride)
 
 
-def _c2f(row: _Row) -> Made:
-    row.takes(4)
-    row.ungrouped(2)
-    channels, shortcut = row.channels(), row.flag(1, "shortcut", False)
-    expansion = row.ratio(3, "expansion", 0.5)
-    module = C2f(
-        row.single(), channels, row.repeats(), shortcut, expansion=expansion, activation=row.activation
-    )
-    return Made(module, channels)
+def _partial(block: type[C2 | C2f | C3], shortcut: bool) -> Callable[[_Row], Made]:
+    """The older cross-stage partial blocks, which differ in whether they have shortcuts unless told."""
 
+    def maker(row: _Row) -> Made:
+        row.takes(4)
+        row.ungrouped(2)
+        channels = row.channels()
+        module = block(
+            row.single(),
+            channels,
+            row.repeats(),
+            row.flag(1, "shortcut", shortcut),
+            expansion=row.ratio(3, "expansion", 0.5),
+            activation=row.activation,
+        )
+        return Made(module, channels)
 
-def _c3(row: _Row) -> Made:
-    row.takes(4)
-    row.ungrouped(2)
-    channels, shortcut = row.channels(), row.flag(1, "shortcut", True)
-    expansion = row.ratio(3, "expansion", 0.5)
-    module = C3(
-        row.single(), channels, row.repeats(), shortcut, expansion=expansion, activation=row.activation
-    )
-    return Made(module, channels)
+    return maker
 
 
 def _c3k2(row: _Row) -> Made:
@@ -320,9 +319,10 @@ def _detect(row: _Row) -> Made:
 _MAKERS: dict[str, Callable[[_Row], Made]] = {
     "A2C2f": _a2c2f,
     "C2PSA": _c2psa,
-    "C2f": _c2f,
+    "C2": _partial(C2, shortcut=True),
+    "C2f": _partial(C2f, shortcut=False),
     "C2fCIB": _c2fcib,
-    "C3": _c3,
+    "C3": _partial(C3, shortcut=True),
     "C3k2": _c3k2,
     "Concat": _concat,
     "Conv": _conv,
