@@ -26,7 +26,10 @@ class DFL(nn.Module):
         super().__init__()
         self.bins = bins
         self.conv = nn.Conv2d(bins, 1, 1, bias=False).requires_grad_(False)
-        self.conv.weight.data.copy_(torch.arange(bins, dtype=torch.float32).view(1, bins, 1, 1))
+        # Not `arange`: on the meta device, where checkpoints are built, it would load torch's compiler.
+        self.conv.weight.data.copy_(
+            torch.tensor([float(number) for number in range(bins)]).view(1, bins, 1, 1)
+        )
 
     def forward(self, logits: Tensor) -> Tensor:
         """(…, 4 · bins) logits → (…, 4) distances, in cells, of left, top, right, bottom."""
@@ -69,9 +72,7 @@ class Detect(nn.Module):
         box_width = max(16, inputs[0] // 4, 4 * reg_max)
         class_width = max(inputs[0], min(classes, 100)) if class_width is None else class_width
         class_branch = _light_branch if light else _branch
-        self.cv2 = nn.ModuleList(
-            _branch(channels, box_width, 4 * reg_max, activation) for channels in inputs
-        )
+        self.cv2 = nn.ModuleList(_branch(channels, box_width, 4 * reg_max, activation) for channels in inputs)
         self.cv3 = nn.ModuleList(
             class_branch(channels, class_width, classes, activation) for channels in inputs
         )
