@@ -1,4 +1,4 @@
-"""The command line: `companion run|demo|detect|send|echo|config|train|bench`.
+"""The command line: `companion run|demo|detect|models|evaluate|send|echo|config|train|bench`.
 
 Heavy parts are imported when their command runs, so that `companion send` starts at once.
 What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
@@ -13,14 +13,14 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli_flags import with_settings
+from companion.cli_flags import EXIT_BAD_INPUT, plain_errors, with_settings
+from companion.cli_models import models
 from companion.settings import Settings
 
 if TYPE_CHECKING:
@@ -35,19 +35,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+app.add_typer(models, name="models")
+
 EXIT_FAILED = 1
-EXIT_BAD_INPUT = 2
-
-
-@contextmanager
-def plain_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Errors of these kinds are for the person at the keyboard: the message, and exit code 2."""
-    try:
-        yield
-    except expected as error:
-        for line in str(error).splitlines():
-            typer.echo(f"companion: {line}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
 @app.command()
@@ -159,6 +149,60 @@ def detect(
         raise typer.Exit(EXIT_BAD_INPUT)
 
 
+@app.command()
+def evaluate(
+    dataset: Annotated[Path, typer.Argument(help="a YOLO-format folder or data.yaml, or a COCO JSON")],
+    model: Annotated[str, typer.Option(help="a checkpoint, or a name in the models folder")] = "default",
+    split: Annotated[str | None, typer.Option(help="of a data.yaml: train, val or test; else val")] = None,
+    images: Annotated[Path | None, typer.Option(help="folder of a COCO file's images")] = None,
+    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
+    iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
+    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "float32",
+    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="only the first so many images")] = None,
+    misses: Annotated[Path, typer.Option(help="the picture of the worst misses")] = Path("misses.png"),
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Judge a model on a labelled data set: mAP50 and mAP50-95, per class too, and the worst misses."""
+    from dataclasses import replace
+
+    from companion.evaluate import (
+        JUDGED_CONFIDENCE,
+        evaluate_dataset,
+        map_classes,
+        report_lines,
+        write_sheet,
+    )
+    from vision.detector import Detector
+    from vision.evaluation.dataset import DatasetError, open_dataset
+    from vision.yolo.checkpoint import CheckpointError
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    with plain_errors(CheckpointError, DatasetError, ValueError, OSError):
+        data = open_dataset(dataset, split=split, images=images)
+        if limit is not None:
+            data = replace(data, samples=data.samples[:limit])
+        detector = Detector(
+            model,
+            confidence=JUDGED_CONFIDENCE,
+            iou=iou,
+            image_size=image_size,
+            precision=precision,  # type: ignore[arg-type]
+            threads=threads,
+        )
+        evaluation = evaluate_dataset(data, detector, map_classes(detector.class_names, data))
+        shown = write_sheet(evaluation, misses)
+    if as_json:
+        settings = {"model": model, "dataset": str(dataset), "image_size": image_size, "precision": precision}
+        sheet = str(misses) if shown else None
+        typer.echo(json.dumps({**settings, **evaluation.plain(), "misses_picture": sheet}))
+        return
+    for line in report_lines(evaluation):
+        typer.echo(line)
+    if shown:
+        typer.echo(f"the worst misses: {misses}")
+
+
 def parse_classes(text: str | None) -> list[str | int] | None:
     """`person,car` or `0,2` as a detector takes them; None for all."""
     if text is None or not text.strip():
@@ -169,7 +213,9 @@ def parse_classes(text: str | None) -> list[str | int] | None:
 
 @app.command()
 def train(
-    output: Annotated[Path, typer.Option(help="the checkpoint to write")] = Path("runs/model.pt"),
+    output: Annotated[Path, typer.Option(help="what to write: NAME.safetensors and NAME.yaml")] = Path(
+        "runs/model.safetensors"
+    ),
     seed: Annotated[int | None, typer.Option(min=0, help="of weights and scenes; else the recipe's")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="a shorter or longer course")] = None,
     hours: Annotated[float | None, typer.Option(min=0.001, help="stop after so long")] = None,
@@ -194,7 +240,8 @@ def train(
             held_out=held_out,
         )
     typer.echo(
-        f"{output}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} on {held_out} held-out scenes"
+        f"{output.with_suffix('.safetensors')}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} "
+        f"on {held_out} held-out scenes"
     )
 
 

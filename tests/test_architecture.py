@@ -26,6 +26,8 @@ FLOORS = {
     "rehearsal": 5,
     "demo": 6,
     "detect": 6,
+    "evaluate": 6,
+    "models": 6,
     "train": 6,
     "bench": 6,
     "cli": 7,

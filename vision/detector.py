@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vision.detections import Detections
 from vision.letterbox import Letterbox, fit
+from vision.model_files import find_model
 from vision.runtimes.contract import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, start_runtime
 from vision.runtimes.source import read_source
@@ -207,7 +208,7 @@ def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) ->
 
 def _model_path(model: str | Path) -> Path:
     if str(model) != DEFAULT_MODEL:
-        return Path(model).expanduser()
+        return find_model(model)
     if not DEFAULT_WEIGHTS.is_file():
         raise CheckpointError(
             f"{DEFAULT_WEIGHTS}: the bundled model is missing from this installation; "

@@ -1,7 +1,7 @@
-"""Checkpoints: our own format, and the ordinary Ultralytics `.pt`, both read without running them.
+"""Checkpoints: our own pair of files, and the ordinary Ultralytics `.pt`, both read without running them.
 
-Our own is a dictionary that `torch.load(weights_only=True)` reads too:
-`{"format", "description", "state_dict" (float16), "metadata"}`.
+Our own is `NAME.safetensors` with `NAME.yaml` (`checkpoint_pair`). The first version's was a dictionary that
+`torch.load(weights_only=True)` reads too, `{"format", "description", "state_dict" (float16), "metadata"}`.
 An Ultralytics checkpoint is a pickled `DetectionModel`; its description, class names and tensors are taken
 from the inert records that `torch_archive` makes of it.
 """
@@ -18,8 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
 from vision.yolo.pickled_layers import as_trained
-from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line
+from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line, shown
 from vision.yolo.torch_archive import read_archive
 
 __all__ = [
@@ -37,8 +38,12 @@ _DETECTION_MODELS = (
     "ultralytics.nn.tasks.YOLOv10DetectionModel",  # As the authors of YOLOv10 published it.
 )
 _DEEPEST = 16
-_MOST_NODES = 200_000
+_MOST_NODES = 100_000
+_MOST_MODULES = 20_000
+_LONGEST_NAME = 500
 _LONGEST_TEXT = 100_000
+# Of all layers together: the largest published networks have some eighty.
+_MOST_REPEATS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +67,7 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
     """Write `model` at `path`, weights as float16 (those beyond its range as float32), in one step.
 
     Args:
+        path: `NAME.safetensors` (its description goes to `NAME.yaml` beside it), or `.pt`.
         metadata: plain values only (dicts, lists, texts, numbers, booleans, None), else `TypeError`.
     """
     path = Path(path)
@@ -69,10 +75,15 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
         plain_metadata = _plain(dict(metadata))
     except CheckpointError as error:
         raise TypeError(f"metadata must be plain values: {error}") from None
+    description = model.description.to_plain()
+    weights = {name: _compact(tensor) for name, tensor in model.state_dict().items()}
+    if path.suffix == WEIGHTS_SUFFIX:
+        write_pair(path, description, weights, plain_metadata)
+        return
     content = {
         "format": FORMAT,
-        "description": model.description.to_plain(),
-        "state_dict": {name: _compact(tensor) for name, tensor in model.state_dict().items()},
+        "description": description,
+        "state_dict": weights,
         "metadata": plain_metadata,
     }
     # A reader, or the next start after a power cut, sees the old file or the new one.
@@ -82,18 +93,23 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
 
 
 def load_checkpoint(path: str | Path) -> LoadedModel:
-    """Read our own checkpoint or an Ultralytics detection checkpoint (YOLOv5u, v8, v10, 11, 12, 26).
+    """Read our own checkpoint (either file of a pair, or a `.pt`) or an Ultralytics detection checkpoint.
+
+    Of Ultralytics': YOLOv5u, v8, v10, 11, 12, 26.
 
     Raises:
         UnsafeCheckpointError: the file asks for code to be run, named in the message.
         CheckpointError: missing, damaged, of another kind, or weights that do not fit the description.
     """
-    content = read_archive(path)
+    pair = is_pair(Path(path))
+    content = read_pair(Path(path)) if pair else read_archive(path)
     try:
-        return _interpret(content)
+        return _described(content) if pair else _interpret(content)
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
         raise kind(one_line(f"{path}: {error}")) from None
+    except RecursionError:
+        raise CheckpointError(one_line(f"{path}: its values are nested too deeply")) from None
 
 
 def _interpret(content: Any) -> LoadedModel:
@@ -112,7 +128,12 @@ def _interpret(content: Any) -> LoadedModel:
 
 def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
     if content["format"] != FORMAT:
-        raise CheckpointError(f"has format {content['format']!r:.100}, this version reads {FORMAT!r}")
+        raise CheckpointError(f"has format {shown(content['format'])}, this version reads {FORMAT!r}")
+    return _described(content)
+
+
+def _described(content: dict[Any, Any]) -> LoadedModel:
+    """A network from `description`, `state_dict` and `metadata`."""
     description = ModelDescription.from_plain(_plain_dictionary(content, "description"))
     weights = content.get("state_dict")
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
@@ -141,7 +162,7 @@ def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedMode
         if isinstance(module, nn.BatchNorm2d) and trained is not None:
             epsilon = trained.state.get("eps", module.eps)
             if type(epsilon) is not float or not 0 < epsilon < 1:
-                raise CheckpointError(f"{name} has the epsilon {epsilon!r:.100}, expected a small number")
+                raise CheckpointError(f"{name} has the epsilon {shown(epsilon)}, expected a small number")
             module.eps = epsilon
     metadata = {"origin": f"Ultralytics {_note(content, 'version')}".strip()}
     for key, source in (("licence", "license"), ("date", "date")):
@@ -175,8 +196,10 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
     while waiting:
         name, module, depth = waiting.pop()
         seen += 1
-        if depth > _DEEPEST or seen > _MOST_NODES:
-            raise CheckpointError("its modules contain each other")
+        if depth > _DEEPEST or seen > _MOST_MODULES or len(waiting) > _MOST_MODULES:
+            raise CheckpointError("its modules contain each other, or are too many")
+        if len(name) > _LONGEST_NAME:
+            raise CheckpointError(f"it has a module whose name has {len(name)} characters")
         yield name, module
         children = module.state.get("_modules", {})
         if not isinstance(children, dict):
@@ -189,13 +212,15 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
 
 
 def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
+    """Each tensor with its dotted name, taken out of its module: who gets it holds it alone."""
     for name, module in modules.items():
         passing = module.state.get("_non_persistent_buffers_set", frozenset())
         for kind in ("_parameters", "_buffers"):
             tensors = module.state.get(kind, {})
             if not isinstance(tensors, dict):
                 raise CheckpointError(f"{name}'s {kind} are not a dictionary")
-            for key, tensor in tensors.items():
+            for key in list(tensors):
+                tensor = tensors.pop(key)
                 if tensor is None or (isinstance(passing, frozenset) and key in passing):
                     continue
                 if not isinstance(tensor, Tensor):
@@ -204,7 +229,11 @@ def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
 
 
 def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
-    """The described network with exactly these weights; every name of either side accounted for."""
+    """The described network with exactly these weights; every name of either side accounted for.
+
+    Empties `weights`, so that a number is not held twice for longer than its layer needs.
+    """
+    _check_sizes(description, weights)
     # Shapes only: a description that promises more than the file holds must not cost memory.
     with torch.device("meta"):
         model = YoloModel(description)
@@ -226,12 +255,21 @@ def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> 
             raise CheckpointError(f"{name} should be {expected[name].dtype}, it is {tensor.dtype}")
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise CheckpointError(f"{name} has numbers that are not finite")
-    model.load_state_dict(
-        {name: tensor.to(expected[name].dtype, copy=True).contiguous() for name, tensor in weights.items()},
-        strict=True,
-        assign=True,
-    )
+    converted = {}
+    for name, meant in expected.items():
+        converted[name] = weights.pop(name).to(meant.dtype, copy=True).contiguous()
+    model.load_state_dict(converted, strict=True, assign=True)
     return model.eval()
+
+
+def _check_sizes(description: ModelDescription, weights: dict[str, Tensor]) -> None:
+    """What a file makes large: layers repeated, and the same numbers used for many weights."""
+    repeats = sum(max(1, round(row.repeats * description.depth_multiple)) for row in description.rows)
+    if repeats > _MOST_REPEATS:
+        raise CheckpointError(f"describes {repeats} layers, at most {_MOST_REPEATS} make sense")
+    storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage() for tensor in weights.values()}
+    if sum(tensor.nbytes for tensor in weights.values()) > sum(map(len, storages.values())):
+        raise CheckpointError("uses the same numbers for several weights; it is not a checkpoint")
 
 
 def _compact(tensor: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vision.yolo.description import ModelDescription
 from vision.yolo.layer_row import A2C2F_DEFAULTS, C3K2_DEFAULTS, SPPF_DEFAULTS, LayerRow
-from vision.yolo.safe_pickle import CheckpointError, Inert
+from vision.yolo.safe_pickle import CheckpointError, Inert, shown
 
 Modules = Mapping[str, Inert]
 """Dotted name → module, `model.<row>` for the rows."""
@@ -87,9 +87,12 @@ def _with_head(description: ModelDescription, name: str, modules: Modules) -> Mo
     chosen = head.state.get("_end2end")
     last = _tensor(modules, f"{name}.{branches}.0.2")
     width = last.shape[1] if last is not None and last.dim() == 4 else None
+    bins = head.state.get("reg_max", description.reg_max)
+    if type(bins) is not int:
+        raise CheckpointError(f"its head has the reg_max {shown(bins)}, expected a whole number")
     return dataclasses.replace(
         description,
-        reg_max=head.state.get("reg_max", description.reg_max),
+        reg_max=bins,
         light_classes=light,
         end_to_end=two_heads and chosen is not False,
         class_width=width,

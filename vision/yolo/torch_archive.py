@@ -10,7 +10,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -31,11 +31,19 @@ _STORAGES: dict[str, torch.dtype] = {
     "torch.BoolStorage": torch.bool,
 }
 
-_LARGEST_PICKLE_BYTES = 64 << 20
-_MOST_MEMBERS = 100_000
+_LARGEST_PICKLE_BYTES = 16 << 20
+# The table of contents becomes an object a member; the largest checkpoints have some thousands.
+_LARGEST_CONTENTS_BYTES = 1 << 20
+_MOST_MEMBERS = 10_000
+# The end record with the longest comment, and the two records of zip64 before it.
+_LONGEST_ENDING_BYTES = 22 + 65535 + 20 + 56
 _MOST_DIMENSIONS = 8
 # Views may share a storage (a state dictionary beside its model), but not without end.
 _MOST_VIEWS_PER_ELEMENT = 4
+# What the values of the pickle may take in memory, and as much again as the file has.
+_VALUES_BYTES = 16 << 20
+# A set's numbers can be chosen to collide, and then take for ever.
+_LARGEST_SET = 10_000
 
 
 def read_archive(path: str | Path) -> Any:
@@ -67,8 +75,9 @@ def _read(path: Path) -> Any:
             raise CheckpointError(
                 "not a checkpoint: expected the zip archive that torch.save writes (torch 1.6 or newer)"
             )
-        file.seek(0)
         try:
+            _check_contents(file, size)
+            file.seek(0)
             with zipfile.ZipFile(file) as archive:
                 return _Archive(archive, size).value()
         # What the zip module raises for damaged headers, encryption, unknown compression and bad names.
@@ -88,11 +97,31 @@ def _read(path: Path) -> Any:
             ) from None
 
 
+def _check_contents(file: BinaryIO, size: int) -> None:
+    """The size of the table of contents (APPNOTE 4.3.16, 4.3.14), before the zip module reads it."""
+    start = max(0, size - _LONGEST_ENDING_BYTES)
+    file.seek(start)
+    ending = file.read()
+    found = ending.rfind(b"PK\x05\x06")
+    if found < 0 or len(ending) - found < 22:
+        raise CheckpointError("the archive is truncated or damaged (no end of it); copy or download it again")
+    (contents,) = struct.unpack_from("<L", ending, found + 12)
+    large = ending.rfind(b"PK\x06\x06", 0, found)
+    if 0 <= large <= found - 56:
+        (contents,) = struct.unpack_from("<Q", ending, large + 40)
+    if contents > _LARGEST_CONTENTS_BYTES:
+        raise CheckpointError(
+            f"the archive's table of contents has {contents} bytes, a checkpoint's at most "
+            f"{_LARGEST_CONTENTS_BYTES}"
+        )
+
+
 class _Archive:
     """One open archive; storages are read when the pickle names them."""
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
         self._archive = archive
+        self._size = size
         members = archive.infolist()
         if len(members) > _MOST_MEMBERS:
             raise CheckpointError(f"the archive has {len(members)} members, a checkpoint far fewer")
@@ -119,7 +148,7 @@ class _Archive:
 
     def value(self) -> Any:
         data = self._bytes(self._members[f"{self._root}data.pkl"], _LARGEST_PICKLE_BYTES)
-        return unpickle(data, self._admitted(), self._storage)
+        return unpickle(data, self._admitted(), self._storage, _VALUES_BYTES + self._size)
 
     def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
         if largest is not None and member.file_size > largest:
@@ -222,6 +251,10 @@ def _dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
 
 def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     values = arguments[0] if len(arguments) == 1 else None
-    if not isinstance(values, list) or not all(isinstance(value, str | int | float) for value in values):
+    if (
+        not isinstance(values, list)
+        or len(values) > _LARGEST_SET
+        or not all(isinstance(value, str | int | float) for value in values)
+    ):
         raise CheckpointError("its pickle has a set of something else than names and numbers")
     return frozenset(values)
