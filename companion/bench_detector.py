@@ -186,10 +186,12 @@ def machine() -> dict[str, Any]:
 
 def table(result: dict[str, Any], against: dict[str, Any] | None = None) -> list[str]:
     """The rows as lines; with an earlier result, how each compares."""
-    lines = ["  ".join(f"{name:>{width}}" for name, width in _TABLE.items())]
+    longest = max(len(str(row["runtime"])) for row in result["rows"])
+    columns = _TABLE | {"runtime": max(longest, _TABLE["runtime"])}
+    lines = ["  ".join(f"{name:>{width}}" for name, width in columns.items())]
     before = {_key(row): row for row in (against or {}).get("rows", [])}
     for row in result["rows"]:
-        line = "  ".join(f"{row[name]!s:>{width}}" for name, width in _TABLE.items())
+        line = "  ".join(f"{row[name]!s:>{width}}" for name, width in columns.items())
         earlier = before.get(_key(row))
         if earlier is not None:
             line += f"   p50 was {earlier['p50_ms']} ms: {row['p50_ms'] / earlier['p50_ms']:.2f} of it"
