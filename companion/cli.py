@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from companion.cli_bench import bench
 from companion.cli_flags import EXIT_BAD_INPUT, plain_errors, with_settings
 from companion.cli_models import models
 from companion.settings import Settings
@@ -36,6 +37,7 @@ app = typer.Typer(
 )
 
 app.add_typer(models, name="models")
+app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
 
@@ -106,7 +108,8 @@ def detect(
     confidence: Annotated[float, typer.Option(min=0, max=1)] = 0.25,
     iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
     image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
+    runtime: Annotated[str, typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto")] = "torch",
+    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
     every: Annotated[int, typer.Option(min=1, help="look at every N-th frame")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, help="end after so many frames")] = None,
@@ -131,8 +134,6 @@ def detect(
     from vision.yolo.checkpoint import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
-    if precision not in ("auto", "float32", "bfloat16"):
-        raise typer.BadParameter(f"{precision!r} is not auto, float32 or bfloat16", param_hint="--precision")
     with plain_errors(CheckpointError, ValueError):
         detector = Detector(
             model,
@@ -142,6 +143,7 @@ def detect(
             image_size=image_size,
             precision=precision,  # type: ignore[arg-type]
             threads=threads,
+            runtime=runtime,  # type: ignore[arg-type]
         )
         looking: FrameDetector = detector
         if tiles:
@@ -253,70 +255,6 @@ def train(
         f"{output.with_suffix('.safetensors')}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} "
         f"on {held_out} held-out scenes"
     )
-
-
-bench = typer.Typer(help="Measure on this machine. Figures, never verdicts.", no_args_is_help=True)
-app.add_typer(bench, name="bench")
-
-_JSON = Annotated[bool, typer.Option("--json", help="one JSON object")]
-
-
-@bench.command("detector")
-def bench_detector(
-    model: Annotated[str, typer.Option(help="a checkpoint")] = "default",
-    image_size: Annotated[int, typer.Option(min=32)] = 640,
-    frames: Annotated[int, typer.Option(min=5, help="measured, after a warm-up")] = 100,
-    threads: Annotated[int | None, typer.Option(min=1)] = None,
-    as_json: _JSON = False,
-) -> None:
-    """Milliseconds a 640x480 frame, pixels in, boxes out."""
-    from companion.bench import measure_detector
-    from vision.yolo.checkpoint import CheckpointError
-
-    with plain_errors(CheckpointError, ValueError):
-        _print_figures(
-            measure_detector(model, image_size=image_size, frames=frames, threads=threads), as_json
-        )
-
-
-@bench.command("latency")
-def bench_latency(
-    seconds: Annotated[float, typer.Option(min=1, help="measured, in flight")] = 10.0,
-    driver: Annotated[str, typer.Option(help="mavsdk or pymavlink")] = "mavsdk",
-    as_json: _JSON = False,
-) -> None:
-    """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
-    from companion.bench_latency import measure_latency
-    from companion.bus.session import BusError
-    from companion.config import ConfigurationError
-    from companion.perception import PerceptionStartError
-    from companion.rehearsal import RehearsalError
-    from companion.vehicle.driver import LinkError
-
-    with plain_errors(RehearsalError, ConfigurationError, LinkError, PerceptionStartError, BusError):
-        _print_figures(measure_latency(seconds, driver=driver), as_json)
-
-
-@bench.command("setpoints")
-def bench_setpoints(
-    seconds: Annotated[float, typer.Option(min=1)] = 10.0,
-    rate_hz: Annotated[float, typer.Option(min=5, max=250)] = 50.0,
-    load: Annotated[int, typer.Option(min=0, help="busy processes beside the loop")] = 2,
-    as_json: _JSON = False,
-) -> None:
-    """Spacing of setpoints as a receiver sees them, while other processes keep every core busy."""
-    from companion.bench import measure_setpoints
-
-    _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
-
-
-def _print_figures(figures: dict[str, object], as_json: bool) -> None:
-    if as_json:
-        typer.echo(json.dumps(figures))
-        return
-    width = max(len(name) for name in figures)
-    for name, value in figures.items():
-        typer.echo(f"{name:<{width}}  {value}")
 
 
 @app.command()

@@ -193,6 +193,7 @@ def _load(settings: Settings) -> Detector:
         image_size=wanted.image_size,
         precision=wanted.precision,
         threads=wanted.threads,
+        runtime=wanted.runtime,
     )
 
 

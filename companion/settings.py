@@ -184,7 +184,7 @@ class DetectorSection(Section):
     enabled: bool = True
     """false: frames are read and nothing is looked for"""
     model: Annotated[str, Field(min_length=1)] = DEFAULT_MODEL
-    """a YOLOv8 checkpoint (.pt); default: the model of this package, which knows drawn scenes"""
+    """a checkpoint or an exported file; default: the model of this package, which knows drawn scenes"""
     classes: tuple[str | int, ...] = ()
     """only these classes, by name or id; none: all that the model knows"""
     confidence: Annotated[float, Field(ge=0, le=1)] = 0.25
@@ -193,10 +193,12 @@ class DetectorSection(Section):
     """boxes of one class that overlap by more than this are one object"""
     image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
     """the frame's longer side as the network sees it, pixels"""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] = "torch"
+    """what computes the network; auto takes the fastest installed, measured once on this board"""
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
-    """processor threads of the network; unset: as many as torch takes by itself"""
+    """processor threads of the network; unset: as many as the runtime takes by itself"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """look at every N-th frame only"""
     tiles: bool = False
