@@ -106,3 +106,19 @@ def test_a_real_model_finds_most_of_what_real_photographs_show(tmp_path: Path) -
     data = replace(data, samples=data.samples[:16])
     score = evaluate_dataset(data, detector, map_classes(detector.class_names, data)).score
     assert score.map50 > 0.5
+
+
+def test_detect_and_evaluate_look_in_tiles_when_asked(
+    tmp_path: Path, small_model: Path, pictures: Path
+) -> None:
+    options = ["--model", str(small_model), "--image-size", "64", "--tiles", "--tile-size", "80"]
+    result = CliRunner().invoke(app, ["detect", str(pictures), *options, "--limit", "2", "--json"])
+    assert result.exit_code == 0, result.stderr
+    assert [json.loads(line)["width"] for line in result.stdout.splitlines()] == [160, 160]
+    picture = tmp_path / "a.png"
+    assert cv2.imwrite(str(picture), np.zeros((120, 160, 3), np.uint8))
+    picture.with_suffix(".txt").write_text("0 0.5 0.5 0.5 0.5\n")
+    misses = ["--misses", str(tmp_path / "m.png"), "--json"]
+    result = CliRunner().invoke(app, ["evaluate", str(tmp_path), *options, *misses])
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["tiles"] is True
