@@ -22,6 +22,7 @@ FLOORS = {
     "cli_flags": 2,
     "messages": 2,
     "operator": 3,
+    "views": 3,
     "service": 4,
     "rehearsal": 5,
     "demo": 6,
