@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours
-from vision.yolo.maps import Head, LevelMaps
+from vision.runtimes.torch_runtime import torch_product
+from vision.yolo.maps import Head, LevelMaps, Product
 
 
 class TorchScriptRuntime:
     """See `contract.Runtime`. Computes in float32, what the file is in."""
 
+    product: Product = staticmethod(torch_product)
     name: RuntimeName = "torch"
 
     def __init__(
@@ -57,8 +59,7 @@ class TorchScriptRuntime:
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
         with torch.inference_mode():
             maps = [level[0].numpy() for level in self._module(torch.from_numpy(image_bgr).unsqueeze(0))]
-        step = len(maps) // len(self.head.strides)
-        return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
+        return self.head.levels(maps)
 
 
 def torchscript_facts(path: Path) -> ExportedFacts:
