@@ -5,6 +5,7 @@ A TorchScript file is a program, though one of tensor operations alone. Load tho
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,11 @@ class TorchScriptRuntime:
         if not path.is_file():
             raise RuntimeUnusableError(f"{path}: no such file")
         try:
-            load: Any = torch.jit.load
-            self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
+            with warnings.catch_warnings():
+                # torch would have files of this kind made otherwise; those that are there want to be read.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                load: Any = torch.jit.load
+                self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:300]
             raise RuntimeUnusableError(f"{path}: torch cannot load it: {reason}") from error

@@ -112,7 +112,7 @@ def candidates_of(
         logits = level.classes.reshape(len(ids), -1)
         cells, channel = (_pairs_above if head.end_to_end else _best_above)(logits, floor)
         class_id = ids[channel]
-        score: NDArray[np.float32] = 1 / (1 + np.exp(-logits[channel, cells], dtype=np.float32))
+        score = (1 / (1 + np.exp(-logits[channel, cells]))).astype(np.float32, copy=False)
         kept = score > confidence
         if wanted is not None:
             kept &= wanted[class_id]
