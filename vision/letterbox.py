@@ -11,9 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 PADDING = 114
 STRIDE = 32
@@ -124,18 +122,3 @@ def fit(
         left=spare_width // 2,
         top=spare_height // 2,
     )
-
-
-def to_tensor(boxed_bgr: NDArray[np.uint8], dtype: torch.dtype = torch.float32) -> Tensor:
-    """(H, W, 3) uint8 BGR → (1, 3, H, W) RGB in 0..1, channels-last in memory."""
-    rgb = cv2.cvtColor(boxed_bgr, cv2.COLOR_BGR2RGB)
-    pixels = torch.from_numpy(rgb).permute(2, 0, 1).unsqueeze(0)
-    return pixels.to(dtype).div_(255)
-
-
-def letterbox(
-    image_bgr: NDArray[np.uint8], image_size: int = 640, *, square: bool = False
-) -> tuple[Tensor, Letterbox]:
-    """A BGR frame → ((1, 3, H, W) float32 RGB in 0..1, the transform back)."""
-    box = fit(image_bgr.shape[1], image_bgr.shape[0], image_size, square=square)
-    return to_tensor(box.apply(image_bgr)), box

@@ -75,6 +75,43 @@ def test_only_the_classes_asked_for_are_reported(model_path: Path, frame: np.nda
     assert not len(Detector(model_path, classes=["person", 1], image_size=64).detect(frame))
 
 
+@pytest.mark.parametrize("change", ["read-only", "mirrored", "a part of a larger one", "channels turned"])
+def test_a_frame_may_lie_in_memory_as_it_likes(
+    model_path: Path, frame: np.ndarray[Any, Any], change: str
+) -> None:
+    larger = np.zeros((100, 200, 3), np.uint8)
+    changed = {
+        "read-only": frame.copy(),
+        "mirrored": frame[:, ::-1],
+        "a part of a larger one": larger[:64, :128],
+        "channels turned": frame[..., ::-1],
+    }[change]
+    if change == "a part of a larger one":
+        changed[:] = frame
+    changed.flags.writeable = change != "read-only"
+    for image_size in (64, 128):
+        detector = Detector(model_path, image_size=image_size)
+        expected = detector.detect(np.ascontiguousarray(changed).copy())
+        np.testing.assert_array_equal(detector.detect(changed).xyxy, expected.xyxy)
+
+
+def test_a_prepared_detector_detects_as_any_other(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    detector = Detector(model_path, image_size=64)
+    detector.prepare(128, 64)
+    assert len(detector.detect(frame)) == 2
+    assert detector.threads >= 1
+
+
+def test_boxes_one_by_one_are_the_boxes_of_whole_maps(
+    model_path: Path, frame: np.ndarray[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_by_one = Detector(model_path, image_size=128).detect(frame)
+    monkeypatch.setattr(detector_module, "_SPARSE_FROM", 2.0)
+    whole = Detector(model_path, image_size=128).detect(frame)
+    np.testing.assert_allclose(one_by_one.xyxy, whole.xyxy, atol=1e-3)
+    assert len(whole) == 8
+
+
 def test_a_detection_says_how_long_its_parts_took(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
     detector = Detector(model_path, image_size=64)
     assert detector.last_timing is None

@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.yolo.maps import Head, LevelMaps
+from vision.yolo.maps import Head, LevelMaps, Product
 
 RuntimeName = Literal["torch", "onnxruntime", "openvino", "tensorrt"]
 RUNTIMES: tuple[RuntimeName, ...] = ("torch", "onnxruntime", "openvino", "tensorrt")
@@ -51,6 +51,10 @@ class Runtime(Protocol):
     def threads(self) -> int: ...
     @property
     def head(self) -> Head: ...
+
+    @property
+    def product(self) -> Product:
+        """Of two float32 matrices, with the runtime's own threads where it has such a thing."""
 
     def prepare(self, height: int, width: int) -> None:
         """Make ready for inputs of one size, so that the first `infer` is as fast as the rest."""

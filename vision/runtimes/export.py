@@ -189,8 +189,7 @@ def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -
         found: list[Any] = []
         try:
             for level in runtime.infer(picture[0].numpy()):
-                found += [level.sides, level.classes]
-                found += [] if level.features is None else [level.features]
+                found += [getattr(level, kind) for kind in head.kinds]
         except (RuntimeError, RuntimeUnusableError) as error:
             raise _unfaithful(to, picture.shape, str(error)) from error
         worst = _largest_difference(expected, found)

@@ -1,39 +1,45 @@
 """A trained model made into what is run: pixels as they come, classes that are wanted, maps kept apart.
 
-Three changes, none of which changes the results beyond rounding:
+Changes, none of which alters the results beyond rounding:
 
 * The first convolution takes the bytes of a BGR picture: the division by 255 and the channels' order are
   folded into its weights.
 * Of the last convolution of the class branches only the wanted classes' rows are kept.
-* Box sides and class logits stay separate maps, which saves joining and taking them apart again.
+* Box sides and class logits stay separate maps, which saves joining and taking them apart again; and with
+  `sparse_boxes` the box branches are left out, as `BoxBranch` computes them where there is something.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from vision.runtimes.contract import RuntimeUnusableError
 from vision.yolo.architecture import YoloModel
 from vision.yolo.layers import Detect
-from vision.yolo.maps import ClassRows, Head
+from vision.yolo.maps import BoxBranch, ClassRows, Head
 from vision.yolo.postprocess import head_of
 
 
 class Network(nn.Module):
-    """(1, H, W, 3) uint8 BGR → for each level box sides, class logits and, with `class_ids`, features.
+    """(1, H, W, 3) uint8 BGR → for each level the maps of `Head.kinds`.
 
     All maps are (1, C, H / stride, W / stride) float32, in one flat tuple. `names` gives each a name.
 
     Args:
         model: is taken over and changed; do not use it afterwards.
         class_ids: sorted; the classes to compute. None: all.
+        sparse_boxes: give the neck's maps, from which the few boxes are computed later, instead of all sides.
     """
 
-    def __init__(self, model: YoloModel, class_ids: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, model: YoloModel, class_ids: Sequence[int] | None = None, *, sparse_boxes: bool = False
+    ) -> None:
         super().__init__()
         if model.description.channels != 3:
             raise RuntimeUnusableError(
@@ -41,8 +47,9 @@ class Network(nn.Module):
             )
         model.fuse().requires_grad_(False)
         self.head = _sliced(head_of(model), model.detect, class_ids)
-        self.features = self.head.rows is not None
-        model.model[-1] = _SplitHead(model.detect, self.features)
+        if sparse_boxes:
+            self.head = replace(self.head, boxes=_box_branches(model.detect, model.description.activation))
+        model.model[-1] = _SplitHead(model.detect, self.head.kinds)
         self._folded = _fold_pixels(model)
         self.body = model
         self.dtype = torch.float32
@@ -51,8 +58,7 @@ class Network(nn.Module):
     @property
     def names(self) -> list[str]:
         """Of the maps, in the order of the output."""
-        kinds = ("sides", "classes", "features") if self.features else ("sides", "classes")
-        return [f"{kind}_{stride}" for stride in self.head.strides for kind in kinds]
+        return [f"{kind}_{stride}" for stride in self.head.strides for kind in self.head.kinds]
 
     def in_precision(self, dtype: torch.dtype) -> Network:
         """Compute in `dtype`, but for the last class convolutions, which decide, in place."""
@@ -82,20 +88,19 @@ class Network(nn.Module):
 class _SplitHead(Detect):
     """The head's branches with their maps kept apart."""
 
-    def __init__(self, head: Detect, features: bool) -> None:
+    def __init__(self, head: Detect, kinds: tuple[str, ...]) -> None:
         nn.Module.__init__(self)
         self.__dict__.update({name: value for name, value in head.__dict__.items() if name != "_modules"})
         self._modules = dict(head._modules)
-        self.features = features
+        self.kinds = kinds
 
     def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
         found: list[Tensor] = []
         branches = zip(_branches(self.box_branches), _branches(self.class_branches), strict=True)
         for x, (boxes, classes) in zip(maps, branches, strict=True):
-            sides = boxes(x)
             features = classes[:-1](x).float()
-            found += [sides.float(), classes[-1](features)]
-            if self.features:
+            found += [(x if "neck" in self.kinds else boxes(x)).float(), classes[-1](features)]
+            if "features" in self.kinds:
                 found.append(features)
         return found
 
@@ -120,9 +125,24 @@ def _sliced(head: Head, detect: Detect, class_ids: Sequence[int] | None) -> Head
         last.out_channels = len(index)
     # In an end-to-end head every class speaks for itself: nobody is asked who else would.
     wins = None if head.end_to_end else tuple(rows)
-    return Head(
-        head.strides, head.reg_max, head.end_to_end, head.class_count, tuple(int(i) for i in class_ids), wins
-    )
+    return replace(head, class_ids=tuple(int(index) for index in class_ids), rows=wins)
+
+
+def _box_branches(detect: Detect, activation: str) -> tuple[BoxBranch, ...] | None:
+    """The box branches' weights, as `BoxBranch` wants them; None for branches of another make."""
+    made = []
+    for branch in _branches(detect.box_branches):
+        layers = [cast(nn.Conv2d, getattr(layer, "conv", layer)) for layer in branch]
+        shapes = [(layer.kernel_size, layer.stride, layer.padding, layer.groups) for layer in layers]
+        if shapes != [((3, 3), (1, 1), (1, 1), 1)] * 2 + [((1, 1), (1, 1), (0, 0), 1)]:
+            return None
+        weights = [layer.weight.detach().float().permute(2, 3, 1, 0) for layer in layers]
+        first, second, last = (
+            np.ascontiguousarray(weight.reshape(-1, weight.shape[-1]).numpy()) for weight in weights
+        )
+        biases = tuple(cast(Tensor, layer.bias).detach().float().numpy().copy() for layer in layers)
+        made.append(BoxBranch((first, second, last), (biases[0], biases[1], biases[2]), activation))
+    return tuple(made)
 
 
 def _fold_pixels(model: YoloModel) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, ExportedFacts, not_ours
-from vision.yolo.maps import Head, LevelMaps
+from vision.yolo.maps import Head, LevelMaps, Product
 
 # As ONNX Runtime names them. A provider that is there is wanted: its package was chosen for it.
 _PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
@@ -27,6 +27,7 @@ class OnnxRuntime:
         threads: of the processor; None: as many as ONNX Runtime takes.
     """
 
+    product: Product = staticmethod(np.matmul)
     name: RuntimeName = "onnxruntime"
 
     def __init__(
@@ -58,7 +59,6 @@ class OnnxRuntime:
         self.head = head if head is not None else onnx_facts(path, self._session).head()
         self.precision, self.precision_reason = "float32", f"what the file is in ({started[0]})"
         self._threads = threads
-        self._features = len(self._session.get_outputs()) == 3 * len(self.head.strides)
 
     @property
     def threads(self) -> int:
@@ -69,8 +69,7 @@ class OnnxRuntime:
 
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
         maps = [level[0] for level in self._session.run(None, {INPUT: image_bgr[None]})]
-        step = 3 if self._features else 2
-        return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
+        return self.head.levels(maps)
 
 
 def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vision.runtimes import contract
 from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours
-from vision.yolo.maps import Head, LevelMaps
+from vision.yolo.maps import Head, LevelMaps, Product
 
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
 _MOST_SIZES = 2
@@ -30,6 +30,7 @@ class OpenVinoRuntime:
         threads: of the processor; None: as many as OpenVINO takes.
     """
 
+    product: Product = staticmethod(np.matmul)
     name: RuntimeName = "openvino"
 
     def __init__(
@@ -44,7 +45,6 @@ class OpenVinoRuntime:
         self._core = self._openvino.Core()
         self._model = _read(self._core, path)
         self.head = head if head is not None else openvino_facts(path, self._model).head()
-        self._features = len(self._model.outputs) == 3 * len(self.head.strides)
         native = contract.bfloat16_instructions()
         if precision == "auto":
             self.precision = "bfloat16" if native else "float32"
@@ -79,8 +79,7 @@ class OpenVinoRuntime:
         request.set_input_tensor(self._openvino.Tensor(image_bgr[None], shared_memory=True))
         request.infer()
         maps = [request.get_output_tensor(index).data[0] for index in range(len(self._model.outputs))]
-        step = 3 if self._features else 2
-        return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
+        return self.head.levels(maps)
 
     def _compiled(self, size: tuple[int, int]) -> Any:
         try:

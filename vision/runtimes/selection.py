@@ -61,12 +61,15 @@ def start_runtime(
     precision: Precision = "auto",
     threads: int | None = None,
     image_size: int = 640,
+    sparse_boxes: bool = False,
 ) -> Started:
     """Make a model ready on the runtime that was asked for.
 
     Args:
         class_ids: sorted; a checkpoint's network computes these alone. Of an exported file's classes they
             are picked afterwards.
+        sparse_boxes: compute a checkpoint's boxes only where something is; for confidences that few cells
+            reach. An exported file computes all.
 
     Raises:
         RuntimeMissingError: the named runtime is not installed. Nothing else is taken in its place.
@@ -75,7 +78,7 @@ def start_runtime(
     if choice != "auto" and choice not in RUNTIMES:
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
     if choice != "auto":
-        runtime = _start(source, choice, class_ids, precision, threads, image_size)
+        runtime = _start(source, choice, class_ids, precision, threads, image_size, sparse_boxes)
         return Started(runtime, "as asked")
     from vision.runtimes.trial import fastest_runtime
 
@@ -93,7 +96,7 @@ def start_runtime(
             threads=threads,
             image_size=image_size,
         )
-    return Started(_start(source, name, class_ids, precision, threads, image_size), reason)
+    return Started(_start(source, name, class_ids, precision, threads, image_size, sparse_boxes), reason)
 
 
 def runtime_of_file(
@@ -136,6 +139,7 @@ def _start(
     precision: Precision,
     threads: int | None,
     image_size: int,
+    sparse_boxes: bool,
 ) -> Runtime:
     if name not in source.runners():
         raise cannot_run(source, name)
@@ -144,8 +148,14 @@ def _start(
     if source.kind is not None:
         return runtime_of_file(name, source.path, precision=precision, threads=threads)
     if name == "torch":
-        return TorchRuntime(source.take_model(), class_ids=class_ids, precision=precision, threads=threads)
-    network = Network(source.take_model(), class_ids)
+        return TorchRuntime(
+            source.take_model(),
+            class_ids=class_ids,
+            precision=precision,
+            threads=threads,
+            sparse_boxes=sparse_boxes,
+        )
+    network = Network(source.take_model(), class_ids, sparse_boxes=sparse_boxes)
     path = _converted(source, network, name, image_size)
     return runtime_of_file(name, path, network.head, precision=precision, threads=threads)
 
@@ -159,7 +169,8 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     # A plan is made for a largest side; the others leave the size open.
     side = image_size if kind == "tensorrt" else 640
     plain = source.description.to_plain()
-    key = json.dumps([FORMAT, digest, plain, head.class_ids, torch.__version__, version(name), side])
+    made_of = [FORMAT, digest, plain, head.class_ids, head.kinds, side]
+    key = json.dumps([*made_of, torch.__version__, version(name)])
     stem = f"{source.path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
     path = cache_folder() / f"{stem}{SUFFIXES[kind]}"
     if not path.is_file():

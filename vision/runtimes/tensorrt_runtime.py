@@ -16,7 +16,7 @@ from vision.runtimes.contract import (
     required,
 )
 from vision.runtimes.exported import INPUT, ExportedFacts, split_facts
-from vision.yolo.maps import Head, LevelMaps
+from vision.yolo.maps import Head, LevelMaps, Product
 
 _CUDA = "cuda.bindings.runtime"
 
@@ -28,6 +28,7 @@ class TensorRtRuntime:
     when it was built.
     """
 
+    product: Product = staticmethod(np.matmul)
     name: RuntimeName = "tensorrt"
 
     def __init__(
@@ -55,7 +56,7 @@ class TensorRtRuntime:
         self._engine = engine
         self._context = engine.create_execution_context()
         names = [engine.get_tensor_name(index) for index in range(engine.num_io_tensors)]
-        kinds = {"sides": 0, "classes": 1, "features": 2}
+        kinds = {"sides": 0, "neck": 0, "classes": 1, "features": 2}
         self._outputs = sorted(
             (name for name in names if name != INPUT),
             key=lambda name: (int(name.rpartition("_")[2]), kinds[name.rpartition("_")[0]]),
@@ -84,9 +85,8 @@ class TensorRtRuntime:
         for (pointer, _), found in zip(outputs, self._maps, strict=True):
             self._cuda.to_host(found, pointer)
         self._cuda.wait()
-        step = len(self._maps) // len(self.head.strides)
         maps = [level[0] for level in self._maps]
-        return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
+        return self.head.levels(maps)
 
     def _allocate(self, size: tuple[int, int]) -> None:
         """Memory on both sides for one size of input."""

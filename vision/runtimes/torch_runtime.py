@@ -20,7 +20,7 @@ from vision.runtimes import contract
 from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.yolo.architecture import YoloModel
-from vision.yolo.maps import Head, LevelMaps
+from vision.yolo.maps import Head, LevelMaps, Product
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +35,13 @@ _TRIAL_RUNS = 5
 _TRIAL_SIDE = 320
 
 
+def torch_product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`a @ b` with torch's threads: numpy's own pool would spin beside them."""
+    with torch.inference_mode():
+        product: NDArray[np.float32] = (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()
+    return product
+
+
 class TorchRuntime:
     """A model on torch. See `contract.Runtime`.
 
@@ -43,8 +50,10 @@ class TorchRuntime:
         class_ids: sorted; the only classes to compute. None: all.
         precision: `auto` takes bfloat16 only where the processor computes in it and it measures faster.
         threads: processor threads, of the whole process's torch; None leaves them as they are.
+        sparse_boxes: see `Network`.
     """
 
+    product: Product = staticmethod(torch_product)
     name: RuntimeName = "torch"
 
     def __init__(
@@ -54,6 +63,7 @@ class TorchRuntime:
         class_ids: Sequence[int] | None = None,
         precision: Precision = "auto",
         threads: int | None = None,
+        sparse_boxes: bool = False,
     ) -> None:
         if precision not in ("auto", *_DTYPES):
             raise RuntimeUnusableError(
@@ -61,7 +71,7 @@ class TorchRuntime:
             )
         if threads is not None:
             torch.set_num_threads(threads)
-        self._network = Network(model, class_ids).channels_last()
+        self._network = Network(model, class_ids, sparse_boxes=sparse_boxes).channels_last()
         self.head: Head = self._network.head
         self.precision, self.precision_reason = self._choose_precision(precision)
         self._network.in_precision(_DTYPES[self.precision])
@@ -83,8 +93,7 @@ class TorchRuntime:
         with torch.inference_mode():
             graph = self._graph or self._graph_of_size(pixels)
             maps = [level[0].numpy() for level in graph(pixels)]
-        step = 3 if self._network.features else 2
-        return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
+        return self.head.levels(maps)
 
     def _any_size(self) -> Graph | None:
         """One graph for inputs of every size; None if the tracer took a size for a constant."""

@@ -5,6 +5,7 @@ A TorchScript file is a program, though one of tensor operations alone. Load tho
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ from numpy.typing import NDArray
 
 from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours
-from vision.yolo.maps import Head, LevelMaps
+from vision.runtimes.torch_runtime import torch_product
+from vision.yolo.maps import Head, LevelMaps, Product
 
 
 class TorchScriptRuntime:
     """See `contract.Runtime`. Computes in float32, what the file is in."""
 
+    product: Product = staticmethod(torch_product)
     name: RuntimeName = "torch"
 
     def __init__(
@@ -38,8 +41,11 @@ class TorchScriptRuntime:
         if not path.is_file():
             raise RuntimeUnusableError(f"{path}: no such file")
         try:
-            load: Any = torch.jit.load
-            self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
+            with warnings.catch_warnings():
+                # torch would have files of this kind made otherwise; those that are there want to be read.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                load: Any = torch.jit.load
+                self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:300]
             raise RuntimeUnusableError(f"{path}: torch cannot load it: {reason}") from error
@@ -57,8 +63,7 @@ class TorchScriptRuntime:
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
         with torch.inference_mode():
             maps = [level[0].numpy() for level in self._module(torch.from_numpy(image_bgr).unsqueeze(0))]
-        step = len(maps) // len(self.head.strides)
-        return [LevelMaps(*maps[first : first + step]) for first in range(0, len(maps), step)]
+        return self.head.levels(maps)
 
 
 def torchscript_facts(path: Path) -> ExportedFacts:

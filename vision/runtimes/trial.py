@@ -147,7 +147,13 @@ def measure(
     from vision.runtimes.selection import start_runtime
 
     started = start_runtime(
-        source, runtime, class_ids=class_ids, precision=precision, threads=threads, image_size=image_size
+        source,
+        runtime,
+        class_ids=class_ids,
+        precision=precision,
+        threads=threads,
+        image_size=image_size,
+        sparse_boxes=True,
     ).runtime
     stride = max(started.head.strides)
     height = max(stride, image_size * 3 // 4 // stride * stride)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vision.yolo.architecture import YoloModel
-from vision.yolo.maps import Head, LevelMaps
+from vision.yolo.maps import Head, LevelMaps, Product
 
 MOST_BOXES = 300
 # Up to so many boxes all pairs are compared at once; beyond, the table of pairs costs more than it saves.
@@ -38,10 +38,6 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.xyxy)
 
-    def at(self, index: NDArray[np.int64]) -> Boxes:
-        """Those at `index`, in its order."""
-        return Boxes(self.xyxy[index], self.confidence[index], self.class_id[index])
-
 
 def select_boxes(
     model: YoloModel,
@@ -55,7 +51,7 @@ def select_boxes(
     """One image's maps as the model gives them, (1, 4 · reg_max + classes, H, W) a level → its boxes."""
     sides = 4 * model.reg_max
     arrays = [level[0].detach().float().cpu().numpy() for level in maps]
-    levels = [LevelMaps(array[:sides], array[sides:]) for array in arrays]
+    levels = [LevelMaps(classes=array[sides:], sides=array[:sides]) for array in arrays]
     return boxes_of(head_of(model), levels, confidence=confidence, iou=iou, class_ids=class_ids, most=most)
 
 
@@ -74,60 +70,109 @@ def boxes_of(
     class_ids: Sequence[int] | None = None,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """One image's maps → its boxes.
+    """One image's maps → its boxes: `candidates_of`, `sides_of` and `boxes_from` in a row."""
+    candidates = candidates_of(head, levels, confidence, class_ids)
+    return boxes_from(head, levels, candidates, sides_of(head, levels, candidates), iou, most)
 
-    A cell speaks for its most probable class, of all that the model knows. Cells of other classes than
-    `class_ids`, and those not above `confidence`, are dropped before anything is decoded; then each class
-    suppresses its own overlaps.
 
-    The one-to-one head (YOLOv10, Wang et al., 2024; YOLO26) has learnt to speak once an object: overlapping
-    boxes are different objects. Its cells speak for every class above `confidence`, the `most` best pairs of
-    cell and class are kept, and `iou` is of no consequence.
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """The cells of one level that may become boxes.
+
+    Attributes:
+        cell: (N,) int64, counted row by row.
+        confidence: (N,) float32 in 0..1.
+        class_id: (N,) int64.
+    """
+
+    cell: NDArray[np.int64]
+    confidence: NDArray[np.float32]
+    class_id: NDArray[np.int64]
+
+
+def candidates_of(
+    head: Head, levels: Sequence[LevelMaps], confidence: float, class_ids: Sequence[int] | None = None
+) -> list[Candidates]:
+    """The cells of each level that speak for a wanted class, above `confidence`.
+
+    A cell speaks for its most probable class, of all that the model knows. In a one-to-one head (YOLOv10,
+    Wang et al., 2024; YOLO26), which has learnt to speak once an object, it speaks for every class.
 
     Args:
         class_ids: None: all. Where the maps hold some classes alone, those must be among them.
     """
-    candidates = _candidates(head, levels, confidence, class_ids)
-    if head.end_to_end:
-        order = np.argsort(-candidates.confidence, kind="stable")[:most]
-        return candidates.at(order)
-    return candidates.at(suppress(candidates.xyxy, candidates.confidence, candidates.class_id, iou, most))
-
-
-def _candidates(
-    head: Head, levels: Sequence[LevelMaps], confidence: float, class_ids: Sequence[int] | None
-) -> Boxes:
     floor = _logit(confidence) - _LOGIT_MARGIN
     ids = np.asarray(head.class_ids, np.int64)
     wanted = None
     if class_ids is not None:
         wanted = np.zeros(head.class_count, np.bool_)
         wanted[list(class_ids)] = True
-    boxes, scores, classes = [], [], []
-    for number, (level, stride) in enumerate(zip(levels, head.strides, strict=True)):
+    found = []
+    for number, level in enumerate(levels):
         logits = level.classes.reshape(len(ids), -1)
-        if head.end_to_end:
-            cells, channel = _pairs_above(logits, floor)
-        else:
-            cells, channel = _best_above(logits, floor)
-        if not len(cells):
-            continue
-        found = ids[channel]
-        score = 1 / (1 + np.exp(-logits[channel, cells], dtype=np.float32))
+        cells, channel = (_pairs_above if head.end_to_end else _best_above)(logits, floor)
+        class_id = ids[channel]
+        score = (1 / (1 + np.exp(-logits[channel, cells]))).astype(np.float32, copy=False)
         kept = score > confidence
         if wanted is not None:
-            kept &= wanted[found]
-        if head.rows is not None and level.features is not None and not head.end_to_end:
+            kept &= wanted[class_id]
+        if head.rows is not None and level.features is not None and len(cells):
             # A class that nobody asked for may be the better one, and then the cell speaks for that.
             features = level.features.reshape(len(level.features), -1)[:, cells]
             kept &= np.isin(head.rows[number].best_class(features), ids)
-        cells = cells[kept]
-        boxes.append(_decode(level, cells, head.reg_max, stride))
-        scores.append(score[kept])
-        classes.append(found[kept])
-    if not boxes:
-        return Boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64))
-    return Boxes(np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes))
+        found.append(Candidates(cells[kept], score[kept], class_id[kept]))
+    return found
+
+
+def sides_of(
+    head: Head,
+    levels: Sequence[LevelMaps],
+    candidates: Sequence[Candidates],
+    product: Product = np.matmul,
+) -> list[NDArray[np.float32]]:
+    """Each level's (4 · reg_max, N) raw box sides at its N candidates, computed where the maps lack them.
+
+    Args:
+        product: of two matrices, for where they are computed.
+    """
+    found = []
+    for number, (level, some) in enumerate(zip(levels, candidates, strict=True)):
+        if level.sides is not None:
+            found.append(level.sides.reshape(len(level.sides), -1)[:, some.cell])
+            continue
+        if head.boxes is None or level.neck is None:
+            raise ValueError("maps without box sides need the neck's maps and the head's box branches")
+        # A cell of a one-to-one head may be there several times, for several classes.
+        cells, back = np.unique(some.cell, return_inverse=True)
+        found.append(head.boxes[number].sides(level.neck, cells, product)[:, back])
+    return found
+
+
+def boxes_from(
+    head: Head,
+    levels: Sequence[LevelMaps],
+    candidates: Sequence[Candidates],
+    sides: Sequence[NDArray[np.float32]],
+    iou: float = 0.7,
+    most: int = MOST_BOXES,
+) -> Boxes:
+    """Decode the candidates; each class then suppresses its own overlaps, and the `most` confident stay.
+
+    In a one-to-one head boxes that overlap are different objects; nothing is suppressed.
+    """
+    xyxy = np.concatenate(
+        [
+            _decode(raw, some.cell, level.classes.shape[2], head.reg_max, stride)
+            for level, some, raw, stride in zip(levels, candidates, sides, head.strides, strict=True)
+        ]
+    )
+    confidence = np.concatenate([some.confidence for some in candidates])
+    class_id = np.concatenate([some.class_id for some in candidates])
+    if head.end_to_end:
+        kept = np.argsort(-confidence, kind="stable")[:most]
+    else:
+        kept = suppress(xyxy, confidence, class_id, iou, most)
+    return Boxes(xyxy[kept], confidence[kept], class_id[kept])
 
 
 def _logit(probability: float) -> float:
@@ -149,16 +194,17 @@ def _pairs_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.
     return cells[place], channel
 
 
-def _decode(level: LevelMaps, cells: NDArray[np.int64], reg_max: int, stride: int) -> NDArray[np.float32]:
-    """The boxes of some cells of a level → (N, 4) float32 xyxy in pixels of the input."""
-    sides = level.sides.reshape(4 * reg_max, -1)[:, cells]
+def _decode(
+    sides: NDArray[np.float32], cells: NDArray[np.int64], width: int, reg_max: int, stride: int
+) -> NDArray[np.float32]:
+    """(4 · reg_max, N) raw sides of N cells of a level → (N, 4) float32 xyxy in pixels of the input."""
     if reg_max > 1:
         # The expected value of the distribution over the distances 0 … reg_max - 1 (Li et al., 2020).
         weights = sides.reshape(4, reg_max, -1)
         weights = np.exp(weights - weights.max(axis=1, keepdims=True))
         bins = np.arange(reg_max, dtype=np.float32)
         sides = np.einsum("sbn,b->sn", weights, bins) / weights.sum(axis=1)
-    row, column = np.divmod(cells, level.sides.shape[2])
+    row, column = np.divmod(cells, width)
     x, y = column.astype(np.float32) + 0.5, row.astype(np.float32) + 0.5
     xyxy = np.stack((x - sides[0], y - sides[1], x + sides[2], y + sides[3]), axis=1)
     return (xyxy * np.float32(stride)).astype(np.float32, copy=False)
