@@ -1,11 +1,9 @@
-"""Measurements of the parts, on this machine: the detector, and the spacing of setpoints under load."""
+"""The spacing of setpoints under load, measured on this machine."""
 
 from __future__ import annotations
 
 import asyncio
 import multiprocessing
-import platform
-import resource
 import socket
 import threading
 import time
@@ -16,7 +14,6 @@ import numpy as np
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.streamer import Streamer
 
-_WARM_UP = 10
 # SET_POSITION_TARGET_LOCAL_NED in MAVLink 2: what a setpoint weighs on the wire.
 _SETPOINT_BYTES = 65
 
@@ -28,37 +25,6 @@ def percentiles(values: Sequence[float]) -> dict[str, float]:
         "p50_ms": round(float(np.percentile(array, 50)), 3),
         "p99_ms": round(float(np.percentile(array, 99)), 3),
         "max_ms": round(float(array.max()), 3),
-    }
-
-
-def measure_detector(model: str, *, image_size: int, frames: int, threads: int | None) -> dict[str, object]:
-    """Time `Detector.detect` on 640×480 pictures of the built-in world; memory is this process's largest."""
-    from mavlink_sim.training_scenes import random_scene
-    from vision.detector import Detector
-
-    detector = Detector(model, image_size=image_size, threads=threads)
-    rng = np.random.default_rng(0)
-    pictures = [random_scene(rng, 640, 480)[0] for _ in range(8)]
-    for index in range(_WARM_UP):
-        detector.detect(pictures[index % len(pictures)])
-    total_ms, network_ms = [], []
-    for index in range(frames):
-        started = time.perf_counter()
-        detector.detect(pictures[index % len(pictures)])
-        total_ms.append((time.perf_counter() - started) * 1e3)
-        assert detector.last_timing is not None
-        network_ms.append(detector.last_timing.inference_ms)
-    figures = percentiles(total_ms)
-    return {
-        "model": model,
-        "precision": detector.precision,
-        "image_size": image_size,
-        "frames": frames,
-        **figures,
-        "network_p50_ms": round(float(np.median(network_ms)), 3),
-        "frames_per_s": round(1e3 * len(total_ms) / sum(total_ms), 1),
-        "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
-        "machine": platform.machine(),
     }
 
 

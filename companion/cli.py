@@ -1,4 +1,4 @@
-"""The command line: `companion run|demo|detect|send|echo|config|train|bench`.
+"""The command line: `companion run|demo|detect|models|evaluate|send|echo|config|train|bench`.
 
 Heavy parts are imported when their command runs, so that `companion send` starts at once.
 What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import json
 import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli_flags import with_settings
+from companion.cli_bench import bench
+from companion.cli_evaluate import evaluate
+from companion.cli_flags import EXIT_BAD_INPUT, plain_errors, with_settings
+from companion.cli_models import models
 from companion.settings import Settings
 
 if TYPE_CHECKING:
@@ -35,19 +36,11 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+app.add_typer(models, name="models")
+app.command()(evaluate)
+app.add_typer(bench, name="bench")
+
 EXIT_FAILED = 1
-EXIT_BAD_INPUT = 2
-
-
-@contextmanager
-def plain_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Errors of these kinds are for the person at the keyboard: the message, and exit code 2."""
-    try:
-        yield
-    except expected as error:
-        for line in str(error).splitlines():
-            typer.echo(f"companion: {line}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
 @app.command()
@@ -117,10 +110,16 @@ def detect(
     confidence: Annotated[float, typer.Option(min=0, max=1)] = 0.25,
     iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
     image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "auto",
+    runtime: Annotated[str, typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto")] = "torch",
+    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "auto",
     threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
     every: Annotated[int, typer.Option(min=1, help="look at every N-th frame")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, help="end after so many frames")] = None,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="look at large frames in tiles too: small objects, much slower")
+    ] = False,
+    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the frame")] = 640,
+    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
     save: Annotated[Path | None, typer.Option(help="folder for inputs and annotated images")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object a frame")] = False,
     width: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
@@ -131,12 +130,12 @@ def detect(
     """Detect objects in every frame of a source; one line a frame on standard output."""
     from companion.detect import detect_source
     from vision.detector import Detector
+    from vision.pipeline import FrameDetector
     from vision.sources import SourceError, SourceSettings, open_source
+    from vision.tiling import TiledDetector
     from vision.yolo.checkpoint import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
-    if precision not in ("auto", "float32", "bfloat16"):
-        raise typer.BadParameter(f"{precision!r} is not auto, float32 or bfloat16", param_hint="--precision")
     with plain_errors(CheckpointError, ValueError):
         detector = Detector(
             model,
@@ -146,14 +145,18 @@ def detect(
             image_size=image_size,
             precision=precision,  # type: ignore[arg-type]
             threads=threads,
+            runtime=runtime,  # type: ignore[arg-type]
         )
+        looking: FrameDetector = detector
+        if tiles:
+            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
         settings = SourceSettings(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         looked_at = detect_source(
-            frames, detector, every=every, limit=limit, save=save, as_json=as_json, write=write
+            frames, looking, every=every, limit=limit, save=save, as_json=as_json, write=write
         )
     if not looked_at:
         typer.echo(f"companion: {source} had no frames", err=True)
@@ -170,7 +173,9 @@ def parse_classes(text: str | None) -> list[str | int] | None:
 
 @app.command()
 def train(
-    output: Annotated[Path, typer.Option(help="the checkpoint to write")] = Path("runs/model.pt"),
+    output: Annotated[Path, typer.Option(help="what to write: NAME.safetensors and NAME.yaml")] = Path(
+        "runs/model.safetensors"
+    ),
     seed: Annotated[int | None, typer.Option(min=0, help="of weights and scenes; else the recipe's")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="a shorter or longer course")] = None,
     hours: Annotated[float | None, typer.Option(min=0.001, help="stop after so long")] = None,
@@ -195,95 +200,9 @@ def train(
             held_out=held_out,
         )
     typer.echo(
-        f"{output}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} on {held_out} held-out scenes"
+        f"{output.with_suffix('.safetensors')}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} "
+        f"on {held_out} held-out scenes"
     )
-
-
-bench = typer.Typer(help="Measure on this machine. Figures, never verdicts.", no_args_is_help=True)
-app.add_typer(bench, name="bench")
-
-_JSON = Annotated[bool, typer.Option("--json", help="one JSON object")]
-
-
-@bench.command("detector")
-def bench_detector(
-    model: Annotated[str, typer.Option(help="a checkpoint")] = "default",
-    image_size: Annotated[int, typer.Option(min=32)] = 640,
-    frames: Annotated[int, typer.Option(min=5, help="measured, after a warm-up")] = 100,
-    threads: Annotated[int | None, typer.Option(min=1)] = None,
-    as_json: _JSON = False,
-) -> None:
-    """Milliseconds a 640x480 frame, pixels in, boxes out."""
-    from companion.bench import measure_detector
-    from vision.yolo.checkpoint import CheckpointError
-
-    with plain_errors(CheckpointError, ValueError):
-        _print_figures(
-            measure_detector(model, image_size=image_size, frames=frames, threads=threads), as_json
-        )
-
-
-@bench.command("latency")
-def bench_latency(
-    seconds: Annotated[float, typer.Option(min=1, help="measured, in flight")] = 10.0,
-    driver: Annotated[str, typer.Option(help="mavsdk or pymavlink")] = "mavsdk",
-    as_json: _JSON = False,
-) -> None:
-    """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
-    from companion.bench_latency import measure_latency
-    from companion.bus.session import BusError
-    from companion.config import ConfigurationError
-    from companion.perception import PerceptionStartError
-    from companion.rehearsal import RehearsalError
-    from companion.vehicle.driver import LinkError
-
-    with plain_errors(RehearsalError, ConfigurationError, LinkError, PerceptionStartError, BusError):
-        _print_figures(measure_latency(seconds, driver=driver), as_json)
-
-
-@bench.command("setpoints")
-def bench_setpoints(
-    seconds: Annotated[float, typer.Option(min=1)] = 10.0,
-    rate_hz: Annotated[float, typer.Option(min=5, max=250)] = 50.0,
-    load: Annotated[int, typer.Option(min=0, help="busy processes beside the loop")] = 2,
-    as_json: _JSON = False,
-) -> None:
-    """Spacing of setpoints as a receiver sees them, while other processes keep every core busy."""
-    from companion.bench import measure_setpoints
-
-    _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
-
-
-@bench.command("tracking")
-def bench_tracking(
-    seconds: Annotated[float, typer.Option(min=1, help="of each rendered sequence")] = 12.0,
-    rate_hz: Annotated[float, typer.Option(min=1, max=120, help="frames a second")] = 30.0,
-    model: Annotated[str | None, typer.Option(help="a checkpoint; unset: boxes made of the truth")] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    as_json: _JSON = False,
-) -> None:
-    """Identity switches, fragmentation and MOTA with and without tracking, on rendered sequences."""
-    from rich.console import Console
-
-    from companion.bench_tracking import measure_tracking, tracking_table
-    from vision.yolo.checkpoint import CheckpointError
-
-    with plain_errors(CheckpointError, ValueError):
-        figures = measure_tracking(seconds, rate_hz=rate_hz, model=model, seed=seed)
-    if as_json:
-        typer.echo(json.dumps(figures))
-    else:
-        Console().print(tracking_table(figures))
-        typer.echo(f"tracker: {figures['tracker_ms']}")
-
-
-def _print_figures(figures: dict[str, object], as_json: bool) -> None:
-    if as_json:
-        typer.echo(json.dumps(figures))
-        return
-    width = max(len(name) for name in figures)
-    for name, value in figures.items():
-        typer.echo(f"{name:<{width}}  {value}")
 
 
 @app.command()

@@ -1,16 +1,19 @@
-"""Every setting as a flag, `--detector-image-size 320`, with short names for the usual ones."""
+"""What the commands share: errors for a person, and every setting as a flag, `--detector-image-size 320`."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
 
 from companion.config import ConfigurationError, Flag, flags, load_settings
+
+EXIT_BAD_INPUT = 2
 
 # The ones typed every day; each is also there under its full name.
 SHORT_NAMES = {
@@ -23,6 +26,17 @@ SHORT_NAMES = {
     "recording.video": "--video",
     "log.level": "--log-level",
 }
+
+
+@contextmanager
+def plain_errors(*expected: type[Exception]) -> Iterator[None]:
+    """Errors of these kinds are for the person at the keyboard: the message, and exit code 2."""
+    try:
+        yield
+    except expected as error:
+        for line in str(error).splitlines():
+            typer.echo(f"companion: {line}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
 def with_settings(command: Callable[..., None]) -> Callable[..., None]:

@@ -35,7 +35,7 @@ from companion.perception_messages import (
 from companion.perception_outbox import Outbox, OutboxHandler
 from companion.settings import Settings
 from vision.frame import Frame
-from vision.pipeline import PerceptionResult, Pipeline
+from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import SharingSource
@@ -150,7 +150,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
         outbox.put(_ready(settings, perception))
         pipeline = Pipeline(
             perception.source,
-            perception.detector,
+            _looking(settings, perception.detector),
             selection=settings.detector.selection(),
             recorder=perception.recording,
             tracker=_tracker(begin),
@@ -185,6 +185,16 @@ def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
     return Perception(source, detector, recording)
 
 
+def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | None:
+    """The detector as the pipeline uses it."""
+    wanted = settings.detector
+    if detector is None or not wanted.tiles:
+        return detector
+    from vision.tiling import TiledDetector
+
+    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
+
+
 def _load(settings: Settings) -> Detector:
     # Only here: this import brings torch, and a worker that only records needs none.
     from vision.detector import Detector
@@ -198,6 +208,7 @@ def _load(settings: Settings) -> Detector:
         image_size=wanted.image_size,
         precision=wanted.precision,
         threads=wanted.threads,
+        runtime=wanted.runtime,
     )
 
 

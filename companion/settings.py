@@ -195,7 +195,7 @@ class DetectorSection(Section):
     enabled: bool = True
     """false: frames are read and nothing is looked for"""
     model: Annotated[str, Field(min_length=1)] = DEFAULT_MODEL
-    """a YOLOv8 checkpoint (.pt); default: the model of this package, which knows drawn scenes"""
+    """a checkpoint or an exported file; default: the model of this package, which knows drawn scenes"""
     classes: tuple[str | int, ...] = ()
     """only these classes, by name or id; none: all that the model knows"""
     confidence: Annotated[float, Field(ge=0, le=1)] = 0.25
@@ -204,7 +204,9 @@ class DetectorSection(Section):
     """boxes of one class that overlap by more than this are one object"""
     image_size: Annotated[int, Field(ge=32, le=4096, multiple_of=32)] = 640
     """the frame's longer side as the network sees it, pixels"""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    runtime: Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"] = "torch"
+    """what computes the network; auto takes the fastest installed, measured once on this board"""
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
     """processor threads of the network; unset: one for every processor but one"""
@@ -214,6 +216,12 @@ class DetectorSection(Section):
     """look at no more than so many frames a second; unset: at all that come"""
     max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
     """do not look at a frame that was captured longer ago, seconds; unset: look at all"""
+    tiles: bool = False
+    """look at large frames in overlapping tiles too, for small objects; 1080p takes some 14 times as long"""
+    tile_size: Annotated[int, Field(ge=64, le=4096)] = 640
+    """side of a tile, pixels of the frame; best as large as image_size"""
+    tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
+    """of neighbouring tiles, share of a tile"""
 
     def selection(self) -> Selection:
         """Which frames are looked at."""

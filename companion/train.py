@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from mavlink_sim.shapes import CLASS_NAMES
 from mavlink_sim.training_scenes import random_scene
 from vision.yolo.checkpoint import save_checkpoint
+from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX
 from vision.yolo.evaluation import evaluate
 from vision.yolo.metrics import Score
 from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE
@@ -38,7 +39,7 @@ def train_default(
     resume: bool = False,
     held_out: int = 400,
 ) -> Score:
-    """Train by the recipe (with what is given here changed), judge, and write `output` and its `.json`.
+    """Train by the recipe (with what is given here changed), judge, and write the result (`judge_and_save`).
 
     The state of training is kept beside it as `<output>.training`, for `resume`.
 
@@ -69,7 +70,10 @@ def train_default(
 
 
 def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettings, held_out: int) -> Score:
-    """Score a model on held-out scenes and write it, fp16, with licence, score and settings."""
+    """Score a model on held-out scenes and write it, fp16, with licence, score and settings.
+
+    Whatever the ending of `output`, what is written is the pair `NAME.safetensors` and `NAME.yaml`.
+    """
     width, height = HELD_OUT_SIZE
     score = evaluate(trained.model, random_scene, HELD_OUT_SEED, held_out, width, height)
     metadata = {
@@ -86,8 +90,7 @@ def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettin
         },
         "settings": json.loads(json.dumps(asdict(settings))),
     }
-    save_checkpoint(output, trained.model, metadata=metadata)
-    output.with_suffix(".json").write_text(json.dumps(metadata, indent=2) + "\n")
+    save_checkpoint(output.with_suffix(WEIGHTS_SUFFIX), trained.model, metadata=metadata)
     return score
 
 

@@ -27,6 +27,8 @@ FLOORS = {
     "rehearsal": 5,
     "demo": 6,
     "detect": 6,
+    "evaluate": 6,
+    "models": 6,
     "train": 6,
     "bench": 6,
     "cli": 7,
@@ -38,7 +40,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.rotation",
     "vision.shared_frame",
 }
-MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench"}
+MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench", "models"}
 
 
 def modules() -> dict[str, Path]:

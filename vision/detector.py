@@ -1,34 +1,34 @@
-"""Frames in, detections out: letterbox → network → class filter → suppression → the frame's own pixels."""
+"""Frames in, detections out: letterbox → runtime → class filter → suppression → the frame's own pixels."""
 
 from __future__ import annotations
 
-import copy
 import difflib
 import logging
-import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from vision.detections import Detections
-from vision.letterbox import Letterbox, fit, to_tensor
+from vision.letterbox import Letterbox, fit
+from vision.model_files import find_model
+from vision.runtimes.contract import PRECISIONS, Precision
+from vision.runtimes.selection import RuntimeChoice, start_runtime
+from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
-from vision.yolo.architecture import YoloModel
-from vision.yolo.checkpoint import CheckpointError, load_checkpoint
+from vision.yolo.checkpoint import CheckpointError
 from vision.yolo.description import ModelDescription
-from vision.yolo.postprocess import select_boxes
+from vision.yolo.postprocess import boxes_from, candidates_of, sides_of
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_MODEL = "default"
-Precision = Literal["auto", "float32", "bfloat16"]
-_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+# From this confidence on so few cells are left that their boxes cost less one by one than as whole maps.
+_SPARSE_FROM = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +45,17 @@ class Timing:
 
 
 class Detector:
-    """A YOLOv8 network with its thresholds. Not to be shared between threads.
+    """A YOLO network with its thresholds. Not to be shared between threads.
 
     Attributes:
         class_names: id → name, the model's own table.
         class_ids: those it reports, sorted; None for all.
-        precision: what the network computes in, `float32` or `bfloat16`.
+        runtime: what computes the network: `torch`, `onnxruntime`, `openvino` or `tensorrt`.
+        runtime_reason: why that one, in words.
+        precision: what the network computes in, `float32`, `bfloat16` or `float16`.
         precision_reason: why, in words.
-        description: what the network was built from.
-        metadata: what the checkpoint tells about itself (licence, origin, score).
+        description: what the network was built from; None of an exported file.
+        metadata: what the file tells about itself (licence, origin, score).
         last_timing: of the latest `detect`; None before the first.
     """
 
@@ -68,59 +70,82 @@ class Detector:
         precision: Precision = "auto",
         threads: int | None = None,
         square: bool = False,
+        runtime: RuntimeChoice = "torch",
     ) -> None:
         """Load the model and make it ready.
 
         Args:
-            model: `default`, the bundled one, or the path of a checkpoint: our own, or an Ultralytics YOLOv8
-                `.pt`.
-            classes: names or ids to report; None for all.
+            model: `default`, the bundled one, or the path of a checkpoint (our own, or an Ultralytics `.pt`),
+                or of a file that `vision.runtimes.export` made of one.
+            classes: names or ids to report; None for all. The network does not compute the others.
             confidence: boxes not above this are dropped, 0..1.
             iou: of two boxes of one class overlapping more than this the less confident is dropped, 0..1.
-            image_size: longer side of the network's input, pixels, a multiple of 32.
+            image_size: longer side of the network's input, pixels, a multiple of its largest stride (32).
             precision: `auto` takes bfloat16 only where the processor computes in it and it measures faster.
-            threads: processor threads for the whole process's torch; None leaves them as they are.
-            square: pad the input to a square rather than to the next multiple of 32.
+            threads: processor threads of the runtime (torch: of the whole process); None: its own choice.
+            square: pad the input to a square rather than to the next multiple of the stride.
+            runtime: by name, or `auto` for the fastest installed one (measured once, remembered).
 
         Raises:
             CheckpointError: the model cannot be read.
+            RuntimeMissingError: the named runtime is not installed; the message names its extra.
+            RuntimeUnusableError: the runtime cannot run this model, or not in this precision.
             ValueError: an unknown class (the message names the nearest), or a number out of its range.
         """
         for name, value in (("confidence", confidence), ("iou", iou)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in 0..1, got {value}")
-        if precision not in ("auto", *_DTYPES):
-            raise ValueError(f"precision must be auto, float32 or bfloat16, got {precision!r}")
-        if threads is not None:
-            if threads < 1:
-                raise ValueError(f"threads must be at least 1, got {threads}")
-            torch.set_num_threads(threads)
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision must be {', '.join(PRECISIONS)}; got {precision!r}")
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads must be at least 1, got {threads}")
         fit(image_size, image_size, image_size)  # Refuses a bad size now, not at the first frame.
         path = _model_path(model)
-        loaded = load_checkpoint(path)
-        if loaded.description.channels != 3:
-            raise CheckpointError(f"{path}: takes {loaded.description.channels} channels, frames have 3")
-        self.class_names: tuple[str, ...] = loaded.class_names
-        self.class_ids = None if classes is None else resolve_classes(classes, loaded.class_names)
-        self.description: ModelDescription = loaded.description
-        self.metadata: dict[str, Any] = loaded.metadata
+        source = read_source(path)
+        self._stride = max(source.strides)
+        fit(image_size, image_size, image_size, stride=self._stride)
+        self.class_names: tuple[str, ...] = source.class_names
+        self.class_ids = None if classes is None else resolve_classes(classes, source.class_names)
+        self.description: ModelDescription | None = source.description
+        self.metadata: dict[str, Any] = source.metadata
         self.confidence = confidence
         self.iou = iou
         self.image_size = image_size
         self.square = square
         self.last_timing: Timing | None = None
         self._letterbox: Letterbox | None = None
-        self._model = _ready(loaded.model)
-        self.precision, self.precision_reason = self._choose_precision(precision)
-        self._dtype = _DTYPES[self.precision]
-        self._model.to(self._dtype)
+        self._boxed: NDArray[np.uint8] | None = None
+        started = start_runtime(
+            source,
+            runtime,
+            class_ids=self.class_ids,
+            precision=precision,
+            threads=threads,
+            image_size=image_size,
+            sparse_boxes=confidence >= _SPARSE_FROM,
+        )
+        self._runtime = started.runtime
+        self.runtime, self.runtime_reason = self._runtime.name, started.reason
+        self.precision, self.precision_reason = self._runtime.precision, self._runtime.precision_reason
         logger.info(
-            "model %s: %d classes, %s (%s)",
+            "model %s: %d classes, on %s (%s), in %s (%s)",
             path,
             len(self.class_names),
+            self.runtime,
+            self.runtime_reason,
             self.precision,
             self.precision_reason,
         )
+
+    @property
+    def threads(self) -> int:
+        """Processor threads of the runtime; 0 where it does not tell before the first frame."""
+        return self._runtime.threads
+
+    def prepare(self, width: int, height: int) -> None:
+        """Make ready for frames of one size, so that the first is looked at as fast as the rest."""
+        box = self._fit(width, height)
+        self._runtime.prepare(box.height, box.width)
 
     def detect(self, image_bgr: NDArray[np.uint8]) -> Detections:
         """What is in one frame.
@@ -137,51 +162,35 @@ class Detector:
             )
         started = time.perf_counter()
         box = self._fit(image_bgr.shape[1], image_bgr.shape[0])
-        pixels = to_tensor(box.apply(image_bgr), self._dtype)
+        picture = box.apply(image_bgr, self._boxed)
+        if not (picture.flags.c_contiguous and picture.flags.writeable):
+            # Runtimes look at the memory itself, in this order, and some insist that it were theirs.
+            picture = picture.copy(order="C")
         prepared = time.perf_counter()
-        with torch.inference_mode():
-            maps = self._model(pixels)
-            inferred = time.perf_counter()
-            boxes = select_boxes(
-                self._model, maps, confidence=self.confidence, iou=self.iou, class_ids=self.class_ids
-            )
+        head, maps = self._runtime.head, self._runtime.infer(picture)
+        mapped = time.perf_counter()
+        candidates = candidates_of(head, maps, self.confidence, self.class_ids)
+        selected = time.perf_counter()
+        # The network's last part, where only the cells that matter are computed.
+        sides = sides_of(head, maps, candidates, self._runtime.product)
+        inferred = time.perf_counter()
+        boxes = boxes_from(head, maps, candidates, sides, self.iou)
         detections = Detections(box.to_frame(boxes.xyxy), boxes.confidence, boxes.class_id, self.class_names)
         done = time.perf_counter()
+        network_s = (mapped - prepared) + (inferred - selected)
         self.last_timing = Timing(
-            (prepared - started) * 1e3, (inferred - prepared) * 1e3, (done - inferred) * 1e3
+            preprocess_ms=(prepared - started) * 1e3,
+            inference_ms=network_s * 1e3,
+            postprocess_ms=(done - prepared - network_s) * 1e3,
         )
         return detections
 
     def _fit(self, width: int, height: int) -> Letterbox:
         box = self._letterbox
         if box is None or (box.frame_width, box.frame_height) != (width, height):
-            box = self._letterbox = fit(width, height, self.image_size, square=self.square)
+            box = fit(width, height, self.image_size, square=self.square, stride=self._stride)
+            self._letterbox, self._boxed = box, box.blank()
         return box
-
-    def _choose_precision(self, asked: Precision) -> tuple[str, str]:
-        native = _bfloat16_instructions()
-        if asked == "bfloat16" and not native:
-            logger.warning("this processor does not compute in bfloat16; it is emulated, and slow")
-        if asked != "auto":
-            return asked, "as asked"
-        if not native:
-            return "float32", "this processor does not compute in bfloat16"
-        full, half = self._measure_ms(torch.float32), self._measure_ms(torch.bfloat16)
-        chosen = "bfloat16" if half < full else "float32"
-        return chosen, f"measured {full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
-
-    def _measure_ms(self, dtype: torch.dtype) -> float:
-        """Median time of one inference at the full input size."""
-        model = copy.deepcopy(self._model).to(dtype)
-        pixels = torch.zeros(1, self.description.channels, self.image_size, self.image_size, dtype=dtype)
-        pixels = pixels.contiguous(memory_format=torch.channels_last)
-        times = []
-        with torch.inference_mode():
-            for _ in range(6):
-                started = time.perf_counter()
-                model(pixels)
-                times.append((time.perf_counter() - started) * 1e3)
-        return statistics.median(times[1:])
 
 
 def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) -> tuple[int, ...]:
@@ -206,32 +215,12 @@ def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) ->
     return tuple(sorted(ids))
 
 
-def _ready(model: YoloModel) -> YoloModel:
-    """Normalisation folded in, no gradients, weights laid out channels-last (the faster layout here)."""
-    model.fuse().requires_grad_(False)
-    for parameter in model.parameters():
-        if parameter.dim() == 4:
-            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
-    return model
-
-
 def _model_path(model: str | Path) -> Path:
     if str(model) != DEFAULT_MODEL:
-        return Path(model).expanduser()
+        return find_model(model)
     if not DEFAULT_WEIGHTS.is_file():
         raise CheckpointError(
             f"{DEFAULT_WEIGHTS}: the bundled model is missing from this installation; "
             "install the package again, make one with `companion train`, or give the path of another"
         )
     return DEFAULT_WEIGHTS
-
-
-def _bfloat16_instructions() -> str:
-    """The processor's own bfloat16 arithmetic, as Linux names it; empty where it has none."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-    except OSError:
-        return ""
-    # x86 lists `flags`, ARM lists `Features`.
-    flags = {flag for line in lines if line.startswith(("flags", "Features")) for flag in line.split()}
-    return " ".join(sorted(flags & {"avx512_bf16", "amx_bf16", "bf16"}))

@@ -11,9 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 PADDING = 114
 STRIDE = 32
@@ -39,22 +37,35 @@ class Letterbox:
     left: int
     top: int
 
-    def apply(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(frame_height, frame_width, 3) uint8 → (height, width, 3) uint8, the same channel order."""
+    def apply(self, image: NDArray[np.uint8], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """(frame_height, frame_width, 3) uint8 → (height, width, 3) uint8, the same channel order.
+
+        Args:
+            into: what `blank` gave for this letterbox, or an earlier result of it; is overwritten, which
+                saves making and padding a new one. None: a new one.
+
+        Returns:
+            `into`, a new array, or the frame itself where it fits as it is.
+        """
         if image.shape != (self.frame_height, self.frame_width, 3):
             raise ValueError(
                 f"this letterbox is for ({self.frame_height}, {self.frame_width}, 3), got {image.shape}"
             )
         if (self.width, self.height) == (self.frame_width, self.frame_height):
             return image
-        boxed = np.full((self.height, self.width, 3), PADDING, np.uint8)
+        boxed = self.blank() if into is None else into
         inside = boxed[self.top : self.top + self.resized_height, self.left : self.left + self.resized_width]
         if (self.resized_width, self.resized_height) == (self.frame_width, self.frame_height):
             inside[:] = image
         else:
             size = (self.resized_width, self.resized_height)
-            inside[:] = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+            if cv2.resize(image, size, dst=inside, interpolation=cv2.INTER_LINEAR) is not inside:
+                raise RuntimeError("the image library did not resize in place")
         return boxed
+
+    def blank(self) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8, padding all over."""
+        return np.full((self.height, self.width, 3), PADDING, np.uint8)
 
     def to_frame(self, xyxy: NDArray[Any]) -> NDArray[np.float32]:
         """(N, 4) boxes in the network's input → (N, 4) float32 in the frame, clipped to it."""
@@ -79,24 +90,27 @@ class Letterbox:
         return np.array([self.left, self.top] * 2, np.float32)
 
 
-def fit(frame_width: int, frame_height: int, image_size: int = 640, *, square: bool = False) -> Letterbox:
+def fit(
+    frame_width: int, frame_height: int, image_size: int = 640, *, square: bool = False, stride: int = STRIDE
+) -> Letterbox:
     """The letterbox for frames of one size.
 
     Args:
-        image_size: the input's longer side, a multiple of 32.
-        square: pad to image_size × image_size; else only to the next multiple of 32 (faster).
+        image_size: the input's longer side, a multiple of the stride.
+        square: pad to image_size × image_size; else only to the next multiple of the stride (faster).
+        stride: the network's largest, pixels.
     """
     if frame_width < 1 or frame_height < 1:
         raise ValueError(f"a frame needs pixels, got {frame_width}x{frame_height}")
-    if image_size < STRIDE or image_size % STRIDE:
-        raise ValueError(f"image_size must be a multiple of {STRIDE} (such as 640), got {image_size}")
+    if image_size < stride or image_size % stride:
+        raise ValueError(f"image_size must be a multiple of {stride} (such as 640), got {image_size}")
     scale = min(image_size / frame_height, image_size / frame_width)
     # A frame a thousand times wider than high still keeps one row.
     resized_width = max(1, round(frame_width * scale))
     resized_height = max(1, round(frame_height * scale))
     spare_width, spare_height = image_size - resized_width, image_size - resized_height
     if not square:
-        spare_width, spare_height = spare_width % STRIDE, spare_height % STRIDE
+        spare_width, spare_height = spare_width % stride, spare_height % stride
     return Letterbox(
         frame_width=frame_width,
         frame_height=frame_height,
@@ -108,18 +122,3 @@ def fit(frame_width: int, frame_height: int, image_size: int = 640, *, square: b
         left=spare_width // 2,
         top=spare_height // 2,
     )
-
-
-def to_tensor(boxed_bgr: NDArray[np.uint8], dtype: torch.dtype = torch.float32) -> Tensor:
-    """(H, W, 3) uint8 BGR → (1, 3, H, W) RGB in 0..1, channels-last in memory."""
-    rgb = cv2.cvtColor(boxed_bgr, cv2.COLOR_BGR2RGB)
-    pixels = torch.from_numpy(rgb).permute(2, 0, 1).unsqueeze(0)
-    return pixels.to(dtype).div_(255)
-
-
-def letterbox(
-    image_bgr: NDArray[np.uint8], image_size: int = 640, *, square: bool = False
-) -> tuple[Tensor, Letterbox]:
-    """A BGR frame → ((1, 3, H, W) float32 RGB in 0..1, the transform back)."""
-    box = fit(image_bgr.shape[1], image_bgr.shape[0], image_size, square=square)
-    return to_tensor(box.apply(image_bgr)), box

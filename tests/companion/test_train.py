@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import companion.train
 from companion.train import train_default
@@ -25,10 +25,10 @@ def test_a_training_run_leaves_a_model_with_licence_and_score(
     )
     monkeypatch.setattr(companion.train, "DEFAULT_RECIPE", small)
     monkeypatch.setattr(companion.train, "HELD_OUT_SIZE", (96, 96))
-    output = tmp_path / "out" / "model.pt"
+    output = tmp_path / "out" / "model.safetensors"
     score = train_default(output, held_out=2)
     assert 0.0 <= score.map50 <= 1.0
-    written = json.loads(output.with_suffix(".json").read_text())
+    written = yaml.safe_load(output.with_suffix(".yaml").read_text())
     assert written["licence"] == "Apache-2.0"
     assert written["score"]["held_out_scenes"] == 2
     assert written["steps_done"] == 2

@@ -75,6 +75,43 @@ def test_only_the_classes_asked_for_are_reported(model_path: Path, frame: np.nda
     assert not len(Detector(model_path, classes=["person", 1], image_size=64).detect(frame))
 
 
+@pytest.mark.parametrize("change", ["read-only", "mirrored", "a part of a larger one", "channels turned"])
+def test_a_frame_may_lie_in_memory_as_it_likes(
+    model_path: Path, frame: np.ndarray[Any, Any], change: str
+) -> None:
+    larger = np.zeros((100, 200, 3), np.uint8)
+    changed = {
+        "read-only": frame.copy(),
+        "mirrored": frame[:, ::-1],
+        "a part of a larger one": larger[:64, :128],
+        "channels turned": frame[..., ::-1],
+    }[change]
+    if change == "a part of a larger one":
+        changed[:] = frame
+    changed.flags.writeable = change != "read-only"
+    for image_size in (64, 128):
+        detector = Detector(model_path, image_size=image_size)
+        expected = detector.detect(np.ascontiguousarray(changed).copy())
+        np.testing.assert_array_equal(detector.detect(changed).xyxy, expected.xyxy)
+
+
+def test_a_prepared_detector_detects_as_any_other(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
+    detector = Detector(model_path, image_size=64)
+    detector.prepare(128, 64)
+    assert len(detector.detect(frame)) == 2
+    assert detector.threads >= 1
+
+
+def test_boxes_one_by_one_are_the_boxes_of_whole_maps(
+    model_path: Path, frame: np.ndarray[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_by_one = Detector(model_path, image_size=128).detect(frame)
+    monkeypatch.setattr(detector_module, "_SPARSE_FROM", 2.0)
+    whole = Detector(model_path, image_size=128).detect(frame)
+    np.testing.assert_allclose(one_by_one.xyxy, whole.xyxy, atol=1e-3)
+    assert len(whole) == 8
+
+
 def test_a_detection_says_how_long_its_parts_took(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
     detector = Detector(model_path, image_size=64)
     assert detector.last_timing is None
@@ -100,32 +137,6 @@ def test_bfloat16_sees_the_same(model_path: Path, frame: np.ndarray[Any, Any]) -
     np.testing.assert_allclose(sorted(a.xyxy.tolist()), sorted(b.xyxy.tolist()), atol=1.0)
 
 
-def test_without_native_bfloat16_auto_is_float32(model_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "")
-    detector = Detector(model_path, image_size=64)
-    assert detector.precision == "float32"
-    assert "does not compute in bfloat16" in detector.precision_reason
-
-
-@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (9.0, "float32")])
-def test_with_native_bfloat16_auto_takes_the_faster(
-    model_path: Path, monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
-) -> None:
-    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "amx_bf16")
-    times = {torch.float32: 5.0, torch.bfloat16: half_ms}
-    monkeypatch.setattr(Detector, "_measure_ms", lambda self, dtype: times[dtype])
-    detector = Detector(model_path, image_size=64)
-    assert detector.precision == chosen
-    assert "5.0 ms in float32" in detector.precision_reason
-
-
-def test_auto_measures_both_where_it_must(model_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(detector_module, "_bfloat16_instructions", lambda: "amx_bf16")
-    detector = Detector(model_path, image_size=64)
-    assert detector.precision in ("float32", "bfloat16")
-    assert detector.precision_reason.startswith("measured")
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -140,7 +151,8 @@ def test_auto_measures_both_where_it_must(model_path: Path, monkeypatch: pytest.
         pytest.param({"confidence": float("nan")}, r"confidence must be in 0\.\.1", id="not a number"),
         pytest.param({"iou": -0.1}, r"iou must be in 0\.\.1, got -0.1", id="iou"),
         pytest.param({"image_size": 100}, "multiple of 32", id="image size"),
-        pytest.param({"precision": "float8"}, "precision must be auto, float32 or bfloat16", id="precision"),
+        pytest.param({"precision": "float8"}, "must be auto, float32, bfloat16, float16", id="precision"),
+        pytest.param({"runtime": "tflite"}, "runtime must be auto, torch, onnxruntime", id="runtime"),
         pytest.param({"threads": 0}, "threads must be at least 1", id="threads"),
     ],
 )

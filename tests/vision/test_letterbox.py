@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vision.letterbox import PADDING, fit, letterbox, to_tensor
+from vision.letterbox import PADDING, fit
 
 
 @pytest.mark.parametrize(
@@ -79,26 +78,46 @@ def test_no_boxes_stay_no_boxes() -> None:
     assert fit(320, 240, 640).to_frame(np.zeros((0, 4))).shape == (0, 4)
 
 
-def test_the_padding_is_grey_and_the_picture_is_rgb() -> None:
+def test_the_padding_is_grey_and_the_picture_keeps_its_colours() -> None:
     image = np.zeros((16, 64, 3), np.uint8)
     image[:] = (10, 20, 30)  # blue, green, red
-    pixels, box = letterbox(image, 64, square=True)
-    assert pixels.shape == (1, 3, 64, 64)
-    assert pixels.dtype == torch.float32
-    assert pixels.is_contiguous(memory_format=torch.channels_last)
-    torch.testing.assert_close(pixels[0, :, box.top, 0] * 255, torch.tensor([30.0, 20.0, 10.0]))
-    torch.testing.assert_close(pixels[0, :, 0, 0] * 255, torch.full((3,), float(PADDING)))
+    box = fit(64, 16, 64, square=True)
+    boxed = box.apply(image)
+    assert boxed.shape == (64, 64, 3)
+    assert boxed[box.top, 0].tolist() == [10, 20, 30]
+    assert boxed[0, 0].tolist() == [PADDING] * 3
+    assert (boxed == PADDING).all(axis=2).sum() == 64 * 64 - 16 * 64
+
+
+@pytest.mark.parametrize("size", [(64, 16), (33, 50), (50, 33), (128, 96), (64, 64)])
+def test_a_buffer_that_is_used_again_gives_what_a_new_one_gives(size: tuple[int, int]) -> None:
+    box = fit(*size, 64)
+    buffer = box.blank()
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        image = random.integers(0, 256, (size[1], size[0], 3), np.uint8)
+        again = box.apply(image, buffer)
+        np.testing.assert_array_equal(again, box.apply(image))
+        assert again is buffer or again is image
+
+
+def test_a_frame_that_fits_is_not_copied() -> None:
+    image = np.zeros((64, 96, 3), np.uint8)
+    assert fit(96, 64, 96).apply(image) is image
 
 
 def test_the_frame_itself_is_left_as_it_was() -> None:
     image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
     before = image.copy()
-    letterbox(image, 64)
+    fit(64, 32, 64, square=True).apply(image)
     np.testing.assert_array_equal(image, before)
 
 
-def test_half_precision_is_filled_directly() -> None:
-    assert to_tensor(np.zeros((32, 32, 3), np.uint8), torch.bfloat16).dtype == torch.bfloat16
+def test_a_network_of_larger_strides_is_given_multiples_of_them() -> None:
+    box = fit(640, 426, 640, stride=64)
+    assert (box.width, box.height) == (640, 448)
+    with pytest.raises(ValueError, match="multiple of 64"):
+        fit(640, 480, 96, stride=64)
 
 
 @pytest.mark.parametrize("size", [0, 31, 100, -32])

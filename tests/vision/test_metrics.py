@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vision.yolo.metrics import ImageResult, average_precision, box_iou, score_detections
@@ -110,6 +110,7 @@ def plain_average_precision(confidences, right, objects):
     return sum(points) / 101
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 10**6), st.booleans()), max_size=30, unique_by=lambda p: p[0]),
     st.integers(0, 5),
@@ -123,3 +124,68 @@ def test_average_precision_agrees_with_its_definition(pairs, missed):
     assert average_precision(confidences, right, objects) == pytest.approx(
         plain_average_precision(confidences.tolist(), right.tolist(), objects), abs=1e-6
     )
+
+
+def test_an_ignored_region_makes_nothing_right_or_wrong():
+    crowd = ImageResult(
+        np.array([SQUARE, FAR], np.float32),
+        np.array([0.9, 0.8], np.float32),
+        np.array([0, 0]),
+        np.array([(0, 0, 30, 30), FAR], np.float32),
+        np.array([0, 0]),
+        np.array([True, False]),
+    )
+    score = score_detections([crowd], NAMES)
+    assert score.per_class["car"].objects == 1
+    assert score.map50 == pytest.approx(1)
+
+
+def test_the_score_is_that_of_cocos_own_program():
+    """Random scenes with crowds, second boxes and false alarms, against pycocotools."""
+    coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
+    cocoeval = pytest.importorskip("pycocotools.cocoeval")
+    rng = np.random.default_rng(3)
+    results, images, annotations, found = [], [], [], []
+    for image in range(40):
+        true = rng.uniform(0, 80, (rng.integers(0, 6), 4)).astype(np.float32)
+        true[:, 2:] = true[:, :2] + rng.uniform(8, 60, (len(true), 2))
+        classes, ignored = rng.integers(0, 2, len(true)), rng.random(len(true)) < 0.15
+        near = np.repeat(true, 2, axis=0) + rng.normal(0, 4, (2 * len(true), 4))
+        extra = rng.uniform(0, 80, (130 if image == 0 else 3, 4))
+        extra[:, 2:] = extra[:, :2] + rng.uniform(5, 40, (len(extra), 2))
+        boxes = np.concatenate([near, extra]).astype(np.float32)
+        boxes[:, 2:] = np.maximum(boxes[:, 2:], boxes[:, :2] + 1)
+        kinds = np.concatenate([np.repeat(classes, 2), rng.integers(0, 2, len(extra))])
+        confidences = rng.permutation(len(boxes)).astype(np.float32) / len(boxes) + image * 1e-5
+        results.append(ImageResult(boxes, confidences, kinds, true, classes, ignored))
+        images.append({"id": image + 1, "width": 200, "height": 200})
+        for box, kind, crowd in zip(true.tolist(), classes.tolist(), ignored.tolist(), strict=True):
+            left, top, right, bottom = box
+            size = [right - left, bottom - top]
+            annotations.append(
+                {"id": len(annotations) + 1, "image_id": image + 1, "category_id": kind + 1}
+                | {"bbox": [left, top, *size], "area": size[0] * size[1], "iscrowd": int(crowd)}
+            )
+        for box, kind, confidence in zip(boxes.tolist(), kinds.tolist(), confidences.tolist(), strict=True):
+            left, top, right, bottom = box
+            found.append(
+                {"image_id": image + 1, "category_id": kind + 1, "score": confidence}
+                | {"bbox": [left, top, right - left, bottom - top]}
+            )
+    truth = coco.COCO()
+    truth.dataset = {
+        "info": {},
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": index + 1, "name": name} for index, name in enumerate(NAMES)],
+    }
+    truth.createIndex()
+    judge = cocoeval.COCOeval(truth, truth.loadRes(found), "bbox")
+    judge.evaluate()
+    judge.accumulate()
+    # (thresholds, recalls, classes, sizes, limits): all sizes, at most 100.
+    precision = judge.eval["precision"][:, :, :, 0, -1]
+    score = score_detections(results, NAMES)
+    for index, name in enumerate(NAMES):
+        assert score.per_class[name].ap50 == pytest.approx(precision[0, :, index].mean(), abs=1e-3)
+        assert score.per_class[name].ap50_95 == pytest.approx(precision[:, :, index].mean(), abs=1e-3)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Literal
+from unittest import mock
+
 import numpy as np
 import pytest
 import torch
@@ -9,8 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from vision.yolo import postprocess
 from vision.yolo.architecture import YoloModel, build, yolov8_description
-from vision.yolo.postprocess import select_boxes, suppress
+from vision.yolo.maps import ClassRows, Head, LevelMaps
+from vision.yolo.postprocess import boxes_of, candidates_of, select_boxes, suppress
 
 NAMES = ("car", "dog", "boat")
 
@@ -104,6 +109,70 @@ def test_a_box_must_be_above_the_confidence(model: YoloModel) -> None:
     assert len(select_boxes(model, maps, confidence=0.5)) == 0
 
 
+def test_a_one_to_one_head_speaks_for_every_class_and_suppresses_nothing() -> None:
+    head = Head((8,), 1, True, 3, (0, 1, 2))
+    classes = np.full((3, 4, 4), -9.0, np.float32)
+    classes[0, 1, 1], classes[2, 1, 1], classes[0, 1, 2] = 3.0, 1.0, 2.0
+    sides = np.full((4, 4, 4), 1.5, np.float32)
+    boxes = boxes_of(head, [LevelMaps(classes=classes, sides=sides)], iou=0.1)
+    assert boxes.class_id.tolist() == [0, 0, 2]
+    np.testing.assert_allclose(boxes.xyxy[0], [0, 0, 24, 24])
+    np.testing.assert_allclose(boxes.xyxy[2], boxes.xyxy[0])
+    assert boxes_of(head, [LevelMaps(classes=classes, sides=sides)], most=2).class_id.tolist() == [0, 0]
+    only = boxes_of(head, [LevelMaps(classes=classes, sides=sides)], class_ids=[2])
+    assert only.class_id.tolist() == [2]
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    classes=st.integers(1, 7),
+    wanted=st.sets(st.integers(0, 6), min_size=1),
+    confidence=st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]),
+)
+def test_computing_only_the_wanted_classes_is_the_same_as_filtering_afterwards(
+    seed: int, classes: int, wanted: set[int], confidence: float
+) -> None:
+    """Whole numbers, so that logits are exact and ties between classes are many."""
+    random = np.random.default_rng(seed)
+    ids = sorted(index for index in wanted if index < classes) or [0]
+    # Few different rows: some classes have the very same weights.
+    weight = random.integers(-2, 3, (3, 4))[random.integers(0, 3, classes)].astype(np.float32)
+    bias = random.integers(-1, 2, classes).astype(np.float32)
+    features = random.integers(-2, 3, (4, 5, 6)).astype(np.float32)
+    sides = random.random((4, 5, 6), np.float32)
+    logits = np.einsum("cf,fhw->chw", weight, features) + bias[:, None, None]
+    whole = Head((8,), 1, False, classes, tuple(range(classes)))
+    rows = (ClassRows.distinct(weight, bias),) if len(ids) < classes else None
+    sliced = Head((8,), 1, False, classes, tuple(ids), rows)
+    (expected,) = candidates_of(whole, [LevelMaps(classes=logits, sides=sides)], confidence, ids)
+    maps = LevelMaps(classes=logits[ids], sides=sides, features=features if rows else None)
+    (found,) = candidates_of(sliced, [maps], confidence, ids)
+    assert found.cell.tolist() == expected.cell.tolist()
+    assert found.class_id.tolist() == expected.class_id.tolist()
+    assert found.confidence.tolist() == expected.confidence.tolist()
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_the_memory_order_of_the_maps_does_not_matter(order: Literal["C", "F"]) -> None:
+    random = np.random.default_rng(0)
+    classes, sides = random.normal(size=(5, 6, 7)), random.normal(size=(64, 6, 7))
+    head = Head((8,), 16, False, 5, tuple(range(5)))
+    plain = boxes_of(head, [LevelMaps(classes=classes.astype(np.float32), sides=sides.astype(np.float32))])
+    # Channels last in memory, as torch gives them.
+    moved = [
+        np.array(a.transpose(1, 2, 0), np.float32, order=order).transpose(2, 0, 1) for a in (classes, sides)
+    ]
+    again = boxes_of(head, [LevelMaps(classes=moved[0], sides=moved[1])])
+    np.testing.assert_allclose(again.xyxy, plain.xyxy, atol=1e-4)
+    assert again.class_id.tolist() == plain.class_id.tolist()
+
+
+def test_maps_without_sides_and_without_what_gives_them_are_refused() -> None:
+    head = Head((8,), 16, False, 1, (0,))
+    with pytest.raises(ValueError, match="need the neck's maps"):
+        boxes_of(head, [LevelMaps(classes=np.ones((1, 2, 2), np.float32))])
+
+
 BOXES = st.lists(
     st.tuples(
         st.integers(0, 60),
@@ -124,8 +193,11 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
+@pytest.mark.parametrize("paired", [512, 0], ids=["all pairs at once", "one by one"])
 @given(boxes=BOXES, iou=st.sampled_from([0.0, 0.3, 0.5, 0.7, 1.0]), most=st.integers(1, 50))
-def test_suppression_is_what_the_definition_says(boxes: list[tuple[int, ...]], iou: float, most: int) -> None:
+def test_suppression_is_what_the_definition_says(
+    paired: int, boxes: list[tuple[int, ...]], iou: float, most: int
+) -> None:
     table = np.array(boxes, np.float64).reshape(-1, 6)
     xyxy = np.column_stack([table[:, :2], table[:, :2] + table[:, 2:4]])
     confidence, class_id = table[:, 4] / 100, table[:, 5].astype(np.int64)
@@ -134,7 +206,8 @@ def test_suppression_is_what_the_definition_says(boxes: list[tuple[int, ...]], i
         rivals = (kept for kept in expected if class_id[kept] == class_id[index])
         if len(expected) < most and all(overlap(xyxy[kept], xyxy[index]) <= iou for kept in rivals):
             expected.append(index)
-    assert suppress(xyxy, confidence, class_id, iou, most).tolist() == expected
+    with mock.patch.object(postprocess, "_MOST_PAIRED", paired):
+        assert suppress(xyxy, confidence, class_id, iou, most).tolist() == expected
 
 
 def test_boxes_without_area_do_not_break_the_suppression() -> None:

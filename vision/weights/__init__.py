@@ -4,4 +4,4 @@ from __future__ import annotations
 
 from pathlib import Path
 
-DEFAULT_WEIGHTS = Path(__file__).parent / "default.pt"
+DEFAULT_WEIGHTS = Path(__file__).parent / "default.safetensors"

@@ -5,18 +5,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from vision.yolo.description import ArchitectureError, LayerRow, ModelDescription, yolov8_description
-from vision.yolo.layers import SPPF, C2f, Concat, Conv, Detect
+from vision.yolo.layers import Concat, Conv, Detect, LargeKernelDWConv
+from vision.yolo.rows import HEADS, LAYERS, make
 
 __all__ = [
-    "STRIDES",
     "ArchitectureError",
     "LayerRow",
     "ModelDescription",
@@ -27,22 +25,24 @@ __all__ = [
     "yolov8_description",
 ]
 
-STRIDES = (8, 16, 32)
 _IMAGE = -1
-_LARGEST_CHANNELS = 1 << 14
-_MOST_REPEATS = 64
+# The deepest published network repeats 48 blocks; a description of far more is not a network.
+_MOST_REPEATS_ALTOGETHER = 256
+_LARGEST_STRIDE = 128
 
 
 class YoloModel(nn.Module):
-    """A built network. `model` holds one module per row of `description`; `strides` one number per level."""
+    """A built network. `model` holds one module per row of `description`; `strides` one number per level.
+
+    Sides of the input must be multiples of the largest stride.
+    """
 
     def __init__(self, description: ModelDescription) -> None:
         super().__init__()
         self.description = description
-        layers, self._sources = _build_layers(description)
+        layers, self._sources, self.strides = _build_layers(description)
         self.model = nn.ModuleList(layers)
         self._last_use = {source: index for index, sources in enumerate(self._sources) for source in sources}
-        self.strides = STRIDES
         self.detect.initialise_biases(self.strides)
 
     @property
@@ -60,11 +60,17 @@ class YoloModel(nn.Module):
     def reg_max(self) -> int:
         return self.description.reg_max
 
-    def forward(self, x: Tensor) -> list[Tensor]:
-        """(B, channels, H, W) RGB in 0..1, H and W multiples of 32 → raw maps, one per stride.
+    @property
+    def end_to_end(self) -> bool:
+        """Whether the head speaks once an object: its boxes are to be selected, not suppressed (NMS)."""
+        return self.detect.end_to_end
 
-        Each is (B, 4 · reg_max + classes, H / stride, W / stride): first the logits of the four box sides'
-        distributions (left, top, right, bottom), then the class logits.
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """(B, channels, H, W) RGB in 0..1, H and W multiples of the largest stride → raw maps, one a stride.
+
+        Each is (B, 4 · reg_max + classes, H / stride, W / stride): first the four box sides (left, top,
+        right, bottom), logits of their distributions or, with `reg_max` 1, distances in cells; then the
+        class logits. An end-to-end head gives its one-to-one maps in evaluation, the others in training.
         """
         outputs: dict[int, Tensor] = {_IMAGE: x}
         for index, (layer, sources) in enumerate(zip(self.model, self._sources, strict=True)):
@@ -85,10 +91,13 @@ class YoloModel(nn.Module):
         return torch.cat((boxes, logits.sigmoid()), dim=2)
 
     def fuse(self) -> YoloModel:
-        """Fold every batch normalisation into its convolution, in place, and switch to inference."""
+        """Fold every batch normalisation into its convolution, in place, and switch to inference.
+
+        Branches that inference does not use are dropped.
+        """
         self.eval()
-        for module in self.modules():
-            if isinstance(module, Conv):
+        for module in list(self.modules()):
+            if isinstance(module, Conv | LargeKernelDWConv | Detect):
                 module.fuse()
         return self
 
@@ -121,158 +130,44 @@ def decode_boxes(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
     return torch.cat((centres - distances[..., :2], centres + distances[..., 2:]), dim=-1) * strides
 
 
-def _build_layers(description: ModelDescription) -> tuple[list[nn.Module], list[tuple[int, ...]]]:
-    """One module per row, and for each row the numbers of the rows it reads (-1: the image)."""
+def _build_layers(
+    description: ModelDescription,
+) -> tuple[list[nn.Module], list[tuple[int, ...]], tuple[int, ...]]:
+    """One module per row; for each row the numbers of the rows it reads (-1: the image); the strides."""
     layers: list[nn.Module] = []
     sources: list[tuple[int, ...]] = []
     channels = {_IMAGE: description.channels}
     reduction = {_IMAGE: 1}
     last = len(description.rows) - 1
+    if sum(row.repeats for row in description.rows if row.repeats > 1) * description.depth_multiple > (
+        _MOST_REPEATS_ALTOGETHER
+    ):
+        raise ArchitectureError(f"repeats more than {_MOST_REPEATS_ALTOGETHER} blocks altogether")
     for index, row in enumerate(description.rows):
         reads = tuple(index + source if source < 0 else source for source in row.source)
         if not all(source in channels for source in reads):
             raise ArchitectureError(f"row {index} ({row.layer}) reads {row.source}, rows before it only")
-        if (row.layer == "Detect") != (index == last):
+        if (row.layer in HEADS) != (index == last):
             raise ArchitectureError(
                 f"row {index} is {row.layer!r:.100}: the last row, and no other, must be 'Detect'"
             )
-        maker = _LAYERS.get(row.layer)
-        if maker is None:
-            raise ArchitectureError(
-                f"row {index}: unknown layer {row.layer!r:.100}; known are {', '.join(sorted(_LAYERS))}"
-            )
-        inputs = tuple(channels[source] for source in reads)
-        if len({reduction[source] for source in reads}) > 1 and row.layer != "Detect":
+        if len({reduction[source] for source in reads}) > 1 and row.layer not in HEADS:
             raise ArchitectureError(f"row {index} ({row.layer}) joins maps of different sizes")
-        if row.layer == "Detect" and tuple(reduction[source] for source in reads) != STRIDES:
+        if row.layer not in LAYERS:
             raise ArchitectureError(
-                f"row {index}: Detect must read maps reduced by {STRIDES}, "
-                f"got {tuple(reduction[source] for source in reads)}"
+                f"row {index}: unknown layer {row.layer!r:.100}; known are {', '.join(LAYERS)}"
             )
         try:
-            made = maker(inputs, row, description)
+            made = make(row, [channels[source] for source in reads], description)
         except ArchitectureError as error:
             raise ArchitectureError(f"row {index} ({row.layer}): {error}") from None
         layers.append(made.module)
         sources.append(reads)
         channels[index] = made.channels
         reduction[index] = reduction[reads[0]] * made.reduction // made.enlargement
-    return layers, sources
-
-
-@dataclass(frozen=True, slots=True)
-class _Made:
-    module: nn.Module
-    channels: int
-    reduction: int = 1
-    enlargement: int = 1
-
-
-def _scaled_channels(count: int, description: ModelDescription) -> int:
-    if count in description.unscaled_channels:
-        return count
-    limited = count if description.max_channels is None else min(count, description.max_channels)
-    return max(8, math.ceil(limited * description.width_multiple / 8) * 8)
-
-
-def _scaled_repeats(row: LayerRow, description: ModelDescription) -> int:
-    if row.repeats == 1:
-        return 1
-    repeats = max(1, round(row.repeats * description.depth_multiple))
-    if repeats > _MOST_REPEATS:
-        raise ArchitectureError(f"would repeat {repeats} times, at most {_MOST_REPEATS} make sense")
-    return repeats
-
-
-def _single(inputs: tuple[int, ...], row: LayerRow) -> int:
-    if len(inputs) != 1:
-        raise ArchitectureError(f"reads one row, got {row.source}")
-    return inputs[0]
-
-
-def _number(row: LayerRow, position: int, name: str, largest: int, default: int | None = None) -> int:
-    value = row.arguments[position] if position < len(row.arguments) else default
-    if type(value) is not int or not 1 <= value <= largest:
-        raise ArchitectureError(f"{name} must be a whole number in 1..{largest}, got {value!r:.100}")
-    return value
-
-
-def _arguments(row: LayerRow, most: int) -> None:
-    if len(row.arguments) > most:
-        raise ArchitectureError(f"takes at most {most} arguments, got {list(row.arguments)!r:.200}")
-
-
-def _once(row: LayerRow) -> None:
-    if row.repeats != 1:
-        raise ArchitectureError(f"cannot repeat, got repeats {row.repeats}")
-
-
-def _conv(inputs: tuple[int, ...], row: LayerRow, description: ModelDescription) -> _Made:
-    _arguments(row, 3)
-    _once(row)
-    channels = _scaled_channels(_number(row, 0, "channels", _LARGEST_CHANNELS), description)
-    kernel = _number(row, 1, "kernel", 31, 1)
-    stride = _number(row, 2, "stride", 2, 1)
-    if kernel % 2 == 0:
-        raise ArchitectureError(f"the kernel must be odd, got {kernel}")
-    module = Conv(_single(inputs, row), channels, kernel, stride, activation=description.activation)
-    return _Made(module, channels, reduction=stride)
-
-
-def _c2f(inputs: tuple[int, ...], row: LayerRow, description: ModelDescription) -> _Made:
-    _arguments(row, 2)
-    channels = _scaled_channels(_number(row, 0, "channels", _LARGEST_CHANNELS), description)
-    shortcut = row.arguments[1] if len(row.arguments) > 1 else False
-    if not isinstance(shortcut, bool):
-        raise ArchitectureError(f"the shortcut must be true or false, got {shortcut!r:.100}")
-    repeats = _scaled_repeats(row, description)
-    module = C2f(_single(inputs, row), channels, repeats, shortcut, activation=description.activation)
-    return _Made(module, channels)
-
-
-def _sppf(inputs: tuple[int, ...], row: LayerRow, description: ModelDescription) -> _Made:
-    _arguments(row, 2)
-    _once(row)
-    channels = _scaled_channels(_number(row, 0, "channels", _LARGEST_CHANNELS), description)
-    kernel = _number(row, 1, "kernel", 31, 5)
-    if kernel % 2 == 0:
-        raise ArchitectureError(f"the kernel must be odd, got {kernel}")
-    return _Made(SPPF(_single(inputs, row), channels, kernel, activation=description.activation), channels)
-
-
-def _upsample(inputs: tuple[int, ...], row: LayerRow, description: ModelDescription) -> _Made:
-    _once(row)
-    size, factor, mode = (*row.arguments, None, None, None)[:3]
-    if size not in (None, "None") or type(factor) is not int or factor != 2 or mode != "nearest":
-        raise ArchitectureError(f"only [None, 2, 'nearest'] is known, got {list(row.arguments)!r:.200}")
-    return _Made(nn.Upsample(scale_factor=2, mode="nearest"), _single(inputs, row), enlargement=2)
-
-
-def _concat(inputs: tuple[int, ...], row: LayerRow, description: ModelDescription) -> _Made:
-    _once(row)
-    if tuple(row.arguments) not in ((), (1,)):
-        raise ArchitectureError(f"joins channels (axis 1), got {list(row.arguments)!r:.200}")
-    return _Made(Concat(1), sum(inputs))
-
-
-def _detect(inputs: tuple[int, ...], row: LayerRow, description: ModelDescription) -> _Made:
-    _once(row)
-    if tuple(row.arguments) not in (("nc",), (len(description.class_names),)):
+    strides = tuple(reduction[source] for source in sources[-1])
+    if strides[0] < 2 or strides[-1] > _LARGEST_STRIDE or list(strides) != sorted(set(strides)):
         raise ArchitectureError(
-            f"takes the number of classes, {len(description.class_names)}, got {list(row.arguments)!r:.200}"
+            f"row {last}: Detect must read maps each smaller than the one before, got strides {strides}"
         )
-    module = Detect(
-        len(description.class_names), inputs, description.reg_max, activation=description.activation
-    )
-    return _Made(module, 0)
-
-
-_LAYERS: dict[str, Callable[[tuple[int, ...], LayerRow, ModelDescription], _Made]] = {
-    "Conv": _conv,
-    "C2f": _c2f,
-    "SPPF": _sppf,
-    "nn.Upsample": _upsample,
-    "Upsample": _upsample,
-    "Concat": _concat,
-    "Detect": _detect,
-}
+    return layers, sources, strides

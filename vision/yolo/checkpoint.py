@@ -1,14 +1,13 @@
-"""Checkpoints: our own format, and the ordinary Ultralytics `.pt`, both read without running them.
+"""Checkpoints: our own pair of files, and the ordinary Ultralytics `.pt`, both read without running them.
 
-Our own is a dictionary that `torch.load(weights_only=True)` reads too:
-`{"format", "description", "state_dict" (float16), "metadata"}`.
+Our own is `NAME.safetensors` with `NAME.yaml` (`checkpoint_pair`). The first version's was a dictionary that
+`torch.load(weights_only=True)` reads too, `{"format", "description", "state_dict" (float16), "metadata"}`.
 An Ultralytics checkpoint is a pickled `DetectionModel`; its description, class names and tensors are taken
 from the inert records that `torch_archive` makes of it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,8 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vision.yolo.architecture import STRIDES, ArchitectureError, ModelDescription, YoloModel
-from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line
+from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
+from vision.yolo.pickled_layers import as_trained
+from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line, shown
 from vision.yolo.torch_archive import read_archive
 
 __all__ = [
@@ -32,10 +33,17 @@ __all__ = [
 ]
 
 FORMAT = "mavlink-companion.yolo.v1"
-_DETECTION_MODEL = "ultralytics.nn.tasks.DetectionModel"
+_DETECTION_MODELS = (
+    "ultralytics.nn.tasks.DetectionModel",
+    "ultralytics.nn.tasks.YOLOv10DetectionModel",  # As the authors of YOLOv10 published it.
+)
 _DEEPEST = 16
-_MOST_NODES = 200_000
+_MOST_NODES = 100_000
+_MOST_MODULES = 20_000
+_LONGEST_NAME = 500
 _LONGEST_TEXT = 100_000
+# Of all layers together: the largest published networks have some eighty.
+_MOST_REPEATS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +67,7 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
     """Write `model` at `path`, weights as float16 (those beyond its range as float32), in one step.
 
     Args:
+        path: `NAME.safetensors` (its description goes to `NAME.yaml` beside it), or `.pt`.
         metadata: plain values only (dicts, lists, texts, numbers, booleans, None), else `TypeError`.
     """
     path = Path(path)
@@ -66,10 +75,15 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
         plain_metadata = _plain(dict(metadata))
     except CheckpointError as error:
         raise TypeError(f"metadata must be plain values: {error}") from None
+    description = model.description.to_plain()
+    weights = {name: _compact(tensor) for name, tensor in model.state_dict().items()}
+    if path.suffix == WEIGHTS_SUFFIX:
+        write_pair(path, description, weights, plain_metadata)
+        return
     content = {
         "format": FORMAT,
-        "description": model.description.to_plain(),
-        "state_dict": {name: _compact(tensor) for name, tensor in model.state_dict().items()},
+        "description": description,
+        "state_dict": weights,
         "metadata": plain_metadata,
     }
     # A reader, or the next start after a power cut, sees the old file or the new one.
@@ -79,18 +93,23 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
 
 
 def load_checkpoint(path: str | Path) -> LoadedModel:
-    """Read our own checkpoint or an Ultralytics YOLOv8 detection checkpoint.
+    """Read our own checkpoint (either file of a pair, or a `.pt`) or an Ultralytics detection checkpoint.
+
+    Of Ultralytics': YOLOv5u, v8, v10, 11, 12, 26.
 
     Raises:
         UnsafeCheckpointError: the file asks for code to be run, named in the message.
         CheckpointError: missing, damaged, of another kind, or weights that do not fit the description.
     """
-    content = read_archive(path)
+    pair = is_pair(Path(path))
+    content = read_pair(Path(path)) if pair else read_archive(path)
     try:
-        return _interpret(content)
+        return _described(content) if pair else _interpret(content)
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
         raise kind(one_line(f"{path}: {error}")) from None
+    except RecursionError:
+        raise CheckpointError(one_line(f"{path}: its values are nested too deeply")) from None
 
 
 def _interpret(content: Any) -> LoadedModel:
@@ -109,7 +128,12 @@ def _interpret(content: Any) -> LoadedModel:
 
 def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
     if content["format"] != FORMAT:
-        raise CheckpointError(f"has format {content['format']!r:.100}, this version reads {FORMAT!r}")
+        raise CheckpointError(f"has format {shown(content['format'])}, this version reads {FORMAT!r}")
+    return _described(content)
+
+
+def _described(content: dict[Any, Any]) -> LoadedModel:
+    """A network from `description`, `state_dict` and `metadata`."""
     description = ModelDescription.from_plain(_plain_dictionary(content, "description"))
     weights = content.get("state_dict")
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
@@ -119,20 +143,26 @@ def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
 
 
 def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedModel:
-    if record.name != _DETECTION_MODEL:
+    if record.name not in _DETECTION_MODELS:
         raise CheckpointError(f"holds a {record.name.rpartition('.')[2]}; only detection models can be used")
     table = _plain_dictionary(record.state, "yaml")
     modules = dict(_modules(record))
     description = ModelDescription.from_plain(table, _class_names(record, table))
-    description = _as_trained(description, table, modules)
+    description = as_trained(description, modules)
     weights = dict(_weights(modules))
+    if not description.end_to_end:
+        # A checkpoint of two heads whose user chose the one with NMS: the other is not part of this network.
+        weights = {name: tensor for name, tensor in weights.items() if ".one2one_" not in name}
     model = _with_weights(description, weights)
+    stride = modules[f"model.{len(description.rows) - 1}"].state.get("stride")
+    if isinstance(stride, Tensor) and tuple(stride.flatten().tolist()) != model.strides:
+        raise CheckpointError(f"its head has strides {stride.flatten().tolist()!r:.100}, not {model.strides}")
     for name, module in model.named_modules():
         trained = modules.get(name)
         if isinstance(module, nn.BatchNorm2d) and trained is not None:
             epsilon = trained.state.get("eps", module.eps)
             if type(epsilon) is not float or not 0 < epsilon < 1:
-                raise CheckpointError(f"{name} has the epsilon {epsilon!r:.100}, expected a small number")
+                raise CheckpointError(f"{name} has the epsilon {shown(epsilon)}, expected a small number")
             module.eps = epsilon
     metadata = {"origin": f"Ultralytics {_note(content, 'version')}".strip()}
     for key, source in (("licence", "license"), ("date", "date")):
@@ -159,29 +189,6 @@ def _class_names(record: Inert, table: dict[Any, Any]) -> list[str]:
     return names
 
 
-def _as_trained(
-    description: ModelDescription, table: dict[Any, Any], modules: dict[str, Inert]
-) -> ModelDescription:
-    """What the pickled layers know and the table may not say: activation, bins, unscaled channel counts."""
-    heads = [module for module in modules.values() if module.name.endswith(".head.Detect")]
-    for head in heads:
-        stride = head.state.get("stride")
-        if isinstance(stride, Tensor) and stride.flatten().tolist() != list(STRIDES):
-            raise CheckpointError(f"its head has strides {stride.flatten().tolist()!r:.100}, not {STRIDES}")
-        bins = head.state.get("reg_max", description.reg_max)
-        description = dataclasses.replace(description, reg_max=bins)
-    activations = {
-        module.name.rpartition(".")[2]
-        for name, module in modules.items()
-        if name.endswith(".act") and ".activation." in module.name
-    }
-    if len(activations) > 1:
-        raise CheckpointError(f"mixes the activations {', '.join(sorted(activations))}")
-    for activation in activations:
-        description = dataclasses.replace(description, activation=activation)
-    return dataclasses.replace(description, unscaled_channels=(len(description.class_names),))
-
-
 def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
     """Every module below `record` with its dotted name."""
     waiting = [("", record, 0)]
@@ -189,8 +196,10 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
     while waiting:
         name, module, depth = waiting.pop()
         seen += 1
-        if depth > _DEEPEST or seen > _MOST_NODES:
-            raise CheckpointError("its modules contain each other")
+        if depth > _DEEPEST or seen > _MOST_MODULES or len(waiting) > _MOST_MODULES:
+            raise CheckpointError("its modules contain each other, or are too many")
+        if len(name) > _LONGEST_NAME:
+            raise CheckpointError(f"it has a module whose name has {len(name)} characters")
         yield name, module
         children = module.state.get("_modules", {})
         if not isinstance(children, dict):
@@ -203,13 +212,15 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
 
 
 def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
+    """Each tensor with its dotted name, taken out of its module: who gets it holds it alone."""
     for name, module in modules.items():
         passing = module.state.get("_non_persistent_buffers_set", frozenset())
         for kind in ("_parameters", "_buffers"):
             tensors = module.state.get(kind, {})
             if not isinstance(tensors, dict):
                 raise CheckpointError(f"{name}'s {kind} are not a dictionary")
-            for key, tensor in tensors.items():
+            for key in list(tensors):
+                tensor = tensors.pop(key)
                 if tensor is None or (isinstance(passing, frozenset) and key in passing):
                     continue
                 if not isinstance(tensor, Tensor):
@@ -218,7 +229,11 @@ def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
 
 
 def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
-    """The described network with exactly these weights; every name of either side accounted for."""
+    """The described network with exactly these weights; every name of either side accounted for.
+
+    Empties `weights`, so that a number is not held twice for longer than its layer needs.
+    """
+    _check_sizes(description, weights)
     # Shapes only: a description that promises more than the file holds must not cost memory.
     with torch.device("meta"):
         model = YoloModel(description)
@@ -240,12 +255,21 @@ def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> 
             raise CheckpointError(f"{name} should be {expected[name].dtype}, it is {tensor.dtype}")
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise CheckpointError(f"{name} has numbers that are not finite")
-    model.load_state_dict(
-        {name: tensor.to(expected[name].dtype, copy=True).contiguous() for name, tensor in weights.items()},
-        strict=True,
-        assign=True,
-    )
+    converted = {}
+    for name, meant in expected.items():
+        converted[name] = weights.pop(name).to(meant.dtype, copy=True).contiguous()
+    model.load_state_dict(converted, strict=True, assign=True)
     return model.eval()
+
+
+def _check_sizes(description: ModelDescription, weights: dict[str, Tensor]) -> None:
+    """What a file makes large: layers repeated, and the same numbers used for many weights."""
+    repeats = sum(max(1, round(row.repeats * description.depth_multiple)) for row in description.rows)
+    if repeats > _MOST_REPEATS:
+        raise CheckpointError(f"describes {repeats} layers, at most {_MOST_REPEATS} make sense")
+    storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage() for tensor in weights.values()}
+    if sum(tensor.nbytes for tensor in weights.values()) > sum(map(len, storages.values())):
+        raise CheckpointError("uses the same numbers for several weights; it is not a checkpoint")
 
 
 def _compact(tensor: Tensor) -> Tensor:

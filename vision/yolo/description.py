@@ -1,6 +1,7 @@
 """What a network is made of: rows of (from, repeats, layer, arguments) and three multipliers.
 
-A checkpoint carries this description of itself; `yolov8_description` writes the published one.
+A checkpoint carries this description of itself; `yolov8_description` and `published_description` write the
+published ones.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vision.yolo.layers import ACTIVATIONS
+from vision.yolo.convolution import ACTIVATIONS
+from vision.yolo.layer_row import ArchitectureError, LayerRow, settle_pooling, settle_scale
+
+__all__ = ["YOLOV8_SCALES", "ArchitectureError", "LayerRow", "ModelDescription", "yolov8_description"]
 
 # scale → depth multiple, width multiple, largest channel count before the width multiple (published table).
 YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
@@ -19,45 +23,10 @@ YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
     "l": (1.0, 1.00, 512),
     "x": (1.0, 1.25, 512),
 }
-_LARGEST_REPEATS = 64
 _LARGEST_ROWS = 128
-
-
-class ArchitectureError(ValueError):
-    """A description that cannot be built; the message names the row."""
-
-
-@dataclass(frozen=True, slots=True)
-class LayerRow:
-    """One layer: the rows it reads (-1 is the row before), how often it repeats, its name, its arguments."""
-
-    source: tuple[int, ...]
-    repeats: int
-    layer: str
-    arguments: tuple[Any, ...] = ()
-
-    @classmethod
-    def from_plain(cls, row: object, index: int) -> LayerRow:
-        """From `[from, repeats, layer, arguments]`; raises `ArchitectureError` naming row `index`."""
-        if not isinstance(row, list | tuple) or len(row) != 4:
-            raise ArchitectureError(
-                f"row {index} must be [from, repeats, layer, arguments], got {row!r:.200}"
-            )
-        source, repeats, layer, arguments = row
-        sources = tuple(source) if isinstance(source, list | tuple) else (source,)
-        if not sources or not all(type(value) is int for value in sources):
-            raise ArchitectureError(f"row {index}: 'from' must be row numbers, got {source!r:.200}")
-        if type(repeats) is not int or not 1 <= repeats <= _LARGEST_REPEATS:
-            raise ArchitectureError(
-                f"row {index}: repeats must be 1..{_LARGEST_REPEATS}, got {repeats!r:.200}"
-            )
-        if not isinstance(layer, str) or not isinstance(arguments, list | tuple):
-            raise ArchitectureError(f"row {index}: expected a layer's name and arguments, got {row!r:.99}")
-        return cls(sources, repeats, layer, tuple(arguments))
-
-    def to_plain(self) -> list[Any]:
-        source = self.source[0] if len(self.source) == 1 else list(self.source)
-        return [source, self.repeats, self.layer, list(self.arguments)]
+_LARGEST_CLASS_WIDTH = 1 << 14
+# Since these layers the class branches of the head are light.
+_LIGHT_SINCE = frozenset({"C3k2", "A2C2f", "C2fCIB", "v10Detect"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +40,13 @@ class ModelDescription:
         width_multiple: multiplies channel counts, rounded up to a multiple of 8.
         max_channels: channel counts are limited to this before the width multiple; None for no limit.
         channels: of the input image.
-        reg_max: bins of the distribution over each box side.
+        reg_max: bins of the distribution over each box side; 1 for none, the sides themselves.
         activation: `SiLU` or `ReLU`.
         unscaled_channels: channel counts that the width multiple leaves alone. (Ultralytics' networks do not
             scale a row whose channel count equals the number of classes.)
+        light_classes: the head's class branches are depthwise (YOLOv10, YOLO11 and later).
+        class_width: channels within the head's class branches; None for the usual.
+        end_to_end: the head speaks once an object, and needs no NMS.
     """
 
     class_names: tuple[str, ...]
@@ -87,6 +59,9 @@ class ModelDescription:
     reg_max: int = 16
     activation: str = "SiLU"
     unscaled_channels: tuple[int, ...] = ()
+    light_classes: bool = False
+    class_width: int | None = None
+    end_to_end: bool = False
 
     def __post_init__(self) -> None:
         if not self.class_names or not all(isinstance(name, str) for name in self.class_names):
@@ -98,10 +73,10 @@ class ModelDescription:
             value = getattr(self, name)
             if type(value) not in (int, float) or not 0 < value <= 16:
                 raise ArchitectureError(f"{name} must be a number in 0..16, got {value!r:.200}")
-        limits = {"channels": 64, "reg_max": 256, "max_channels": None}
+        limits = {"channels": 64, "reg_max": 256, "max_channels": None, "class_width": _LARGEST_CLASS_WIDTH}
         for name, largest in limits.items():
             value = getattr(self, name)
-            if name == "max_channels" and value is None:
+            if name in ("max_channels", "class_width") and value is None:
                 continue
             if type(value) is not int or value < 1 or (largest is not None and value > largest):
                 raise ArchitectureError(f"{name} must be a whole number from 1, got {value!r:.200}")
@@ -109,6 +84,9 @@ class ModelDescription:
             raise ArchitectureError(
                 f"unscaled_channels must be whole numbers, got {self.unscaled_channels!r:.99}"
             )
+        for name in ("light_classes", "end_to_end"):
+            if not isinstance(getattr(self, name), bool):
+                raise ArchitectureError(f"{name} must be true or false, got {getattr(self, name)!r:.200}")
         if not isinstance(self.activation, str) or self.activation not in ACTIVATIONS:
             raise ArchitectureError(
                 f"unknown activation {self.activation!r:.200}; known are {', '.join(ACTIVATIONS)}"
@@ -133,6 +111,9 @@ class ModelDescription:
             "reg_max": self.reg_max,
             "activation": self.activation,
             "unscaled_channels": list(self.unscaled_channels),
+            "light_classes": self.light_classes,
+            "class_width": self.class_width,
+            "end2end": self.end_to_end,
             "backbone": [row.to_plain() for row in self.backbone],
             "head": [row.to_plain() for row in self.head],
         }
@@ -143,19 +124,24 @@ class ModelDescription:
     ) -> ModelDescription:
         """Read a model table: our own (`to_plain`) or one with a `scales` table and a `scale` letter in it.
 
+        What such a table leaves unsaid, because its scale or its layers imply it, the description says.
         `class_names` overrides the table's `names`. Raises `ArchitectureError`.
         """
-        if plain.get("end2end"):
-            raise ArchitectureError("an end-to-end head (without NMS) is not YOLOv8; use a YOLOv8 model")
         names = plain.get("names") if class_names is None else class_names
         if isinstance(names, str) or not isinstance(names, Sequence):
             raise ArchitectureError(f"a model needs a list of class names, got {names!r:.200}")
         depth, width, max_channels = _multiples(plain)
-        backbone, head = _list(plain, "backbone"), _list(plain, "head")
+        plain_rows = [*_list(plain, "backbone"), *_list(plain, "head")]
+        rows = tuple(
+            settle_scale(settle_pooling(LayerRow.from_plain(row, index)), _scale(plain))
+            for index, row in enumerate(plain_rows)
+        )
+        layers = {row.layer for row in rows}
+        in_backbone = len(_list(plain, "backbone"))
         return cls(
             class_names=tuple(names),
-            backbone=tuple(LayerRow.from_plain(row, index) for index, row in enumerate(backbone)),
-            head=tuple(LayerRow.from_plain(row, index) for index, row in enumerate(head, len(backbone))),
+            backbone=rows[:in_backbone],
+            head=rows[in_backbone:],
             depth_multiple=depth,
             width_multiple=width,
             max_channels=max_channels,
@@ -163,6 +149,9 @@ class ModelDescription:
             reg_max=_first(plain, ("reg_max",), 16),
             activation=_activation_name(_first(plain, ("activation",), "SiLU")),
             unscaled_channels=tuple(_list(plain, "unscaled_channels")),
+            light_classes=_first(plain, ("light_classes",), not _LIGHT_SINCE.isdisjoint(layers)),
+            class_width=plain.get("class_width"),
+            end_to_end=_first(plain, ("end2end",), "v10Detect" in layers),
         )
 
 
@@ -246,7 +235,7 @@ def _multiples(plain: Mapping[Any, Any]) -> tuple[float, float, int | None]:
         )
     if not isinstance(scales, Mapping):
         raise ArchitectureError(f"`scales` must be a table, got {scales!r:.200}")
-    scale = _first(plain, ("scale",), next(iter(scales)))
+    scale = plain.get("scale") or next(iter(scales))
     if not isinstance(scale, str) or scale not in scales:
         raise ArchitectureError(f"scale {scale!r:.100} is not in the table {', '.join(map(str, scales))}")
     row = scales[scale]
@@ -254,3 +243,11 @@ def _multiples(plain: Mapping[Any, Any]) -> tuple[float, float, int | None]:
         raise ArchitectureError(f"scale {scale!r} must be [depth, width, max_channels], got {row!r:.200}")
     depth, width, max_channels = row
     return depth, width, max_channels
+
+
+def _scale(plain: Mapping[Any, Any]) -> str:
+    """The letter of the scale; empty where the table has none. Bad ones are refused by `_multiples`."""
+    scales = plain.get("scales")
+    first = next(iter(scales)) if isinstance(scales, Mapping) and scales else ""
+    scale = plain.get("scale") or first
+    return scale if isinstance(scale, str) else ""

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vision.yolo.architecture import YoloModel, decode_boxes
+from vision.yolo.architecture import YoloModel
+from vision.yolo.maps import Head, LevelMaps, Product
 
 MOST_BOXES = 300
+# Up to so many boxes all pairs are compared at once; beyond, the table of pairs costs more than it saves.
+_MOST_PAIRED = 512
+# Below the threshold by this much a cell is still looked at: rounding must not decide in logit space.
+_LOGIT_MARGIN = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,46 +48,166 @@ def select_boxes(
     class_ids: Sequence[int] | None = None,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """One image's maps, (1, 4 · reg_max + classes, H, W) a level → its boxes.
-
-    A cell speaks for its most probable class. Cells of other classes than `class_ids`, and those not above
-    `confidence`, are dropped before anything is decoded; then each class suppresses its own overlaps.
-    """
-    candidates = _candidates(model, maps, confidence, class_ids)
-    kept = suppress(candidates.xyxy, candidates.confidence, candidates.class_id, iou, most)
-    return Boxes(candidates.xyxy[kept], candidates.confidence[kept], candidates.class_id[kept])
+    """One image's maps as the model gives them, (1, 4 · reg_max + classes, H, W) a level → its boxes."""
+    sides = 4 * model.reg_max
+    arrays = [level[0].detach().float().cpu().numpy() for level in maps]
+    levels = [LevelMaps(classes=array[sides:], sides=array[:sides]) for array in arrays]
+    return boxes_of(head_of(model), levels, confidence=confidence, iou=iou, class_ids=class_ids, most=most)
 
 
-def _candidates(
-    model: YoloModel, maps: Sequence[Tensor], confidence: float, class_ids: Sequence[int] | None
+def head_of(model: YoloModel) -> Head:
+    """How to read the maps of a whole model."""
+    classes = len(model.class_names)
+    return Head(tuple(model.strides), model.reg_max, model.end_to_end, classes, tuple(range(classes)))
+
+
+def boxes_of(
+    head: Head,
+    levels: Sequence[LevelMaps],
+    *,
+    confidence: float = 0.25,
+    iou: float = 0.7,
+    class_ids: Sequence[int] | None = None,
+    most: int = MOST_BOXES,
 ) -> Boxes:
-    side_channels = 4 * model.reg_max
-    sides, centres, strides, scores, classes = [], [], [], [], []
+    """One image's maps → its boxes: `candidates_of`, `sides_of` and `boxes_from` in a row."""
+    candidates = candidates_of(head, levels, confidence, class_ids)
+    return boxes_from(head, levels, candidates, sides_of(head, levels, candidates), iou, most)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """The cells of one level that may become boxes.
+
+    Attributes:
+        cell: (N,) int64, counted row by row.
+        confidence: (N,) float32 in 0..1.
+        class_id: (N,) int64.
+    """
+
+    cell: NDArray[np.int64]
+    confidence: NDArray[np.float32]
+    class_id: NDArray[np.int64]
+
+
+def candidates_of(
+    head: Head, levels: Sequence[LevelMaps], confidence: float, class_ids: Sequence[int] | None = None
+) -> list[Candidates]:
+    """The cells of each level that speak for a wanted class, above `confidence`.
+
+    A cell speaks for its most probable class, of all that the model knows. In a one-to-one head (YOLOv10,
+    Wang et al., 2024; YOLO26), which has learnt to speak once an object, it speaks for every class.
+
+    Args:
+        class_ids: None: all. Where the maps hold some classes alone, those must be among them.
+    """
+    floor = _logit(confidence) - _LOGIT_MARGIN
+    ids = np.asarray(head.class_ids, np.int64)
     wanted = None
     if class_ids is not None:
-        wanted = torch.zeros(len(model.class_names), dtype=torch.bool, device=maps[0].device)
+        wanted = np.zeros(head.class_count, np.bool_)
         wanted[list(class_ids)] = True
-    for level, stride in zip(maps, model.strides, strict=True):
-        width = level.shape[3]
-        cells = level[0].flatten(1)
-        best, best_class = cells[side_channels:].max(dim=0)
-        score = best.float().sigmoid_()
-        above = score > confidence
+    found = []
+    for number, level in enumerate(levels):
+        logits = level.classes.reshape(len(ids), -1)
+        cells, channel = (_pairs_above if head.end_to_end else _best_above)(logits, floor)
+        class_id = ids[channel]
+        score = (1 / (1 + np.exp(-logits[channel, cells]))).astype(np.float32, copy=False)
+        kept = score > confidence
         if wanted is not None:
-            above &= wanted[best_class]
-        index = above.nonzero().squeeze(1)
-        # Most cells are background: only the few that remain are decoded.
-        sides.append(cells[:side_channels, index].float().T)
-        centres.append(torch.stack((index % width, index // width), dim=1) + 0.5)
-        strides.append(torch.full((len(index), 1), float(stride), device=level.device))
-        scores.append(score[index])
-        classes.append(best_class[index])
-    xyxy = decode_boxes(model.detect.dfl(torch.cat(sides)), torch.cat(centres), torch.cat(strides))
-    return Boxes(
-        xyxy.cpu().numpy().astype(np.float32, copy=False),
-        torch.cat(scores).cpu().numpy(),
-        torch.cat(classes).cpu().numpy().astype(np.int64, copy=False),
+            kept &= wanted[class_id]
+        if head.rows is not None and level.features is not None and len(cells):
+            # A class that nobody asked for may be the better one, and then the cell speaks for that.
+            features = level.features.reshape(len(level.features), -1)[:, cells]
+            kept &= np.isin(head.rows[number].best_class(features), ids)
+        found.append(Candidates(cells[kept], score[kept], class_id[kept]))
+    return found
+
+
+def sides_of(
+    head: Head,
+    levels: Sequence[LevelMaps],
+    candidates: Sequence[Candidates],
+    product: Product = np.matmul,
+) -> list[NDArray[np.float32]]:
+    """Each level's (4 · reg_max, N) raw box sides at its N candidates, computed where the maps lack them.
+
+    Args:
+        product: of two matrices, for where they are computed.
+    """
+    found = []
+    for number, (level, some) in enumerate(zip(levels, candidates, strict=True)):
+        if level.sides is not None:
+            found.append(level.sides.reshape(len(level.sides), -1)[:, some.cell])
+            continue
+        if head.boxes is None or level.neck is None:
+            raise ValueError("maps without box sides need the neck's maps and the head's box branches")
+        # A cell of a one-to-one head may be there several times, for several classes.
+        cells, back = np.unique(some.cell, return_inverse=True)
+        found.append(head.boxes[number].sides(level.neck, cells, product)[:, back])
+    return found
+
+
+def boxes_from(
+    head: Head,
+    levels: Sequence[LevelMaps],
+    candidates: Sequence[Candidates],
+    sides: Sequence[NDArray[np.float32]],
+    iou: float = 0.7,
+    most: int = MOST_BOXES,
+) -> Boxes:
+    """Decode the candidates; each class then suppresses its own overlaps, and the `most` confident stay.
+
+    In a one-to-one head boxes that overlap are different objects; nothing is suppressed.
+    """
+    xyxy = np.concatenate(
+        [
+            _decode(raw, some.cell, level.classes.shape[2], head.reg_max, stride)
+            for level, some, raw, stride in zip(levels, candidates, sides, head.strides, strict=True)
+        ]
     )
+    confidence = np.concatenate([some.confidence for some in candidates])
+    class_id = np.concatenate([some.class_id for some in candidates])
+    if head.end_to_end:
+        kept = np.argsort(-confidence, kind="stable")[:most]
+    else:
+        kept = suppress(xyxy, confidence, class_id, iou, most)
+    return Boxes(xyxy[kept], confidence[kept], class_id[kept])
+
+
+def _logit(probability: float) -> float:
+    if probability <= 0:
+        return -math.inf
+    return math.inf if probability >= 1 else math.log(probability / (1 - probability))
+
+
+def _best_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(K, N) logits → the cells whose largest is above `floor`, and which that is."""
+    cells = np.flatnonzero(logits.max(axis=0) > floor)
+    return cells, logits[:, cells].argmax(axis=0)
+
+
+def _pairs_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(K, N) logits → every cell and channel above `floor`, cell by cell."""
+    cells = np.flatnonzero(logits.max(axis=0) > floor)
+    place, channel = (logits[:, cells].T > floor).nonzero()
+    return cells[place], channel
+
+
+def _decode(
+    sides: NDArray[np.float32], cells: NDArray[np.int64], width: int, reg_max: int, stride: int
+) -> NDArray[np.float32]:
+    """(4 · reg_max, N) raw sides of N cells of a level → (N, 4) float32 xyxy in pixels of the input."""
+    if reg_max > 1:
+        # The expected value of the distribution over the distances 0 … reg_max - 1 (Li et al., 2020).
+        weights = sides.reshape(4, reg_max, -1)
+        weights = np.exp(weights - weights.max(axis=1, keepdims=True))
+        bins = np.arange(reg_max, dtype=np.float32)
+        sides = np.einsum("sbn,b->sn", weights, bins) / weights.sum(axis=1)
+    row, column = np.divmod(cells, width)
+    x, y = column.astype(np.float32) + 0.5, row.astype(np.float32) + 0.5
+    xyxy = np.stack((x - sides[0], y - sides[1], x + sides[2], y + sides[3]), axis=1)
+    return (xyxy * np.float32(stride)).astype(np.float32, copy=False)
 
 
 def suppress(
@@ -105,10 +230,34 @@ def suppress(
         Indices of the kept boxes, the most confident first; of equals, the earlier.
     """
     order = np.argsort(-confidence, kind="stable")
-    left, top, right, bottom = (np.asarray(side, np.float64)[order] for side in xyxy.T)
-    area = (right - left).clip(0) * (bottom - top).clip(0)
-    classes = class_id[order]
-    waiting = np.arange(len(order))
+    sides = np.asarray(xyxy, np.float64)[order].T
+    area = (sides[2] - sides[0]).clip(0) * (sides[3] - sides[1]).clip(0)
+    walk = _kept_by_pairs if len(order) <= _MOST_PAIRED else _kept_one_by_one
+    return order[walk(sides, area, class_id[order], iou, most)]
+
+
+def _kept_by_pairs(
+    sides: NDArray[np.float64], area: NDArray[np.float64], classes: NDArray[Any], iou: float, most: int
+) -> NDArray[np.int64]:
+    left, top, right, bottom = sides
+    width = np.minimum(right[:, None], right) - np.maximum(left[:, None], left)
+    height = np.minimum(bottom[:, None], bottom) - np.maximum(top[:, None], top)
+    common = width.clip(0) * height.clip(0)
+    overlaps = common > iou * (area[:, None] + area - common)
+    overlaps &= classes[:, None] == classes
+    alive = np.ones(len(area), np.bool_)
+    # Only a box that overlaps a later one can change anything.
+    for index in np.flatnonzero(np.triu(overlaps, 1).any(axis=1)):
+        if alive[index]:
+            alive[index + 1 :] &= ~overlaps[index, index + 1 :]
+    return np.flatnonzero(alive)[:most]
+
+
+def _kept_one_by_one(
+    sides: NDArray[np.float64], area: NDArray[np.float64], classes: NDArray[Any], iou: float, most: int
+) -> NDArray[np.int64]:
+    left, top, right, bottom = sides
+    waiting = np.arange(len(area))
     kept: list[int] = []
     while len(waiting) and len(kept) < most:
         first, rest = waiting[0], waiting[1:]
@@ -118,4 +267,4 @@ def suppress(
         common = width.clip(0) * height.clip(0)
         overlaps = common > iou * (area[first] + area[rest] - common)
         waiting = rest[~(overlaps & (classes[rest] == classes[first]))]
-    return order[np.array(kept, dtype=np.int64)]
+    return np.array(kept, dtype=np.int64)

@@ -4,11 +4,15 @@ Python's own unpickler imports what a file names and calls it. This one knows to
 up in the caller's table of admitted names, "calling" it makes an `Inert` record or asks the table's own
 function, and setting state fills a record's dictionary. No import, no attribute of a real object, no class of
 the file's choosing. The opcodes are those of pickle protocol 2 (PEP 307); any other is refused.
+
+What the values would take is counted as they are made, and a pickle that makes much of little is refused: a
+list is one byte in the file and sixty in memory, and a filled dictionary can be copied by five more.
 """
 
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -52,10 +56,30 @@ def one_line(message: str) -> str:
 
 _MARK = object()
 _SCALARS = (str, int, float, bool, type(None))
+# No checkpoint numbers its keys higher; larger ones can be chosen to collide in a dictionary, for ever.
+_LARGEST_KEY = 1 << 20
+# What values take in CPython, bytes, rounded up.
+_REFERENCE_BYTES = 8
+_OBJECT_BYTES = 64
+_PAIR_BYTES = 128
+_MEMO_BYTES = 128
+_CALL_BYTES = 768
+_DEFAULT_ALLOWANCE_BYTES = 16 << 20
+
+
+def shown(value: object) -> str:
+    """A value from a file for a message: a scalar as it is, of anything else its type.
+
+    The text of a container can be longer than any memory: each tuple may hold the one before twice.
+    """
+    return f"{value!r:.100}" if isinstance(value, _SCALARS) else f"a {type(value).__name__}"
 
 
 def unpickle(
-    data: bytes, admitted: Mapping[str, Admitted], persistent: Callable[[tuple[Any, ...]], Any]
+    data: bytes,
+    admitted: Mapping[str, Admitted],
+    persistent: Callable[[tuple[Any, ...]], Any],
+    allowance_bytes: int = _DEFAULT_ALLOWANCE_BYTES,
 ) -> Any:
     """The value that `data` describes.
 
@@ -63,22 +87,28 @@ def unpickle(
         data: a pickle of protocol 2.
         admitted: `module.name` → what it stands for.
         persistent: answers a persistent id (for torch: a storage).
+        allowance_bytes: what the values may take in memory, storages not counted.
 
     Raises:
         UnsafeCheckpointError: a global that is not admitted; the message names it.
         CheckpointError: not such a pickle.
     """
-    return _Machine(data, admitted, persistent).run()
+    return _Machine(data, admitted, persistent, allowance_bytes).run()
 
 
 class _Machine:
     def __init__(
-        self, data: bytes, admitted: Mapping[str, Admitted], persistent: Callable[[tuple[Any, ...]], Any]
+        self,
+        data: bytes,
+        admitted: Mapping[str, Admitted],
+        persistent: Callable[[tuple[Any, ...]], Any],
+        allowance_bytes: int,
     ) -> None:
         self._data = data
         self._position = 0
         self._admitted = admitted
         self._persistent = persistent
+        self._left_bytes = allowance_bytes
         self._stack: list[Any] = []
         # A dictionary, not a list: the file chooses the numbers, and a huge one must not cost memory.
         self._memo: dict[int, Any] = {}
@@ -90,11 +120,21 @@ class _Machine:
             handler = _HANDLERS.get(opcode)
             if handler is None:
                 raise CheckpointError(f"its pickle has opcode {opcode!r}, which torch.save does not write")
+            # Its place on the stack; what it makes beyond that, it counts itself.
+            self._left_bytes -= _REFERENCE_BYTES
             handler(self)
+            if self._left_bytes < 0:
+                raise CheckpointError("its pickle makes more values than a checkpoint needs")
         value = self._pop()
         if self._stack:
             raise CheckpointError("its pickle ends with values left over")
         return value
+
+    def _spend(self, count: int) -> None:
+        """Count bytes that are about to be taken; refuse before a large piece is."""
+        self._left_bytes -= count
+        if self._left_bytes < 0:
+            raise CheckpointError("its pickle makes more values than a checkpoint needs")
 
     def _take(self, count: int) -> bytes:
         chunk = self._data[self._position : self._position + count]
@@ -133,6 +173,11 @@ class _Machine:
     def _push(self, value: Any) -> None:
         self._stack.append(value)
 
+    def _make(self, value: Any) -> None:
+        """Push a value of its own, not one that is shared."""
+        self._left_bytes -= sys.getsizeof(value)
+        self._stack.append(value)
+
     def _top(self, kind: type) -> Any:
         if not self._stack or not isinstance(self._stack[-1], kind):
             raise CheckpointError(f"its pickle fills a {kind.__name__} that is not there")
@@ -145,30 +190,32 @@ class _Machine:
         self._push(_MARK)
 
     def integer(self) -> None:
-        self._push(struct.unpack("<i", self._take(4))[0])
+        self._make(struct.unpack("<i", self._take(4))[0])
 
     def long(self) -> None:
-        self._push(int.from_bytes(self._take(self._unsigned(1)), "little", signed=True))
+        self._make(int.from_bytes(self._take(self._unsigned(1)), "little", signed=True))
 
     def real(self) -> None:
-        self._push(struct.unpack(">d", self._take(8))[0])
+        self._make(struct.unpack(">d", self._take(8))[0])
 
     def text(self) -> None:
-        self._push(_text(self._take(self._unsigned(4))))
+        self._make(_text(self._take(self._unsigned(4))))
 
     def tuple_to_mark(self) -> None:
-        self._push(tuple(self._pop_to_mark()))
+        self._make(tuple(self._pop_to_mark()))
 
     def tuple_of(self, count: int) -> None:
         values = [self._pop() for _ in range(count)]
-        self._push(tuple(reversed(values)))
+        self._make(tuple(reversed(values)))
 
     def append(self) -> None:
         value = self._pop()
+        self._left_bytes -= _REFERENCE_BYTES
         self._top(list).append(value)
 
     def appends(self) -> None:
         values = self._pop_to_mark()
+        self._spend(_REFERENCE_BYTES * len(values))
         self._top(list).extend(values)
 
     def set_item(self) -> None:
@@ -182,16 +229,20 @@ class _Machine:
         target = self._top(dict)
         if len(values) % 2:
             raise CheckpointError("its pickle has a dictionary key without a value")
+        self._spend(_OBJECT_BYTES + _PAIR_BYTES * (len(values) // 2))
         for key, value in zip(values[::2], values[1::2], strict=True):
             # Hashing a nested tuple can be made to take for ever; no checkpoint needs one as a key.
             if not isinstance(key, _SCALARS):
                 raise CheckpointError(f"its pickle has a dictionary key of type {type(key).__name__}")
+            if isinstance(key, int | float) and not -_LARGEST_KEY < key < _LARGEST_KEY:
+                raise CheckpointError(f"its pickle has the dictionary key {key!r}; expected a small number")
             target[key] = value
 
     def put(self, width: int) -> None:
         index = self._unsigned(width)
         if not self._stack or self._stack[-1] is _MARK:
             raise CheckpointError("its pickle remembers a value that is not there")
+        self._left_bytes -= _MEMO_BYTES
         self._memo[index] = self._stack[-1]
 
     def get(self, width: int) -> None:
@@ -213,6 +264,9 @@ class _Machine:
         arguments, function = self._pop(), self._pop()
         if not isinstance(function, Admitted) or not isinstance(arguments, tuple):
             raise UnsafeCheckpointError(f"its pickle calls a {type(function).__name__}; nothing was run")
+        # A set and a size are copies of what they are given.
+        copied = arguments[0] if arguments else None
+        self._spend(_CALL_BYTES + _PAIR_BYTES * (len(copied) if isinstance(copied, list | tuple) else 0))
         self._push(function.call(arguments))
 
     def new_object(self) -> None:
@@ -220,6 +274,7 @@ class _Machine:
         if not isinstance(kind, Admitted) or kind.make is not None or not isinstance(arguments, tuple):
             name = kind.name if isinstance(kind, Admitted) else type(kind).__name__
             raise UnsafeCheckpointError(f"its pickle makes an instance of {name}; nothing was run")
+        self._left_bytes -= _CALL_BYTES
         self._push(Inert(kind.name, arguments))
 
     def build(self) -> None:
@@ -231,6 +286,7 @@ class _Machine:
             raise UnsafeCheckpointError(
                 f"its pickle sets attributes of a {type(target).__name__}; nothing was run"
             )
+        self._spend(_OBJECT_BYTES + _PAIR_BYTES * (len(state) if isinstance(state, dict) else 1))
         # Some classes (numpy.dtype) have a state of their own kind; it is kept, and means nothing here.
         target.state.update(state if isinstance(state, dict) else {"__setstate__": state})
 
@@ -255,7 +311,7 @@ _HANDLERS: dict[bytes, Callable[[_Machine], None]] = {
     b"\x88": lambda machine: machine._push(True),
     b"\x89": lambda machine: machine._push(False),
     b"K": lambda machine: machine._push(machine._unsigned(1)),
-    b"M": lambda machine: machine._push(machine._unsigned(2)),
+    b"M": lambda machine: machine._make(machine._unsigned(2)),
     b"J": _Machine.integer,
     b"\x8a": _Machine.long,
     b"G": _Machine.real,
@@ -265,10 +321,10 @@ _HANDLERS: dict[bytes, Callable[[_Machine], None]] = {
     b"\x85": lambda machine: machine.tuple_of(1),
     b"\x86": lambda machine: machine.tuple_of(2),
     b"\x87": lambda machine: machine.tuple_of(3),
-    b"]": lambda machine: machine._push([]),
+    b"]": lambda machine: machine._make([]),
     b"a": _Machine.append,
     b"e": _Machine.appends,
-    b"}": lambda machine: machine._push({}),
+    b"}": lambda machine: machine._make({}),
     b"s": _Machine.set_item,
     b"u": _Machine.set_items,
     b"q": lambda machine: machine.put(1),

@@ -10,11 +10,12 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
+from vision.yolo.admitted_names import INERT
 from vision.yolo.safe_pickle import Admitted, CheckpointError, UnsafeCheckpointError, one_line, unpickle
 
 _STORAGES: dict[str, torch.dtype] = {
@@ -30,78 +31,19 @@ _STORAGES: dict[str, torch.dtype] = {
     "torch.BoolStorage": torch.bool,
 }
 
-# Layers and values that detection checkpoints hold. Each becomes an inert record; that a name stands here
-# lets the file be read, so that the builder can name the layer it does not know.
-_INERT = (
-    *(
-        f"torch.nn.modules.{name}"
-        for name in (
-            "activation.GELU",
-            "activation.Hardswish",
-            "activation.LeakyReLU",
-            "activation.ReLU",
-            "activation.ReLU6",
-            "activation.SiLU",
-            "activation.Sigmoid",
-            "batchnorm.BatchNorm2d",
-            "container.ModuleList",
-            "container.Sequential",
-            "conv.Conv2d",
-            "conv.ConvTranspose2d",
-            "dropout.Dropout",
-            "linear.Identity",
-            "linear.Linear",
-            "module.Module",
-            "pooling.AdaptiveAvgPool2d",
-            "pooling.MaxPool2d",
-            "upsampling.Upsample",
-        )
-    ),
-    *(
-        f"ultralytics.nn.modules.{name}"
-        for name in (
-            "block.Attention",
-            "block.Bottleneck",
-            "block.C2PSA",
-            "block.C2f",
-            "block.C3",
-            "block.C3k",
-            "block.C3k2",
-            "block.DFL",
-            "block.PSABlock",
-            "block.Proto",
-            "block.SPPF",
-            "conv.Concat",
-            "conv.Conv",
-            "conv.DWConv",
-            "head.Classify",
-            "head.Detect",
-            "head.OBB",
-            "head.Pose",
-            "head.Segment",
-        )
-    ),
-    "ultralytics.nn.tasks.ClassificationModel",
-    "ultralytics.nn.tasks.DetectionModel",
-    "ultralytics.nn.tasks.OBBModel",
-    "ultralytics.nn.tasks.PoseModel",
-    "ultralytics.nn.tasks.SegmentationModel",
-    "ultralytics.utils.IterableSimpleNamespace",
-    "ultralytics.yolo.utils.IterableSimpleNamespace",
-    "numpy.core.multiarray.scalar",
-    "numpy._core.multiarray.scalar",
-    "numpy.dtype",
-    "pathlib.PosixPath",
-    "pathlib.PurePosixPath",
-    "pathlib.WindowsPath",
-    "_codecs.encode",
-    "torch.device",
-)
-_LARGEST_PICKLE_BYTES = 64 << 20
-_MOST_MEMBERS = 100_000
+_LARGEST_PICKLE_BYTES = 16 << 20
+# The table of contents becomes an object a member; the largest checkpoints have some thousands.
+_LARGEST_CONTENTS_BYTES = 1 << 20
+_MOST_MEMBERS = 10_000
+# The end record with the longest comment, and the two records of zip64 before it.
+_LONGEST_ENDING_BYTES = 22 + 65535 + 20 + 56
 _MOST_DIMENSIONS = 8
 # Views may share a storage (a state dictionary beside its model), but not without end.
 _MOST_VIEWS_PER_ELEMENT = 4
+# What the values of the pickle may take in memory, and as much again as the file has.
+_VALUES_BYTES = 16 << 20
+# A set's numbers can be chosen to collide, and then take for ever.
+_LARGEST_SET = 10_000
 
 
 def read_archive(path: str | Path) -> Any:
@@ -133,8 +75,9 @@ def _read(path: Path) -> Any:
             raise CheckpointError(
                 "not a checkpoint: expected the zip archive that torch.save writes (torch 1.6 or newer)"
             )
-        file.seek(0)
         try:
+            _check_contents(file, size)
+            file.seek(0)
             with zipfile.ZipFile(file) as archive:
                 return _Archive(archive, size).value()
         # What the zip module raises for damaged headers, encryption, unknown compression and bad names.
@@ -154,11 +97,31 @@ def _read(path: Path) -> Any:
             ) from None
 
 
+def _check_contents(file: BinaryIO, size: int) -> None:
+    """The size of the table of contents (APPNOTE 4.3.16, 4.3.14), before the zip module reads it."""
+    start = max(0, size - _LONGEST_ENDING_BYTES)
+    file.seek(start)
+    ending = file.read()
+    found = ending.rfind(b"PK\x05\x06")
+    if found < 0 or len(ending) - found < 22:
+        raise CheckpointError("the archive is truncated or damaged (no end of it); copy or download it again")
+    (contents,) = struct.unpack_from("<L", ending, found + 12)
+    large = ending.rfind(b"PK\x06\x06", 0, found)
+    if 0 <= large <= found - 56:
+        (contents,) = struct.unpack_from("<Q", ending, large + 40)
+    if contents > _LARGEST_CONTENTS_BYTES:
+        raise CheckpointError(
+            f"the archive's table of contents has {contents} bytes, a checkpoint's at most "
+            f"{_LARGEST_CONTENTS_BYTES}"
+        )
+
+
 class _Archive:
     """One open archive; storages are read when the pickle names them."""
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
         self._archive = archive
+        self._size = size
         members = archive.infolist()
         if len(members) > _MOST_MEMBERS:
             raise CheckpointError(f"the archive has {len(members)} members, a checkpoint far fewer")
@@ -185,7 +148,7 @@ class _Archive:
 
     def value(self) -> Any:
         data = self._bytes(self._members[f"{self._root}data.pkl"], _LARGEST_PICKLE_BYTES)
-        return unpickle(data, self._admitted(), self._storage)
+        return unpickle(data, self._admitted(), self._storage, _VALUES_BYTES + self._size)
 
     def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
         if largest is not None and member.file_size > largest:
@@ -201,11 +164,14 @@ class _Archive:
             "torch._utils._rebuild_parameter_with_state": _parameter,
             "torch.Size": _size,
             "collections.OrderedDict": _dictionary,
+            "collections.defaultdict": _default_dictionary,
             "__builtin__.set": _set,
             "builtins.set": _set,
+            # Releases from 8.0.200 to 8.2 wrote with dill where it was installed, which names types this way.
+            "dill._dill._load_type": _type_by_name,
         }
         return (
-            {name: Admitted(name) for name in (*_INERT, *_STORAGES)}
+            {name: Admitted(name) for name in (*INERT, *_STORAGES)}
             | {name: Admitted(name, make) for name, make in calls.items()}
         )  # fmt: skip
 
@@ -286,8 +252,27 @@ def _dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
     return {}
 
 
+def _default_dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
+    """What it would make for a missing key is of no use here; its own entries follow one by one."""
+    if any(not isinstance(argument, Admitted | None) for argument in arguments[:1]) or len(arguments) > 1:
+        raise UnsafeCheckpointError("its pickle fills a default dictionary by a call; nothing was run")
+    return {}
+
+
 def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     values = arguments[0] if len(arguments) == 1 else None
-    if not isinstance(values, list) or not all(isinstance(value, str | int | float) for value in values):
+    if (
+        not isinstance(values, list)
+        or len(values) > _LARGEST_SET
+        or not all(isinstance(value, str | int | float) for value in values)
+    ):
         raise CheckpointError("its pickle has a set of something else than names and numbers")
     return frozenset(values)
+
+
+def _type_by_name(arguments: tuple[Any, ...]) -> Admitted:
+    if arguments not in (("set",), ("frozenset",)):
+        raise UnsafeCheckpointError(
+            f"its pickle asks for the type {', '.join(map(repr, arguments))!s:.100}; nothing was run"
+        )
+    return Admitted(f"builtins.{arguments[0]}", _set)

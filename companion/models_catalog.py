@@ -1,0 +1,95 @@
+"""The official models that can be had by name, each with what its file must be.
+
+Size and SHA-256 are those that GitHub records for the assets of Ultralytics' release v8.4.0, taken from
+published tables of them; every digest was found in at least two independent ones. A model whose digest was
+not found stands here without one, and `pull` asks for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_RELEASE = "https://github.com/ultralytics/assets/releases/download/v8.4.0"
+AGPL = "AGPL-3.0"
+LICENCE_NOTES = {
+    AGPL: (
+        "these weights are Ultralytics', under AGPL-3.0 (or their commercial licence). AGPL-3.0 asks whoever "
+        "lets others use a program over a network to offer them its source. That is between you and "
+        "Ultralytics: https://www.ultralytics.com/license"
+    )
+}
+
+
+@dataclass(frozen=True, slots=True)
+class KnownModel:
+    """An official file.
+
+    Attributes:
+        name: what `pull` is given; the file is `NAME.pt`.
+        url: where it is published.
+        size_bytes: of the file; None where it is not known here.
+        sha256: 64 hexadecimal digits; None where it is not known here.
+        licence: SPDX identifier.
+        about: one line.
+    """
+
+    name: str
+    url: str
+    size_bytes: int | None
+    sha256: str | None
+    licence: str
+    about: str
+
+    @property
+    def file(self) -> str:
+        return f"{self.name}.pt"
+
+
+_PINNED = {
+    "yolov8n": (6549796, "f59b3d833e2ff32e194b5bb8e08d211dc7c5bdf144b90d2c8412c47ccfc83b36"),
+    "yolov8s": (22588772, "1f47a78bf100391c2a140b7ac73a1caae18c32779be7d310658112f7ac9aa78a"),
+    "yolov8m": (52136884, "5d4a90cdc7a21786cc59cd19778e9eafff836df9e2da32524737c7ee6efe4fe5"),
+    "yolov8l": (87792836, "64c9115303f6a25575f82200d1b22ec409fa6bd7d08d0313884fc20d919478cd"),
+    "yolov8x": (136890692, "3df4ada6b4dad6d657868f2fdf7faecfb34dcfccf3a25c4b82079064718524c8"),
+    "yolo11n": (5613764, "0ebbc80d4a7680d14987a577cd21342b65ecfd94632bd9a8da63ae6417644ee1"),
+    "yolo11s": (19313732, "85a76fe86dd8afe384648546b56a7a78580c7cb7b404fc595f97969322d502d5"),
+    "yolo11m": (40684120, "d5ffc1a674953a08e11a8d21e022781b1b23a19b730afc309290bd9fb5305b95"),
+    "yolo11l": (51387343, "9ebd0e09d59811db4b1d61e2bc6730649608b1ac47f8dd01e2da6bca7c20023f"),
+    "yolo11x": (114636239, "7bc158aa95c0ebfdd87f70f01653c1131b93e92522dbe15c228bcd742e773a24"),
+    "yolo12n": (5595063, "419ff3dca37d69bacc93a50fa0c186a1c6f9fe62fae0f108b0872829689e9ca6"),
+    "yolo12s": (19006455, "e915c2c4286e3f6f8610ef106fa3f94a7b8c19b30eccede5887e22c33ef75f58"),
+    "yolo12m": (40904955, "4c6d179786eddf6134ee469ae2f4ce04cbe4e9d1a47d6b669d9cd6b9c6c513d8"),
+    "yolo12l": (53699086, "0babd8dc8f775bb64bb052debdff3d8b9e9b57efa9d7bfa11c84bb82c3fec336"),
+    "yolo12x": (119322638, "682ce8dadee004dbe964950f1bf3eda451671815a6ed62db80b398916b9b7c6f"),
+    "yolo26n": (5544453, "9b09cc8bf347f0fc8a5f7657480587f25db09b34bf33b0652110fb03a8ad4fef"),
+    "yolo26s": (20422725, "646f8bc3fe0a656803d95c294f7852321748cb29d13466a1af8862e2db384a1b"),
+    "yolo26m": (44255705, "401cea9ab23ad19246ff7744859816bc599f350e93c9dd30367b6f0a0745d0b7"),
+    "yolo26l": (53211173, "9fe3c544f2b19bebad7ea41e76d7ad3d88b7c2f10d11d24430c5311f6b32db26"),
+    "yolo26x": (118667365, "9fdd44a31c504547ffb81d2c6d9e6dac3493c8eaa8b0398d3f43bae6c7003e92"),
+}
+_UNPINNED = tuple(f"yolov5{scale}u" for scale in "nsmlx")
+_GENERATIONS = {
+    "yolov5": "YOLOv5u",
+    "yolov8": "YOLOv8",
+    "yolo11": "YOLO11",
+    "yolo12": "YOLO12",
+    "yolo26": "YOLO26",
+}
+
+
+def _about(name: str) -> str:
+    return f"{_GENERATIONS[name[:6]]}, scale {name[6]}, 80 classes of COCO"
+
+
+KNOWN: dict[str, KnownModel] = {
+    **{name: KnownModel(name, f"{_RELEASE}/{name}.pt", None, None, AGPL, _about(name)) for name in _UNPINNED},
+    **{
+        name: KnownModel(name, f"{_RELEASE}/{name}.pt", size, digest, AGPL, _about(name))
+        for name, (size, digest) in _PINNED.items()
+    },
+}
+
+
+def known_by_digest(sha256: str) -> KnownModel | None:
+    """The official model whose file has this SHA-256."""
+    return next((model for model in KNOWN.values() if model.sha256 == sha256), None)

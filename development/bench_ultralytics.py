@@ -1,0 +1,135 @@
+"""Ultralytics and ours on the same pictures in the same run, in turn; for development only.
+
+Each contestant is a process of its own (`companion.bench_detector`), and they take turns, so that whatever
+else the machine does falls on all alike. Ultralytics is measured as anybody calls it, `predict` on a picture:
+as installed (it chooses its threads), with the threads forced, and on its own OpenVINO export.
+
+    PYTHONPATH=. OTHER_VENV/bin/python development/bench_ultralytics.py --model yolov8n.pt --threads 2
+
+`OTHER_VENV` holds `ultralytics` and what this project needs. Figures, never verdicts: see the ratios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+os.environ.setdefault("YOLO_OFFLINE", "1")
+os.environ.setdefault("YOLO_AUTOINSTALL", "false")
+
+CONTESTANTS = ("as-installed", "forced-threads", "own-openvino")
+OURS = ("torch", "onnxruntime", "openvino")
+
+
+def contestant() -> int:
+    """The process that is measured; see `companion.bench_detector`."""
+    from companion.bench_detector import memory_mb
+
+    order = json.loads(sys.stdin.readline())
+    sys.stdout = sys.stderr  # their messages must not mix with the answers
+    import torch
+    from ultralytics import YOLO
+
+    pictures = np.load(order["pictures"])
+    model = YOLO(order["model"], task="detect")
+    size = list(pictures.shape[1:3])
+
+    def predict(picture: Any) -> list[float]:
+        started = time.perf_counter()
+        result = model.predict(picture, imgsz=size, device="cpu", verbose=False)[0]
+        total_ms = (time.perf_counter() - started) * 1e3
+        before, network = result.speed["preprocess"], result.speed["inference"]
+        return [before, network, total_ms - before - network]
+
+    predict(pictures[0])
+    # After the first call: it sets its own number then.
+    if order["threads"] is not None:
+        torch.set_num_threads(order["threads"])
+    name = f"ultralytics {order['name']}"
+    # What OpenVINO takes inside Ultralytics is its own affair.
+    threads = "own" if order["name"] == "own-openvino" else torch.get_num_threads()
+    _say({"runtime": name, "precision": "float32", "threads": threads, "memory_mb": memory_mb()})
+    for line in sys.stdin:
+        times = [predict(pictures[number % len(pictures)]) for number in range(int(line))]
+        _say({"times_ms": times, "memory_mb": memory_mb()})
+    return 0
+
+
+def _say(what: dict[str, Any]) -> None:
+    sys.__stdout__.write(json.dumps(what) + "\n")  # type: ignore[union-attr]
+    sys.__stdout__.flush()  # type: ignore[union-attr]
+
+
+def export_openvino(model: Path, folder: Path, size: tuple[int, int]) -> Path:
+    """Their export of a copy of the checkpoint, for one size (height, width)."""
+    from ultralytics import YOLO
+
+    copy = folder / model.name
+    shutil.copyfile(model, copy)
+    return Path(YOLO(copy).export(format="openvino", imgsz=list(size), half=False, verbose=False))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Ultralytics and ours, measured in turn.")
+    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--threads", type=int, default=2, help="ours, and theirs where forced")
+    parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--frame", default="640x480")
+    parser.add_argument("--only", default="", help="of " + ", ".join((*CONTESTANTS, *OURS)))
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--contestant", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    from companion.bench_detector import Measured, draw_pictures, in_turn, machine, table
+
+    width, height = (int(number) for number in arguments.frame.split("x"))
+    wanted = arguments.only.split(",") if arguments.only else [*CONTESTANTS, *OURS]
+    measured: list[Measured] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        order: dict[str, Any] = {
+            "model": str(arguments.model),
+            "pictures": str(draw_pictures(folder / "pictures.npy", width, height)),
+            "image_size": max(width, height),
+            "precision": "auto",
+            "classes": None,
+        }
+        try:
+            for one in wanted:
+                if one in OURS:
+                    command = [sys.executable, "-m", "companion.bench_detector"]
+                    asked = {"runtime": one, "threads": arguments.threads}
+                else:
+                    command = [sys.executable, __file__, "--model", "-", "--contestant"]
+                    asked = {"name": one, "threads": arguments.threads if one == "forced-threads" else None}
+                    if one == "own-openvino":
+                        asked["model"] = str(export_openvino(arguments.model, folder, (height, width)))
+                measured.append(Measured(one, command, order | asked))
+            in_turn(measured, arguments.frames)
+            rows = [one.figures() for one in measured]
+        finally:
+            for one in measured:
+                one.close()
+    result = {"machine": machine(), "frame": arguments.frame, "rows": rows}
+    if arguments.json:
+        print(json.dumps(result))
+        return 0
+    for line in table(result):
+        print(line)
+    rates = {row["runtime"]: row["frames_per_s"] for row in rows}
+    for theirs in (name for name in rates if name.startswith("ultralytics")):
+        for ours in (name for name in rates if not name.startswith("ultralytics")):
+            print(f"{ours}: {rates[ours] / rates[theirs]:.2f} times the frames per second of {theirs}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(contestant() if "--contestant" in sys.argv else main())

@@ -1,0 +1,163 @@
+"""Exported networks: the same maps, loadable alone, refused when they are not what they should be."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.vision.runtimes.conftest import NAMES, lively_model, picture
+from vision.detector import Detector
+from vision.runtimes import export as export_module
+from vision.runtimes.contract import (
+    RUNTIMES,
+    RuntimeMissingError,
+    RuntimeName,
+    RuntimeUnusableError,
+    installed,
+)
+from vision.runtimes.export import export
+from vision.runtimes.exported import SUFFIXES, ExportKind
+from vision.runtimes.selection import runtime_of_file
+from vision.runtimes.source import read_source
+from vision.runtimes.torch_runtime import TorchRuntime
+
+PAIRS: list[tuple[ExportKind, RuntimeName]] = [
+    ("onnx", "onnxruntime"),
+    ("onnx", "openvino"),
+    ("openvino", "openvino"),
+    ("torchscript", "torch"),
+]
+
+
+def needs(*packages: str) -> None:
+    for package in packages:
+        pytest.importorskip(package, reason=f"{package} is an optional extra")
+
+
+@pytest.fixture(scope="module")
+def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Each kind is made once."""
+    folder = tmp_path_factory.mktemp("exported")
+    made: dict[ExportKind, Path] = {}
+
+    def of(kind: ExportKind) -> Path:
+        needs(*{"onnx": ("onnx", "onnxruntime"), "openvino": ("openvino",)}.get(kind, ()))
+        if kind not in made:
+            path = folder / f"net{SUFFIXES[kind]}"
+            made[kind] = export(checkpoint, kind, path, 96, generation="YOLOv8")
+        return made[kind]
+
+    return of
+
+
+@pytest.mark.parametrize(("kind", "runtime"), PAIRS)
+def test_an_exported_network_says_what_torch_says_at_every_size(
+    exported: Any, kind: ExportKind, runtime: RuntimeName
+) -> None:
+    needs(runtime)
+    found = runtime_of_file(runtime, exported(kind), threads=1)
+    reference = TorchRuntime(lively_model(), precision="float32")
+    # A checkpoint's weights are kept in half precision.
+    for size in ((96, 96), (64, 160), (96, 96), (32, 32)):
+        image = picture(*size)
+        for a, b in zip(found.infer(image), reference.infer(image), strict=True):
+            np.testing.assert_allclose(a.sides, b.sides, atol=0.1)
+            np.testing.assert_allclose(a.classes, b.classes, atol=0.1)
+    assert found.name == runtime
+    assert found.threads >= 1
+
+
+@pytest.mark.parametrize(("kind", "runtime"), PAIRS)
+def test_an_exported_file_is_a_model_by_itself(
+    exported: Any, checkpoint: Path, kind: ExportKind, runtime: RuntimeName
+) -> None:
+    needs(runtime)
+    alone = Detector(exported(kind), runtime=runtime, image_size=96, threads=1, classes=["car", "boat"])
+    source = Detector(checkpoint, image_size=96, precision="float32", classes=["car", "boat"])
+    assert alone.class_names == NAMES
+    assert alone.metadata == {"licence": "Apache-2.0"}
+    assert (alone.runtime, alone.runtime_reason, alone.precision) == (runtime, "as asked", alone.precision)
+    image = picture(64, 96)
+    a, b = alone.detect(image), source.detect(image)
+    assert len(a) == len(b)
+    np.testing.assert_allclose(a.confidence, b.confidence, atol=1e-3)
+    np.testing.assert_allclose(a.xyxy, b.xyxy, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", ["onnx", "openvino", "torchscript"])
+def test_an_exported_file_carries_its_facts(exported: Any, checkpoint: Path, kind: ExportKind) -> None:
+    facts = read_source(exported(kind)).facts
+    assert facts is not None
+    assert facts.class_names == NAMES
+    assert facts.strides == (8, 16, 32)
+    assert facts.generation == "YOLOv8"
+    assert facts.source_sha256 == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+
+
+def test_an_export_lies_beside_its_checkpoint_unless_told_otherwise(checkpoint: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "mine.pt"
+    copy.write_bytes(checkpoint.read_bytes())
+    assert export(copy, "torchscript", image_size=64) == tmp_path / "mine.torchscript"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.pt", "mine.torchscript"]
+
+
+def test_a_file_whose_maps_are_not_the_networks_is_not_kept(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_another(network: Any, facts: Any, path: Path) -> None:
+        network.body.model[0].conv.weight.data.mul_(1.5)
+        export_network(network, facts, path)
+        network.body.model[0].conv.weight.data.div_(1.5)
+
+    export_network = export_module._write_torchscript
+    monkeypatch.setattr(export_module, "_write_torchscript", write_another)
+    with pytest.raises(RuntimeUnusableError, match="file's maps are not the network's"):
+        export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"to": "coreml"}, "can export to onnx, openvino, tensorrt, torchscript"),
+        ({"to": "torchscript", "image_size": 100}, "multiple of 32"),
+        ({"to": "torchscript", "output": Path("net.onnx")}, "must end in .torchscript"),
+    ],
+)
+def test_a_senseless_export_is_refused(checkpoint: Path, arguments: dict[str, Any], expected: str) -> None:
+    with pytest.raises(RuntimeUnusableError, match=expected):
+        export(checkpoint, **arguments)
+
+
+@pytest.mark.parametrize("kind", ["onnx", "openvino", "torchscript"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "text", "missing"])
+def test_a_damaged_file_is_one_line(exported: Any, tmp_path: Path, kind: ExportKind, damage: str) -> None:
+    whole = exported(kind).read_bytes()
+    path = tmp_path / f"net{SUFFIXES[kind]}"
+    if damage != "missing":
+        path.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2], "text": b"hello\n" * 99}[damage])
+    with pytest.raises(RuntimeUnusableError, match=path.name) as caught:
+        read_source(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_somebody_elses_file_says_that_it_does_not_say_what_it_is(exported: Any, tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(str(exported("onnx")))
+    del model.metadata_props[:]
+    onnx.save(model, str(tmp_path / "net.onnx"))
+    with pytest.raises(RuntimeUnusableError, match="does not say what it is"):
+        read_source(tmp_path / "net.onnx")
+
+
+@pytest.mark.parametrize("runtime", [name for name in RUNTIMES if name != "torch" and not installed(name)])
+def test_an_export_for_what_is_not_installed_names_the_extra(
+    checkpoint: Path, tmp_path: Path, runtime: RuntimeName
+) -> None:
+    kind = {"onnxruntime": "onnx", "openvino": "openvino", "tensorrt": "tensorrt"}[runtime]
+    with pytest.raises(RuntimeMissingError, match=rf"mavlink-companion\[{runtime}\]"):
+        export(checkpoint, kind, tmp_path / f"net{SUFFIXES[kind]}")  # type: ignore[arg-type,index]

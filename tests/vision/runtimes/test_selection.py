@@ -1,0 +1,188 @@
+"""Which runtime runs a model, and how the fastest is found."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.vision.runtimes.conftest import picture
+from vision.detector import Detector
+from vision.runtimes import contract, trial
+from vision.runtimes.contract import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
+from vision.runtimes.export import export
+from vision.runtimes.selection import cache_folder, runtime_of_file, start_runtime
+from vision.runtimes.source import read_source
+
+
+def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """As if these runtimes alone were installed."""
+    real = contract.importlib.util.find_spec
+    absent = set(contract.RUNTIMES) - set(names)
+    monkeypatch.setattr(
+        contract.importlib.util, "find_spec", lambda name: None if name in absent else real(name)
+    )
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino", "tensorrt"])
+def test_a_named_runtime_that_is_missing_is_an_error_naming_its_extra(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch, runtime: RuntimeName
+) -> None:
+    only(monkeypatch, "torch")
+    with pytest.raises(RuntimeMissingError, match=rf"pip install 'mavlink-companion\[{runtime}\]'"):
+        Detector(checkpoint, image_size=96, runtime=runtime)
+    with pytest.raises(RuntimeMissingError, match=runtime):
+        runtime_of_file(runtime, checkpoint)
+
+
+def test_a_runtime_that_is_installed_and_broken_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(name: str) -> Any:
+        raise ImportError("libsomething.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(contract.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(contract.importlib, "import_module", broken)
+    with pytest.raises(RuntimeMissingError, match=r"cannot be loaded: libsomething"):
+        contract.required("openvino")
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+def test_a_checkpoint_runs_on_a_named_runtime_and_is_converted_once(
+    checkpoint: Path, runtime: RuntimeName
+) -> None:
+    pytest.importorskip(runtime, reason=f"{runtime} is an optional extra")
+    pytest.importorskip("onnx", reason="onnx comes with the optional extras")
+    image = picture(64, 96)
+    for classes in (None, ["car", "dog"]):
+        settings: dict[str, Any] = {"image_size": 96, "classes": classes, "threads": 1, "confidence": 0.3}
+        reference = Detector(checkpoint, precision="float32", **settings).detect(image)
+        assert len(reference)
+        found = Detector(checkpoint, runtime=runtime, precision="float32", **settings).detect(image)
+        assert found.names == reference.names
+        assert found.confidence == pytest.approx(reference.confidence, abs=1e-3)
+        assert found.xyxy == pytest.approx(reference.xyxy, abs=0.05)
+    before = {path: path.stat().st_mtime_ns for path in cache_folder().iterdir()}
+    Detector(checkpoint, runtime=runtime, precision="float32", **settings)
+    assert {path: path.stat().st_mtime_ns for path in cache_folder().iterdir()} == before
+
+
+def test_a_runtime_is_not_given_a_file_it_does_not_read(checkpoint: Path, tmp_path: Path) -> None:
+    path = export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
+    with pytest.raises(RuntimeUnusableError, match=r"openvino does not run \.torchscript files"):
+        start_runtime(read_source(path), "openvino")
+
+
+def test_precisions_that_a_runtime_does_not_have_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+    path = export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
+    with pytest.raises(RuntimeUnusableError, match="computes in float32"):
+        Detector(path, precision="bfloat16")
+    if installed("onnxruntime") and installed("onnx"):  # type: ignore[arg-type]
+        with pytest.raises(RuntimeUnusableError, match="computes in float32"):
+            Detector(checkpoint, runtime="onnxruntime", precision="float16")
+
+
+def test_with_torch_alone_auto_is_torch_without_a_trial(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only(monkeypatch, "torch")
+    detector = Detector(checkpoint, image_size=96, runtime="auto")
+    assert detector.runtime == "torch"
+    assert detector.runtime_reason == "no other that runs this model is installed"
+
+
+class Trial:
+    """Stands for the measuring processes: answers by a table, and counts how often it is asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: dict[str, float | str]) -> None:
+        self.answer, self.asked = answer, 0
+        monkeypatch.setattr(trial, "_measured", self._measured)
+        monkeypatch.setattr(trial, "version", lambda name: "1.0")
+
+    def _measured(self, source: Any, candidates: list[str], *_: Any) -> dict[str, float | str]:
+        self.asked += 1
+        return {name: self.answer[name] for name in candidates}
+
+
+CHOICE: dict[str, Any] = {"class_ids": None, "precision": "auto", "threads": None, "image_size": 96}
+
+
+@pytest.mark.parametrize(
+    ("answer", "best"),
+    [
+        pytest.param({"torch": 50.0, "openvino": 30.0, "onnxruntime": 40.0}, "openvino", id="the fastest"),
+        pytest.param({"torch": 50.0, "openvino": 49.0}, "torch", id="torch where it hardly matters"),
+        pytest.param({"torch": 50.0, "openvino": "illegal instruction"}, "torch", id="one that breaks"),
+    ],
+)
+def test_auto_takes_the_fastest_and_says_why(
+    checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    answer: dict[str, Any],
+    best: str,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    asked = Trial(monkeypatch, answer)
+    caplog.set_level(logging.INFO)
+    source = read_source(checkpoint)
+    name, reason = trial.fastest_runtime(source, list(answer), **CHOICE)
+    assert name == best
+    assert reason.startswith("measured now: ")
+    assert all(f"{key} {value:.1f} ms" in reason for key, value in answer.items() if value != str(value))
+    assert f"runtime auto: {best}" in caplog.text
+    again = trial.fastest_runtime(source, list(answer), **CHOICE)
+    assert again == (best, reason.replace("measured now", "measured before"))
+    assert asked.asked == 1
+
+
+def test_a_choice_is_measured_again_when_what_it_hangs_on_changes(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    asked = Trial(monkeypatch, {"torch": 2.0, "openvino": 1.0})
+    source = read_source(checkpoint)
+    names: list[RuntimeName] = ["torch", "openvino"]
+    trial.fastest_runtime(source, names, **CHOICE)
+    trial.fastest_runtime(source, names, **CHOICE | {"image_size": 128})
+    trial.fastest_runtime(source, names, **CHOICE | {"threads": 1})
+    monkeypatch.setattr(trial, "version", lambda name: "2.0")
+    trial.fastest_runtime(source, names, **CHOICE)
+    monkeypatch.setattr(trial, "board", lambda: ["another"])
+    trial.fastest_runtime(source, names, **CHOICE)
+    assert asked.asked == 5
+    for kept in cache_folder().glob("trial-*.json"):
+        kept.write_text(json.dumps({"question": {}, "answer": []}))
+    trial.fastest_runtime(source, names, **CHOICE)
+    assert asked.asked == 6
+
+
+def test_a_choice_that_cannot_be_kept_is_made_all_the_same(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    Trial(monkeypatch, {"torch": 2.0, "openvino": 1.0})
+    name, _ = trial.fastest_runtime(read_source(checkpoint), ["torch", "openvino"], **CHOICE)
+    assert name == "openvino"
+    assert "cannot be kept" in caplog.text
+
+
+def test_when_none_runs_it_everybodys_reason_is_told(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    Trial(monkeypatch, {"openvino": "no", "onnxruntime": "never"})
+    with pytest.raises(RuntimeUnusableError, match="openvino: no; onnxruntime: never"):
+        trial.fastest_runtime(read_source(checkpoint), ["openvino", "onnxruntime"], **CHOICE)
+
+
+def test_a_trial_is_a_real_measurement_in_a_process_of_its_own(checkpoint: Path) -> None:
+    source = read_source(checkpoint)
+    answer = trial._measured(source, ["torch", "tensorrt"], [1, 2], "float32", 1, 64)
+    assert isinstance(answer["torch"], float)
+    assert answer["torch"] > 0
+    if not installed("tensorrt"):
+        assert "mavlink-companion[tensorrt]" in answer["tensorrt"]

@@ -1,0 +1,111 @@
+"""The default runtime: precision, sizes, memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.vision.runtimes.conftest import lively_model, picture
+from vision.runtimes import contract
+from vision.runtimes import torch_runtime as torch_runtime_module
+from vision.runtimes.contract import RuntimeUnusableError
+from vision.runtimes.network import Network
+from vision.runtimes.torch_runtime import TorchRuntime, torch_product
+
+
+@pytest.fixture
+def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contract, "bfloat16_instructions", lambda: "")
+
+
+@pytest.fixture
+def with_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contract, "bfloat16_instructions", lambda: "amx_bf16")
+
+
+def expected(image: np.ndarray) -> list[np.ndarray]:
+    network = Network(lively_model())
+    with torch.inference_mode():
+        return [level[0].numpy() for level in network(torch.from_numpy(image)[None])]
+
+
+@pytest.mark.usefixtures("no_bfloat16")
+def test_one_graph_serves_every_size() -> None:
+    runtime = TorchRuntime(lively_model())
+    for size in ((64, 96), (96, 64), (32, 32), (64, 96), (256, 320)):
+        image = picture(*size)
+        found = [maps for level in runtime.infer(image) for maps in (level.sides, level.classes)]
+        for a, b in zip(found, expected(image), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-3)
+    assert not runtime._graphs
+
+
+@pytest.mark.usefixtures("no_bfloat16")
+def test_a_network_that_needs_a_graph_for_each_size_gets_one_and_keeps_a_few(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(TorchRuntime, "_any_size", lambda self: None)
+    monkeypatch.setattr(torch_runtime_module, "_MOST_GRAPHS", 2)
+    runtime = TorchRuntime(lively_model())
+    for size in ((64, 96), (96, 64), (64, 96), (32, 32)):
+        image = picture(*size)
+        classes = runtime.infer(image)[0].classes
+        np.testing.assert_allclose(classes, expected(image)[1], atol=1e-3)
+    assert set(runtime._graphs) == {(64, 96), (32, 32)}
+
+
+def test_bfloat16_says_nearly_the_same_and_its_maps_are_float32() -> None:
+    image = picture(64, 96)
+    full = TorchRuntime(lively_model(), precision="float32")
+    half = TorchRuntime(lively_model(), precision="bfloat16", sparse_boxes=True)
+    assert (full.precision, half.precision) == ("float32", "bfloat16")
+    for a, b in zip(full.infer(image), half.infer(image), strict=True):
+        assert b.classes.dtype == np.float32
+        assert b.neck is not None
+        assert b.neck.dtype == np.float32
+        assert np.corrcoef(a.classes.ravel(), b.classes.ravel())[0, 1] > 0.99
+
+
+@pytest.mark.usefixtures("no_bfloat16")
+def test_without_native_bfloat16_auto_is_float32() -> None:
+    runtime = TorchRuntime(lively_model())
+    assert runtime.precision == "float32"
+    assert "does not compute in bfloat16" in runtime.precision_reason
+
+
+@pytest.mark.usefixtures("with_bfloat16")
+@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (9.0, "float32")])
+def test_with_native_bfloat16_auto_takes_the_faster(
+    monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
+) -> None:
+    times = {torch.float32: 5.0, torch.bfloat16: half_ms}
+    monkeypatch.setattr(TorchRuntime, "_measure_ms", lambda self, dtype: times[dtype])
+    runtime = TorchRuntime(lively_model())
+    assert runtime.precision == chosen
+    assert "5.0 ms in float32" in runtime.precision_reason
+
+
+@pytest.mark.usefixtures("with_bfloat16")
+def test_auto_measures_both_where_it_must() -> None:
+    runtime = TorchRuntime(lively_model())
+    assert runtime.precision in ("float32", "bfloat16")
+    assert runtime.precision_reason.startswith("measured")
+
+
+def test_a_precision_it_does_not_have_is_refused() -> None:
+    with pytest.raises(RuntimeUnusableError, match="float32 or bfloat16"):
+        TorchRuntime(lively_model(), precision="float16")
+
+
+def test_threads_are_set_and_told() -> None:
+    before = torch.get_num_threads()
+    try:
+        assert TorchRuntime(lively_model(), precision="float32", threads=1).threads == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_products_are_products() -> None:
+    a, b = np.random.default_rng(0).random((2, 5, 5), np.float32)
+    np.testing.assert_allclose(torch_product(a, b), a @ b, rtol=1e-5)

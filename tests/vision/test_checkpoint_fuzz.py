@@ -1,0 +1,192 @@
+"""The reader against files that nobody meant well: refused by name, at once, without running or growing.
+
+Every file is read in a process of its own kind (`checkpoint_memory.py`) that ends should anything try to run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from checkpoint_bombs import BOMBS, archive
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from vision.weights import DEFAULT_WEIGHTS
+from vision.yolo.architecture import build, yolov8_description
+from vision.yolo.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+
+READER = Path(__file__).with_name("checkpoint_memory.py")
+ROOT = Path(__file__).parent.parent.parent
+REAL = (
+    Path(os.environ.get("COMPANION_TEST_DATA", ROOT.parent / "shared" / "data"))
+    / "models"
+    / "yolov8n_coco.pt"
+)
+# What reading may take beside three times the file: `docs/models.md`.
+FIXED_BYTES = 32 << 20
+
+
+def read_apart(*paths: Path) -> list[dict[str, Any]]:
+    """What a process of its own says of each file; it may take a minute for all."""
+    done = subprocess.run(
+        [sys.executable, str(READER), str(DEFAULT_WEIGHTS), *map(str, paths)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:] or done.stdout[-2000:]
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def small_pt(folder: Path) -> Path:
+    path = folder / "small.pt"
+    torch.manual_seed(0)
+    save_checkpoint(path, build(yolov8_description((0.1, 0.01, 64), ("car", "dog"))).eval(), metadata={})
+    return path
+
+
+def members_of(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as file:
+        return {name: file.read(name) for name in file.namelist()}
+
+
+def mutated(data: bytes, dice: random.Random) -> bytes:
+    """A few bytes flipped, cut out, doubled, or put in."""
+    changed = bytearray(data)
+    for _ in range(dice.randint(1, 4)):
+        at = dice.randrange(len(changed))
+        match dice.randrange(5):
+            case 0:
+                changed[at] ^= 1 << dice.randrange(8)
+            case 1:
+                del changed[at : at + dice.randint(1, 9)]
+            case 2:
+                changed[at:at] = changed[at : at + dice.randint(1, 30)]
+            case 3:
+                changed[at:at] = dice.choice([b"R", b"b", b"\x81", b"h\x00", b"\x85", b"]", b"a", b"0", b"u"])
+            case _:
+                other = dice.randrange(len(changed))
+                changed[at : at + 8] = changed[other : other + 8]
+    return bytes(changed)
+
+
+def assert_harmless(path: Path, said: dict[str, Any]) -> None:
+    assert said["outcome"].startswith(("loaded ", "CheckpointError: ", "UnsafeCheckpointError: ")), said
+    assert said["outcome"].isprintable()
+    limit = 3 * sum(each.stat().st_size for each in path.parent.glob(f"{path.stem}.*")) + FIXED_BYTES
+    assert said["bytes"] <= limit, (path.name, said)
+
+
+def test_mutations_are_read_or_refused_by_name(tmp_path: Path) -> None:
+    ours = small_pt(tmp_path)
+    paths = [
+        *mutated_pickles(ours, tmp_path, 24),
+        *mutated_bytes(ours.read_bytes(), tmp_path, 24),
+        *mutated_pairs(ours, tmp_path, 24),
+    ]
+    for path, said in zip(paths, read_apart(*paths), strict=True):
+        assert_harmless(path, said)
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason=f"{REAL} is not here; set COMPANION_TEST_DATA")
+def test_a_real_checkpoint_and_mutations_of_it_take_less_than_three_times_its_size(tmp_path: Path) -> None:
+    paths = [REAL, *mutated_pickles(REAL, tmp_path, 8)]
+    real, *mutations = read_apart(*paths)
+    assert real["outcome"] == "loaded 80 classes"
+    assert real["bytes"] < 3 * REAL.stat().st_size
+    for path, said in zip(paths[1:], mutations, strict=True):
+        assert_harmless(path, said)
+
+
+def mutated_pickles(source: Path, folder: Path, count: int) -> list[Path]:
+    """The archive is whole, what it says is not."""
+    original = members_of(source)
+    name = next(name for name in original if name.endswith("data.pkl"))
+    return [
+        archive(folder / f"m{seed}.pt", original | {name: mutated(original[name], random.Random(seed))})
+        for seed in range(count)
+    ]
+
+
+def mutated_bytes(data: bytes, folder: Path, count: int) -> list[Path]:
+    """Cut off somewhere, or changed anywhere."""
+    paths = []
+    for seed in range(count):
+        dice = random.Random(seed)
+        paths.append(folder / f"b{seed}.pt")
+        paths[-1].write_bytes(mutated(data, dice) if seed % 3 else data[: dice.randrange(len(data))])
+    return paths
+
+
+def mutated_pairs(source: Path, folder: Path, count: int) -> list[Path]:
+    """The header of one file or the text of the other changed."""
+    save_checkpoint(folder / "o.safetensors", load_checkpoint(source).model, metadata={"a": [1]})
+    weights = (folder / "o.safetensors").read_bytes()
+    table = yaml.safe_load((folder / "o.yaml").read_bytes())
+    del table["weights"]  # Without the checksum, so that a damaged header is read at all.
+    said = yaml.safe_dump(table).encode()
+    length = int.from_bytes(weights[:8], "little") + 8
+    paths = []
+    for seed in range(count):
+        dice, path = random.Random(seed), folder / f"p{seed}.safetensors"
+        head = mutated(weights[:length], dice) if seed % 2 else weights[:length]
+        path.write_bytes(head + weights[length:])
+        path.with_suffix(".yaml").write_bytes(said if seed % 2 else mutated(said, dice))
+        paths.append(path)
+    return paths
+
+
+OPCODES = st.sampled_from(
+    [bytes([code]) for code in b"(N\x88\x89)t\x85\x86\x87]ae}suRb\x81Q"]
+    + [
+        b"K\x01",
+        b"K\xff",
+        b"M\xff\xff",
+        b"J\x00\x00\x00\x80",
+        b"\x8a\x02\xff\x7f",
+        b"G" + struct.pack(">d", 1.5),
+    ]
+    + [b"X\x01\x00\x00\x00a", b"q\x00", b"h\x00", b"q\x01", b"h\x01"]
+    + [b"X" + len(text).to_bytes(4, "little") + text for text in (b"model", b"format", b"storage", b"0")]
+    + [
+        b"c" + name.replace(".", "\n").encode() + b"\n"
+        for name in ("collections.OrderedDict", "torch.FloatStorage", "torch.Size", "builtins.set")
+    ]
+    + [b"ctorch._utils\n_rebuild_tensor_v2\n", b"cultralytics.nn.tasks\nDetectionModel\n", b"cos\nsystem\n"]
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(OPCODES, max_size=40))
+def test_any_program_of_the_pickle_machine_ends_in_a_model_or_a_named_error(
+    tmp_path: Path, program: list[bytes]
+) -> None:
+    pickled = b"\x80\x02" + b"".join(program) + b"."
+    path = archive(tmp_path / "a.pt", {"m/data.pkl": pickled, "m/data/0": bytes(16)})
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(path)
+    assert str(caught.value).isprintable()
+
+
+def test_every_bomb_is_refused_by_name_without_growing(tmp_path: Path) -> None:
+    paths = []
+    for index, (make, _) in enumerate(BOMBS.values()):
+        (folder := tmp_path / f"{index}").mkdir()
+        paths.append(make(folder / "bomb.pt"))
+    for (name, (_, says)), path, said in zip(BOMBS.items(), paths, read_apart(*paths), strict=True):
+        assert_harmless(path, said)
+        assert re.search(says, said["outcome"]), (name, said)

@@ -1,0 +1,1 @@
+"""Judging a detector on labelled photographs: data sets read, misses shown."""

@@ -1,0 +1,40 @@
+"""Where models are kept on this machine: one folder, in which a model is found by its bare name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# What counts as a model in the folder, in the order in which a bare name is looked for.
+MODEL_SUFFIXES = (".safetensors", ".pt")
+
+
+def models_folder() -> Path:
+    """`$COMPANION_MODELS_FOLDER`, else `mavlink-companion/models` in the user's data folder (XDG)."""
+    if chosen := os.environ.get("COMPANION_MODELS_FOLDER"):
+        return Path(chosen).expanduser()
+    data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+    return Path(data).expanduser() / "mavlink-companion" / "models"
+
+
+def kept_models(folder: Path | None = None) -> list[Path]:
+    """The model files in the folder, by name; none if there is no folder."""
+    folder = models_folder() if folder is None else folder
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix in MODEL_SUFFIXES and path.is_file())
+
+
+def find_model(name: str | Path) -> Path:
+    """The file that `name` means: a path that exists, else `NAME` or `NAME.pt` in the models folder.
+
+    What is in neither place comes back as it is, for the reader to name in its error.
+    """
+    path = Path(name).expanduser()
+    if path.exists() or path.name != str(name):
+        return path
+    kept = models_folder() / path.name
+    for candidate in (kept, *(kept.with_name(kept.name + suffix) for suffix in MODEL_SUFFIXES)):
+        if candidate.is_file():
+            return candidate
+    return path

@@ -1,0 +1,1 @@
+"""What computes the network: torch, ONNX Runtime, OpenVINO or TensorRT behind one small contract."""

@@ -1,0 +1,211 @@
+"""A checkpoint written as what another runtime reads, with its facts inside, checked before it is kept."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, required
+from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
+from vision.runtimes.network import Network
+from vision.yolo.checkpoint import load_checkpoint
+
+logger = logging.getLogger(__name__)
+
+# The lowest with everything that these networks need, for the oldest readers.
+_OPSET = 17
+# Maps of the exported file may differ from torch's by this much, in logits; accumulated rounding is far less.
+_TOLERANCE = 0.02
+_READER: dict[ExportKind, RuntimeName] = {
+    "onnx": "onnxruntime",
+    "openvino": "openvino",
+    "tensorrt": "tensorrt",
+    "torchscript": "torch",
+}
+
+
+def export(
+    model_path: Path,
+    to: ExportKind,
+    output: Path | None = None,
+    image_size: int = 640,
+    *,
+    generation: str = "",
+) -> Path:
+    """Write a checkpoint's network for another runtime.
+
+    The file takes (1, H, W, 3) uint8 BGR, H and W any multiples of the largest stride, and gives for each
+    level (stride S) `sides_S` and `classes_S`, see `LevelMaps`. It carries its `ExportedFacts`.
+
+    Args:
+        output: where to; None: beside the checkpoint, with the kind's own ending (`SUFFIXES`).
+        image_size: what it is tuned for and checked at; of a TensorRT plan the largest side.
+        generation: of the network, to be told on.
+
+    Raises:
+        CheckpointError: the checkpoint cannot be read.
+        RuntimeMissingError: the runtime that the file is for is not installed.
+        RuntimeUnusableError: the network cannot be exported, or the file's maps are not the network's.
+    """
+    if to not in SUFFIXES:
+        raise RuntimeUnusableError(f"can export to {', '.join(SUFFIXES)}, not to {to!r:.50}")
+    required(_READER[to])
+    loaded = load_checkpoint(model_path)
+    model = loaded.model
+    facts = ExportedFacts(
+        class_names=loaded.class_names,
+        strides=tuple(model.strides),
+        reg_max=model.reg_max,
+        end_to_end=model.end_to_end,
+        image_size=image_size,
+        source_sha256=file_sha256(model_path),
+        generation=generation,
+        metadata=loaded.metadata,
+    )
+    if image_size < 2 * max(facts.strides) or image_size % max(facts.strides):
+        raise RuntimeUnusableError(f"image_size must be a multiple of {max(facts.strides)}, got {image_size}")
+    path = model_path.with_suffix(SUFFIXES[to]) if output is None else output
+    if path.suffix != SUFFIXES[to]:
+        raise RuntimeUnusableError(f"{path}: a file for {to} must end in {SUFFIXES[to]}")
+    return export_network(Network(model), facts, to, path)
+
+
+def export_network(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -> Path:
+    """Write a network that is ready. The file appears whole or not at all (OpenVINO's `.xml` last)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        partial = Path(folder) / path.name
+        if to == "onnx":
+            _write_onnx(network, facts, partial)
+        elif to == "openvino":
+            _write_openvino(network, facts, partial)
+        elif to == "torchscript":
+            _write_torchscript(network, facts, partial)
+        else:
+            _write_tensorrt(network, facts, partial)
+        _check(network, facts, to, partial)
+        for made in sorted(Path(folder).iterdir(), key=lambda made: made.name == path.name):
+            os.replace(made, path.with_name(made.name))
+    logger.info("%s: written for %s", path, to)
+    return path
+
+
+def file_sha256(path: Path) -> str:
+    """Of a file's bytes, as hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _example(side: int, *, height: int | None = None, seed: int = 0) -> torch.Tensor:
+    """A smooth random picture: (1, H, W, 3) uint8, so that every layer has something to see."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand((1, 3, 8, 8), generator=generator)
+    shape = (side if height is None else height, side)
+    fine = torch.nn.functional.interpolate(coarse, shape, mode="bilinear")
+    return (fine * 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Exporters warn of what is theirs to know: their deprecations, and sizes seen by the tracer."""
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
+    onnx = required("onnxruntime", also="onnx") and __import__("onnx")
+    with _quietly():
+        torch.onnx.export(
+            network,
+            (_example(facts.image_size),),
+            str(path),
+            input_names=[INPUT],
+            output_names=network.names,
+            dynamic_axes={INPUT: {1: "height", 2: "width"}}
+            | {name: {2: f"{name}_height", 3: f"{name}_width"} for name in network.names},
+            opset_version=_OPSET,
+            # The tracing exporter: the other one needs one more package.
+            dynamo=False,
+        )
+    made = onnx.load(str(path))
+    entry = made.metadata_props.add()
+    entry.key, entry.value = KEY, facts.to_json()
+    onnx.save(made, str(path))
+
+
+def _write_openvino(network: Network, facts: ExportedFacts, path: Path) -> None:
+    openvino = required("openvino")
+    with _quietly():
+        any_size = openvino.PartialShape([1, -1, -1, 3])
+        example = (_example(facts.image_size),)
+        made = openvino.convert_model(network, example_input=example, input=[any_size])
+    made.inputs[0].get_tensor().set_names({INPUT})
+    for output, name in zip(made.outputs, network.names, strict=True):
+        output.get_tensor().set_names({name})
+    made.set_rt_info(facts.to_json(), [KEY])
+    openvino.save_model(made, str(path), compress_to_fp16=False)
+
+
+def _write_torchscript(network: Network, facts: ExportedFacts, path: Path) -> None:
+    with _quietly():
+        trace: Any = torch.jit.trace
+        traced = trace(network, _example(facts.image_size), check_trace=False)
+        torch.jit.save(traced, str(path), _extra_files={KEY: facts.to_json()})
+
+
+def _write_tensorrt(network: Network, facts: ExportedFacts, path: Path) -> None:
+    from vision.runtimes.tensorrt_build import build_plan
+
+    onnx_path = path.with_suffix(".onnx")
+    _write_onnx(network, facts, onnx_path)
+    plan = build_plan(onnx_path, largest_side=facts.image_size, stride=max(facts.strides))
+    path.write_bytes(with_facts(facts, plan))
+    onnx_path.unlink()
+
+
+def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -> None:
+    """The file's maps against torch's, on a square and on another input: sizes must have stayed open."""
+    from vision.runtimes.selection import runtime_of_file
+
+    head = network.head
+    runtime = runtime_of_file(_READER[to], path, head, precision="auto" if to == "tensorrt" else "float32")
+    stride = max(facts.strides)
+    square = _example(facts.image_size)
+    other = _example(facts.image_size, height=max(stride, facts.image_size // 2 // stride * stride), seed=1)
+    for picture in (square, other):
+        with torch.inference_mode():
+            expected = [level[0].numpy() for level in network(picture)]
+        found: list[Any] = []
+        try:
+            for level in runtime.infer(picture[0].numpy()):
+                found += [getattr(level, kind) for kind in head.kinds]
+        except (RuntimeError, RuntimeUnusableError) as error:
+            raise _unfaithful(to, picture.shape, str(error)) from error
+        worst = _largest_difference(expected, found)
+        # Half precision rounds every layer; whether boxes agree is for `companion models verify`.
+        if not worst <= (_TOLERANCE if runtime.precision == "float32" else 50 * _TOLERANCE):
+            raise _unfaithful(to, picture.shape, f"they differ by {worst:.3g}")
+
+
+def _largest_difference(expected: Sequence[Any], found: Sequence[Any]) -> float:
+    if [a.shape for a in expected] != [b.shape for b in found]:
+        return float("inf")
+    return max(float(np.abs(a - b).max()) for a, b in zip(expected, found, strict=True))
+
+
+def _unfaithful(to: str, shape: Sequence[int], why: str) -> RuntimeUnusableError:
+    return RuntimeUnusableError(
+        f"the network cannot be exported to {to}: for a picture of {shape[2]}x{shape[1]} the file's maps are "
+        f"not the network's ({' '.join(why.split())[:300]})"
+    )

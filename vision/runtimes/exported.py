@@ -1,0 +1,128 @@
+"""What an exported file tells of itself, so that it can be loaded alone.
+
+The facts travel inside the file: ONNX metadata, OpenVINO's `rt_info`, TorchScript's extra files, and before
+a TensorRT plan, which has no room of its own, as `MAGIC`, their length (little-endian uint32) and the facts.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from vision.runtimes.contract import RuntimeUnusableError
+from vision.yolo.maps import Head
+
+FORMAT = "mavlink-companion.network.v1"
+KEY = "mavlink_companion"
+MAGIC = b"MCNETWRK"
+INPUT = "image_bgr"
+_LONGEST_FACTS = 16 << 20
+
+ExportKind = Literal["onnx", "openvino", "tensorrt", "torchscript"]
+SUFFIXES: dict[ExportKind, str] = {
+    "onnx": ".onnx",
+    "openvino": ".xml",
+    "tensorrt": ".engine",
+    "torchscript": ".torchscript",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedFacts:
+    """Of one exported network.
+
+    Attributes:
+        class_names: id → name.
+        strides, reg_max, end_to_end: how its maps are read, see `Head`.
+        image_size: pixels that it was made for; it takes others too, unless `fixed_size` names the one.
+        fixed_size: (height, width) of the only input it takes; None: any multiples of the largest stride.
+        generation: of the network, as the exporter was told; may be empty.
+        source_sha256: of the file that it was made from.
+        metadata: the source's own: licence, origin, score.
+    """
+
+    class_names: tuple[str, ...]
+    strides: tuple[int, ...]
+    reg_max: int
+    end_to_end: bool
+    image_size: int
+    source_sha256: str
+    fixed_size: tuple[int, int] | None = None
+    generation: str = ""
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def head(self) -> Head:
+        classes = len(self.class_names)
+        return Head(self.strides, self.reg_max, self.end_to_end, classes, tuple(range(classes)))
+
+    def to_json(self) -> str:
+        return json.dumps({"format": FORMAT, **asdict(self)}, ensure_ascii=True)
+
+    @classmethod
+    def from_json(cls, text: str, path: Path) -> ExportedFacts:
+        """Raises `RuntimeUnusableError` for anything but what `to_json` writes."""
+        try:
+            plain = json.loads(text)
+            if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT:
+                raise ValueError(f"its format is not {FORMAT}")
+            facts = cls(**plain)
+            names, strides = tuple(facts.class_names), tuple(facts.strides)
+            fixed = None if facts.fixed_size is None else tuple(facts.fixed_size)
+            whole = (*strides, facts.reg_max, facts.image_size, *(fixed or ()))
+            if not names or not strides or not all(isinstance(name, str) for name in names):
+                raise ValueError("it names no classes or no strides")
+            if not all(type(number) is int and number > 0 for number in whole) or len(fixed or (1, 1)) != 2:
+                raise ValueError("its strides, bins and sizes must be whole numbers above 0")
+            if not isinstance(facts.metadata, dict) or not isinstance(facts.end_to_end, bool):
+                raise ValueError("its metadata is no table")
+        except (ValueError, TypeError, RecursionError) as error:
+            raise RuntimeUnusableError(
+                f"{path}: its description of itself cannot be used ({error!s:.200}); "
+                "make it again with `companion models export`"
+            ) from None
+        return cls(
+            names,
+            strides,
+            facts.reg_max,
+            facts.end_to_end,
+            facts.image_size,
+            str(facts.source_sha256),
+            None if fixed is None else (fixed[0], fixed[1]),
+            str(facts.generation),
+            facts.metadata,
+        )
+
+
+def not_ours(path: Path) -> RuntimeUnusableError:
+    """For a file that carries no facts."""
+    return RuntimeUnusableError(
+        f"{path}: does not say what it is (no {KEY} metadata); "
+        "make it from the checkpoint with `companion models export`"
+    )
+
+
+def kind_of(path: Path) -> ExportKind | None:
+    """By the name's ending; None for a checkpoint."""
+    return next((kind for kind, suffix in SUFFIXES.items() if path.suffix == suffix), None)
+
+
+def with_facts(facts: ExportedFacts, plan: bytes) -> bytes:
+    """A TensorRT plan with its facts before it."""
+    text = facts.to_json().encode()
+    return MAGIC + struct.pack("<I", len(text)) + text + plan
+
+
+def split_facts(content: bytes, path: Path) -> tuple[ExportedFacts, memoryview]:
+    """The reverse of `with_facts`; the plan is not copied."""
+    view = memoryview(content)
+    start = len(MAGIC) + 4
+    if len(content) < start or view[: len(MAGIC)] != MAGIC:
+        raise not_ours(path)
+    (length,) = struct.unpack("<I", view[len(MAGIC) : start])
+    if length > min(_LONGEST_FACTS, len(content) - start):
+        raise RuntimeUnusableError(f"{path}: is cut short; make it again with `companion models export`")
+    text = bytes(view[start : start + length]).decode(errors="replace")
+    return ExportedFacts.from_json(text, path), view[start + length :]

@@ -1,0 +1,106 @@
+"""ONNX Runtime: on the processor, or on an NVIDIA GPU where its package is built for one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, required
+from vision.runtimes.exported import INPUT, KEY, ExportedFacts, not_ours
+from vision.yolo.maps import Head, LevelMaps, Product
+
+# As ONNX Runtime names them. A provider that is there is wanted: its package was chosen for it.
+_PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
+_ERRORS_ONLY = 3
+
+
+class OnnxRuntime:
+    """An ONNX file that `export` made. See `contract.Runtime`.
+
+    Args:
+        path: the file.
+        head: how its maps are read; None: as the file says.
+        precision: `float32`, what the file is in.
+        threads: of the processor; None: as many as ONNX Runtime takes.
+    """
+
+    product: Product = staticmethod(np.matmul)
+    name: RuntimeName = "onnxruntime"
+
+    def __init__(
+        self,
+        path: Path,
+        head: Head | None = None,
+        *,
+        precision: Precision = "auto",
+        threads: int | None = None,
+    ) -> None:
+        if precision not in ("auto", "float32"):
+            raise RuntimeUnusableError(
+                f"onnxruntime computes in float32, what its files are in; not {precision}"
+            )
+        onnxruntime = required("onnxruntime")
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = _ERRORS_ONLY
+        if threads is not None:
+            options.intra_op_num_threads = threads
+        available = onnxruntime.get_available_providers()
+        providers = [provider for provider in _PROVIDERS if provider in available]
+        self._session = _session(onnxruntime, path, options, providers)
+        started = self._session.get_providers()
+        if started[:1] != providers[:1]:
+            raise RuntimeUnusableError(
+                f"onnxruntime cannot start {providers[0]}, which its package is built for; "
+                f"started {started}. Its GPU libraries are missing, or install the package for processors"
+            )
+        self.head = head if head is not None else onnx_facts(path, self._session).head()
+        self.precision, self.precision_reason = "float32", f"what the file is in ({started[0]})"
+        self._threads = threads
+
+    @property
+    def threads(self) -> int:
+        return self._threads or processors()
+
+    def prepare(self, height: int, width: int) -> None:
+        self.infer(np.zeros((height, width, 3), np.uint8))
+
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+        maps = [level[0] for level in self._session.run(None, {INPUT: image_bgr[None]})]
+        return self.head.levels(maps)
+
+
+def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:
+    """What an ONNX file of ours tells of itself."""
+    if session is None:
+        onnxruntime = required("onnxruntime")
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = _ERRORS_ONLY
+        # Only to be read: nothing is optimised.
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        session = _session(onnxruntime, path, options, ["CPUExecutionProvider"])
+    text = session.get_modelmeta().custom_metadata_map.get(KEY)
+    if text is None:
+        raise not_ours(path)
+    return ExportedFacts.from_json(text, path)
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    import os
+
+    return len(os.sched_getaffinity(0))
+
+
+def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -> Any:
+    if not path.is_file():
+        raise RuntimeUnusableError(f"{path}: no such file")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=providers)
+    # Its errors have no common class of their own but Exception.
+    except Exception as error:
+        raise RuntimeUnusableError(
+            f"{path}: onnxruntime cannot load it: {' '.join(str(error).split())}"
+        ) from error

@@ -1,0 +1,124 @@
+"""OpenVINO, on the processor: Intel's and AMD's, and ARM's."""
+
+from __future__ import annotations
+
+import collections
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.runtimes import contract
+from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, required
+from vision.runtimes.exported import KEY, ExportedFacts, not_ours
+from vision.yolo.maps import Head, LevelMaps, Product
+
+_HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
+_MOST_SIZES = 2
+
+
+class OpenVinoRuntime:
+    """An OpenVINO or ONNX file that `export` made. See `contract.Runtime`.
+
+    The network is compiled for each size of input, which makes it faster than leaving the size open.
+
+    Args:
+        path: the `.xml` (its `.bin` beside it) or `.onnx`.
+        head: how its maps are read; None: as the file says.
+        precision: `auto`: bfloat16 where the processor computes in it, else float32.
+        threads: of the processor; None: as many as OpenVINO takes.
+    """
+
+    product: Product = staticmethod(np.matmul)
+    name: RuntimeName = "openvino"
+
+    def __init__(
+        self,
+        path: Path,
+        head: Head | None = None,
+        *,
+        precision: Precision = "auto",
+        threads: int | None = None,
+    ) -> None:
+        self._openvino = required("openvino")
+        self._core = self._openvino.Core()
+        self._model = _read(self._core, path)
+        self.head = head if head is not None else openvino_facts(path, self._model).head()
+        native = contract.bfloat16_instructions()
+        if precision == "auto":
+            self.precision = "bfloat16" if native else "float32"
+            self.precision_reason = (
+                f"the processor computes in it ({native})"
+                if native
+                else "this processor does not compute in bfloat16"
+            )
+        else:
+            self.precision, self.precision_reason = precision, "as asked"
+        self._settings: dict[str, Any] = {
+            "PERFORMANCE_HINT": "LATENCY",
+            "INFERENCE_PRECISION_HINT": _HINTS[self.precision],
+        }
+        if threads is not None:
+            self._settings["INFERENCE_NUM_THREADS"] = threads
+        self._threads = threads
+        self._requests: collections.OrderedDict[tuple[int, int], Any] = collections.OrderedDict()
+
+    @property
+    def threads(self) -> int:
+        """As compiled; before the first inference as asked, 0 for unknown."""
+        return self._threads or 0
+
+    def prepare(self, height: int, width: int) -> None:
+        self.infer(np.zeros((height, width, 3), np.uint8))
+
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+        size = (image_bgr.shape[0], image_bgr.shape[1])
+        request = self._requests.get(size) or self._compiled(size)
+        # Both ways without a copy: the tensor is the picture, the maps are the request's own memory.
+        request.set_input_tensor(self._openvino.Tensor(image_bgr[None], shared_memory=True))
+        request.infer()
+        maps = [request.get_output_tensor(index).data[0] for index in range(len(self._model.outputs))]
+        return self.head.levels(maps)
+
+    def _compiled(self, size: tuple[int, int]) -> Any:
+        try:
+            sized = self._model.clone()
+            sized.reshape([1, *size, 3])
+            compiled = self._core.compile_model(sized, "CPU", self._settings)
+        except RuntimeError as error:
+            raise RuntimeUnusableError(
+                f"openvino cannot compile the network for {size[1]}x{size[0]}: {' '.join(str(error).split())}"
+            ) from error
+        used = str(compiled.get_property("INFERENCE_PRECISION_HINT"))
+        if _HINTS[self.precision] not in used.replace("float", "f"):
+            raise RuntimeUnusableError(
+                f"openvino computes in {used} on this processor, not in {self.precision}"
+            )
+        self._threads = int(compiled.get_property("INFERENCE_NUM_THREADS")) or self._threads
+        request = self._requests[size] = compiled.create_infer_request()
+        if len(self._requests) > _MOST_SIZES:
+            self._requests.popitem(last=False)
+        return request
+
+
+def openvino_facts(path: Path, model: Any = None) -> ExportedFacts:
+    """What an OpenVINO or ONNX file of ours tells of itself."""
+    if model is None:
+        model = _read(required("openvino").Core(), path)
+    # An ONNX file's metadata is found among the frontend's.
+    for place in ([KEY], ["framework", KEY]):
+        if model.has_rt_info(place):
+            return ExportedFacts.from_json(str(model.get_rt_info(place).value), path)
+    raise not_ours(path)
+
+
+def _read(core: Any, path: Path) -> Any:
+    if not path.is_file():
+        raise RuntimeUnusableError(f"{path}: no such file")
+    try:
+        return core.read_model(str(path))
+    except RuntimeError as error:
+        raise RuntimeUnusableError(
+            f"{path}: openvino cannot load it: {' '.join(str(error).split())}"
+        ) from error

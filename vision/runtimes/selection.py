@@ -1,0 +1,194 @@
+"""Which runtime runs a model: the one named, or with `auto` the fastest installed one on this board."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from vision.runtimes.contract import (
+    RUNTIMES,
+    Precision,
+    Runtime,
+    RuntimeName,
+    RuntimeUnusableError,
+    installed,
+    required,
+    version,
+)
+from vision.runtimes.export import export_network, file_sha256
+from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
+from vision.runtimes.network import Network
+from vision.runtimes.source import ModelSource, cannot_run
+from vision.runtimes.torch_runtime import TorchRuntime
+from vision.yolo.maps import Head
+
+logger = logging.getLogger(__name__)
+
+RuntimeChoice = Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"]
+# What each runtime reads best of what can be exported.
+_EXPORTS: dict[RuntimeName, ExportKind] = {
+    "onnxruntime": "onnx",
+    "openvino": "openvino",
+    "tensorrt": "tensorrt",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A runtime that runs.
+
+    Attributes:
+        reason: why this one, in words.
+    """
+
+    runtime: Runtime
+    reason: str
+
+
+def start_runtime(
+    source: ModelSource,
+    choice: RuntimeChoice,
+    *,
+    class_ids: Sequence[int] | None = None,
+    precision: Precision = "auto",
+    threads: int | None = None,
+    image_size: int = 640,
+    sparse_boxes: bool = False,
+) -> Started:
+    """Make a model ready on the runtime that was asked for.
+
+    Args:
+        class_ids: sorted; a checkpoint's network computes these alone. Of an exported file's classes they
+            are picked afterwards.
+        sparse_boxes: compute a checkpoint's boxes only where something is; for confidences that few cells
+            reach. An exported file computes all.
+
+    Raises:
+        RuntimeMissingError: the named runtime is not installed. Nothing else is taken in its place.
+        RuntimeUnusableError: it cannot run this file, or not in this precision.
+    """
+    if choice != "auto" and choice not in RUNTIMES:
+        raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
+    if choice != "auto":
+        runtime = _start(source, choice, class_ids, precision, threads, image_size, sparse_boxes)
+        return Started(runtime, "as asked")
+    from vision.runtimes.trial import fastest_runtime
+
+    candidates = [name for name in source.runners() if installed(name)]
+    if not candidates:
+        raise cannot_run(source, "auto")  # type: ignore[arg-type]
+    if len(candidates) == 1:
+        name, reason = candidates[0], "no other that runs this model is installed"
+    else:
+        name, reason = fastest_runtime(
+            source,
+            candidates,
+            class_ids=class_ids,
+            precision=precision,
+            threads=threads,
+            image_size=image_size,
+        )
+    return Started(_start(source, name, class_ids, precision, threads, image_size, sparse_boxes), reason)
+
+
+def runtime_of_file(
+    name: RuntimeName,
+    path: Path,
+    head: Head | None = None,
+    *,
+    precision: Precision = "auto",
+    threads: int | None = None,
+) -> Runtime:
+    """A runtime on an exported file. `head` None: as the file itself says."""
+    if name == "torch":
+        from vision.runtimes.torchscript_runtime import TorchScriptRuntime
+
+        return TorchScriptRuntime(path, head, precision=precision, threads=threads)
+    if name == "onnxruntime":
+        from vision.runtimes.onnx_runtime import OnnxRuntime
+
+        return OnnxRuntime(path, head, precision=precision, threads=threads)
+    if name == "openvino":
+        from vision.runtimes.openvino_runtime import OpenVinoRuntime
+
+        return OpenVinoRuntime(path, head, precision=precision, threads=threads)
+    from vision.runtimes.tensorrt_runtime import TensorRtRuntime
+
+    return TensorRtRuntime(path, head, precision=precision, threads=threads)
+
+
+def cache_folder() -> Path:
+    """Where converted networks and measured choices are kept: `$XDG_CACHE_HOME` or `~/.cache`."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"
+    return root / "mavlink-companion" / "runtimes"
+
+
+def _start(
+    source: ModelSource,
+    name: RuntimeName,
+    class_ids: Sequence[int] | None,
+    precision: Precision,
+    threads: int | None,
+    image_size: int,
+    sparse_boxes: bool,
+) -> Runtime:
+    if name not in source.runners():
+        raise cannot_run(source, name)
+    if name != "torch":
+        required(name)
+    if source.kind is not None:
+        return runtime_of_file(name, source.path, precision=precision, threads=threads)
+    if name == "torch":
+        return TorchRuntime(
+            source.take_model(),
+            class_ids=class_ids,
+            precision=precision,
+            threads=threads,
+            sparse_boxes=sparse_boxes,
+        )
+    network = Network(source.take_model(), class_ids, sparse_boxes=sparse_boxes)
+    path = _converted(source, network, name, image_size)
+    return runtime_of_file(name, path, network.head, precision=precision, threads=threads)
+
+
+def _converted(source: ModelSource, network: Network, name: RuntimeName, image_size: int) -> Path:
+    """The checkpoint's network as a file for another runtime, made once and kept."""
+    assert source.description is not None
+    kind = _EXPORTS[name]
+    head = network.head
+    digest = file_sha256(source.path)
+    # A plan is made for a largest side; the others leave the size open.
+    side = image_size if kind == "tensorrt" else 640
+    plain = source.description.to_plain()
+    made_of = [FORMAT, digest, plain, head.class_ids, head.kinds, side]
+    key = json.dumps([*made_of, torch.__version__, version(name)])
+    stem = f"{source.path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
+    path = cache_folder() / f"{stem}{SUFFIXES[kind]}"
+    if not path.is_file():
+        logger.info("converting %s for %s, once; kept at %s", source.path.name, name, path)
+        facts = ExportedFacts(
+            tuple(source.class_names[index] for index in head.class_ids),
+            head.strides,
+            head.reg_max,
+            head.end_to_end,
+            max(side, 2 * max(head.strides)),
+            digest,
+            metadata=source.metadata,
+        )
+        try:
+            export_network(network, facts, kind, path)
+        except OSError as error:
+            raise RuntimeUnusableError(
+                f"{path}: the converted network cannot be written ({error.strerror}); "
+                "set XDG_CACHE_HOME to a folder that can"
+            ) from error
+    return path

@@ -1,0 +1,111 @@
+"""A model file, whatever its kind, and what it tells before any runtime is chosen."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, installed
+from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
+from vision.yolo.architecture import YoloModel
+from vision.yolo.checkpoint import load_checkpoint
+from vision.yolo.description import ModelDescription
+
+logger = logging.getLogger(__name__)
+
+# Who runs what. A checkpoint everybody does, by way of an export.
+_RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {
+    "onnx": ("onnxruntime", "openvino"),
+    "openvino": ("openvino",),
+    "tensorrt": ("tensorrt",),
+    "torchscript": ("torch",),
+}
+
+
+@dataclass(slots=True)
+class ModelSource:
+    """What was read of a model file.
+
+    Attributes:
+        path: the file.
+        kind: of an exported file; None for a checkpoint.
+        class_names: id → name.
+        metadata: what the file tells about itself: licence, origin, score.
+        strides: one a level, pixels.
+        description: what a checkpoint's network is built from.
+        facts: what an exported file tells.
+    """
+
+    path: Path
+    kind: ExportKind | None
+    class_names: tuple[str, ...]
+    metadata: dict[str, Any]
+    strides: tuple[int, ...]
+    description: ModelDescription | None
+    facts: ExportedFacts | None
+    _model: YoloModel | None = None
+
+    def take_model(self) -> YoloModel:
+        """The checkpoint's network, for the caller to change; read again if it was given away before."""
+        model, self._model = self._model, None
+        return load_checkpoint(self.path).model if model is None else model
+
+    def runners(self) -> tuple[RuntimeName, ...]:
+        """The runtimes that can run this kind of file."""
+        return ("torch", "onnxruntime", "openvino", "tensorrt") if self.kind is None else _RUNNERS[self.kind]
+
+
+def read_source(path: Path) -> ModelSource:
+    """Read a checkpoint, or the facts of an exported file.
+
+    Raises:
+        CheckpointError: a checkpoint that cannot be read.
+        RuntimeMissingError: an exported file, and nothing that reads it is installed.
+        RuntimeUnusableError: an exported file that is damaged or does not say what it is.
+    """
+    kind = kind_of(path)
+    if kind is None:
+        loaded = load_checkpoint(path)
+        return ModelSource(
+            path,
+            None,
+            loaded.class_names,
+            loaded.metadata,
+            tuple(loaded.model.strides),
+            loaded.description,
+            None,
+            loaded.model,
+        )
+    if not path.is_file():
+        raise RuntimeUnusableError(f"{path}: no such file")
+    facts = _facts(path, kind)
+    return ModelSource(path, kind, facts.class_names, facts.metadata, facts.strides, None, facts)
+
+
+def _facts(path: Path, kind: ExportKind) -> ExportedFacts:
+    if kind == "torchscript":
+        from vision.runtimes.torchscript_runtime import torchscript_facts
+
+        return torchscript_facts(path)
+    if kind == "tensorrt":
+        from vision.runtimes.tensorrt_runtime import tensorrt_facts
+
+        return tensorrt_facts(path)
+    if kind == "onnx" and installed("onnxruntime"):
+        from vision.runtimes.onnx_runtime import onnx_facts
+
+        return onnx_facts(path)
+    from vision.runtimes.openvino_runtime import openvino_facts
+
+    return openvino_facts(path)
+
+
+def cannot_run(source: ModelSource, runtime: RuntimeName) -> RuntimeUnusableError:
+    """For a runtime that was asked for by name and does not take this kind of file."""
+    assert source.kind is not None
+    return RuntimeUnusableError(
+        f"{source.path}: {runtime} does not run {SUFFIXES[source.kind]} files; "
+        f"ask for the runtime {' or '.join(source.runners())}, or auto, or give the checkpoint"
+    )

@@ -1,0 +1,164 @@
+"""TensorRT, on an NVIDIA GPU (TensorRT 10's API; the CUDA runtime through NVIDIA's `cuda-python`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.runtimes.contract import (
+    Precision,
+    RuntimeMissingError,
+    RuntimeName,
+    RuntimeUnusableError,
+    required,
+)
+from vision.runtimes.exported import INPUT, ExportedFacts, split_facts
+from vision.yolo.maps import Head, LevelMaps, Product
+
+_CUDA = "cuda.bindings.runtime"
+
+
+class TensorRtRuntime:
+    """An `.engine` that `export` made, on the first GPU. See `contract.Runtime`.
+
+    Plans are bound to the GPU and the TensorRT version that built them. What a plan computes in was decided
+    when it was built.
+    """
+
+    product: Product = staticmethod(np.matmul)
+    name: RuntimeName = "tensorrt"
+
+    def __init__(
+        self,
+        path: Path,
+        head: Head | None = None,
+        *,
+        precision: Precision = "auto",
+        threads: int | None = None,
+    ) -> None:
+        if precision not in ("auto", "float16"):
+            raise RuntimeUnusableError(f"{path}: a TensorRT plan computes in float16, not in {precision}")
+        tensorrt = required("tensorrt", also=_CUDA)
+        facts, plan = _read(path)
+        self.head = facts.head() if head is None else head
+        self._cuda = _Cuda()
+        # Kept: the engine refers to it.
+        self._runtime = tensorrt.Runtime(tensorrt.Logger(tensorrt.Logger.ERROR))
+        engine = self._runtime.deserialize_cuda_engine(plan)
+        if engine is None:
+            raise RuntimeUnusableError(
+                f"{path}: TensorRT {tensorrt.__version__} cannot load this plan on this GPU; plans are bound "
+                "to both: make it again here with `companion models export`"
+            )
+        self._engine = engine
+        self._context = engine.create_execution_context()
+        names = [engine.get_tensor_name(index) for index in range(engine.num_io_tensors)]
+        kinds = {"sides": 0, "neck": 0, "classes": 1, "features": 2}
+        self._outputs = sorted(
+            (name for name in names if name != INPUT),
+            key=lambda name: (int(name.rpartition("_")[2]), kinds[name.rpartition("_")[0]]),
+        )
+        self._size: tuple[int, int] | None = None
+        self._maps: list[NDArray[np.float32]] = []
+        self._device: list[tuple[int, int]] = []
+        self.precision, self.precision_reason = "float16", "what plans are built in"
+        # One thread waits for the GPU.
+        self.threads = 1
+
+    def prepare(self, height: int, width: int) -> None:
+        for _ in range(2):
+            self.infer(np.zeros((height, width, 3), np.uint8))
+
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+        size = (image_bgr.shape[0], image_bgr.shape[1])
+        if size != self._size:
+            self._allocate(size)
+        picture, *outputs = self._device
+        self._cuda.to_device(picture[0], image_bgr)
+        if not self._context.execute_async_v3(self._cuda.stream):
+            raise RuntimeUnusableError(
+                "TensorRT could not run the network; its log on standard error says why"
+            )
+        for (pointer, _), found in zip(outputs, self._maps, strict=True):
+            self._cuda.to_host(found, pointer)
+        self._cuda.wait()
+        maps = [level[0] for level in self._maps]
+        return self.head.levels(maps)
+
+    def _allocate(self, size: tuple[int, int]) -> None:
+        """Memory on both sides for one size of input."""
+        self._size = None
+        for pointer, _ in self._device:
+            self._cuda.free(pointer)
+        self._device, self._maps = [], []
+        if not self._context.set_input_shape(INPUT, (1, *size, 3)):
+            raise RuntimeUnusableError(
+                f"this TensorRT plan does not take {size[1]}x{size[0]}; export it again with a larger size"
+            )
+        self._bind(INPUT, size[0] * size[1] * 3)
+        for name in self._outputs:
+            shape = tuple(self._context.get_tensor_shape(name))
+            found = np.empty(shape, np.float32)
+            self._maps.append(found)
+            self._bind(name, found.nbytes)
+        self._size = size
+
+    def _bind(self, name: str, size_bytes: int) -> None:
+        pointer = self._cuda.allocate(size_bytes)
+        self._device.append((pointer, size_bytes))
+        self._context.set_tensor_address(name, pointer)
+
+
+class _Cuda:
+    """The few calls of the CUDA runtime that are needed, on one stream; errors raised by name."""
+
+    def __init__(self) -> None:
+        import importlib
+
+        try:
+            self._api: Any = importlib.import_module(_CUDA)
+        except ImportError as error:
+            raise RuntimeMissingError(
+                f"{_CUDA} cannot be loaded ({error}): pip install 'mavlink-companion[tensorrt]'"
+            ) from error
+        (self.stream,) = self._called(self._api.cudaStreamCreate())
+
+    def allocate(self, size_bytes: int) -> int:
+        (pointer,) = self._called(self._api.cudaMalloc(size_bytes))
+        return int(pointer)
+
+    def free(self, pointer: int) -> None:
+        self._called(self._api.cudaFree(pointer))
+
+    def to_device(self, pointer: int, array: NDArray[Any]) -> None:
+        kind = self._api.cudaMemcpyKind.cudaMemcpyHostToDevice
+        self._called(self._api.cudaMemcpyAsync(pointer, array.ctypes.data, array.nbytes, kind, self.stream))
+
+    def to_host(self, array: NDArray[Any], pointer: int) -> None:
+        kind = self._api.cudaMemcpyKind.cudaMemcpyDeviceToHost
+        self._called(self._api.cudaMemcpyAsync(array.ctypes.data, pointer, array.nbytes, kind, self.stream))
+
+    def wait(self) -> None:
+        self._called(self._api.cudaStreamSynchronize(self.stream))
+
+    def _called(self, answer: tuple[Any, ...]) -> tuple[Any, ...]:
+        error, *rest = answer
+        if int(error) != 0:
+            raise RuntimeUnusableError(f"CUDA: {error}")
+        return tuple(rest)
+
+
+def tensorrt_facts(path: Path) -> ExportedFacts:
+    """What a `.engine` of ours tells of itself; needs no TensorRT."""
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[ExportedFacts, memoryview]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RuntimeUnusableError(f"{path}: cannot be read: {error.strerror}") from error
+    return split_facts(content, path)

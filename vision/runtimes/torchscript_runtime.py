@@ -1,0 +1,79 @@
+"""A TorchScript file that `export` made, run by torch on the processor.
+
+A TorchScript file is a program, though one of tensor operations alone. Load those you made or trust.
+"""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError
+from vision.runtimes.exported import KEY, ExportedFacts, not_ours
+from vision.runtimes.torch_runtime import torch_product
+from vision.yolo.maps import Head, LevelMaps, Product
+
+
+class TorchScriptRuntime:
+    """See `contract.Runtime`. Computes in float32, what the file is in."""
+
+    product: Product = staticmethod(torch_product)
+    name: RuntimeName = "torch"
+
+    def __init__(
+        self,
+        path: Path,
+        head: Head | None = None,
+        *,
+        precision: Precision = "auto",
+        threads: int | None = None,
+    ) -> None:
+        if precision not in ("auto", "float32"):
+            raise RuntimeUnusableError(f"{path}: a TorchScript file computes in float32, not in {precision}")
+        if threads is not None:
+            torch.set_num_threads(threads)
+        if not path.is_file():
+            raise RuntimeUnusableError(f"{path}: no such file")
+        try:
+            with warnings.catch_warnings():
+                # torch would have files of this kind made otherwise; those that are there want to be read.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                load: Any = torch.jit.load
+                self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:300]
+            raise RuntimeUnusableError(f"{path}: torch cannot load it: {reason}") from error
+        self.head = head if head is not None else torchscript_facts(path).head()
+        self.precision, self.precision_reason = "float32", "what the file is in"
+
+    @property
+    def threads(self) -> int:
+        return torch.get_num_threads()
+
+    def prepare(self, height: int, width: int) -> None:
+        for _ in range(2):
+            self.infer(np.zeros((height, width, 3), np.uint8))
+
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+        with torch.inference_mode():
+            maps = [level[0].numpy() for level in self._module(torch.from_numpy(image_bgr).unsqueeze(0))]
+        return self.head.levels(maps)
+
+
+def torchscript_facts(path: Path) -> ExportedFacts:
+    """What a TorchScript file of ours tells of itself; nothing of it is run."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            name = next((name for name in archive.namelist() if name.endswith(f"/extra/{KEY}")), None)
+            if name is None:
+                raise not_ours(path)
+            text = archive.read(name).decode(errors="replace")
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise RuntimeUnusableError(f"{path}: is no TorchScript file ({error})") from error
+    return ExportedFacts.from_json(text, path)

@@ -1,0 +1,191 @@
+"""A checkpoint as two plain files: `NAME.safetensors`, the numbers, and `NAME.yaml`, what they are.
+
+The YAML file says `format`, `weights` (file name, size, SHA-256 of the other), `architecture` (class
+names, the rows of the network) and whatever else there is to tell: licence, training, score. Neither can
+hold a program.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from torch import Tensor
+
+from vision.plain_yaml import PlainYamlError, load_plain_yaml
+from vision.yolo.safe_pickle import CheckpointError, one_line
+from vision.yolo.safetensors_file import read_safetensors, write_safetensors
+
+PAIR_FORMAT = "mavlink-companion.yolo.v2"
+WEIGHTS_SUFFIX = ".safetensors"
+DESCRIPTION_SUFFIXES = (".yaml", ".yml")
+_LARGEST_DESCRIPTION_BYTES = 2 << 20
+
+
+def is_pair(path: Path) -> bool:
+    """Whether `path` names one of the two files of a pair."""
+    return path.suffix.lower() in (WEIGHTS_SUFFIX, *DESCRIPTION_SUFFIXES)
+
+
+def pair_paths(path: Path) -> tuple[Path, Path]:
+    """Either file of a pair → (weights, description). Of `.yaml` and `.yml` the one that is there."""
+    if path.suffix.lower() in DESCRIPTION_SUFFIXES:
+        return path.with_suffix(WEIGHTS_SUFFIX), path
+    candidates = [path.with_suffix(suffix) for suffix in DESCRIPTION_SUFFIXES]
+    return path, next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+
+
+def read_pair(path: Path) -> dict[str, Any]:
+    """Both files → `description`, `state_dict`, `metadata`, as the other reader gives them.
+
+    Raises:
+        CheckpointError: a file is missing or damaged, or the two do not belong together. One line.
+    """
+    weights_path, description_path = pair_paths(path)
+    table = _read_description(description_path, weights_path)
+    said = table.pop("weights", {})
+    try:
+        _check_belongs(weights_path, said, description_path)
+        content = read_safetensors(weights_path)
+    except CheckpointError as error:
+        raise CheckpointError(one_line(f"{weights_path}: {error}")) from None
+    architecture = table.pop("architecture", None)
+    if not isinstance(architecture, dict):
+        raise CheckpointError(
+            f"{description_path}: has no `architecture`: expected a table with names, backbone and head"
+        )
+    names = architecture.get("names", table.pop("names", None))
+    if isinstance(names, dict):
+        names = _numbered(names, description_path)
+    return {
+        "description": {**architecture, "names": names},
+        "state_dict": content.tensors,
+        "metadata": {**content.metadata, **table},
+    }
+
+
+def write_pair(
+    path: Path, description: Mapping[str, Any], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+) -> None:
+    """Write `path` (`NAME.safetensors`) and `NAME.yaml`; a reader never sees a half-written file.
+
+    Args:
+        description: a network's own, `ModelDescription.to_plain()`.
+        metadata: plain values; the keys `format`, `weights` and `architecture` are taken.
+    """
+    taken = metadata.keys() & {"format", "weights", "architecture"}
+    if taken:
+        raise ValueError(f"the metadata must not have the key {sorted(taken)[0]!r}")
+    description_path = path.with_suffix(DESCRIPTION_SUFFIXES[0])
+    weights_partial = path.with_name(f"{path.name}.partial")
+    description_partial = description_path.with_name(f"{description_path.name}.partial")
+    write_safetensors(weights_partial, tensors, {})
+    table = {
+        "format": PAIR_FORMAT,
+        "weights": {
+            "file": path.name,
+            "bytes": weights_partial.stat().st_size,
+            "sha256": file_sha256(weights_partial),
+        },
+        **metadata,
+        "architecture": _shown(description),
+    }
+    with description_partial.open("w", encoding="utf-8") as file:
+        file.write("# What is in the file of the same name that ends in .safetensors.\n")
+        # The emitter takes this one character for a line break where it does not escape.
+        readable = "\\x85" not in repr(table)
+        yaml.dump(table, file, Dumper=_Dumper, sort_keys=False, allow_unicode=readable, width=110)
+        file.flush()
+        os.fsync(file.fileno())
+    # Should the power fail between the two, the checksum tells that they do not belong together.
+    os.replace(weights_partial, path)
+    os.replace(description_partial, description_path)
+
+
+def file_sha256(path: Path) -> str:
+    """The file's SHA-256, 64 hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read_description(path: Path, weights_path: Path) -> dict[str, Any]:
+    try:
+        size = path.stat().st_size
+        if size > _LARGEST_DESCRIPTION_BYTES:
+            raise CheckpointError(
+                f"{path}: has {size} bytes, at most {_LARGEST_DESCRIPTION_BYTES} make sense"
+            )
+        table = load_plain_yaml(path.read_bytes().decode("utf-8"))
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{path}: no such file; {weights_path.name} needs it beside it, it says what the weights are"
+        ) from None
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError:
+        raise CheckpointError(f"{path}: is not UTF-8 text") from None
+    except PlainYamlError as error:
+        raise CheckpointError(one_line(f"{path}: {error}")) from None
+    if not isinstance(table, dict):
+        raise CheckpointError(f"{path}: expected a table with `format` and `architecture`")
+    found = table.pop("format", None)
+    if found != PAIR_FORMAT:
+        raise CheckpointError(
+            one_line(f"{path}: has format {found!s:.100}, this version reads {PAIR_FORMAT!r}")
+        )
+    return table
+
+
+def _check_belongs(weights_path: Path, said: Any, description_path: Path) -> None:
+    """What the description says of the weights, where it says anything; by hand one may leave it out."""
+    if not isinstance(said, dict):
+        raise CheckpointError(f"`weights` in {description_path.name} must be a table, or left out")
+    expected = said.get("sha256")
+    if expected is None:
+        return
+    try:
+        found = file_sha256(weights_path)
+    except FileNotFoundError:
+        return  # The reader says it better.
+    except OSError as error:
+        raise CheckpointError(f"cannot be read ({error.strerror or error})") from None
+    if found != expected:
+        raise CheckpointError(
+            f"has the SHA-256 {found}, {description_path.name} was written for {expected!s:.100}; "
+            "the two do not belong together, copy both again"
+        )
+
+
+def _numbered(names: dict[Any, Any], path: Path) -> list[Any]:
+    """`{0: person, 1: car}` → a list."""
+    if sorted(map(str, names)) != sorted(map(str, range(len(names)))):
+        raise CheckpointError(f"{path}: its class names are not numbered from 0")
+    return [names[index] if index in names else names[str(index)] for index in range(len(names))]
+
+
+class _Row(list[Any]):
+    """A list to be written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+_Dumper.add_representer(
+    _Row,
+    lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, flow_style=True),
+)
+
+
+def _shown(description: Mapping[str, Any]) -> dict[str, Any]:
+    """The description with one line a row of the network."""
+    return {
+        key: [_Row(row) if isinstance(row, list) else row for row in value]
+        if key in ("backbone", "head")
+        else (_Row(value) if isinstance(value, list) else value)
+        for key, value in description.items()
+    }
