@@ -256,7 +256,8 @@ class PerceptionKeeper:
                 return
             self._state = PerceptionState.RESTARTING
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._stop_asked.wait(), pause_s)
+                async with asyncio.timeout(pause_s):
+                    await self._stop_asked.wait()
                 return
             self._restarts += 1
 

@@ -99,7 +99,8 @@ class PerceptionProcess:
     async def ends_within(self, timeout_s: float) -> bool:
         """Whether it is dead by then."""
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._process.wait(), timeout_s)
+            async with asyncio.timeout(timeout_s):
+                await self._process.wait()
             return True
         return False
 

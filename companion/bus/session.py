@@ -132,7 +132,8 @@ class Bus:
         self._publishers.clear()
         if session is not None:
             with suppress(TimeoutError):
-                await asyncio.wait_for(asyncio.to_thread(session.close), 3.0)
+                async with asyncio.timeout(3.0):
+                    await asyncio.to_thread(session.close)
 
     def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
         """Publish a JSON-able value, or a text as it is. Never blocks, never raises for the network."""
