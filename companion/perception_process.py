@@ -10,7 +10,7 @@ import socket
 import sys
 from typing import Self
 
-from companion.perception_messages import Attitude, Begin, Hud, Message, Stop, packed, read_message
+from companion.perception_messages import Attitude, Begin, Hud, Message, Stop, Watched, packed, read_message
 from companion.settings import Settings
 
 # Results that wait in the kernel are old before they are read: room for about ten, no more.
@@ -86,6 +86,10 @@ class PerceptionProcess:
         """Tell how the vehicle was turned. Left out while an older one waits: a newer will come."""
         if not self._writer.transport.get_write_buffer_size():
             self._put(attitude)
+
+    def watch(self, watched: bool) -> None:
+        """Tell whether anybody wants pictures."""
+        self._put(Watched(watched))
 
     def ask_to_stop(self) -> None:
         self._put(Stop())
