@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 _OPSET = 17
 # Maps of the exported file may differ from torch's by this much, in logits; accumulated rounding is far less.
 _TOLERANCE = 0.02
+# Trained networks' logits stay within this; where a network's are larger, so is their rounding.
+_USUAL_LARGEST = 20.0
 _READER: dict[ExportKind, RuntimeName] = {
     "onnx": "onnxruntime",
     "openvino": "openvino",
@@ -201,7 +203,10 @@ def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -
 def _largest_difference(expected: Sequence[Any], found: Sequence[Any]) -> float:
     if [a.shape for a in expected] != [b.shape for b in found]:
         return float("inf")
-    return max(float(np.abs(a - b).max()) for a, b in zip(expected, found, strict=True))
+    return max(
+        float(np.abs(a - b).max()) / max(1.0, float(np.abs(a).max()) / _USUAL_LARGEST)
+        for a, b in zip(expected, found, strict=True)
+    )
 
 
 def _unfaithful(to: str, shape: Sequence[int], why: str) -> RuntimeUnusableError:
