@@ -83,7 +83,7 @@ def _measure_sent(service: Service, latency_ms: list[float], beyond_ms: list[flo
     def noted(situation: Situation) -> None:
         nonlocal seen, awaited
         update(situation)
-        newest = service.newest
+        newest = service.steering.newest
         if newest is not None and newest.sequence != seen:
             seen, awaited = newest.sequence, (service.pilot.sent, newest)
 

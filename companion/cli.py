@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import json
 import logging
 import signal
 import sys
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli_bench import bench
+from companion.cli_evaluate import evaluate
 from companion.cli_flags import EXIT_BAD_INPUT, plain_errors, with_settings
 from companion.cli_models import models
 from companion.settings import Settings
@@ -37,6 +37,7 @@ app = typer.Typer(
 )
 
 app.add_typer(models, name="models")
+app.command()(evaluate)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
@@ -113,6 +114,11 @@ def detect(
     threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
     every: Annotated[int, typer.Option(min=1, help="look at every N-th frame")] = 1,
     limit: Annotated[int | None, typer.Option(min=1, help="end after so many frames")] = None,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="look at large frames in tiles too: small objects, much slower")
+    ] = False,
+    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the frame")] = 640,
+    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
     save: Annotated[Path | None, typer.Option(help="folder for inputs and annotated images")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object a frame")] = False,
     width: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
@@ -123,7 +129,9 @@ def detect(
     """Detect objects in every frame of a source; one line a frame on standard output."""
     from companion.detect import detect_source
     from vision.detector import Detector
+    from vision.pipeline import FrameDetector
     from vision.sources import SourceError, SourceSettings, open_source
+    from vision.tiling import TiledDetector
     from vision.yolo.checkpoint import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
@@ -138,71 +146,20 @@ def detect(
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )
+        looking: FrameDetector = detector
+        if tiles:
+            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
         settings = SourceSettings(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         looked_at = detect_source(
-            frames, detector, every=every, limit=limit, save=save, as_json=as_json, write=write
+            frames, looking, every=every, limit=limit, save=save, as_json=as_json, write=write
         )
     if not looked_at:
         typer.echo(f"companion: {source} had no frames", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
-
-
-@app.command()
-def evaluate(
-    dataset: Annotated[Path, typer.Argument(help="a YOLO-format folder or data.yaml, or a COCO JSON")],
-    model: Annotated[str, typer.Option(help="a checkpoint, or a name in the models folder")] = "default",
-    split: Annotated[str | None, typer.Option(help="of a data.yaml: train, val or test; else val")] = None,
-    images: Annotated[Path | None, typer.Option(help="folder of a COCO file's images")] = None,
-    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
-    precision: Annotated[str, typer.Option(help="auto, float32 or bfloat16")] = "float32",
-    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="only the first so many images")] = None,
-    misses: Annotated[Path, typer.Option(help="the picture of the worst misses")] = Path("misses.png"),
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
-) -> None:
-    """Judge a model on a labelled data set: mAP50 and mAP50-95, per class too, and the worst misses."""
-    from dataclasses import replace
-
-    from companion.evaluate import (
-        JUDGED_CONFIDENCE,
-        evaluate_dataset,
-        map_classes,
-        report_lines,
-        write_sheet,
-    )
-    from vision.detector import Detector
-    from vision.evaluation.dataset import DatasetError, open_dataset
-    from vision.yolo.checkpoint import CheckpointError
-
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    with plain_errors(CheckpointError, DatasetError, ValueError, OSError):
-        data = open_dataset(dataset, split=split, images=images)
-        if limit is not None:
-            data = replace(data, samples=data.samples[:limit])
-        detector = Detector(
-            model,
-            confidence=JUDGED_CONFIDENCE,
-            iou=iou,
-            image_size=image_size,
-            precision=precision,  # type: ignore[arg-type]
-            threads=threads,
-        )
-        evaluation = evaluate_dataset(data, detector, map_classes(detector.class_names, data))
-        shown = write_sheet(evaluation, misses)
-    if as_json:
-        settings = {"model": model, "dataset": str(dataset), "image_size": image_size, "precision": precision}
-        sheet = str(misses) if shown else None
-        typer.echo(json.dumps({**settings, **evaluation.plain(), "misses_picture": sheet}))
-        return
-    for line in report_lines(evaluation):
-        typer.echo(line)
-    if shown:
-        typer.echo(f"the worst misses: {misses}")
 
 
 def parse_classes(text: str | None) -> list[str | int] | None:

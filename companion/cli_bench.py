@@ -92,6 +92,29 @@ def bench_setpoints(
     _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
 
 
+@bench.command("tracking")
+def bench_tracking(
+    seconds: Annotated[float, typer.Option(min=1, help="of each rendered sequence")] = 12.0,
+    rate_hz: Annotated[float, typer.Option(min=1, max=120, help="frames a second")] = 30.0,
+    model: Annotated[str | None, typer.Option(help="a checkpoint; unset: boxes made of the truth")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    as_json: _JSON = False,
+) -> None:
+    """Identity switches, fragmentation and MOTA with and without tracking, on rendered sequences."""
+    from rich.console import Console
+
+    from companion.bench_tracking import measure_tracking, tracking_table
+    from vision.yolo.checkpoint import CheckpointError
+
+    with plain_errors(CheckpointError, ValueError):
+        figures = measure_tracking(seconds, rate_hz=rate_hz, model=model, seed=seed)
+    if as_json:
+        typer.echo(json.dumps(figures))
+    else:
+        Console().print(tracking_table(figures))
+        typer.echo(f"tracker: {figures['tracker_ms']}")
+
+
 def _print_figures(figures: dict[str, Any], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(figures))

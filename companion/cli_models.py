@@ -96,6 +96,59 @@ def pull(
     typer.echo(f"{pulled.path} ({'fetched' if pulled.fetched else 'was there'}), SHA-256 {pulled.sha256}")
 
 
+@models.command()
+def export(
+    file: Annotated[str, typer.Argument(help="a checkpoint, `default`, or a name in the models folder")],
+    to: Annotated[str, typer.Option(help="onnx, openvino, tensorrt or torchscript")],
+    output: Annotated[Path | None, typer.Option(help="the file to write; else beside the checkpoint")] = None,
+    image_size: Annotated[int, typer.Option(min=32, help="what it is tuned and checked for, pixels")] = 640,
+) -> None:
+    """Write a model for another runtime; the file is checked against the model before it is kept."""
+    from vision.runtimes.contract import RuntimeUnusableError
+    from vision.runtimes.export import export
+    from vision.yolo.checkpoint import CheckpointError, load_checkpoint
+    from vision.yolo.generation import describe
+
+    path = _path(file)
+    with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
+        facts = describe(load_checkpoint(path).model, image_size)
+        written = export(path, to, output, image_size, generation=facts.generation)  # type: ignore[arg-type]
+    typer.echo(f"{written} ({written.stat().st_size} bytes), for --model")
+
+
+@models.command()
+def verify(
+    source: Annotated[str, typer.Argument(help="the checkpoint")],
+    exported: Annotated[Path, typer.Argument(help="what `companion models export` made of it")],
+    images: Annotated[
+        Path | None, typer.Option(help="folder of pictures to compare on; else drawn scenes")
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="how many pictures")] = 8,
+    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
+    map_tolerance: Annotated[float, typer.Option(min=0, help="of raw maps, logits")] = 0.02,
+    box_tolerance: Annotated[float, typer.Option(min=0, help="of the sides of boxes, pixels")] = 0.5,
+    threads: Annotated[int | None, typer.Option(min=1, help="processor threads")] = None,
+    as_json: _JSON = False,
+) -> None:
+    """Whether an exported model finds what its source finds. Exit code 1 if not."""
+    from companion.models_verify import parity_lines, sample_pictures, verify
+    from vision.runtimes.contract import RuntimeUnusableError
+    from vision.yolo.checkpoint import CheckpointError
+
+    with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
+        pictures = sample_pictures(images, count)
+        parity = verify(_path(source), exported, pictures, image_size, threads=threads)
+    holds = parity.holds(map_tolerance, box_tolerance)
+    if as_json:
+        typer.echo(json.dumps({**parity.plain(), "holds": holds}))
+    else:
+        for line in parity_lines(parity, map_tolerance, box_tolerance):
+            typer.echo(line)
+        typer.echo("the same" if holds else "NOT the same")
+    if not holds:
+        raise typer.Exit(1)
+
+
 def _path(model: str) -> Path:
     from vision.detector import DEFAULT_MODEL
     from vision.model_files import find_model

@@ -13,14 +13,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from companion.settings import Settings
+from companion.settings import Section, Settings
 from companion.settings_fields import (
+    SECTIONS_OF_VIEW,
     expectation,
+    expectation_of_key,
     fields_of_sections,
     help_line,
     plain_type,
+    section_of,
     shown,
     toml_value,
     value_from_text,
@@ -99,21 +103,29 @@ def load_settings(
 
 def to_toml(settings: Settings) -> str:
     """The settings as a TOML file with a comment on every key; `load_settings` reads the same back."""
-    paragraphs = []
-    for section_name, fields in fields_of_sections().items():
-        section = getattr(settings, section_name)
-        lines = [f"# {(type(section).__doc__ or '').strip()}", f"[{section_name}]"]
-        for name, field in fields.items():
-            value = getattr(section, name)
-            lines.append(f"# {help_line(field)}")
-            # TOML has no null: what is unset stands there as a comment.
-            lines.append(f"# {name} =" if value is None else f"{name} = {toml_value(value)}")
-        paragraphs.append("\n".join(lines) + "\n")
+    paragraphs = [_table(section, getattr(settings, section)) for section in fields_of_sections()]
+    for view, sections in settings.views.items():
+        paragraphs += [
+            _table(f"views.{view}.{section}", getattr(sections, section)) for section in SECTIONS_OF_VIEW
+        ]
     return "\n".join(paragraphs)
 
 
+def _table(name: str, section: Section) -> str:
+    lines = [f"# {(type(section).__doc__ or '').strip()}", f"[{name}]"]
+    for key, field in type(section).model_fields.items():
+        value = getattr(section, key)
+        lines.append(f"# {help_line(field)}")
+        # TOML has no null: what is unset stands there as a comment.
+        lines.append(f"# {key} =" if value is None else f"{key} = {toml_value(value)}")
+    return "\n".join(lines) + "\n"
+
+
 class _Reading:
-    """Values gathered key by key, each with where it came from, and the problems met on the way."""
+    """Values gathered key by key, each with where it came from, and the problems met on the way.
+
+    A table is what stands between brackets in the file: `detector`, or `views.down.detector`.
+    """
 
     def __init__(self) -> None:
         self._fields = fields_of_sections()
@@ -124,18 +136,12 @@ class _Reading:
 
     def take_file(self, path: Path) -> None:
         origin = f"in {path}"
-        for section, table in _read_toml(path).items():
-            if section not in self._fields:
-                self._problems.append(
-                    f"unknown section [{section}] ({origin}); {_nearest(section, self._fields)}"
-                )
-            elif not isinstance(table, dict):
-                self._problems.append(
-                    f"{section}: must be a section [{section}], got {shown(table)} ({origin})"
-                )
+        for name, content in _read_toml(path).items():
+            if name == "views" and isinstance(content, dict):
+                for view, sections in content.items():
+                    self._take_view(view, sections, origin)
             else:
-                for name, value in table.items():
-                    self._take(section, name, value, origin)
+                self._take_table(name, content, origin)
 
     def take_environment(self, environment: Mapping[str, str]) -> None:
         for variable in sorted(environment):
@@ -147,8 +153,8 @@ class _Reading:
                 self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
 
     def take_text(self, key: str, text: str, origin: str) -> None:
-        section, _, name = key.partition(".")
-        field = self._fields.get(section, {}).get(name)
+        table, _, name = key.rpartition(".")
+        field = self._field(table, name)
         if field is None:
             self._problems.append(f"unknown key {key} ({origin}); {_nearest(key, self._keys)}")
             return
@@ -157,11 +163,17 @@ class _Reading:
         except ValueError:
             self._problems.append(f"{key}: must be {expectation(field)}, got {text!r} ({origin})")
             return
-        self._take(section, name, value, origin)
+        self._take(table, name, value, origin)
 
     def settings(self) -> Settings:
+        values: dict[str, Any] = {}
+        for table, items in self._values.items():
+            place = values
+            for word in table.split("."):
+                place = place.setdefault(word, {})
+            place.update(items)
         try:
-            settings = Settings.model_validate(self._values)
+            settings = Settings.model_validate(values)
         except ValidationError as error:
             problems = [*self._problems, *(self._explain(details) for details in error.errors())]
             # A list with several bad items is one problem.
@@ -170,22 +182,58 @@ class _Reading:
             raise ConfigurationError(*self._problems)
         return settings
 
-    def _take(self, section: str, name: str, value: Any, origin: str) -> None:
-        key = f"{section}.{name}"
-        if name not in self._fields[section]:
-            self._problems.append(f"unknown key {key} ({origin}); {_nearest(key, self._keys)}")
+    def _field(self, table: str, name: str) -> FieldInfo | None:
+        section = section_of(table)
+        return None if section is None else self._fields[section].get(name)
+
+    def _take_view(self, view: str, sections: Any, origin: str) -> None:
+        if not isinstance(sections, dict):
+            self._problems.append(
+                f"views.{view}: must hold sections such as [views.{view}.source], got {shown(sections)} "
+                f"({origin})"
+            )
+            return
+        for section, content in sections.items():
+            self._take_table(f"views.{view}.{section}", content, origin)
+
+    def _take_table(self, table: str, content: Any, origin: str) -> None:
+        if section_of(table) is None:
+            known = SECTIONS_OF_VIEW if table.startswith("views.") else self._fields
+            self._problems.append(
+                f"unknown section [{table}] ({origin}); {_nearest(table.rpartition('.')[2], known)}"
+            )
+        elif not isinstance(content, dict):
+            self._problems.append(f"{table}: must be a section [{table}], got {shown(content)} ({origin})")
+        else:
+            # An empty table is a view, too: all defaults.
+            self._values.setdefault(table, {})
+            for name, value in content.items():
+                self._take(table, name, value, origin)
+
+    def _take(self, table: str, name: str, value: Any, origin: str) -> None:
+        key = f"{table}.{name}"
+        if self._field(table, name) is None:
+            own = f"{section_of(table)}.{name}"
+            self._problems.append(f"unknown key {key} ({origin}); {_nearest(own, self._keys)}")
             return
         # TOML has arrays; the settings are frozen and hold tuples.
-        self._values.setdefault(section, {})[name] = tuple(value) if isinstance(value, list) else value
+        self._values.setdefault(table, {})[name] = tuple(value) if isinstance(value, list) else value
         self._origins[key] = origin
 
     def _explain(self, details: ErrorDetails) -> str:
-        section, *rest = [str(part) for part in details["loc"]]
-        if not rest:  # a rule about several keys of the section
-            origins = {origin for key, origin in self._origins.items() if key.startswith(f"{section}.")}
-            return f"{section}: {details['ctx']['error']} ({', '.join(sorted(origins))})"
-        key = f"{section}.{rest[0]}"
-        value = shown(self._values[section][rest[0]])
+        parts = [str(part) for part in details["loc"]]
+        if parts[-1:] == ["[key]"]:  # a view's name
+            return f"views.{parts[1]}: a view's name must be {expectation_of_key()}, got {parts[1]!r}"
+        depth = 3 if parts[:1] == ["views"] else 1
+        table, rest = ".".join(parts[:depth]), parts[depth:]
+        if not rest:  # a rule about several keys of the section, or of several sections
+            origins = {origin for key, origin in self._origins.items() if key.startswith(f"{table}.")}
+            said = f" ({', '.join(sorted(origins))})" if table else ""
+            return f"{table}{': ' if table else ''}{details['ctx']['error']}{said}"
+        key = f"{table}.{rest[0]}"
+        value = shown(self._values[table][rest[0]])
+        section = section_of(table)
+        assert section is not None
         expected = expectation(self._fields[section][rest[0]])
         return f"{key}: must be {expected}, got {value} ({self._origins[key]})"
 

@@ -18,8 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vision.annotate import annotate
 from vision.detections import Detections
-from vision.detector import Detector
 from vision.frame import Frame
+from vision.pipeline import FrameDetector
 from vision.sources import Source
 
 logger = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 def detect_source(
     source: Source,
-    detector: Detector,
+    detector: FrameDetector,
     *,
     every: int = 1,
     limit: int | None = None,
@@ -69,14 +69,15 @@ def detect_source(
     return looked_at
 
 
-def _line(frame: Frame, detections: Detections, detector: Detector, as_json: bool) -> str:
+def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json: bool) -> str:
     timing = detector.last_timing
     assert timing is not None
     if not as_json:
+        total_ms = timing.preprocess_ms + timing.inference_ms + timing.postprocess_ms
         seen = ", ".join(
             f"{record['class_name']} {record['confidence']:.2f}" for record in detections.records()
         )
-        return f"{frame.sequence:6d}  {timing.total_ms:6.1f} ms  {seen or 'no objects detected'}"
+        return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {seen or 'no objects detected'}"
     message: dict[str, Any] = {
         "sequence": frame.sequence,
         "captured_ns": frame.captured_ns,

@@ -12,12 +12,16 @@ from companion.bus.topics import NO_OBJECTS
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
+from vision.tracking import TrackEvent
 
 
-def detections_message(result: PerceptionResult, vehicle: str, published_ns: int) -> dict[str, Any]:
+def detections_message(
+    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+) -> dict[str, Any]:
     """One frame's detections, with the three stamps: captured, inferred, published."""
     return {
         "vehicle": vehicle,
+        "view": view,
         "sequence": result.sequence,
         "captured_ns": result.captured_ns,
         "inferred_ns": result.inferred_ns,
@@ -27,6 +31,40 @@ def detections_message(result: PerceptionResult, vehicle: str, published_ns: int
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
         "detections": result.detections.records(),
+    }
+
+
+def tracks_message(
+    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+) -> dict[str, Any]:
+    """What happened to tracks at one frame; every track in it counts as true, or did so until now."""
+    return {
+        "vehicle": vehicle,
+        "view": view,
+        "sequence": result.sequence,
+        "captured_ns": result.captured_ns,
+        "published_ns": published_ns,
+        "width": result.width,
+        "height": result.height,
+        "events": [_track_event(event) for event in result.track_events],
+    }
+
+
+def _track_event(event: TrackEvent) -> dict[str, Any]:
+    track = event.track
+    return {
+        "event": event.kind.value,
+        "stamp_ns": event.stamp_ns,
+        "track_id": track.track_id,
+        "class_id": track.class_id,
+        "class_name": track.class_name,
+        "xyxy": [round(value, 2) for value in track.xyxy],
+        "confidence": round(track.confidence, 4),
+        "track_score": round(track.score, 4),
+        "track_state": track.state.value,
+        "seen": track.seen,
+        "first_ns": track.first_ns,
+        "last_ns": track.last_ns,
     }
 
 

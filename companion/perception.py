@@ -13,10 +13,11 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from companion.perception_messages import (
+    Attitude,
     Ended,
     Heartbeat,
     Hud,
@@ -30,9 +31,12 @@ from companion.perception_messages import (
 from companion.perception_process import PerceptionProcess
 from companion.perception_pulse import Pulse
 from companion.perception_status import PerceptionState, PerceptionStatus
+from companion.perception_tracks import LiveTracks
 from companion.settings import Settings
+from companion.stage_timing import StageTimes
 from companion.standard_input import STANDARD_INPUT, StandardInput
 from vision.pipeline import PerceptionResult
+from vision.rotation import Quaternion
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +44,8 @@ __all__ = ["PerceptionKeeper", "PerceptionStartError", "PerceptionState", "Perce
 
 MAX_RESTARTS = 5
 RESTART_WINDOW_S = 60.0
+# At most 50 attitudes a second go to the worker; the tolerance is for telemetry of 50 Hz, which jitters.
+ATTITUDE_PERIOD_S, ATTITUDE_JITTER_S = 0.02, 0.005
 STOP_S, TERMINATE_S = 5.0, 1.0
 _BACK_OFF_S = (0.2, 1.0, 2.0, 4.0, 8.0)
 _TICK_S = 0.25
@@ -62,10 +68,12 @@ class _End:
 class _Counts:
     frames: int = 0
     dropped: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def add(self, other: _Counts) -> None:
         self.frames += other.frames
         self.dropped += other.dropped
+        self.left_out = _sum(self.left_out, other.left_out)
 
 
 class PerceptionKeeper:
@@ -105,7 +113,10 @@ class PerceptionKeeper:
         self._results = 0
         self._arrivals_s: deque[float] = deque()
         self._before, self._now = _Counts(), _Counts()
+        self._times = StageTimes()
         self._first_sequence = 0
+        self._tracks = LiveTracks()
+        self._attitude_due_ns = 0
 
     async def start(self) -> None:
         """Start the worker; returns when its model is loaded and its source has given a frame.
@@ -161,6 +172,24 @@ class PerceptionKeeper:
         if self._process is not None and self._settings.recording.video is not None:
             self._process.show(self._hud)
 
+    def send_attitude(self, stamp_ns: int, attitude: Quaternion) -> None:
+        """Where the vehicle was turned to, for the tracker. At most 50 a second are sent on; never waits.
+
+        Args:
+            stamp_ns: CLOCK_MONOTONIC nanoseconds.
+            attitude: (w, x, y, z), body FRD to NED.
+        """
+        tracker = self._settings.tracker
+        wanted = tracker.enabled and tracker.camera_motion and self._settings.detector.enabled
+        early_ns = self._attitude_due_ns - stamp_ns
+        if not wanted or self._process is None or early_ns > ATTITUDE_JITTER_S * 1e9:
+            return
+        self._attitude_due_ns = max(
+            self._attitude_due_ns + round(ATTITUDE_PERIOD_S * 1e9),
+            stamp_ns + round(2 * ATTITUDE_JITTER_S * 1e9),
+        )
+        self._process.turn(Attitude(stamp_ns, attitude))
+
     @property
     def class_names(self) -> tuple[str, ...]:
         """What the model knows, id → name; empty before the start and without a detector."""
@@ -180,9 +209,13 @@ class PerceptionKeeper:
             newest=newest,
             age_s=None if newest is None else (time.monotonic_ns() - newest.captured_ns) / 1e9,
             timing_ms={} if newest is None else newest.timing_ms,
+            timing_p50_ms=self._times.quantile_ms(0.5),
+            timing_p99_ms=self._times.quantile_ms(0.99),
             dropped=self._before.dropped + self._now.dropped,
+            left_out=_sum(self._before.left_out, self._now.left_out),
             stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
             class_names=self.class_names,
+            tracks=len(self._tracks),
             problem=self._problem,
         )
 
@@ -272,17 +305,18 @@ class PerceptionKeeper:
             self._process = self._pulse = None
             self._before.add(self._now)
             self._now = _Counts()
+            self._tracks.worker_ended()
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
 
     async def _spawn(self) -> PerceptionProcess:
         settings = self._settings_of_next_worker()
         if settings.source.uri != STANDARD_INPUT:
-            return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL)
+            return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, self._tracks.next_id)
         if self._input is None:
             self._input = StandardInput(settings.source)
         descriptor = self._input.for_worker()
         try:
-            return await PerceptionProcess.spawn(settings, descriptor)
+            return await PerceptionProcess.spawn(settings, descriptor, self._tracks.next_id)
         finally:
             # The worker's copy must be the only one, or its death would not be seen.
             os.close(descriptor)
@@ -356,14 +390,20 @@ class PerceptionKeeper:
         self._on_event("info", f"perception sees {ready.source}, {model} (process {process.pid})")
 
     def _take(self, report: Report) -> None:
-        result = replace(report.result, sequence=report.result.sequence + self._first_sequence)
+        result = self._tracks.take(
+            replace(report.result, sequence=report.result.sequence + self._first_sequence)
+        )
         self._now.frames = report.frames
         self._now.dropped = result.dropped + report.replaced
+        self._now.left_out = {**result.left_out, "unsent": report.replaced}
         self._newest = result
         self._results += 1
         self._arrivals_s.append(time.monotonic())
         self._rate_hz()
         self._on_result(result)
+        # Whoever is called back publishes; what lies between is the way here and that.
+        publish_ms = (time.monotonic_ns() - result.inferred_ns) / 1e6
+        self._times.add({**result.timing_ms, "publish": publish_ms})
 
     def _note(self, message: Message) -> None:
         if isinstance(message, Heartbeat):
@@ -375,3 +415,7 @@ class PerceptionKeeper:
                 self._on_event(level, message.text)
             else:
                 logging.getLogger(message.logger).log(message.level, "%s", message.text)
+
+
+def _sum(one: dict[str, int], other: dict[str, int]) -> dict[str, int]:
+    return {reason: one.get(reason, 0) + other.get(reason, 0) for reason in {**one, **other}}

@@ -15,6 +15,7 @@ from typing import Any
 
 from companion.settings import Settings
 from vision.pipeline import PerceptionResult
+from vision.rotation import Quaternion
 from vision.sources import SourceStatistics
 
 _LENGTH = struct.Struct(">I")
@@ -27,9 +28,10 @@ LARGEST_BYTES = 1 << 24
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """The first message: what to do."""
+    """The first message: what to do. Tracks are numbered from `first_track_id` on."""
 
     settings: Settings
+    first_track_id: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,14 @@ class Hud:
 
     lines: tuple[str, ...]
     highlight: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """The vehicle's attitude (w, x, y, z), body FRD to NED, at a CLOCK_MONOTONIC stamp."""
+
+    stamp_ns: int
+    wxyz: Quaternion
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +117,7 @@ class Ended:
     frames: int
 
 
-Message = Begin | Hud | Stop | Ready | StartFailed | Report | Heartbeat | LogLine | Ended
+Message = Begin | Hud | Attitude | Stop | Ready | StartFailed | Report | Heartbeat | LogLine | Ended
 
 
 class ProtocolError(ConnectionError):

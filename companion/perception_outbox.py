@@ -1,7 +1,7 @@
 """The worker's way out: a thread that sends, so that the loop never waits for a service that reads slowly.
 
-Of results and heartbeats only the newest waits; an older one is replaced and counted. Everything else waits
-in a queue that is bounded too.
+Of results and heartbeats only the newest waits; an older one is replaced and counted, but what it told of
+tracks that began, got lost or ended goes with the newer. Everything else waits in a queue, bounded too.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from companion.perception_messages import Ended, Heartbeat, LogLine, Message, Report, StartFailed, packed
+from vision.tracking import TrackEventKind
 
 _QUEUED_LINES = 1000
 _LONGEST_LINE = 2000
+# A service that has not read for so many is no more; what it would be told is not worth all memory.
+_WAITING_EVENTS = 1000
 
 
 class Outbox:
@@ -50,6 +53,7 @@ class Outbox:
                 if isinstance(message, Heartbeat):
                     return
                 self._replaced += 1
+                message = _with_events_of(self._newest, message)
             self._newest = message
             self._changed.notify()
 
@@ -83,6 +87,15 @@ class Outbox:
                 message = self._next()
         except OSError:
             self._on_lost()
+
+
+def _with_events_of(older: Report, newer: Report) -> Report:
+    """The newer report, with the events of the older that are told once only."""
+    once = tuple(event for event in older.result.track_events if event.kind is not TrackEventKind.UPDATE)
+    if not once:
+        return newer
+    events = (once + newer.result.track_events)[-_WAITING_EVENTS:]
+    return replace(newer, result=replace(newer.result, track_events=events))
 
 
 class OutboxHandler(logging.Handler):

@@ -10,7 +10,7 @@ import socket
 import sys
 from typing import Self
 
-from companion.perception_messages import Begin, Hud, Message, Stop, packed, read_message
+from companion.perception_messages import Attitude, Begin, Hud, Message, Stop, packed, read_message
 from companion.settings import Settings
 
 # Results that wait in the kernel are old before they are read: room for about ten, no more.
@@ -33,11 +33,12 @@ class PerceptionProcess:
         self._writer = writer
 
     @classmethod
-    async def spawn(cls, settings: Settings, standard_input: int) -> Self:
+    async def spawn(cls, settings: Settings, standard_input: int, first_track_id: int = 1) -> Self:
         """Start a fresh interpreter that has nothing of this one but the search path.
 
         Args:
             standard_input: the descriptor that becomes the worker's, or `subprocess.DEVNULL`.
+            first_track_id: the number of its first track.
 
         Raises:
             OSError: no more processes or descriptors.
@@ -65,7 +66,7 @@ class PerceptionProcess:
                 raise
         reader, writer = await asyncio.open_connection(sock=ours)
         worker = cls(process, reader, writer)
-        worker._put(Begin(settings))
+        worker._put(Begin(settings, first_track_id))
         return worker
 
     @property
@@ -80,6 +81,11 @@ class PerceptionProcess:
         """Tell what to draw on the recorded video. Left out while the worker takes no orders."""
         if self._writer.transport.get_write_buffer_size() < _UNREAD_BYTES:
             self._put(hud)
+
+    def turn(self, attitude: Attitude) -> None:
+        """Tell how the vehicle was turned. Left out while an older one waits: a newer will come."""
+        if not self._writer.transport.get_write_buffer_size():
+            self._put(attitude)
 
     def ask_to_stop(self) -> None:
         self._put(Stop())

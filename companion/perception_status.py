@@ -34,9 +34,14 @@ class PerceptionStatus:
         newest: the newest result; None before the first.
         age_s: of the newest result, from its capture.
         timing_ms: stage → milliseconds of the newest result.
+        timing_p50_ms, timing_p99_ms: stage → milliseconds that half, and 99 of 100, of the newest 200 results
+            did not exceed. `publish` is the way from the worker onto the bus.
         dropped: frames lost before they were looked at, and results replaced by newer ones before they left.
+        left_out: reason → frames that were not looked at, or whose result a newer one replaced on its way
+            (`unsent`); see `PerceptionResult`.
         stuck_after_s: the silence after which the worker counts as stuck.
         class_names: what the model knows; empty before the start and without a detector.
+        tracks: objects that are followed now and count as true.
         problem: the last thing that went wrong, empty if nothing did.
     """
 
@@ -49,9 +54,13 @@ class PerceptionStatus:
     newest: PerceptionResult | None = None
     age_s: float | None = None
     timing_ms: Mapping[str, float] = field(default_factory=dict)
+    timing_p50_ms: Mapping[str, float] = field(default_factory=dict)
+    timing_p99_ms: Mapping[str, float] = field(default_factory=dict)
     dropped: int = 0
+    left_out: Mapping[str, int] = field(default_factory=dict)
     stuck_after_s: float | None = None
     class_names: tuple[str, ...] = ()
+    tracks: int = 0
     problem: str = ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -65,9 +74,17 @@ class PerceptionStatus:
             "rate_hz": round(self.rate_hz, 2),
             "sequence": None if self.newest is None else self.newest.sequence,
             "age_s": None if self.age_s is None else round(self.age_s, 3),
-            "timing_ms": {stage: round(value, 3) for stage, value in self.timing_ms.items()},
+            "timing_ms": _rounded(self.timing_ms),
+            "timing_p50_ms": _rounded(self.timing_p50_ms),
+            "timing_p99_ms": _rounded(self.timing_p99_ms),
             "dropped": self.dropped,
+            "left_out": dict(self.left_out),
             "stuck_after_s": self.stuck_after_s,
             "class_names": list(self.class_names),
+            "tracks": self.tracks,
             "problem": self.problem,
         }
+
+
+def _rounded(timing_ms: Mapping[str, float]) -> dict[str, float]:
+    return {stage: round(value, 3) for stage, value in timing_ms.items()}

@@ -16,10 +16,12 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from companion.perception_messages import (
+    Attitude,
     Begin,
     Ended,
     Heartbeat,
@@ -32,9 +34,12 @@ from companion.perception_messages import (
 )
 from companion.perception_outbox import Outbox, OutboxHandler
 from companion.settings import Settings
-from vision.pipeline import PerceptionResult, Pipeline
+from vision.frame import Frame
+from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
+from vision.sources.sharing import SharingSource
+from vision.tracking import AttitudeHistory, CameraView, Tracker
 from vision.video_writer import VideoWriterError
 
 if TYPE_CHECKING:
@@ -56,11 +61,13 @@ class Orders:
     Attributes:
         stop: end now.
         hud: for the recorded video's next frames.
+        attitudes: of the vehicle, the last few seconds.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self.stop = threading.Event()
         self.hud = Hud((), None)
+        self.attitudes = AttitudeHistory()
         self._connection = connection
         self._finished = threading.Event()
         threading.Thread(target=self._take, name="inbox", daemon=True).start()
@@ -73,6 +80,8 @@ class Orders:
         while (message := receive(self._connection)) is not None:
             if isinstance(message, Hud):
                 self.hud = message
+            elif isinstance(message, Attitude):
+                self.attitudes.add(message.stamp_ns, message.wxyz)
             elif isinstance(message, Stop):
                 self.stop.set()
         # The service is gone. Whoever is stuck in a driver by then will not come back from there.
@@ -107,7 +116,7 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop.set())
     outbox = Outbox(connection, on_lost=orders.stop.set)
     logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[OutboxHandler(outbox)])
-    last = _work(begin.settings, orders, outbox)
+    last = _work(begin, orders, outbox)
     outbox.close(last, FAREWELL_S)
     orders.finished()
     return 0 if isinstance(last, Ended) and last.finished else 1
@@ -122,7 +131,8 @@ def _end_with(service_pid: int) -> None:
         os._exit(1)
 
 
-def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
+def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
+    settings = begin.settings
     frames = 0
     with contextlib.ExitStack() as stack:
         try:
@@ -140,9 +150,11 @@ def _work(settings: Settings, orders: Orders, outbox: Outbox) -> Ended | StartFa
         outbox.put(_ready(settings, perception))
         pipeline = Pipeline(
             perception.source,
-            perception.detector,
-            every=settings.detector.every,
+            _looking(settings, perception.detector),
+            selection=settings.detector.selection(),
             recorder=perception.recording,
+            tracker=_tracker(begin),
+            view_at=_view_at(settings, orders.attitudes),
         )
         try:
             _run(pipeline, perception, orders, outbox)
@@ -163,11 +175,24 @@ def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
         stack.callback(recording.close)
     detector = _load(settings) if settings.detector.enabled else None
-    source = stack.enter_context(open_source(settings.source.uri, settings.source.opening()))
+    source = open_source(settings.source.uri, settings.source.opening())
+    if settings.source.share is not None:
+        source = SharingSource(source, settings.source.share)
+    stack.enter_context(source)
     if recording is not None:
         # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)
     return Perception(source, detector, recording)
+
+
+def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | None:
+    """The detector as the pipeline uses it."""
+    wanted = settings.detector
+    if detector is None or not wanted.tiles:
+        return detector
+    from vision.tiling import TiledDetector
+
+    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
 
 
 def _load(settings: Settings) -> Detector:
@@ -178,13 +203,40 @@ def _load(settings: Settings) -> Detector:
     return Detector(
         wanted.model,
         classes=wanted.classes or None,
-        confidence=wanted.confidence,
+        confidence=_least_confidence(settings),
         iou=wanted.iou,
         image_size=wanted.image_size,
         precision=wanted.precision,
         threads=wanted.threads,
         runtime=wanted.runtime,
     )
+
+
+def _least_confidence(settings: Settings) -> float:
+    """A tracker wants to see the weak ones too; it leaves out again what `detector.confidence` leaves out."""
+    wanted, tracker = settings.detector.confidence, settings.tracker
+    return min(wanted, tracker.low_confidence) if tracker.enabled else wanted
+
+
+def _tracker(begin: Begin) -> Tracker | None:
+    settings = begin.settings
+    if not settings.tracker.enabled or not settings.detector.enabled:
+        return None
+    following = settings.tracker.following(settings.detector.confidence)
+    return Tracker(following, first_track_id=begin.first_track_id)
+
+
+def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame], CameraView | None]:
+    """Where the camera looked when it took a frame; None without the vehicle's attitude of that moment."""
+    body_from_optical = settings.camera.mount().body_from_optical
+
+    def view_at(frame: Frame) -> CameraView | None:
+        ned_from_body = attitudes.at(frame.captured_ns)
+        if ned_from_body is None:
+            return None
+        return CameraView(settings.camera.model(frame.width, frame.height), ned_from_body @ body_from_optical)
+
+    return view_at
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

@@ -21,17 +21,23 @@ from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
-from companion.guidance.target import Target
-from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
-from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
+from companion.guidance.targets import StateHistory
+from companion.messages import (
+    detections_message,
+    labels_message,
+    setpoint_message,
+    tracks_message,
+    vehicle_message,
+)
 from companion.operator.console import run_console, terminal_is_free
-from companion.perception import PerceptionKeeper, PerceptionState
+from companion.perception import PerceptionKeeper, PerceptionStartError
 from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
+from companion.views import View, open_views
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -55,7 +61,8 @@ class Service:
 
     Attributes:
         ready: everything is up, and commands are taken.
-        newest: what was last seen.
+        views: the cameras with their models, the first one first.
+        steering: the view whose targets behaviours see.
 
     Args:
         settings: all of them.
@@ -88,14 +95,18 @@ class Service:
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
         )
-        self.perception = PerceptionKeeper(settings, on_result=self._result, on_event=self._event)
-        self.bus = Bus(settings.zenoh, settings.vehicle.name, on_event=self._event, on_command=self.command)
+        self.views = open_views(settings, on_result=self._use, on_event=self._event)
+        self.steering = next(view for view in self.views if view.name == guidance.view)
+        self.bus = Bus(
+            settings.zenoh,
+            settings.vehicle.name,
+            on_event=self._event,
+            on_command=self.command,
+            views=tuple(settings.views),
+        )
         self.ready = False
-        self.newest: PerceptionResult | None = None
         self._notifier = SystemdNotifier()
         self._history = StateHistory()
-        self._targets: tuple[Target, ...] = ()
-        self._unplaced = ""
         self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
         self._started_ns = time.monotonic_ns()
         self._linked = False
@@ -108,12 +119,12 @@ class Service:
         Raises:
             LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
         """
-        unsubscribe = self.driver.subscribe(self._history.add)
+        unsubscribe = self.driver.subscribe(self._take_state)
         tasks: list[asyncio.Task[None]] = []
         try:
             await self._start()
             loops = [self._guide(), self.streamer.run(), self._tell_vehicle(), self._tell_status()]
-            if self._console and terminal_is_free(self.settings.source.uri):
+            if self._console and all(terminal_is_free(view.settings.source.uri) for view in self.views):
                 loops.append(self._take_console())
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("flying" if self.driver.state.armed else "ready")
@@ -133,7 +144,7 @@ class Service:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             await self.bus.close()  # first: it lets answers go out
-            await asyncio.gather(self.perception.stop(), self.driver.close())
+            await asyncio.gather(*(view.keeper.stop() for view in self.views), self.driver.close())
             self._notifier.close()
 
     def stop(self) -> None:
@@ -181,7 +192,7 @@ class Service:
         starts = [
             asyncio.create_task(self.bus.start()),
             asyncio.create_task(self.driver.connect(self.settings.vehicle.connect_timeout_s)),
-            asyncio.create_task(self.perception.start()),
+            *(asyncio.create_task(_start(view)) for view in self.views),
         ]
         try:
             done, _ = await asyncio.wait(starts, return_when=asyncio.FIRST_EXCEPTION)
@@ -292,8 +303,13 @@ class Service:
                 "stream": self.streamer.state.value,
                 "setpoints_sent": self.streamer.sent_count,
             },
-            "perception": self.perception.status.as_dict(),
-            "targets": {"count": len(self._targets), "problem": self._unplaced},
+            "perception": self.views[0].keeper.status.as_dict(),
+            "views": {view.name: view.keeper.status.as_dict() for view in self.views if view.name},
+            "targets": {
+                "view": self.steering.name,
+                "count": len(self.steering.targets),
+                "problem": self.steering.unplaced,
+            },
             "bus": {
                 "connected": self.bus.connected,
                 "published": dict(self.bus.published),
@@ -302,28 +318,19 @@ class Service:
         }
 
     def _situation(self, now_ns: int) -> Situation:
-        age_s = None if self.newest is None else (now_ns - self.newest.captured_ns) / 1e9
+        age_s = self.steering.age_s(now_ns)
         fresh = age_s is not None and age_s <= self.settings.guidance.perception_max_age_s
         return Situation(
             now_ns,
             self.driver.state,
-            self._targets if fresh else (),
+            self.steering.targets if fresh else (),
             age_s,
             fresh,
             self.streamer.last_sent,
         )
 
     def _healthy(self, now_ns: int) -> bool:
-        seeing = (
-            not self.settings.detector.enabled
-            or self.perception.status.state is PerceptionState.FINISHED
-            or (
-                self.newest is not None
-                and (now_ns - self.newest.captured_ns) / 1e9
-                <= max(1.0, self.settings.guidance.perception_max_age_s)
-            )
-        )
-        return seeing and self.driver.state.connected(now_ns)
+        return all(view.seeing(now_ns) for view in self.views) and self.driver.state.connected(now_ns)
 
     def _watch_link(self, now_ns: int) -> None:
         linked = self.driver.state.connected(now_ns)
@@ -334,36 +341,31 @@ class Service:
             else:
                 self._event("error", "the autopilot is not heard any more")
 
-    def _result(self, result: PerceptionResult) -> None:
-        self.newest = result
-        try:
-            self._use(result)
-        except Exception as error:
-            # Perception itself is well: it must not be ended for a fault on this side.
-            logger.exception("a detection message could not be used")
-            self._targets, self._unplaced = (), f"{type(error).__name__}: {error}"
+    def _take_state(self, state: VehicleState) -> None:
+        """Remember where the vehicle was; the trackers want to know where their cameras looked."""
+        self._history.add(state)
+        if state.attitude is not None:
+            for view in self.views:
+                view.keeper.send_attitude(state.attitude_ns, state.attitude)
 
-    def _use(self, result: PerceptionResult) -> None:
-        """Publish it, and work out where what it shows is."""
-        name = self.settings.vehicle.name
-        self.bus.publish(topics.DETECTIONS, detections_message(result, name, time.monotonic_ns()))
-        self.bus.publish(topics.LABELS, labels_message(result))
-        try:
-            self._targets = targets_from_detections(
-                result.detections.records(),
-                result.captured_ns,
-                self.settings.camera.model(result.width, result.height),
-                self.settings.camera.mount(),
-                self._history,
-            )
-            self._unplaced = ""
-        except HistoryError as error:
-            # Without the attitude of that moment a box has no direction: seen and published, not steered by.
-            self._targets, self._unplaced = (), str(error)
+    def _use(self, view: View, result: PerceptionResult) -> None:
+        """Publish what a view saw; work out where it is, if that view steers."""
+        name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
+        self.bus.publish(topics.DETECTIONS, detections_message(result, name, now_ns, view.name), view.name)
+        self.bus.publish(topics.LABELS, labels_message(result), view.name)
+        if result.track_events:
+            self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+        if view is self.steering:
+            view.place(result, self._history)
 
     def _class_names(self) -> tuple[str, ...] | None:
-        """What the detector knows; None while there is none to ask."""
-        return self.perception.status.class_names or None
+        """What the steering detector knows; None while there is none to ask."""
+        return self.steering.class_names
+
+    @property
+    def perception(self) -> PerceptionKeeper:
+        """Of the steering view."""
+        return self.steering.keeper
 
     def _hud(self) -> tuple[str, ...]:
         state: VehicleState = self.driver.state
@@ -389,6 +391,16 @@ class Service:
         self.bus.publish(topics.EVENTS, asdict(event))
         if self._on_event is not None:
             self._on_event(event)
+
+
+async def _start(view: View) -> None:
+    """Start a view; its name goes into what it says when it cannot."""
+    try:
+        await view.keeper.start()
+    except PerceptionStartError as error:
+        if view.name is None:
+            raise
+        raise PerceptionStartError(f"view {view.name}: {error}") from error
 
 
 def _limits(settings: Settings) -> Limits:

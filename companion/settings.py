@@ -12,7 +12,9 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from vision.camera_model import CameraModel, CameraMount
+from vision.frame_selection import Selection
 from vision.sources.source import SourceSettings
+from vision.tracking.tracks import TrackerSettings
 
 # What `vision.detector` calls the bundled model. Named here too, as importing that module would load torch.
 DEFAULT_MODEL = "default"
@@ -27,7 +29,11 @@ class Section(BaseModel):
 
 
 # One word of a zenoh key expression: no `/`, and none of its wildcards and separators `* $ ? # @`.
-KeyWord = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+_KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
+KeyWord = Annotated[str, _KEY_WORD]
+# The same without a dot, as `views.NAME.source` is a key.
+_VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
+ViewName = Annotated[str, _VIEW_NAME]
 VehicleUrl = Annotated[
     str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
 ]
@@ -39,6 +45,7 @@ ZenohEndpoint = Annotated[
 # What a pattern means, in words, for a person whose value did not match it.
 PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
+    r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
     ),
@@ -86,6 +93,8 @@ class SourceSection(Section):
     """how long the first frame may take at start, seconds"""
     read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
     """a live source that is silent for so long is opened again, seconds"""
+    share: Annotated[str | None, _KEY_WORD] = None
+    """also offer the frames to other programs of this computer, and to other views, as shm://NAME"""
 
     @model_validator(mode="after")
     def _can_be_opened(self) -> Self:
@@ -94,7 +103,7 @@ class SourceSection(Section):
 
     def opening(self) -> SourceSettings:
         """The same, as `vision.sources.open_source` takes it. Raises ValueError for a bad pixel format."""
-        return SourceSettings(**self.model_dump(exclude={"uri"}))
+        return SourceSettings(**self.model_dump(exclude={"uri", "share"}))
 
 
 class CameraSection(Section):
@@ -198,9 +207,55 @@ class DetectorSection(Section):
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """arithmetic of the network; auto takes bfloat16 where the processor is fast at it"""
     threads: Annotated[int | None, Field(ge=1, le=256)] = None
-    """processor threads of the network; unset: as many as the runtime takes by itself"""
+    """processor threads of the network; unset: one for every processor but one"""
     every: Annotated[int, Field(ge=1, le=1000)] = 1
     """look at every N-th frame only"""
+    rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
+    """look at no more than so many frames a second; unset: at all that come"""
+    max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
+    """do not look at a frame that was captured longer ago, seconds; unset: look at all"""
+    tiles: bool = False
+    """look at large frames in overlapping tiles too, for small objects; 1080p takes some 14 times as long"""
+    tile_size: Annotated[int, Field(ge=64, le=4096)] = 640
+    """side of a tile, pixels of the frame; best as large as image_size"""
+    tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
+    """of neighbouring tiles, share of a tile"""
+
+    def selection(self) -> Selection:
+        """Which frames are looked at."""
+        return Selection(self.every, self.rate_hz, self.max_age_s)
+
+
+class TrackerSection(Section):
+    """Which detection is which object from frame to frame, and which objects count as true."""
+
+    enabled: bool = True
+    """give every object an identity; false: every frame stands for itself, and all that is seen counts"""
+    high_confidence: Annotated[float, Field(ge=0, le=1)] = 0.35
+    """a detection this sure can begin a track (never less than detector.confidence)"""
+    low_confidence: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """a detection this sure can continue a track, and is then kept in spite of detector.confidence"""
+    true_score: Annotated[float, Field(ge=0, le=1)] = 0.4
+    """a track counts as true when the median of its confidences reaches this; only such can be flown to"""
+    true_frames: Annotated[int, Field(ge=1, le=1000)] = 3
+    """and when it was seen in so many frames"""
+    lost_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    """unseen for so long, a track is lost, seconds"""
+    end_s: Annotated[float, Field(gt=0, le=600)] = 2.0
+    """unseen for so long, a track has ended: what comes then is another, seconds"""
+    camera_motion: bool = True
+    """remove the camera's turning by the vehicle's attitude; false for recorded films and gimbals"""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        self.following(0.0)
+        return self
+
+    def following(self, confidence: float) -> TrackerSettings:
+        """The same, as `vision.tracking` takes it, beside a detector with this `confidence`."""
+        values = self.model_dump(exclude={"enabled", "camera_motion"})
+        values["high_confidence"] = max(self.high_confidence, confidence)
+        return TrackerSettings(keep_confidence=confidence, **values)
 
 
 class GuidanceSection(Section):
@@ -232,6 +287,8 @@ class GuidanceSection(Section):
     """after that a brake is sent for so long, then nothing, and the autopilot's failsafe acts; seconds"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """detections older than this do not steer, seconds from capture"""
+    view: Annotated[str | None, _VIEW_NAME] = None
+    """the view that steers; unset: the one of the sections source, camera and detector"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -289,6 +346,16 @@ class LogSection(Section):
     """the least severe lines that are printed"""
 
 
+class ViewSections(Section):
+    """A further camera or model, with a process of its own, published as views/NAME."""
+
+    source: SourceSection = SourceSection()
+    camera: CameraSection = CameraSection()
+    detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
+    recording: RecordingSection = RecordingSection()
+
+
 class Settings(Section):
     """Everything that can be set."""
 
@@ -296,7 +363,42 @@ class Settings(Section):
     source: SourceSection = SourceSection()
     camera: CameraSection = CameraSection()
     detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
     guidance: GuidanceSection = GuidanceSection()
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()
     log: LogSection = LogSection()
+    views: dict[ViewName, ViewSections] = {}
+
+    @model_validator(mode="after")
+    def _views_fit_together(self) -> Self:
+        if self.guidance.view is not None and self.guidance.view not in self.views:
+            known = ", ".join(self.views) or "none"
+            raise ValueError(f"guidance.view: there is no view {self.guidance.view!r} (views: {known})")
+        openers: dict[str, str] = {}
+        for key, source in self.sources().items():
+            if source.uri in openers and _opens_once(source.uri):
+                raise ValueError(
+                    f"{key}.uri and {openers[source.uri]}.uri are both {source.uri}, which can be "
+                    f'opened once: give one of them share = "NAME" and the other uri = "shm://NAME"'
+                )
+            openers[source.uri] = key
+        return self
+
+    def sources(self) -> dict[str, SourceSection]:
+        """Key of the section → where that view's frames come from, the first view first."""
+        return {"source": self.source} | {
+            f"views.{name}.source": sections.source for name, sections in self.views.items()
+        }
+
+    def of_view(self, name: str | None) -> Settings:
+        """What the worker of one view goes by: the same, with that view's own sections. None: the first."""
+        if name is None:
+            return self.model_copy(update={"views": {}})
+        sections = self.views[name]
+        own = {section: getattr(sections, section) for section in ViewSections.model_fields}
+        return self.model_copy(update={"views": {}, **own})
+
+
+def _opens_once(uri: str) -> bool:
+    return uri == "-" or uri.isdecimal() or uri.startswith("/dev/")

@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen, MultipleOf
 from pydantic import StringConstraints
 from pydantic.fields import FieldInfo
 
-from companion.settings import PATTERN_MEANINGS, Section, Settings
+from companion.settings import PATTERN_MEANINGS, Section, Settings, ViewSections
 
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 _UNSET = ("", "none")
@@ -20,14 +20,30 @@ _LONGEST_SHOWN = 80
 
 
 def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
-    """Section → name → field, in the order of the file."""
+    """Section → name → field, in the order of the file; without the views."""
     sections = {}
     for name, field in Settings.model_fields.items():
+        if name == "views":
+            continue
         section = field.annotation
         assert isinstance(section, type)
         assert issubclass(section, Section)
         sections[name] = section.model_fields
     return sections
+
+
+SECTIONS_OF_VIEW = tuple(ViewSections.model_fields)
+"""The sections that a view has of its own."""
+
+
+def section_of(table: str) -> str | None:
+    """`detector` and `views.down.detector` → `detector`; None where the table is no section."""
+    match table.split("."):
+        case [section] if section in fields_of_sections():
+            return section
+        case ["views", _, section] if section in SECTIONS_OF_VIEW:
+            return section
+    return None
 
 
 def plain_type(field: FieldInfo) -> type:
@@ -66,6 +82,11 @@ def expectation(field: FieldInfo) -> str:
         words = _pattern_meaning(field.metadata) or _KINDS[annotation]
     span = _span(field)
     return words + (f", {span}" if span else "") + (", or unset" if optional else "")
+
+
+def expectation_of_key() -> str:
+    """What a view may be called, to stand after `must be`."""
+    return PATTERN_MEANINGS[r"^[A-Za-z0-9][A-Za-z0-9_-]*$"]
 
 
 def value_from_text(field: FieldInfo, text: str) -> Any:

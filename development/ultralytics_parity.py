@@ -100,9 +100,24 @@ def enliven(model: nn.Module, image: Tensor, seed: int) -> None:
 
 
 def save(path: Path, model: nn.Module) -> None:
-    """As the trainer of the installed release leaves its best model."""
+    """As the trainer of the installed release leaves its latest model: settings and loss are part of it."""
     import ultralytics
 
+    try:
+        from ultralytics.cfg import get_cfg
+    except ImportError:
+        try:
+            from ultralytics.yolo.cfg import get_cfg
+        except ImportError:  # 8.0.0 to 8.0.6
+            from ultralytics.yolo.configs import get_config
+            from ultralytics.yolo.utils import DEFAULT_CONFIG
+
+            def get_cfg() -> Any:
+                return get_config(DEFAULT_CONFIG)
+
+    model.args = get_cfg()
+    if hasattr(model, "init_criterion"):
+        model.criterion = model.init_criterion()
     content = {
         "epoch": -1,
         "best_fitness": None,
@@ -158,7 +173,7 @@ def compare(name: str, folder: Path, seed: int = 0) -> tuple[float, float, float
     save(path, fresh)
     theirs = torch.load(path, weights_only=False)["model"].float().eval()
     ours = load_checkpoint(path).model
-    if ours.end_to_end:
+    if ours.end_to_end and not theirs.model[-1].end2end:
         # Late releases (8.4.190) answer with the other head, and NMS, unless asked for this one.
         theirs.model[-1].end2end = True
     with torch.inference_mode():
@@ -174,7 +189,7 @@ def compare(name: str, folder: Path, seed: int = 0) -> tuple[float, float, float
         boxes = select_boxes(ours, maps, confidence=confidence, iou=0.7)
         reference = oracle_boxes(output[0], confidence, 0.7, ours.end_to_end)
         folded = torch.cat([level.flatten(2) for level in ours.fuse()(image)], dim=2)
-        theirs_folded = oracle_maps(theirs.fuse(verbose=False)(image), ours.end_to_end)
+        theirs_folded = oracle_maps(theirs.fuse()(image), ours.end_to_end)
     mine = torch.cat(
         (
             torch.from_numpy(boxes.xyxy),

@@ -22,6 +22,7 @@ FLOORS = {
     "cli_flags": 2,
     "messages": 2,
     "operator": 3,
+    "views": 3,
     "service": 4,
     "rehearsal": 5,
     "demo": 6,
@@ -39,7 +40,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.rotation",
     "vision.shared_frame",
 }
-MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench"}
+MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench", "models"}
 
 
 def modules() -> dict[str, Path]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.detections import Detections
+from vision.detections import NO_TRACK, Detections
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _GOLDEN_RATIO = 0.618033988749895
@@ -60,7 +60,8 @@ def annotate(
 
     Args:
         image: (height, width, 3) uint8, BGR. Lines and letters scale with its size.
-        detections: each gets a box of its class's colour and a plate: name, confidence, range where known.
+        detections: each gets a box of its class's colour and a plate: name, track and range where
+            known, confidence.
         lines: text for a panel at the top left.
         highlight: index of the detection that matters now: drawn last, tinted, with bracketed corners.
 
@@ -135,7 +136,8 @@ def _draw_plate(
     taken: Sequence[Rectangle],
 ) -> Rectangle:
     class_id = int(detections.class_id[index])
-    text = f"{detections.class_names[class_id]} {float(detections.confidence[index]):.2f}"
+    text = f"{detections.class_names[class_id]}{_identity(detections, index)} "
+    text += f"{float(detections.confidence[index]):.2f}"
     range_m = float(detections.range_m[index])
     if not np.isnan(range_m):
         text += f"  {range_m:.1f} m"
@@ -149,6 +151,14 @@ def _draw_plate(
     at = (left + sizes.padding, top + sizes.padding // 2 + text_height)
     cv2.putText(image, text, at, _FONT, sizes.font_scale, _ink_on(colour), sizes.stroke, cv2.LINE_AA)
     return plate
+
+
+def _identity(detections: Detections, index: int) -> str:
+    """` #7`; ` #7?` while the track does not count as true yet; nothing without a track."""
+    if detections.track_id is None or detections.track_id[index] == NO_TRACK:
+        return ""
+    sure = detections.track_confirmed is not None and bool(detections.track_confirmed[index])
+    return f" #{int(detections.track_id[index])}{'' if sure else '?'}"
 
 
 def _free_place(

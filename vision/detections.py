@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-class DetectionRecord(TypedDict):
-    """One detection as plain values, ready for JSON. `xyxy` and `center` are pixels of the frame."""
+class _TrackRecord(TypedDict):
+    track_id: NotRequired[int | None]
+    track_score: NotRequired[float | None]
+    track_state: NotRequired[str | None]
+
+
+class DetectionRecord(_TrackRecord):
+    """One detection as plain values, ready for JSON. `xyxy` and `center` are pixels of the frame.
+
+    `track_id` and `track_score` are None for a detection that belongs to no track; `track_state` is then
+    `none`, and None if nobody looked for tracks.
+    """
 
     class_id: int
     class_name: str
@@ -19,6 +29,12 @@ class DetectionRecord(TypedDict):
     xyxy: list[float]
     center: list[float]
     range_m: float | None
+
+
+TRACK_NONE, TRACK_TENTATIVE, TRACK_CONFIRMED = "none", "tentative", "confirmed"
+"""A record's `track_state`: no track, one that may be a mistake, one that counts as true."""
+NO_TRACK = -1
+"""In `Detections.track_id`: belongs to no track."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +47,10 @@ class Detections:
         class_id: (N,) int64, index into `class_names`.
         class_names: the model's own table, id → name.
         range_m: (N,) float32, metres along the optical axis to the object's surface, NaN where unknown.
+        track_id: (N,) int64, 1 or more, `NO_TRACK` for none. Together with the next two; all None if nobody
+            looked for tracks.
+        track_score: (N,) float32, the track's median confidence, NaN without a track.
+        track_confirmed: (N,) bool, whether the track counts as true.
     """
 
     xyxy: NDArray[np.float32]
@@ -38,6 +58,9 @@ class Detections:
     class_id: NDArray[np.int64]
     class_names: tuple[str, ...]
     range_m: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    track_id: NDArray[np.int64] | None = None
+    track_score: NDArray[np.float32] | None = None
+    track_confirmed: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.xyxy)
@@ -49,6 +72,13 @@ class Detections:
             shape = getattr(self, name).shape
             if shape != (count,):
                 raise ValueError(f"Detections.{name} must be ({count},) like xyxy, got {shape}")
+        tracks = {name: getattr(self, name) for name in ("track_id", "track_score", "track_confirmed")}
+        missing = [name for name, values in tracks.items() if values is None]
+        if missing and len(missing) < len(tracks):
+            raise ValueError(f"Detections needs all of {', '.join(tracks)} or none; {missing[0]} is missing")
+        for name, values in tracks.items():
+            if values is not None and values.shape != (count,):
+                raise ValueError(f"Detections.{name} must be ({count},) like xyxy, got {values.shape}")
         if count and not (0 <= int(self.class_id.min()) and int(self.class_id.max()) < len(self.class_names)):
             raise ValueError(
                 f"Detections.class_id must be 0..{len(self.class_names) - 1}, got {self.class_id}"
@@ -73,6 +103,9 @@ class Detections:
             self.class_id[index],
             self.class_names,
             self.range_m[index],
+            None if self.track_id is None else self.track_id[index],
+            None if self.track_score is None else self.track_score[index],
+            None if self.track_confirmed is None else self.track_confirmed[index],
         )
 
     @property
@@ -100,6 +133,18 @@ class Detections:
                 xyxy=[round(float(value), 2) for value in self.xyxy[i]],
                 center=[round(float(value), 2) for value in centers[i]],
                 range_m=None if np.isnan(self.range_m[i]) else round(float(self.range_m[i]), 3),
+                **self._track_record(i),
             )
             for i in range(len(self))
         ]
+
+    def _track_record(self, index: int) -> _TrackRecord:
+        if self.track_id is None or self.track_score is None or self.track_confirmed is None:
+            return {"track_id": None, "track_score": None, "track_state": None}
+        if self.track_id[index] == NO_TRACK:
+            return {"track_id": None, "track_score": None, "track_state": TRACK_NONE}
+        return {
+            "track_id": int(self.track_id[index]),
+            "track_score": round(float(self.track_score[index]), 4),
+            "track_state": TRACK_CONFIRMED if self.track_confirmed[index] else TRACK_TENTATIVE,
+        }

@@ -19,12 +19,16 @@ class Frame:
         sequence: counts every frame the source delivered, from 0. A gap means dropped frames.
         depth_m: (height, width) float32, metres along the optical axis, NaN where unknown; None if there is
             no depth.
+        ready_ns: CLOCK_MONOTONIC nanoseconds when the source had the picture decoded; 0 if it does not tell.
+        decode_ms: how long making a picture of its bytes took, milliseconds.
     """
 
     image: NDArray[np.uint8]
     captured_ns: int
     sequence: int
     depth_m: NDArray[np.float32] | None = None
+    ready_ns: int = 0
+    decode_ms: float = 0.0
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:

@@ -1,10 +1,11 @@
-"""The perception worker's one loop: a frame, what is in it, how far that is, and the result on its way."""
+"""The perception worker's one loop: a frame, what is in it, which object that is, how far, and on its way."""
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +14,13 @@ from numpy.typing import NDArray
 from vision.depth import range_of_boxes
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.frame_selection import TOO_OLD, FrameSelector, Selection
 from vision.sources import Source
+from vision.tracking import CameraView, Tracker, TrackEvent
+
+logger = logging.getLogger(__name__)
+
+_SAY_AGAIN_NS = 10_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +32,15 @@ class PerceptionResult:
         captured_ns: CLOCK_MONOTONIC nanoseconds of the frame's capture.
         inferred_ns: of the moment when the detections were known.
         width, height: the frame's size, pixels.
-        detections: in the frame's pixels, with ranges where the frame has depth.
-        timing_ms: stage → milliseconds: `preprocess`, `inference`, `postprocess`, `range`, and `total`.
+        detections: in the frame's pixels, with tracks if there is a tracker, and with ranges where the frame
+            has depth.
+        timing_ms: stage → milliseconds. `capture`: from the capture stamp until its bytes were there;
+            `decode`; `wait`: until the frame was picked up; then `preprocess`, `inference`, `postprocess`,
+            `track`, `range`; `total`: from picking it up to here.
         dropped: frames lost so far, between the source and here; those left out on purpose do not count.
+        left_out: reason → frames so far that were not looked at. `replaced`: a newer one came first;
+            `unreadable`; `too_old`; and on purpose `every` and `rate`.
+        track_events: what happened to tracks, the oldest first; all since the result before.
     """
 
     sequence: int
@@ -38,6 +51,8 @@ class PerceptionResult:
     detections: Detections
     timing_ms: dict[str, float]
     dropped: int
+    track_events: tuple[TrackEvent, ...] = ()
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 class Timing(Protocol):
@@ -68,11 +83,10 @@ class FrameRecorder(Protocol):
 
 
 class Pipeline:
-    """Source → detector → range → result, one frame a step.
+    """Source → detector → tracker → range → result, one frame a step.
 
     Attributes:
         frames: frames read so far.
-        dropped: frames lost so far between the source and here.
     """
 
     def __init__(
@@ -80,26 +94,44 @@ class Pipeline:
         source: Source,
         detector: FrameDetector | None,
         *,
-        every: int = 1,
+        selection: Selection = Selection(),  # noqa: B008 - frozen
         recorder: FrameRecorder | None = None,
+        tracker: Tracker | None = None,
+        view_at: Callable[[Frame], CameraView | None] = lambda _: None,
     ) -> None:
         """
         Args:
             source: open; the caller closes it.
             detector: None: nothing is looked for, and every result is empty.
-            every: look at every N-th frame that was read. The others are only recorded.
+            selection: which frames are looked at. The others are only recorded.
             recorder: is given every frame with the newest detections, after the result has left.
+            tracker: is given the detections of every frame that is looked at.
+            view_at: tells where the camera looked when it took a frame, None where that is not known. Asked
+                after the detection, when what the vehicle told of that moment has come.
         """
-        if every < 1:
-            raise ValueError(f"every must be at least 1, got {every}")
         self._source = source
         self._detector = detector
-        self._every = every
+        self._selector = FrameSelector(selection)
         self._recorder = recorder
+        self._tracker = tracker if detector is not None else None
+        self._view_at = view_at
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
+        self._missing = 0
+        self._say_again_ns = 0
         self.frames = 0
-        self.dropped = 0
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Reason → frames so far that were not looked at; see `PerceptionResult`."""
+        unreadable = self._source.statistics.unreadable
+        replaced = max(self._missing - unreadable, 0)
+        return {"replaced": replaced, "unreadable": unreadable, **self._selector.left_out}
+
+    @property
+    def dropped(self) -> int:
+        """Frames lost so far between the source and here; those left out on purpose do not count."""
+        return self._missing + self._selector.left_out[TOO_OLD]
 
     def step(self, timeout_s: float, deliver: Callable[[PerceptionResult], None]) -> bool:
         """Read one frame, look at it if it is its turn, hand the result to `deliver`, then record the frame.
@@ -113,21 +145,35 @@ class Pipeline:
         frame = self._source.read(timeout_s)
         if frame is None:
             return False
-        self.dropped += max(0, frame.sequence - self._next_sequence)
+        picked_ns = time.monotonic_ns()
+        self._missing += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
-        turn = self.frames % self._every == 0
         self.frames += 1
-        if turn:
-            result = self._look(frame)
+        too_old = self._selector.left_out[TOO_OLD]
+        if self._selector.look_at(frame, picked_ns):
+            result = self._look(frame, picked_ns)
             self._newest = result.detections
             deliver(result)
+        if self._selector.left_out[TOO_OLD] > too_old:
+            self._say_too_old((picked_ns - frame.captured_ns) / 1e9, picked_ns)
         if self._recorder is not None:
             self._recorder.write(frame, self._newest)
         return True
 
-    def _look(self, frame: Frame) -> PerceptionResult:
+    def _say_too_old(self, age_s: float, now_ns: int) -> None:
+        if now_ns >= self._say_again_ns:
+            self._say_again_ns = now_ns + _SAY_AGAIN_NS
+            logger.warning(
+                "%s: a frame is %.2f s old when it comes, too old to be looked at", self._source.uri, age_s
+            )
+
+    def _look(self, frame: Frame, picked_ns: int) -> PerceptionResult:
         started_ns = time.perf_counter_ns()
-        timing_ms: dict[str, float] = {}
+        timing_ms = {"decode": frame.decode_ms}
+        if frame.ready_ns:
+            arrival_ms = (frame.ready_ns - frame.captured_ns) / 1e6
+            timing_ms["capture"] = max(arrival_ms - frame.decode_ms, 0.0)
+            timing_ms["wait"] = (picked_ns - frame.ready_ns) / 1e6
         if self._detector is None:
             detections = self._newest
         else:
@@ -138,10 +184,16 @@ class Pipeline:
                 timing_ms["inference"] = timing.inference_ms
                 timing_ms["postprocess"] = timing.postprocess_ms
         detected_ns = time.perf_counter_ns()
+        events: tuple[TrackEvent, ...] = ()
+        if self._tracker is not None:
+            tracked = self._tracker.update(detections, frame.captured_ns, self._view_at(frame))
+            detections, events = tracked.detections, tracked.events
+        tracked_ns = time.perf_counter_ns()
+        timing_ms["track"] = (tracked_ns - detected_ns) / 1e6
         if frame.depth_m is not None:
             detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
         done_ns = time.perf_counter_ns()
-        timing_ms["range"] = (done_ns - detected_ns) / 1e6
+        timing_ms["range"] = (done_ns - tracked_ns) / 1e6
         timing_ms["total"] = (done_ns - started_ns) / 1e6
         return PerceptionResult(
             sequence=frame.sequence,
@@ -152,4 +204,6 @@ class Pipeline:
             detections=detections,
             timing_ms=timing_ms,
             dropped=self.dropped,
+            track_events=events,
+            left_out=self.left_out,
         )

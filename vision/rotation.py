@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+Quaternion = tuple[float, float, float, float]
+
 # Optical axes (x right, y down, z forward) of a camera looking along the body's forward axis, in FRD.
 BODY_FROM_OPTICAL: NDArray[np.float64] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -67,6 +69,24 @@ def euler_from_quaternion(quaternion: tuple[float, float, float, float]) -> tupl
         math.asin(max(-1.0, min(1.0, -m[2, 0]))),
         math.atan2(m[1, 0], m[0, 0]),
     )
+
+
+def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
+    """Between two attitudes along the shorter way (Shoemake 1985); a fraction above 1 goes on turning.
+
+    Quaternions are (w, x, y, z).
+    """
+    a, b = (np.array(q) / math.sqrt(sum(v * v for v in q)) for q in (first, second))
+    cosine = float(a @ b)
+    if cosine < 0.0:
+        b, cosine = -b, -cosine
+    if cosine > 0.9995:
+        mixed = a + (b - a) * fraction
+    else:
+        angle = math.acos(cosine)
+        mixed = a * math.sin((1.0 - fraction) * angle) + b * math.sin(fraction * angle)
+    w, x, y, z = (float(value) for value in mixed / np.linalg.norm(mixed))
+    return (w, x, y, z)
 
 
 def wrap_angle(angle_rad: float) -> float:

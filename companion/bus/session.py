@@ -10,13 +10,13 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from typing import Any
 
 import zenoh
 
-from companion.bus.topics import TOPICS, Topic, alive_key, command_key
+from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, command_key
 from companion.settings import ZenohSection
 
 logger = logging.getLogger(__name__)
@@ -56,6 +56,11 @@ class Bus:
     Args:
         on_event: called with (level, text) when the network is lost or found.
         on_command: answers a command's text with a JSON-able reply; called in the loop, one task each.
+        views: names of the views that publish besides the first.
+
+    Attributes:
+        published: path of a topic (`Topic.path`) → messages handed to zenoh.
+        unsent: messages that came while there was no session, or that zenoh refused.
     """
 
     def __init__(
@@ -65,6 +70,7 @@ class Bus:
         *,
         on_event: Callable[[str, str], None],
         on_command: CommandHandler,
+        views: Sequence[str] = (),
     ) -> None:
         self._settings = settings
         self._vehicle = vehicle
@@ -78,7 +84,9 @@ class Bus:
         self._watching: asyncio.Task[None] | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._queryable: zenoh.Queryable[None] | None = None
-        self.published: dict[str, int] = {topic.name: 0 for topic in TOPICS}
+        self._streams: list[tuple[Topic, str | None]] = [(topic, None) for topic in TOPICS]
+        self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
+        self.published: dict[str, int] = {topic.path(view): 0 for topic, view in self._streams}
         self.unsent = 0
 
     @property
@@ -126,9 +134,10 @@ class Bus:
             with suppress(TimeoutError):
                 await asyncio.wait_for(asyncio.to_thread(session.close), 3.0)
 
-    def publish(self, topic: Topic, value: Any) -> None:
+    def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
         """Publish a JSON-able value, or a text as it is. Never blocks, never raises for the network."""
-        publisher = self._publishers.get(topic.name)
+        path = topic.path(view)
+        publisher = self._publishers.get(path)
         if publisher is None:
             self.unsent += 1
             return
@@ -137,21 +146,21 @@ class Bus:
             publisher.put(payload)
         except zenoh.ZError as error:
             self.unsent += 1
-            logger.warning("zenoh did not take a message for %s: %s", topic.name, _first_line(error))
+            logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))
             return
-        self.published[topic.name] += 1
+        self.published[path] += 1
 
     def _adopt(self, session: zenoh.Session) -> None:
         self._session = session
         self._publishers = {
-            topic.name: session.declare_publisher(
-                topic.key(self._vehicle),
+            topic.path(view): session.declare_publisher(
+                topic.key(self._vehicle, view),
                 encoding=topic.encoding,
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=topic.priority,
                 express=topic.express,
             )
-            for topic in TOPICS
+            for topic, view in self._streams
         }
         # Presence for free: the token goes when we go, however we go.
         self._token = session.liveliness().declare_token(alive_key(self._vehicle))

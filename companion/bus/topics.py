@@ -33,9 +33,13 @@ class Topic:
     express: bool
     description: str
 
-    def key(self, vehicle: str) -> str:
-        """The zenoh key of one vehicle's stream."""
-        return f"{ROOT}/{vehicle}/{self.name}"
+    def key(self, vehicle: str, view: str | None = None) -> str:
+        """The zenoh key of one vehicle's stream; of a view other than the first, under that view's name."""
+        return f"{ROOT}/{vehicle}/{self.path(view)}"
+
+    def path(self, view: str | None = None) -> str:
+        """The key behind the vehicle's name."""
+        return self.name if view is None else f"views/{view}/{self.name}"
 
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
@@ -54,6 +58,15 @@ LABELS: Final = Topic(
     False,
     "the class names of one frame, comma separated",
 )
+TRACKS: Final = Topic(
+    "tracks",
+    None,
+    None,
+    _JSON,
+    _DATA,
+    False,
+    "what happened to tracks at one frame: new, update, lost, end",
+)
 VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
 SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
 STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
@@ -67,7 +80,10 @@ EVENTS: Final = Topic(
     "what happened: modes, behaviours, parts lost and found",
 )
 
-TOPICS: Final = (DETECTIONS, LABELS, VEHICLE, SETPOINT, STATUS, EVENTS)
+# What every view publishes of its own.
+VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS)
+
+TOPICS: Final = (DETECTIONS, LABELS, TRACKS, VEHICLE, SETPOINT, STATUS, EVENTS)
 
 # The last name of the queryable that takes a command and answers with its outcome.
 COMMAND: Final = "command"

@@ -45,8 +45,8 @@ BASE_TIMEOUT_S = 45.0
 class ApproachBehaviour(Behaviour):
     """Keeps its height, turns its nose to the object and stops `distance_m` before its nearest surface.
 
-    It begins with the object of the class nearest to the nose and stays with that one. Lost, it brakes and
-    looks for `lost_timeout_s` before it gives up.
+    It begins with the object of the class nearest to the nose, among the true ones, and stays with it.
+    Lost, it brakes and looks for `lost_timeout_s` before it gives up.
     """
 
     name = "approach"
@@ -134,7 +134,7 @@ class ApproachBehaviour(Behaviour):
         fitting = [
             target
             for target in situation.targets
-            if target.class_name == self._class_name and target.confidence >= self._confidence
+            if target.class_name == self._class_name and target.score >= self._confidence
         ]
         if self._track is not None:
             if self._track.update(fitting, position):
@@ -142,9 +142,10 @@ class ApproachBehaviour(Behaviour):
             elif situation.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
                 self._find_again(self._track, fitting, position)
             return
-        if not fitting:
+        trusted = [target for target in fitting if target.trusted]
+        if not trusted:
             return
-        chosen = min(fitting, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
+        chosen = min(trusted, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._bearing_rad = chosen.bearing_rad
@@ -155,12 +156,14 @@ class ApproachBehaviour(Behaviour):
         """A wrong range can lead the track away from its object: begin anew with what is where it was."""
         north, east = lost.position_ned_m[0] - position[0], lost.position_ned_m[1] - position[1]
         bearing, range_m = math.atan2(east, north), math.hypot(north, east)
-        for target in fitting:
+        for target in sorted(fitting, key=lambda target: target.track_id != lost.track_id):
             if target.captured_ns <= self._seen_ns or target.position_ned_m is None:
+                continue
+            if not target.trusted or lost.is_another(target):
                 continue
             off = abs(wrap_angle(target.bearing_rad - bearing))
             if off < SAME_BEARING_RAD and 0.5 * range_m < target.range_m < 2.0 * range_m:
-                self._track, self._seen_ns = ObjectTrack(target, position), target.captured_ns
+                self._track, self._seen_ns = lost.anew(target, position), target.captured_ns
                 return
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:

@@ -7,6 +7,13 @@ from collections.abc import Sequence
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
 from companion.vehicle.state import LandedState
 
+PERCEPTION_GAP_S = 1.5
+"""A detector that was heard within this is at work.
+
+It may be late for a moment: a small computer that starts the very program that sends the command is busy.
+Steering asks more (`perception_fresh`); until then behaviours brake.
+"""
+
 AIRBORNE = (LandedState.IN_AIR, LandedState.TAKING_OFF, LandedState.LANDING)
 
 
@@ -33,7 +40,7 @@ def refusal(
                 missing.append(f"to be in the air ({_where(situation)})")
             case Requirement.ON_GROUND if state.landed is not LandedState.ON_GROUND:
                 missing.append(f"to be on the ground ({_where(situation)})")
-            case Requirement.PERCEPTION if not situation.perception_fresh:
+            case Requirement.PERCEPTION if not _perceiving(situation):
                 missing.append(f"perception ({_perception_age(situation)})")
     if class_names is not None:
         unknown = [name for name in behaviour.class_names if name not in class_names]
@@ -54,6 +61,11 @@ def _position_age(situation: Situation) -> str:
         return "none came yet"
     oldest_ns = min(state.position_ns, state.attitude_ns)
     return f"{(situation.now_ns - oldest_ns) / 1e9:.1f} s old"
+
+
+def _perceiving(situation: Situation) -> bool:
+    age_s = situation.perception_age_s
+    return situation.perception_fresh or (age_s is not None and age_s <= PERCEPTION_GAP_S)
 
 
 def _perception_age(situation: Situation) -> str:

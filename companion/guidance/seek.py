@@ -105,12 +105,14 @@ class SeekBehaviour(Behaviour):
         fresh = [t for t in situation.targets if t.captured_ns > self._newest_ns]
         if fresh:
             self._newest_ns = max(t.captured_ns for t in fresh)
-        seen = [t for t in fresh if t.class_name == self._class_name and t.confidence >= self._confidence]
+        seen = [t for t in fresh if t.class_name == self._class_name and t.score >= self._confidence]
         if self._found is not None:
             same = [t for t in seen if _apart(t, self._found) <= SAME_BEARING_RAD]
             if same:
                 found = self._found
-                self._found = min(same, key=lambda t: _apart(t, found))
+                self._found = min(
+                    same, key=lambda t: (t.track_id is None or t.track_id != found.track_id, _apart(t, found))
+                )
             return
         if not seen:
             return
@@ -121,7 +123,7 @@ class SeekBehaviour(Behaviour):
         recent = [t for t in self._sightings if t.captured_ns >= oldest_ns]
         for target in sorted(seen, key=lambda t: -t.confidence):
             frames = {t.captured_ns for t in recent if _apart(t, target) <= SAME_BEARING_RAD}
-            if len(frames) >= FRAMES_NEEDED:
+            if len(frames) >= FRAMES_NEEDED and target.trusted:
                 self._found, self._found_ns = target, situation.now_ns
                 self._facing_since_ns = None
                 return

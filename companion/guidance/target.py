@@ -22,7 +22,7 @@ class Target:
     """One seen object.
 
     Attributes:
-        class_name, confidence: as the detector says.
+        class_name, confidence: as the detector says, of this frame.
         captured_ns: CLOCK_MONOTONIC stamp of the frame.
         bearing_rad: direction of the box's centre, clockwise from north, -π..π (attitude removed).
         elevation_rad: above the horizon, positive up.
@@ -30,6 +30,9 @@ class Target:
         range_source: where that comes from.
         position_ned_m: of that nearest point, local NED; None when the range is unknown.
         box_xyxy: pixels, as detected.
+        track_id: of the object, the same from frame to frame; None without a track.
+        track_score: median confidence over the track; None without a track.
+        trusted: it may be chosen to be flown to: its track counts as true, or nobody looks for tracks.
     """
 
     class_name: str
@@ -41,3 +44,11 @@ class Target:
     range_source: RangeSource = RangeSource.NONE
     position_ned_m: Vector3 | None = None
     box_xyxy: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    track_id: int | None = None
+    track_score: float | None = None
+    trusted: bool = True
+
+    @property
+    def score(self) -> float:
+        """How sure it is, 0..1: of a followed object over its history, else in this frame."""
+        return self.confidence if self.track_score is None else self.track_score

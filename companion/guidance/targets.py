@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.camera_model import CameraModel, CameraMount
-from vision.detections import DetectionRecord
+from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import direction_ned, point_at_depth, point_on_ground
-from vision.rotation import matrix_from_quaternion
+from vision.rotation import matrix_from_quaternion, slerp
 
 HISTORY_S = 3.0
 # Beyond the ends of the history the nearest sample is taken for this long; a quadrotor turns 10° in it.
@@ -140,22 +140,10 @@ def _target(
         range_source=source,
         position_ned_m=(north, east, down) if known else None,
         box_xyxy=(left, top, right, bottom),
+        track_id=detection.get("track_id"),
+        track_score=detection.get("track_score"),
+        trusted=detection.get("track_state") in (None, TRACK_CONFIRMED),
     )
-
-
-def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """Between two attitudes along the shorter way (Shoemake 1985). Quaternions are (w, x, y, z)."""
-    a, b = (np.array(q) / math.sqrt(sum(v * v for v in q)) for q in (first, second))
-    cosine = float(a @ b)
-    if cosine < 0.0:
-        b, cosine = -b, -cosine
-    if cosine > 0.9995:
-        mixed = a + (b - a) * fraction
-    else:
-        angle = math.acos(cosine)
-        mixed = a * math.sin((1.0 - fraction) * angle) + b * math.sin(fraction * angle)
-    w, x, y, z = (float(value) for value in mixed / np.linalg.norm(mixed))
-    return (w, x, y, z)
 
 
 def _newer(samples: deque[tuple[int, Quaternion]], stamp_ns: int) -> bool:

@@ -3,7 +3,8 @@
 The state is a position in local NED (north, east) that wanders (random walk). A measurement is a bearing and,
 where known, a range; its noise is an ellipse along the line of sight, so a bearing alone still corrects what
 it knows about, and the same arithmetic decides whether a detection can be this object at all (Mahalanobis
-distance).
+distance). Where the picture's own tracker knows which box is which, its identities come first: what was seen
+beside the object is never taken for it.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ class ObjectTrack:
         self._down_m = target.position_ned_m[2]
         self._covariance = _noise(target, self._place - vehicle[:2])
         self._captured_ns = target.captured_ns
+        self._track_id = target.track_id
+        self._others: set[int] = set()
         self.confidence = target.confidence
 
     @property
@@ -49,9 +52,24 @@ class ObjectTrack:
         return self._captured_ns
 
     @property
+    def track_id(self) -> int | None:
+        """The object's identity in the picture; None while it has none."""
+        return self._track_id
+
+    @property
     def position_ned_m(self) -> Vector3:
         """Local NED; down is that of the newest measured place."""
         return (float(self._place[0]), float(self._place[1]), self._down_m)
+
+    def is_another(self, target: Target) -> bool:
+        """Whether this was seen beside the object, so that it cannot be the object."""
+        return target.track_id in self._others
+
+    def anew(self, target: Target, vehicle: Vector3) -> ObjectTrack:
+        """The same object begun again at a target that is taken for it."""
+        track = ObjectTrack(target, vehicle)
+        track._others = self._others
+        return track
 
     def update(self, targets: Sequence[Target], vehicle: Vector3) -> bool:
         """Take the detection that is this object, if any. True: there was a new one.
@@ -61,6 +79,9 @@ class ObjectTrack:
             vehicle: the vehicle's position, local NED.
         """
         fresh = [t for t in targets if t.class_name == self._class_name and t.captured_ns > self._captured_ns]
+        if not fresh:
+            return False
+        fresh = self._same_identity(fresh)
         if not fresh:
             return False
         elapsed_s = (fresh[0].captured_ns - self._captured_ns) / 1e9
@@ -82,7 +103,17 @@ class ObjectTrack:
         if target.position_ned_m is not None:
             self._down_m = target.position_ned_m[2]
         self._captured_ns, self.confidence = target.captured_ns, target.confidence
+        if target.track_id is not None:
+            self._track_id = target.track_id
         return True
+
+    def _same_identity(self, targets: list[Target]) -> list[Target]:
+        """Those that can be this object: the one that bears its identity, or else strangers."""
+        own = [t for t in targets if t.track_id is not None and t.track_id == self._track_id]
+        if own:
+            self._others |= {t.track_id for t in targets if t.track_id not in (None, self._track_id)}
+            return own
+        return [t for t in targets if not self.is_another(t)]
 
     def _innovation(
         self, target: Target, vehicle: Vector3

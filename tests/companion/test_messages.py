@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from companion.bus.topics import NO_OBJECTS
-from companion.messages import detections_message, labels_message, setpoint_message, vehicle_message
+from companion.messages import (
+    detections_message,
+    labels_message,
+    setpoint_message,
+    tracks_message,
+    vehicle_message,
+)
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
-from vision.detections import Detections
+from vision.detections import NO_TRACK, Detections
 from vision.pipeline import PerceptionResult
+from vision.tracking import Track, TrackEvent, TrackEventKind, TrackState
 
 NAMES = ("person", "car")
 
@@ -39,6 +47,7 @@ def one_car(range_m: float) -> Detections:
 def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
     message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000))
     assert message == {
+        "view": None,
         "vehicle": "alpha",
         "sequence": 7,
         "captured_ns": 1_000,
@@ -56,6 +65,58 @@ def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
                 "xyxy": [10.0, 20.0, 30.0, 60.0],
                 "center": [20.0, 40.0],
                 "range_m": 11.5,
+                "track_id": None,
+                "track_score": None,
+                "track_state": None,
+            }
+        ],
+    }
+
+
+def test_a_tracked_detection_bears_its_identity_its_median_and_whether_it_counts() -> None:
+    cars = Detections(
+        np.zeros((3, 4), np.float32),
+        np.full(3, 0.9, np.float32),
+        np.ones(3, np.int64),
+        NAMES,
+        track_id=np.array([7, 8, NO_TRACK]),
+        track_score=np.array([0.81, 0.4, np.nan], np.float32),
+        track_confirmed=np.array([True, False, False]),
+    )
+    message = strictly(detections_message(result(cars), "alpha", 3_000))
+    tracks = [
+        (record["track_id"], record["track_score"], record["track_state"])
+        for record in message["detections"]  # type: ignore[index]
+    ]
+    assert tracks == [(7, 0.81, "confirmed"), (8, 0.4, "tentative"), (None, None, "none")]
+
+
+def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> None:
+    track = Track(7, 1, "car", TrackState.CONFIRMED, (10.0, 20.0, 30.123, 60.0), 0.9, 0.81234, 5, 100, 900)
+    events = (TrackEvent(TrackEventKind.LOST, 1_000, track),)
+    message = strictly(tracks_message(replace(result(one_car(1.0)), track_events=events), "alpha", 3_000))
+    assert message == {
+        "view": None,
+        "vehicle": "alpha",
+        "sequence": 7,
+        "captured_ns": 1_000,
+        "published_ns": 3_000,
+        "width": 640,
+        "height": 480,
+        "events": [
+            {
+                "event": "lost",
+                "stamp_ns": 1_000,
+                "track_id": 7,
+                "class_id": 1,
+                "class_name": "car",
+                "xyxy": [10.0, 20.0, 30.12, 60.0],
+                "confidence": 0.9,
+                "track_score": 0.8123,
+                "track_state": "confirmed",
+                "seen": 5,
+                "first_ns": 100,
+                "last_ns": 900,
             }
         ],
     }

@@ -1,7 +1,7 @@
 """Reads one checkpoint in a process of its own, and tells what that took.
 
-Run as `python checkpoint_memory.py WARM_UP FILE…`: for each file one line of JSON with the outcome, the growth of
-the process's peak memory, and the seconds. Whatever tries to run something ends the process.
+Run as `python checkpoint_memory.py WARM_UP FILE…`: for each file one line of JSON with the outcome, the
+growth of the process's peak memory, and the seconds. Whatever tries to run something ends the process.
 """
 
 from __future__ import annotations

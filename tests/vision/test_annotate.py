@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from vision.annotate import annotate, class_colour
-from vision.detections import Detections
+from vision.detections import NO_TRACK, Detections
 
 NAMES = ("person", "bicycle", "car")
 
@@ -111,6 +112,26 @@ def test_labels_of_neighbours_do_not_hide_each_other() -> None:
     areas = [int((drawn == colour).all(axis=2).sum()) for drawn in alone]
     together = int((annotate(image, seen(boxes)) == colour).all(axis=2).sum())
     assert together > 0.9 * sum(areas)
+
+
+def test_a_track_is_named_on_its_plate_and_doubted_until_it_counts_as_true() -> None:
+    image = picture()
+    plain = seen([[200, 200, 240, 260]])
+
+    def plate(track_id: int, confirmed: bool) -> int:
+        tracked = replace(
+            plain,
+            track_id=np.array([track_id]),
+            track_score=np.array([0.5], np.float32),
+            track_confirmed=np.array([confirmed]),
+        )
+        left, _, right, _ = changed(image, annotate(image, tracked))
+        return right - left
+
+    without = plate(NO_TRACK, False)
+    assert without < plate(7, True) < plate(7, False) < plate(7777, False)
+    left, _, right, _ = changed(image, annotate(image, plain))
+    assert right - left == without
 
 
 @pytest.mark.parametrize("highlight", [-1, 1])

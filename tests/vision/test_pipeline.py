@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pickle
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -11,8 +11,10 @@ import pytest
 
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.frame_selection import Selection
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.sources import EndOfStream, Source, SourceSettings, SourceStatistics, open_source
+from vision.tracking import Tracker
 
 WIDTH, HEIGHT = 96, 64
 
@@ -105,15 +107,39 @@ def test_depth_gives_every_detection_its_range() -> None:
 
 
 def test_only_every_nth_frame_is_looked_at() -> None:
-    pipeline = Pipeline(Frames(*(frame_of(number) for number in range(7))), BrightSpot(), every=3)
+    pipeline = Pipeline(
+        Frames(*(frame_of(number) for number in range(7))), BrightSpot(), selection=Selection(every=3)
+    )
     assert [result.sequence for result in run(pipeline)] == [0, 3, 6]
     assert pipeline.frames == 7
     assert pipeline.dropped == 0
+    assert pipeline.left_out == {"replaced": 0, "unreadable": 0, "every": 4, "rate": 0, "too_old": 0}
 
 
 def test_frames_that_the_source_lost_are_counted() -> None:
     pipeline = Pipeline(Frames(frame_of(1), frame_of(2), frame_of(6)), BrightSpot())
-    assert [result.dropped for result in run(pipeline)] == [1, 1, 4]
+    results = run(pipeline)
+    assert [result.dropped for result in results] == [1, 1, 4]
+    assert [result.left_out["replaced"] for result in results] == [1, 1, 4]
+
+
+def test_a_frame_that_is_too_old_is_counted_as_lost_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    # The frames' stamps are from long ago.
+    pipeline = Pipeline(Frames(frame_of(0), frame_of(1)), BrightSpot(), selection=Selection(max_age_s=0.5))
+    assert run(pipeline) == []
+    assert pipeline.dropped == pipeline.left_out["too_old"] == 2
+    (line,) = caplog.messages
+    assert line.startswith("frames: a frame is ")
+
+
+def test_arrival_decoding_and_waiting_are_told_apart() -> None:
+    now_ns = time.monotonic_ns()
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    frame = Frame(image, now_ns - 50_000_000, 0, ready_ns=now_ns - 30_000_000, decode_ms=5.0)
+    (result,) = run(Pipeline(Frames(frame), BrightSpot()))
+    assert result.timing_ms["capture"] == pytest.approx(15.0)
+    assert result.timing_ms["decode"] == 5.0
+    assert result.timing_ms["wait"] >= 30.0
 
 
 def test_a_time_without_a_frame_is_told_and_is_no_end() -> None:
@@ -141,7 +167,70 @@ def test_a_result_is_small_and_survives_pickling() -> None:
 
 def test_every_must_be_a_count() -> None:
     with pytest.raises(ValueError, match="every must be at least 1, got 0"):
-        Pipeline(Frames(), BrightSpot(), every=0)
+        Selection(every=0)
+
+
+class Flickering:
+    """The bright spot, seen surely and weakly in turn, and a weak ghost where nothing is."""
+
+    class_names = ("spot",)
+    last_timing = Timing()
+
+    def __init__(self) -> None:
+        self._spot = BrightSpot()
+        self._calls = 0
+
+    def detect(self, image_bgr: np.ndarray, /) -> Detections:
+        spot = self._spot.detect(image_bgr)
+        ghost = np.array([[0, 50, 10, 60]], np.float32)
+        sure = 0.15 if self._calls % 4 == 3 else 0.9
+        self._calls += 1
+        return Detections(
+            np.concatenate([spot.xyxy, ghost]),
+            np.array([sure, 0.2], np.float32),
+            np.zeros(2, np.int64),
+            self.class_names,
+        )
+
+
+def test_a_tracker_names_what_is_seen_and_keeps_the_weak_that_belong_to_it() -> None:
+    frames = [frame_of(number, spot_x=10 + 3 * number) for number in range(8)]
+    frames = [replace(frame, captured_ns=frame.sequence * 100_000_000 + 1) for frame in frames]
+    results = run(Pipeline(Frames(*frames), Flickering(), tracker=Tracker()))
+    assert [result.detections.track_id.tolist() for result in results] == [[1]] * 8
+    assert [round(float(result.detections.confidence[0]), 2) for result in results] == [
+        0.9,
+        0.9,
+        0.9,
+        0.15,
+    ] * 2
+    kinds = [[event.kind.value for event in result.track_events] for result in results]
+    assert kinds == [[], [], ["new"]] + [["update"]] * 5
+    assert all(result.timing_ms["track"] > 0 for result in results)
+
+
+def test_ranges_are_measured_for_tracked_detections_too() -> None:
+    (result,) = run(Pipeline(Frames(frame_of(0, depth_m=6.5)), Flickering(), tracker=Tracker()))
+    assert result.detections.range_m == pytest.approx([6.5])
+
+
+def test_where_the_camera_looked_is_asked_for_every_frame_after_it_was_looked_at() -> None:
+    asked: list[tuple[int, bool]] = []
+    detector = Flickering()
+
+    def view_at(frame: Frame) -> None:
+        asked.append((frame.sequence, detector._calls == len(asked) + 1))
+
+    run(Pipeline(Frames(frame_of(0), frame_of(1)), detector, tracker=Tracker(), view_at=view_at))
+    assert asked == [(0, True), (1, True)]
+
+
+def test_without_a_tracker_nobody_has_an_identity() -> None:
+    (result,) = run(Pipeline(Frames(frame_of(0)), Flickering()))
+    assert result.detections.track_id is None
+    assert result.track_events == ()
+    (nothing,) = run(Pipeline(Frames(frame_of(0)), None, tracker=Tracker()))
+    assert nothing.detections.track_id is None
 
 
 class Kept:
@@ -158,5 +247,5 @@ def test_every_frame_is_recorded_with_the_newest_detections() -> None:
     dark = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic_ns(), 3)
     recorder = Kept()
     frames = [frame_of(0), frame_of(1), frame_of(2), dark]
-    run(Pipeline(Frames(*frames), BrightSpot(), every=3, recorder=recorder))
+    run(Pipeline(Frames(*frames), BrightSpot(), selection=Selection(every=3), recorder=recorder))
     assert recorder.kept == [(0, 1), (1, 1), (2, 1), (3, 0)]

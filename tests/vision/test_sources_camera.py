@@ -47,11 +47,12 @@ class FakeCamera:
     def get(self, name: int) -> float:
         return self.stamp_ms if name == cv2.CAP_PROP_POS_MSEC else self.values[name]
 
-    def read(self) -> tuple[bool, Any]:
+    def grab(self) -> bool:
         time.sleep(0.005)
         self.reads += 1
-        if self is FakeCamera.opened[0] and self.reads > self.frames_before_unplugged:
-            return False, None
+        return self is not FakeCamera.opened[0] or self.reads <= self.frames_before_unplugged
+
+    def retrieve(self) -> tuple[bool, Any]:
         return True, np.full((480, 640, 3), 50, np.uint8)
 
     def release(self) -> None:

@@ -31,9 +31,12 @@ def find_annotations(folder: Path) -> Path | None:
 
 
 def _looks_like_coco(path: Path) -> bool:
+    """By the keys in its beginning and its end: a file of annotations can be large."""
     with path.open("rb") as file:
-        head = file.read(1 << 16)
-    return b'"images"' in head or b'"annotations"' in head
+        seen = file.read(1 << 16)
+        file.seek(max(0, path.stat().st_size - (1 << 16)))
+        seen += file.read()
+    return b'"images"' in seen and (b'"annotations"' in seen or b'"categories"' in seen)
 
 
 def read_coco(path: Path, images: Path | None = None) -> Dataset:

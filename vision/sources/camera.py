@@ -14,14 +14,12 @@ import logging
 import math
 import os
 import stat
-import time
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from vision.sources.feed import Feed, FeedLost, Picture
-from vision.sources.opencv import quiet_opencv
+from vision.sources.opencv import quiet_opencv, read_capture
 from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings
 
 logger = logging.getLogger(__name__)
@@ -123,14 +121,13 @@ class CameraFeed(Feed):
             logger.info("%s: gives %s", self._device, given_text)
 
     def read(self, timeout_s: float) -> Picture | None:
-        ok, image = self._capture.read()
-        now_ns = time.monotonic_ns()
-        if not ok or image is None:
+        image, now_ns, decode_ms = read_capture(self._capture)
+        if image is None:
             gone = "" if self._device.exists() else "; it was unplugged"
             raise FeedLost(f"the camera gave no frame{gone}")
         driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         captured_ns = driver_ns if 0 <= now_ns - driver_ns < _OLDEST_STAMP_NS else now_ns
-        return Picture(np.ascontiguousarray(image, dtype=np.uint8), captured_ns)
+        return Picture(image, captured_ns, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()

@@ -26,6 +26,8 @@ class Picture:
         depth_m: (height, width) float32 metres along the optical axis, or None.
         media_s: seconds since the start of the recording, for pacing; None where there is no such time.
         skipped: pictures that the writer overwrote since the one before.
+        decode_ms: how long making a picture of its bytes took, milliseconds, as far as the library that does
+            it lets us see.
     """
 
     image: NDArray[np.uint8]
@@ -33,6 +35,7 @@ class Picture:
     depth_m: NDArray[np.float32] | None = None
     media_s: float | None = None
     skipped: int = 0
+    decode_ms: float = 0.0
 
 
 class Feed(ABC):

@@ -83,7 +83,7 @@ class HttpMjpegFeed(Feed):
     def __init__(self, response: http.client.HTTPResponse) -> None:
         self._response = response
         self._parser = MjpegParser()
-        self._ready: deque[tuple[NDArray[np.uint8], int]] = deque()
+        self._ready: deque[tuple[NDArray[np.uint8], int, float]] = deque()
         # A second handle on the same connection, to end a read from another thread.
         self._socket = socket.socket(fileno=os.dup(response.fileno()))
 
@@ -98,10 +98,12 @@ class HttpMjpegFeed(Feed):
             if not data:
                 raise FeedLost("the server closed the connection")
             captured_ns = time.monotonic_ns()
-            self._ready.extend((image, captured_ns) for image in self._parser.push(data))
+            images = self._parser.push(data)
+            decode_ms = (time.monotonic_ns() - captured_ns) / 1e6 / max(len(images), 1)
+            self._ready.extend((image, captured_ns, decode_ms) for image in images)
             self.unreadable = self._parser.unreadable
-        image, captured_ns = self._ready.popleft()
-        return Picture(image, captured_ns)
+        image, captured_ns, decode_ms = self._ready.popleft()
+        return Picture(image, captured_ns, decode_ms=decode_ms)
 
     def interrupt(self) -> None:
         with contextlib.suppress(OSError):  # it is closed already

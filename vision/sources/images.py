@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 from pathlib import Path
 
 import cv2
@@ -73,13 +74,15 @@ class ImagesFeed(Feed):
             index = self._next
             self._next += 1
             path = self._paths[index]
+            started_ns = time.monotonic_ns()
             try:
                 image = decode_image(path.read_bytes())
                 reason = "not an image that OpenCV can read; is it cut short or damaged?"
             except OSError as error:
                 image, reason = None, error.strerror or str(error)
             if image is not None:
-                return Picture(image, media_s=index / self._rate_hz)
+                decode_ms = (time.monotonic_ns() - started_ns) / 1e6
+                return Picture(image, media_s=index / self._rate_hz, decode_ms=decode_ms)
             self.unreadable += 1
             logger.warning("%s: passed over: %s", path, reason)
         if self.unreadable == len(self._paths):

@@ -242,10 +242,13 @@ class LatestSource(Source):
         self._stop.wait(max(self._pace_origin_s + picture.media_s - time.monotonic(), 0.0))
 
     def _publish(self, picture: Picture, feed: Feed) -> None:
-        captured_ns = time.monotonic_ns() if picture.captured_ns is None else picture.captured_ns
+        ready_ns = time.monotonic_ns()
+        captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
         unreadable = self._unreadable_before + feed.unreadable
         self._sequence += picture.skipped + unreadable - self._statistics.unreadable
-        frame = Frame(picture.image, captured_ns, self._sequence, picture.depth_m)
+        frame = Frame(
+            picture.image, captured_ns, self._sequence, picture.depth_m, ready_ns, picture.decode_ms
+        )
         self._sequence += 1
         came_back_after_s = None
         with self._changed:

@@ -7,15 +7,13 @@ import ipaddress
 import os
 import socket
 import tempfile
-import time
 from collections.abc import Mapping
 from urllib.parse import SplitResult, parse_qsl, urlencode, urlsplit, urlunsplit
 
 import cv2
-import numpy as np
 
 from vision.sources.feed import Feed, FeedLost, Picture
-from vision.sources.opencv import open_ffmpeg
+from vision.sources.opencv import open_ffmpeg, read_capture
 from vision.sources.source import SourceError, SourceSettings
 
 # Show frames when they come: no reordering buffer before the decoder, and none of its frame threads.
@@ -66,17 +64,16 @@ class StreamFeed(Feed):
             raise FeedLost(reason or "no video stream came")
 
     def read(self, timeout_s: float) -> Picture | None:
-        ok, image = self._capture.read()
-        if not ok or image is None:
+        image, captured_ns, decode_ms = read_capture(self._capture)
+        if image is None:
             # OpenCV does not tell an end from a silence of `read_timeout_s`.
             raise FeedLost("the stream stopped")
-        captured_ns = time.monotonic_ns()
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
         step_s = 0.0 if self._stamp_s is None else stamp_s - self._stamp_s
         self._stamp_s = stamp_s
         if 0.0 <= step_s <= _LONGEST_STEP_S:
             self._media_s += step_s
-        return Picture(np.ascontiguousarray(image, dtype=np.uint8), captured_ns, media_s=self._media_s)
+        return Picture(image, captured_ns, media_s=self._media_s, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()

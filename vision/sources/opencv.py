@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 _AV_LOG_QUIET = "-8"  # libavutil/log.h
 _environment_lock = threading.Lock()
@@ -40,6 +43,25 @@ def environment(name: str, value: str) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = before
+
+
+def read_capture(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, int, float]:
+    """The next picture of a capture, when it had come, and how long decoding it took.
+
+    Waiting for it and decoding it are two calls of OpenCV; FFmpeg's decoders already work in the first.
+
+    Returns:
+        (height, width, 3) uint8 BGR or None; CLOCK_MONOTONIC nanoseconds of the first call's end;
+        milliseconds of the second.
+    """
+    if not capture.grab():
+        return None, time.monotonic_ns(), 0.0
+    came_ns = time.monotonic_ns()
+    ok, image = capture.retrieve()
+    decode_ms = (time.monotonic_ns() - came_ns) / 1e6
+    if not ok or image is None:
+        return None, came_ns, decode_ms
+    return np.ascontiguousarray(image, dtype=np.uint8), came_ns, decode_ms
 
 
 def open_ffmpeg(

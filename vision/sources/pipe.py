@@ -46,7 +46,7 @@ class PipeFeed(Feed):
         self._poll.register(descriptor, select.POLLIN)
         self._parser: StreamParser | None = _parser_of(settings)
         self._head = b""
-        self._ready: deque[tuple[NDArray[np.uint8], int]] = deque()
+        self._ready: deque[tuple[NDArray[np.uint8], int, float]] = deque()
         self._delivered = 0
         self._heard = False
         with contextlib.suppress(OSError):  # not a pipe, or above the user's limit: the default size does
@@ -62,11 +62,12 @@ class PipeFeed(Feed):
             if not data:
                 self._end()
             self._take(data)
-        image, captured_ns = self._ready.popleft()
+        image, captured_ns, decode_ms = self._ready.popleft()
         rate_hz = self._settings.rate_hz or (self._parser.rate_hz if self._parser else None) or 30.0
         media_s = self._delivered / rate_hz
         self._delivered += 1
-        return Picture(image, None if self._is_file else captured_ns, media_s=media_s)
+        stamp_ns = None if self._is_file else captured_ns
+        return Picture(image, stamp_ns, media_s=media_s, decode_ms=decode_ms)
 
     def _look_for_a_quiet_end(self) -> None:
         # A writer of a FIFO that had gone before we opened raises no POLLHUP; a read tells that it has gone.
@@ -92,7 +93,8 @@ class PipeFeed(Feed):
         except StreamError as error:
             raise FeedLost(str(error)) from error
         self.unreadable = self._parser.unreadable
-        self._ready.extend((image, captured_ns) for image in images)
+        decode_ms = (time.monotonic_ns() - captured_ns) / 1e6 / max(len(images), 1)
+        self._ready.extend((image, captured_ns, decode_ms) for image in images)
 
     def _end(self) -> None:
         leftover = (

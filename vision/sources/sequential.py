@@ -79,8 +79,11 @@ class SequentialSource(Source):
         self._sequence += picture.skipped + self._feed.unreadable - self._unreadable_seen
         self._unreadable_seen = self._feed.unreadable
         self._dropped += picture.skipped
-        captured_ns = time.monotonic_ns() if picture.captured_ns is None else picture.captured_ns
-        frame = Frame(picture.image, captured_ns, self._sequence, picture.depth_m)
+        ready_ns = time.monotonic_ns()
+        captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
+        frame = Frame(
+            picture.image, captured_ns, self._sequence, picture.depth_m, ready_ns, picture.decode_ms
+        )
         self._sequence += 1
         self._delivered += 1
         return frame

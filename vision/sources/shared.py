@@ -38,6 +38,7 @@ class SharedFrameFeed(Feed):
     def read(self, timeout_s: float) -> Picture | None:
         deadline_s = time.monotonic() + timeout_s
         while True:
+            looked_ns = time.monotonic_ns()
             frame = self._reader.latest(self._after)
             if frame is not None and self._after is None and self._is_stale(frame):
                 # What a dead writer left behind is no sign of life.
@@ -50,7 +51,8 @@ class SharedFrameFeed(Feed):
             time.sleep(_LOOK_EVERY_S)
         before, self._after = self._after, frame.sequence
         skipped = 0 if before is None else max(frame.sequence - before - 1, 0)
-        return Picture(frame.image, frame.captured_ns, frame.depth_m, skipped=skipped)
+        copy_ms = (time.monotonic_ns() - looked_ns) / 1e6
+        return Picture(frame.image, frame.captured_ns, frame.depth_m, skipped=skipped, decode_ms=copy_ms)
 
     def _is_stale(self, frame: Frame) -> bool:
         return time.monotonic_ns() - frame.captured_ns > self._stale_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import cv2
@@ -37,7 +38,9 @@ class VideoFileFeed(Feed):
         self._last_s = -self._interval_s
 
     def read(self, timeout_s: float) -> Picture | None:
+        started_ns = time.monotonic_ns()
         ok, image = self._capture.read()
+        decode_ms = (time.monotonic_ns() - started_ns) / 1e6  # a file has no waiting in it
         if not ok:
             # OpenCV says "no frame" for an end and for damage alike; the file's own count tells them apart.
             missing = (self.total_frames or 0) - self._delivered
@@ -49,7 +52,7 @@ class VideoFileFeed(Feed):
         if not stamp_s > self._last_s:  # some containers carry no stamps, or repeat them
             stamp_s = self._last_s + self._interval_s
         self._last_s = stamp_s
-        return Picture(np.ascontiguousarray(image, dtype=np.uint8), media_s=stamp_s)
+        return Picture(np.ascontiguousarray(image, dtype=np.uint8), media_s=stamp_s, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()

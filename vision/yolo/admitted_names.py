@@ -34,6 +34,7 @@ _BLOCKS = (
     "ABlock",
     "Attention",
     "Bottleneck",
+    "C2",
     "C2PSA",
     "C2f",
     "C2fCIB",
@@ -73,6 +74,17 @@ _LOSSES = (
     "ultralytics.yolo.v8.detect.train.Loss",
 )
 
+# Until 8.0.6 the settings of the training were omegaconf's, and the model kept them.
+_OLD_SETTINGS = (
+    "__builtin__.dict",
+    "omegaconf.base.ContainerMetadata",
+    "omegaconf.base.Metadata",
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    "omegaconf.nodes.AnyNode",
+    "typing.Any",
+)
+
 INERT: tuple[str, ...] = (
     *(f"torch.nn.modules.{name}" for name in _TORCH_MODULES),
     *(f"ultralytics.nn.modules.block.{name}" for name in _BLOCKS),
@@ -82,6 +94,7 @@ INERT: tuple[str, ...] = (
     *(f"ultralytics.nn.modules.{name}" for name in (*_BLOCKS, *_CONVOLUTIONS, *_HEADS)),
     *(f"ultralytics.nn.tasks.{name}" for name in _MODELS),
     *_LOSSES,
+    *_OLD_SETTINGS,
     "ultralytics.utils.IterableSimpleNamespace",
     "ultralytics.yolo.utils.IterableSimpleNamespace",
     "numpy.core.multiarray.scalar",

@@ -3,7 +3,7 @@
 Attribute names (`cv1`, `m`, `gamma` …) are those that checkpoints in circulation use.
 
 References: CSPNet (Wang et al., 2019); SPP (He et al., 2014); the published model tables of YOLOv5u, YOLOv8,
-YOLO11, YOLO12, YOLO26; YOLOv10 (Wang et al., 2024); YOLOv12 (Tian et al., 2025).
+YOLO11, YOLO12 and YOLO26; YOLOv12 (Tian et al., 2025).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.attention import ABlock, PSABlock
-from vision.yolo.convolution import Conv, DWConv, LargeKernelDWConv, same_padding
+from vision.yolo.convolution import Conv, same_padding
 
 
 class Bottleneck(nn.Module):
@@ -95,6 +95,33 @@ class C2f(GrowingBlock):
             return Bottleneck(hidden, hidden, shortcut, activation=activation)
 
         super().__init__(inputs, outputs, stage, repeats, hidden, activation=activation)
+
+
+class C2(nn.Module):
+    """Half of the channels pass `repeats` bottlenecks, the other half goes around them (YOLOv8-P6)."""
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        repeats: int = 1,
+        shortcut: bool = True,
+        *,
+        expansion: float = 0.5,
+        activation: str = "SiLU",
+    ) -> None:
+        super().__init__()
+        hidden = int(outputs * expansion)
+        self.cv1 = Conv(inputs, 2 * hidden, activation=activation)
+        self.cv2 = Conv(2 * hidden, outputs, activation=activation)
+        self.m = nn.Sequential(
+            *(Bottleneck(hidden, hidden, shortcut, activation=activation) for _ in range(repeats))
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        through, around = self.cv1(x).chunk(2, dim=1)
+        y: Tensor = self.cv2(torch.cat((self.m(through), around), dim=1))
+        return y
 
 
 class SplitBlock(nn.Module):
@@ -221,64 +248,6 @@ class A2C2f(GrowingBlock):
     def forward(self, x: Tensor) -> Tensor:
         y = super().forward(x)
         return y if self.gamma is None else x + self.gamma.view(1, -1, 1, 1) * y
-
-
-class CIB(nn.Module):
-    """YOLOv10's compact inverted block: depthwise and 1×1 convolutions in turn, added to the input."""
-
-    def __init__(
-        self, channels: int, shortcut: bool, large_kernel: bool, *, activation: str = "SiLU"
-    ) -> None:
-        super().__init__()
-        wide = 2 * channels
-        self.cv1 = nn.Sequential(
-            DWConv(channels, channels, 3, activation=activation),
-            Conv(channels, wide, activation=activation),
-            LargeKernelDWConv(wide) if large_kernel else DWConv(wide, wide, 3, activation=activation),
-            Conv(wide, channels, activation=activation),
-            DWConv(channels, channels, 3, activation=activation),
-        )
-        self.add = shortcut
-
-    def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = self.cv1(x)
-        return x + y if self.add else y
-
-
-class C2fCIB(GrowingBlock):
-    """YOLOv10's: C2f with compact inverted blocks for stages."""
-
-    def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        repeats: int = 1,
-        shortcut: bool = False,
-        large_kernel: bool = False,
-        *,
-        activation: str = "SiLU",
-    ) -> None:
-        hidden = outputs // 2
-
-        def stage() -> nn.Module:
-            return CIB(hidden, shortcut, large_kernel, activation=activation)
-
-        super().__init__(inputs, outputs, stage, repeats, hidden, activation=activation)
-
-
-class SCDown(nn.Module):
-    """YOLOv10's halving: channels by a 1×1 convolution, size by a depthwise one."""
-
-    def __init__(
-        self, inputs: int, outputs: int, kernel: int = 3, stride: int = 2, *, activation: str = "SiLU"
-    ) -> None:
-        super().__init__()
-        self.cv1 = Conv(inputs, outputs, activation=activation)
-        self.cv2 = DWConv(outputs, outputs, kernel, stride, activation=None)
-
-    def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = self.cv2(self.cv1(x))
-        return y
 
 
 class SPPF(nn.Module):

@@ -82,35 +82,3 @@ class DWConv(Conv):
     ) -> None:
         groups = math.gcd(inputs, outputs)
         super().__init__(inputs, outputs, kernel, stride, groups=groups, activation=activation)
-
-
-class LargeKernelDWConv(nn.Module):
-    """Two depthwise convolutions side by side, 7×7 and 3×3, added and activated (RepVGG, Ding et al., 2021).
-
-    `fuse` makes one 7×7 convolution of them.
-    """
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv: nn.Module = DWConv(channels, channels, 7, activation=None)
-        self.conv1: nn.Module | None = DWConv(channels, channels, 3, activation=None)
-        self.act = nn.SiLU(inplace=True)
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.conv(x) if self.conv1 is None else self.conv(x) + self.conv1(x)
-        activated: Tensor = self.act(y)
-        return activated
-
-    def fuse(self) -> None:
-        large, small = self.conv, self.conv1
-        if not isinstance(large, Conv) or not isinstance(small, Conv):
-            return
-        large.fuse()
-        small.fuse()
-        margin = (large.conv.kernel_size[0] - small.conv.kernel_size[0]) // 2
-        with torch.no_grad():
-            large.conv.weight += nn.functional.pad(small.conv.weight, [margin] * 4)
-            assert large.conv.bias is not None
-            assert small.conv.bias is not None
-            large.conv.bias += small.conv.bias
-        self.conv, self.conv1 = large.conv, None

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from vision.yolo.attention import C2PSA, PSA, ABlock, AreaAttention, Attention, PSABlock
 from vision.yolo.blocks import (
+    C2,
     C3,
-    CIB,
     SPPF,
     A2C2f,
     Bottleneck,
     C2f,
-    C2fCIB,
     C3k,
     C3k2,
     Concat,
-    SCDown,
 )
-from vision.yolo.convolution import ACTIVATIONS, Conv, DWConv, LargeKernelDWConv, same_padding
+from vision.yolo.compact_blocks import CIB, C2fCIB, LargeKernelDWConv, SCDown
+from vision.yolo.convolution import ACTIVATIONS, Conv, DWConv, same_padding
 from vision.yolo.heads import DFL, Detect
 
 __all__ = [
     "ACTIVATIONS",
+    "C2",
     "C2PSA",
     "C3",
     "CIB",

@@ -15,12 +15,12 @@ DEFAULT_RECIPE = TrainingSettings(
     depth_multiple=1 / 3,
     width_multiple=0.125,
     max_channels=1024,
-    # Smaller than the frames it is for, with the same field of view: a step costs a quarter, and objects have
-    # about half the pixels. 6400 scenes, each shown three or four times, augmented anew.
-    stages=(Stage(320, 256, 16, 1300, scenes=6400),),
+    # First smaller than the frames it is for, with the same field of view: a step costs a quarter, and
+    # objects have about half the pixels. Then the frames' own size. Scenes come round, augmented anew.
+    stages=(Stage(320, 256, 16, 9000, scenes=12_000), Stage(640, 480, 8, 2200, scenes=4_000)),
     learning_rate=3e-3,
-    decay_steps=450,
+    decay_steps=6000,
     seed=1,
-    threads=2,
+    threads=1,
     workers=1,
 )

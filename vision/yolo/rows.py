@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from torch import nn
 from vision.yolo.attention import CHANNELS_PER_AREA_HEAD, CHANNELS_PER_HEAD
 from vision.yolo.description import ArchitectureError, LayerRow, ModelDescription
 from vision.yolo.layers import (
+    C2,
     C2PSA,
     C3,
     PSA,
@@ -26,10 +26,8 @@ from vision.yolo.layers import (
     SCDown,
     same_padding,
 )
+from vision.yolo.row_arguments import LARGEST_KERNEL, RowArguments
 
-_LARGEST_CHANNELS = 1 << 14
-_MOST_REPEATS = 64
-_LARGEST_KERNEL = 31
 HEADS = ("Detect", "v10Detect")
 
 
@@ -48,91 +46,16 @@ def make(row: LayerRow, inputs: Sequence[int], description: ModelDescription) ->
 
     Raises `ArchitectureError`.
     """
-    return _MAKERS[row.layer](_Row(row, tuple(inputs), description))
+    return _MAKERS[row.layer](RowArguments(row, tuple(inputs), description))
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """A row while it is being made: what it reads and its arguments, each checked when asked for."""
-
-    row: LayerRow
-    inputs: tuple[int, ...]
-    description: ModelDescription
-
-    @property
-    def activation(self) -> str:
-        return self.description.activation
-
-    def takes(self, most: int) -> None:
-        if len(self.row.arguments) > most:
-            raise ArchitectureError(f"takes at most {most} arguments, got {list(self.row.arguments)!r:.200}")
-
-    def once(self) -> None:
-        if self.row.repeats != 1:
-            raise ArchitectureError(f"cannot repeat, got repeats {self.row.repeats}")
-
-    def single(self) -> int:
-        """The channels of the one row it reads."""
-        if len(self.inputs) != 1:
-            raise ArchitectureError(f"reads one row, got {self.row.source}")
-        return self.inputs[0]
-
-    def number(self, position: int, name: str, largest: int, default: int | None = None) -> int:
-        value = self._argument(position, default)
-        if type(value) is not int or not 1 <= value <= largest:
-            raise ArchitectureError(f"{name} must be a whole number in 1..{largest}, got {value!r:.100}")
-        return value
-
-    def odd(self, position: int, name: str, default: int) -> int:
-        value = self.number(position, name, _LARGEST_KERNEL, default)
-        if value % 2 == 0:
-            raise ArchitectureError(f"the {name} must be odd, got {value}")
-        return value
-
-    def flag(self, position: int, name: str, default: bool) -> bool:
-        value = self._argument(position, default)
-        if not isinstance(value, bool):
-            raise ArchitectureError(f"the {name} must be true or false, got {value!r:.100}")
-        return value
-
-    def ratio(self, position: int, name: str, default: float, largest: float = 1.0) -> float:
-        value = self._argument(position, default)
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= largest:
-            raise ArchitectureError(f"the {name} must be a number in 0..{largest:g}, got {value!r:.100}")
-        return float(value)
-
-    def ungrouped(self, position: int) -> None:
-        if self._argument(position, 1) != 1:
-            raise ArchitectureError(f"knows no groups, got {self._argument(position, 1)!r:.100}")
-
-    def _argument(self, position: int, default: object) -> object:
-        return self.row.arguments[position] if position < len(self.row.arguments) else default
-
-    def channels(self) -> int:
-        """The first argument, scaled."""
-        count = self.number(0, "channels", _LARGEST_CHANNELS)
-        description = self.description
-        if count in description.unscaled_channels:
-            return count
-        limited = count if description.max_channels is None else min(count, description.max_channels)
-        return max(8, math.ceil(limited * description.width_multiple / 8) * 8)
-
-    def repeats(self) -> int:
-        if self.row.repeats == 1:
-            return 1
-        repeats = max(1, round(self.row.repeats * self.description.depth_multiple))
-        if repeats > _MOST_REPEATS:
-            raise ArchitectureError(f"would repeat {repeats} times, at most {_MOST_REPEATS} make sense")
-        return repeats
-
-
-def _conv(row: _Row) -> Made:
+def _conv(row: RowArguments) -> Made:
     row.takes(4)
     row.once()
     channels = row.channels()
-    kernel = row.number(1, "kernel", _LARGEST_KERNEL, 1)
+    kernel = row.number(1, "kernel", LARGEST_KERNEL, 1)
     stride = row.number(2, "stride", 2, 1)
-    padding = row.number(3, "padding", _LARGEST_KERNEL, None) if len(row.row.arguments) > 3 else None
+    padding = row.number(3, "padding", LARGEST_KERNEL, None) if len(row.row.arguments) > 3 else None
     if padding is None and kernel % 2 == 0:
         raise ArchitectureError(f"the kernel must be odd where no padding is given, got {kernel}")
     # What keeps every size a whole number of cells: size / stride, neither more nor less.
@@ -142,7 +65,7 @@ def _conv(row: _Row) -> Made:
     return Made(module, channels, reduction=stride)
 
 
-def _depthwise(row: _Row) -> Made:
+def _depthwise(row: RowArguments) -> Made:
     row.takes(3)
     row.once()
     channels = row.channels()
@@ -151,7 +74,7 @@ def _depthwise(row: _Row) -> Made:
     return Made(module, channels, reduction=stride)
 
 
-def _scdown(row: _Row) -> Made:
+def _scdown(row: RowArguments) -> Made:
     row.takes(3)
     row.once()
     channels = row.channels()
@@ -160,29 +83,27 @@ def _scdown(row: _Row) -> Made:
     return Made(module, channels, reduction=stride)
 
 
-def _c2f(row: _Row) -> Made:
-    row.takes(4)
-    row.ungrouped(2)
-    channels, shortcut = row.channels(), row.flag(1, "shortcut", False)
-    expansion = row.ratio(3, "expansion", 0.5)
-    module = C2f(
-        row.single(), channels, row.repeats(), shortcut, expansion=expansion, activation=row.activation
-    )
-    return Made(module, channels)
+def _partial(block: type[C2 | C2f | C3], shortcut: bool) -> Callable[[RowArguments], Made]:
+    """The older cross-stage partial blocks, which differ in whether they have shortcuts unless told."""
+
+    def maker(row: RowArguments) -> Made:
+        row.takes(4)
+        row.ungrouped(2)
+        channels = row.channels()
+        module = block(
+            row.single(),
+            channels,
+            row.repeats(),
+            row.flag(1, "shortcut", shortcut),
+            expansion=row.ratio(3, "expansion", 0.5),
+            activation=row.activation,
+        )
+        return Made(module, channels)
+
+    return maker
 
 
-def _c3(row: _Row) -> Made:
-    row.takes(4)
-    row.ungrouped(2)
-    channels, shortcut = row.channels(), row.flag(1, "shortcut", True)
-    expansion = row.ratio(3, "expansion", 0.5)
-    module = C3(
-        row.single(), channels, row.repeats(), shortcut, expansion=expansion, activation=row.activation
-    )
-    return Made(module, channels)
-
-
-def _c3k2(row: _Row) -> Made:
+def _c3k2(row: RowArguments) -> Made:
     row.takes(6)
     row.ungrouped(4)
     channels, expansion = row.channels(), row.ratio(2, "expansion", 0.5)
@@ -202,7 +123,7 @@ def _c3k2(row: _Row) -> Made:
     return Made(module, channels)
 
 
-def _a2c2f(row: _Row) -> Made:
+def _a2c2f(row: RowArguments) -> Made:
     row.takes(8)
     row.ungrouped(6)
     channels, expansion = row.channels(), row.ratio(5, "expansion", 0.5)
@@ -231,7 +152,7 @@ def _a2c2f(row: _Row) -> Made:
     return Made(module, channels)
 
 
-def _c2fcib(row: _Row) -> Made:
+def _c2fcib(row: RowArguments) -> Made:
     row.takes(3)
     channels = row.channels()
     shortcut, large = row.flag(1, "shortcut", False), row.flag(2, "large kernel", False)
@@ -239,20 +160,20 @@ def _c2fcib(row: _Row) -> Made:
     return Made(module, channels)
 
 
-def _psa(row: _Row) -> Made:
+def _psa(row: RowArguments) -> Made:
     row.takes(1)
     row.once()
     channels = _attended(row)
     return Made(PSA(channels, activation=row.activation), channels)
 
 
-def _c2psa(row: _Row) -> Made:
+def _c2psa(row: RowArguments) -> Made:
     row.takes(1)
     channels = _attended(row)
     return Made(C2PSA(channels, row.repeats(), activation=row.activation), channels)
 
 
-def _attended(row: _Row) -> int:
+def _attended(row: RowArguments) -> int:
     """The channels of a block whose half passes attention: as many as it reads."""
     channels = row.channels()
     if row.single() != channels:
@@ -266,7 +187,7 @@ def _divides_into_heads(channels: int) -> None:
         raise ArchitectureError(f"cannot divide {channels} channels into heads of {CHANNELS_PER_HEAD}")
 
 
-def _sppf(row: _Row) -> Made:
+def _sppf(row: RowArguments) -> Made:
     row.takes(5)
     row.once()
     channels = row.channels()
@@ -282,7 +203,7 @@ def _sppf(row: _Row) -> Made:
     return Made(module, channels)
 
 
-def _upsample(row: _Row) -> Made:
+def _upsample(row: RowArguments) -> Made:
     row.once()
     size, factor, mode = (*row.row.arguments, None, None, None)[:3]
     if size not in (None, "None") or type(factor) is not int or factor != 2 or mode != "nearest":
@@ -290,14 +211,14 @@ def _upsample(row: _Row) -> Made:
     return Made(nn.Upsample(scale_factor=2, mode="nearest"), row.single(), enlargement=2)
 
 
-def _concat(row: _Row) -> Made:
+def _concat(row: RowArguments) -> Made:
     row.once()
     if tuple(row.row.arguments) not in ((), (1,)):
         raise ArchitectureError(f"joins channels (axis 1), got {list(row.row.arguments)!r:.200}")
     return Made(Concat(1), sum(row.inputs))
 
 
-def _detect(row: _Row) -> Made:
+def _detect(row: RowArguments) -> Made:
     row.once()
     description = row.description
     classes = len(description.class_names)
@@ -317,12 +238,13 @@ def _detect(row: _Row) -> Made:
     return Made(module, 0)
 
 
-_MAKERS: dict[str, Callable[[_Row], Made]] = {
+_MAKERS: dict[str, Callable[[RowArguments], Made]] = {
     "A2C2f": _a2c2f,
     "C2PSA": _c2psa,
-    "C2f": _c2f,
+    "C2": _partial(C2, shortcut=True),
+    "C2f": _partial(C2f, shortcut=False),
     "C2fCIB": _c2fcib,
-    "C3": _c3,
+    "C3": _partial(C3, shortcut=True),
     "C3k2": _c3k2,
     "Concat": _concat,
     "Conv": _conv,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,8 +23,8 @@ All randomness must come from `rng`. With workers it must be picklable: a functi
 `functools.partial` of one.
 """
 
-KEPT_BYTES = 3 << 30
-"""How much of returning scenes each drawing process keeps; beyond that it draws them anew."""
+KEPT_BYTES = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4
+"""How much of returning scenes each drawing process keeps, a quarter of the memory; others it draws anew."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -164,8 +164,11 @@ class _Archive:
             "torch._utils._rebuild_parameter_with_state": _parameter,
             "torch.Size": _size,
             "collections.OrderedDict": _dictionary,
+            "collections.defaultdict": _default_dictionary,
             "__builtin__.set": _set,
             "builtins.set": _set,
+            # Releases from 8.0.200 to 8.2 wrote with dill where it was installed, which names types this way.
+            "dill._dill._load_type": _type_by_name,
         }
         return (
             {name: Admitted(name) for name in (*INERT, *_STORAGES)}
@@ -249,6 +252,13 @@ def _dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
     return {}
 
 
+def _default_dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
+    """What it would make for a missing key is of no use here; its own entries follow one by one."""
+    if any(not isinstance(argument, Admitted | None) for argument in arguments[:1]) or len(arguments) > 1:
+        raise UnsafeCheckpointError("its pickle fills a default dictionary by a call; nothing was run")
+    return {}
+
+
 def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     values = arguments[0] if len(arguments) == 1 else None
     if (
@@ -258,3 +268,11 @@ def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     ):
         raise CheckpointError("its pickle has a set of something else than names and numbers")
     return frozenset(values)
+
+
+def _type_by_name(arguments: tuple[Any, ...]) -> Admitted:
+    if arguments not in (("set",), ("frozenset",)):
+        raise UnsafeCheckpointError(
+            f"its pickle asks for the type {', '.join(map(repr, arguments))!s:.100}; nothing was run"
+        )
+    return Admitted(f"builtins.{arguments[0]}", _set)

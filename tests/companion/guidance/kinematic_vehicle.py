@@ -78,6 +78,9 @@ class SeenObject:
     visible: bool = True
     with_range: bool = True
     source: RangeSource = RangeSource.GROUND_PLANE
+    track_id: int | None = None
+    track_score: float | None = None
+    trusted: bool = True
 
 
 def look(
@@ -112,6 +115,9 @@ def look(
                 range_m if thing.with_range else math.nan,
                 thing.source if thing.with_range else RangeSource.NONE,
                 place if thing.with_range else None,
+                track_id=thing.track_id,
+                track_score=thing.track_score,
+                trusted=thing.trusted,
             )
         )
     return tuple(targets)

@@ -426,6 +426,17 @@ async def test_without_perception_seek_is_refused_with_its_age(age_s):
     assert ("2.0 s old" if age_s else "nothing came") in reason
 
 
+async def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_steer_it_either():
+    cockpit = Cockpit(flying())
+    cockpit.perception_age_s = 0.8
+    await cockpit.turn(0.1)
+    future = cockpit.pilot.command(SeekBehaviour("car"))
+    await cockpit.turn(0.5)
+    assert not future.done()
+    assert cockpit.pilot.phase == "offboard"
+    assert cockpit.pilot.asked.yaw_rate_radps in (None, 0.0)
+
+
 async def test_a_refusal_leaves_the_current_behaviour_flying():
     cockpit = Cockpit(flying())
     future = await engaged(cockpit)

@@ -52,6 +52,21 @@ def optical_point(camera, mount, attitude, position, point):
     return mount.body_from_optical.T @ body
 
 
+def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_true():
+    tracks = [
+        {},  # nobody looks for tracks
+        {"track_id": None, "track_score": None, "track_state": "none"},
+        {"track_id": 4, "track_score": 0.6, "track_state": "tentative"},
+        {"track_id": 5, "track_score": 0.7, "track_state": "confirmed"},
+    ]
+    found = [detection((310, 300, 330, 400)) | track for track in tracks]
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    targets = targets_from_detections(found, T0, CAMERA, MOUNT, history)
+    assert [target.trusted for target in targets] == [True, False, False, True]
+    assert [target.track_id for target in targets] == [None, None, 4, 5]
+    assert [target.score for target in targets] == [0.8, 0.8, 0.6, 0.7]
+
+
 angles = st.floats(-0.5, 0.5)
 scenes = st.tuples(
     angles,

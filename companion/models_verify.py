@@ -1,0 +1,198 @@
+"""`companion models verify`: does an exported model say what its source says, on real pictures?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.training_scenes import random_scene
+from vision.evaluation.dataset import image_files, read_image
+from vision.letterbox import fit
+from vision.runtimes.contract import Precision, Runtime, RuntimeUnusableError
+from vision.runtimes.exported import KEY
+from vision.runtimes.selection import start_runtime
+from vision.runtimes.source import ModelSource, read_source
+from vision.yolo.checkpoint_pair import file_sha256
+from vision.yolo.maps import LevelMaps
+from vision.yolo.metrics import box_iou
+from vision.yolo.postprocess import Boxes, boxes_of
+
+CONFIDENCE = 0.25
+# A box so near the threshold may be said by one and not by the other without meaning anything.
+_CONFIDENCE_MARGIN = 0.02
+_SAMPLE_SIZE = (640, 480)
+
+
+@dataclass(frozen=True, slots=True)
+class Parity:
+    """How far an exported model is from its source.
+
+    Attributes:
+        images: how many pictures were compared.
+        runtime, precision: what ran the exported model.
+        map_difference: largest absolute difference of any raw number, logits.
+        score_difference: largest difference of a class probability, 0..1.
+        box_difference_px: largest difference of a side of a box that both found, pixels of the input.
+        boxes: found by the source above confidence 0.25.
+        unmatched: boxes that only one of the two found, those at the threshold not counted.
+        same_source: whether the export names this very file as what it was made from.
+    """
+
+    images: int
+    runtime: str
+    precision: str
+    map_difference: float
+    score_difference: float
+    box_difference_px: float
+    boxes: int
+    unmatched: int
+    same_source: bool
+
+    def plain(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def holds(self, map_tolerance: float, box_tolerance_px: float) -> bool:
+        """Whether the two say the same."""
+        return (
+            self.map_difference <= map_tolerance
+            and self.box_difference_px <= box_tolerance_px
+            and not self.unmatched
+        )
+
+
+def sample_pictures(folder: Path | None, count: int) -> list[NDArray[np.uint8]]:
+    """The first pictures of a folder, or as many drawn scenes. Raises `ValueError` for an empty folder."""
+    if folder is None:
+        rng = np.random.default_rng(0)
+        return [random_scene(rng, *_SAMPLE_SIZE)[0] for _ in range(count)]
+    files = image_files(folder)[:count]
+    if not files:
+        raise ValueError(f"{folder}: has no images")
+    return [read_image(file) for file in files]
+
+
+def verify(
+    source_path: Path,
+    exported_path: Path,
+    pictures: Iterable[NDArray[np.uint8]],
+    image_size: int = 640,
+    *,
+    threads: int | None = None,
+) -> Parity:
+    """Run both on the same pictures: the source with torch in float32, the export with what it is for.
+
+    Raises:
+        CheckpointError, RuntimeUnusableError: one of the two cannot be read or run.
+    """
+    source, exported = read_source(source_path), read_source(exported_path)
+    if exported.kind is None:
+        raise RuntimeUnusableError(f"{exported_path}: is a checkpoint; give a file that `models export` made")
+    if source.kind is not None:
+        raise RuntimeUnusableError(
+            f"{source_path}: is an export itself; give the checkpoint it was made from"
+        )
+    _check_same_kind(source, exported)
+    assert exported.facts is not None
+    original = start_runtime(
+        source, "torch", precision="float32", threads=threads, image_size=image_size
+    ).runtime
+    runner = exported.runners()[0]
+    # A plan has its precision built in.
+    precision: Precision = "auto" if exported.kind == "tensorrt" else "float32"
+    other = start_runtime(
+        exported, runner, precision=precision, threads=threads, image_size=image_size
+    ).runtime
+    largest = _Largest()
+    for picture in pictures:
+        box = fit(picture.shape[1], picture.shape[0], image_size, stride=max(source.strides))
+        pixels = np.ascontiguousarray(box.apply(picture)).copy()
+        largest.compare(_maps(original, pixels), _maps(other, pixels), original, other)
+    return Parity(
+        images=largest.images,
+        runtime=other.name,
+        precision=other.precision,
+        map_difference=largest.maps,
+        score_difference=largest.scores,
+        box_difference_px=largest.boxes_px,
+        boxes=largest.boxes,
+        unmatched=largest.unmatched,
+        same_source=exported.facts.source_sha256 == file_sha256(source_path),
+    )
+
+
+def parity_lines(parity: Parity, map_tolerance: float, box_tolerance_px: float) -> list[str]:
+    """For a person."""
+    lines = [
+        f"{parity.images} pictures, {parity.runtime} in {parity.precision} against torch in float32",
+        f"raw maps       differ by at most {parity.map_difference:.2e} (tolerance {map_tolerance:g})",
+        f"probabilities  differ by at most {parity.score_difference:.2e}",
+        f"boxes          {parity.boxes} found, sides differ by at most {parity.box_difference_px:.3g} px "
+        f"(tolerance {box_tolerance_px:g}), {parity.unmatched} found by one alone",
+    ]
+    if not parity.same_source:
+        lines.append("note: the export says that it was made from another file")
+    return lines
+
+
+def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:
+    if source.class_names != exported.class_names or source.strides != exported.strides:
+        raise RuntimeUnusableError(
+            f"{exported.path}: knows {len(exported.class_names)} classes at strides {exported.strides}, "
+            f"{source.path} {len(source.class_names)} at {source.strides}: it is another model "
+            f"(its {KEY} says so)"
+        )
+
+
+def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelMaps]:
+    return [LevelMaps(level.sides.copy(), level.classes.copy()) for level in runtime.infer(pixels)]
+
+
+class _Largest:
+    """The largest differences so far."""
+
+    def __init__(self) -> None:
+        self.images = self.boxes = self.unmatched = 0
+        self.maps = self.scores = self.boxes_px = 0.0
+
+    def compare(
+        self, first: Sequence[LevelMaps], second: Sequence[LevelMaps], one: Runtime, other: Runtime
+    ) -> None:
+        self.images += 1
+        for a, b in zip(first, second, strict=True):
+            for mine, its in ((a.sides, b.sides), (a.classes, b.classes)):
+                # Not a number differs from everything.
+                self.maps = max(self.maps, _worst(mine, its))
+            self.scores = max(self.scores, _worst(_probability(a.classes), _probability(b.classes)))
+        self._compare_boxes(
+            boxes_of(one.head, first, confidence=CONFIDENCE),
+            boxes_of(other.head, second, confidence=CONFIDENCE),
+        )
+
+    def _compare_boxes(self, first: Boxes, second: Boxes) -> None:
+        self.boxes += len(first)
+        alike = box_iou(first.xyxy, second.xyxy) * (first.class_id[:, None] == second.class_id[None])
+        free = np.ones(len(second), np.bool_)
+        for index in range(len(first)):
+            best = int(np.where(free, alike[index], -1).argmax()) if len(second) else -1
+            if best >= 0 and free[best] and alike[index, best] > 0.5:
+                free[best] = False
+                self.boxes_px = max(self.boxes_px, _worst(first.xyxy[index], second.xyxy[best]))
+            elif first.confidence[index] > CONFIDENCE + _CONFIDENCE_MARGIN:
+                self.unmatched += 1
+        self.unmatched += int((second.confidence[free] > CONFIDENCE + _CONFIDENCE_MARGIN).sum())
+
+
+def _worst(first: NDArray[Any], second: NDArray[Any]) -> float:
+    if first.shape != second.shape or not np.isfinite(second).all():
+        return float("inf")
+    return float(np.abs(first - second).max(initial=0.0))
+
+
+def _probability(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    probability: NDArray[np.float32] = 1 / (1 + np.exp(-logits.clip(-60, 60)))
+    return probability

@@ -1,0 +1,62 @@
+"""The one value between the detector and everybody else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vision.detections import NO_TRACK, Detections
+
+
+def three(**tracks: Any) -> Detections:
+    return Detections(
+        np.arange(12, dtype=np.float32).reshape(3, 4),
+        np.array([0.9, 0.5, 0.2], np.float32),
+        np.array([0, 1, 1]),
+        ("person", "car"),
+        np.array([1.0, np.nan, 3.0], np.float32),
+        **tracks,
+    )
+
+
+def tracked() -> Detections:
+    return three(
+        track_id=np.array([4, NO_TRACK, 9]),
+        track_score=np.array([0.8, np.nan, 0.3], np.float32),
+        track_confirmed=np.array([True, False, False]),
+    )
+
+
+@pytest.mark.parametrize(
+    "index", [slice(1, 3), np.array([False, True, True]), np.array([1, 2])], ids=["slice", "mask", "indices"]
+)
+def test_a_part_keeps_everything_of_its_detections(index: Any) -> None:
+    part = tracked()[index]
+    assert part.names == ["car", "car"]
+    assert part.track_id.tolist() == [NO_TRACK, 9]
+    assert part.track_confirmed.tolist() == [False, False]
+    assert part.records() == tracked().records()[1:]
+    untracked = three()[index]
+    assert untracked.track_id is untracked.track_score is untracked.track_confirmed is None
+
+
+def test_records_tell_of_tracks_what_is_known() -> None:
+    tracks = [(r["track_id"], r["track_score"], r["track_state"]) for r in tracked()]
+    assert tracks == [(4, 0.8, "confirmed"), (None, None, "none"), (9, 0.3, "tentative")]
+    assert {(r["track_id"], r["track_score"], r["track_state"]) for r in three()} == {(None, None, None)}
+
+
+def test_tracks_come_whole_or_not_at_all() -> None:
+    with pytest.raises(ValueError, match=r"all of track_id, .* or none; track_score is missing"):
+        three(track_id=np.array([1, 2, 3]))
+
+
+def test_tracks_are_as_many_as_boxes() -> None:
+    with pytest.raises(ValueError, match=r"Detections.track_confirmed must be \(3,\) like xyxy, got \(2,\)"):
+        three(
+            track_id=np.array([1, 2, 3]),
+            track_score=np.zeros(3, np.float32),
+            track_confirmed=np.zeros(2, np.bool_),
+        )

@@ -1,0 +1,166 @@
+"""Data sets as they come, YOLO's and COCO's, and each mistake in them named with its file and line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.evaluation.dataset import Dataset, DatasetError, open_dataset
+
+
+def picture(path: Path, width: int = 200, height: int = 100) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.full((height, width, 3), 90, np.uint8))
+    return path
+
+
+def text(path: Path, content: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+    return path
+
+
+@pytest.fixture
+def yolo(tmp_path: Path) -> Path:
+    """Two labelled images and one that shows nothing."""
+    for name in ("a", "b", "c"):
+        picture(tmp_path / "images" / "val" / f"{name}.jpg")
+    text(tmp_path / "labels" / "val" / "a.txt", "0 0.5 0.5 0.2 0.4\n\n1 0.25 0.25 0.5 0.5\n")
+    text(tmp_path / "labels" / "val" / "b.txt", "1 0.1 0.1 0.3 0.1 0.3 0.5 0.1 0.5\n")
+    return tmp_path
+
+
+def pixels(dataset: Dataset, index: int) -> list[list[int]]:
+    return dataset.samples[index].boxes_in(200, 100).round().astype(int).tolist()
+
+
+def test_images_and_labels_in_folders_of_their_own(yolo: Path) -> None:
+    dataset = open_dataset(yolo)
+    assert (dataset.kind, dataset.class_names) == ("YOLO", None)
+    assert [sample.image.name for sample in dataset.samples] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert pixels(dataset, 0) == [[80, 30, 120, 70], [0, 0, 100, 50]]
+    assert dataset.samples[0].class_ids.tolist() == [0, 1]
+    assert pixels(dataset, 1) == [[20, 10, 60, 50]]  # A polygon's box.
+    assert len(dataset.samples[2].boxes) == 0
+
+
+def test_images_with_their_texts_beside_them(tmp_path: Path) -> None:
+    picture(tmp_path / "x.png")
+    text(tmp_path / "x.txt", "0 0.5 0.5 1 1")
+    assert pixels(open_dataset(tmp_path), 0) == [[0, 0, 200, 100]]
+
+
+@pytest.mark.parametrize("names", ["[car, no]", "{0: car, 1: no}"])
+def test_a_data_yaml_gives_names_and_splits(yolo: Path, names: str) -> None:
+    text(
+        yolo / "data.yaml",
+        f"path: /where/it/was/made\nval: images/val\ntrain: images/train\nnames: {names}\n",
+    )
+    for path in (yolo, yolo / "data.yaml"):
+        dataset = open_dataset(path)
+        assert dataset.class_names == ("car", "no")
+        assert len(dataset.samples) == 3
+    with pytest.raises(DatasetError, match=r"`train` names .*images/train, which is not there"):
+        open_dataset(yolo, split="train")
+    with pytest.raises(DatasetError, match="has no split 'test'; it has val, train"):
+        open_dataset(yolo, split="test")
+
+
+def test_a_split_may_be_a_list_of_files(yolo: Path) -> None:
+    text(yolo / "val.txt", "./images/val/b.jpg\n\nimages/val/gone.jpg\n")
+    text(yolo / "data.yaml", "val: val.txt\nnames: [car, dog]\n")
+    with pytest.raises(DatasetError, match=r"val\.txt, line 3: .*gone\.jpg is not there"):
+        open_dataset(yolo)
+    text(yolo / "val.txt", "./images/val/b.jpg\n")
+    assert [sample.image.name for sample in open_dataset(yolo).samples] == ["b.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("0 0.5 0.5 0.2", "got 4 numbers"),
+        ("0 0.5 0.5 0.2 0.2 0.9", "got 6 numbers"),
+        ("car 0.5 0.5 0.2 0.2", "expected numbers"),
+        ("0.5 0.5 0.5 0.2 0.2", "the class must be a whole number"),
+        ("-1 0.5 0.5 0.2 0.2", "the class must be a whole number"),
+        ("2 0.5 0.5 0.2 0.2", r"whole number, 0\.\.1, got 2"),
+        ("0 0.5 0.5 0 0.2", "width and height must be above 0"),
+        ("0 120 50 20 20", r"fractions of the image, 0\.\.1, got 20 to 120"),
+        ("0 nan 0.5 0.2 0.2", "not finite"),
+    ],
+)
+def test_a_wrong_label_is_named_with_file_and_line(yolo: Path, line: str, says: str) -> None:
+    text(yolo / "data.yaml", "val: images/val\nnames: [car, dog]\n")
+    text(yolo / "labels" / "val" / "b.txt", f"0 0.5 0.5 0.1 0.1\n{line}\n")
+    with pytest.raises(DatasetError, match=rf"b\.txt, line 2: .*{says}"):
+        open_dataset(yolo)
+
+
+def test_a_folder_that_is_no_data_set_says_what_was_expected(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no such file or folder"):
+        open_dataset(tmp_path / "none")
+    with pytest.raises(DatasetError, match="has no images"):
+        open_dataset(tmp_path)
+    picture(tmp_path / "images" / "a.jpg")
+    with pytest.raises(DatasetError, match=r"none of its 1 images has labels; .*labels/a\.txt was expected"):
+        open_dataset(tmp_path)
+
+
+def coco(tmp_path: Path, **changes: Any) -> Path:
+    picture(tmp_path / "val2017" / "a.jpg")
+    content = {
+        "images": [{"id": 7, "file_name": "a.jpg", "width": 200, "height": 100}],
+        "categories": [{"id": 3, "name": "car"}, {"id": 90, "name": "dog"}],
+        "annotations": [
+            {"image_id": 7, "category_id": 90, "bbox": [10, 20, 30, 40], "iscrowd": 0},
+            {"image_id": 7, "category_id": 3, "bbox": [0, 0, 5.5, 5], "iscrowd": 1},
+        ],
+    } | changes
+    return text(tmp_path / "annotations" / "instances_val2017.json", json.dumps(content))
+
+
+def test_a_coco_file_is_read_with_its_crowds(tmp_path: Path) -> None:
+    path = coco(tmp_path)
+    for where in (path, tmp_path):
+        dataset = open_dataset(where)
+        assert (dataset.kind, dataset.class_names) == ("COCO", ("car", "dog"))
+        (sample,) = dataset.samples
+        assert sample.image == tmp_path / "val2017" / "a.jpg"
+        assert sample.boxes_in(1, 1).tolist() == [[10, 20, 40, 60], [0, 0, 5.5, 5]]
+        assert sample.class_ids.tolist() == [1, 0]
+        assert sample.ignored.tolist() == [False, True]
+
+
+def annotated(**changes: Any) -> dict[str, Any]:
+    return {"annotations": [{"image_id": 7, "category_id": 3, "bbox": [0, 0, 1, 1]} | changes]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (annotated(category_id=1), "annotation 0: its category_id 1"),
+        (annotated(bbox=[0, 0, -1, 1]), "annotation 0: its bbox must"),
+        (annotated(image_id=8), "annotations of the image 8"),
+        ({"annotations": {}}, "`annotations` must be a list"),
+        ({"categories": []}, "has no categories"),
+        ({"categories": [{"id": 1}]}, "category 0: expected"),
+        ({"images": [{"id": 7, "file_name": "gone.jpg"}]}, "image 0: gone.jpg is in none of .*--images"),
+    ],
+)  # fmt: skip
+def test_a_wrong_entry_of_a_coco_file_is_named(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(DatasetError, match=says):
+        open_dataset(coco(tmp_path, **changes))
+
+
+def test_what_is_no_json_and_what_is_two_files_is_told(tmp_path: Path) -> None:
+    path = coco(tmp_path)
+    text(path.with_name("instances_train2017.json"), "{}")
+    with pytest.raises(DatasetError, match="several annotation files"):
+        open_dataset(tmp_path)
+    with pytest.raises(DatasetError, match="is not JSON"):
+        open_dataset(text(tmp_path / "x.json", "{"))

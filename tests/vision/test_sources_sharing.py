@@ -1,0 +1,65 @@
+"""One camera, several readers: what is read is offered in shared memory as well."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.shared_frame import SharedFrameReader, SharedFrameWriter
+from vision.sources import SourceError, open_source
+from vision.sources.sharing import SharingSource
+
+
+@pytest.fixture
+def name() -> Iterator[str]:
+    name = f"companion-test-{secrets.token_hex(4)}"
+    yield name
+    assert not Path("/dev/shm", name).exists(), "the shared memory was left behind"
+
+
+def pictures(folder: Path, *sizes: tuple[int, int]) -> Path:
+    rng = np.random.default_rng(1)
+    for index, (width, height) in enumerate(sizes):
+        picture = rng.integers(0, 255, (height, width, 3), dtype=np.uint8)
+        assert cv2.imwrite(str(folder / f"{index}.png"), picture)
+    return folder
+
+
+def test_what_is_read_is_there_for_others_with_its_stamp(name: str, tmp_path: Path) -> None:
+    folder = pictures(tmp_path, (32, 24), (32, 24))
+    with SharingSource(open_source(str(folder)), name) as source:
+        for _ in range(2):
+            frame = source.read()
+            assert frame is not None
+            with SharedFrameReader(name) as reader:
+                other = reader.latest()
+            assert other is not None
+            assert (other.sequence, other.captured_ns) == (frame.sequence, frame.captured_ns)
+            assert np.array_equal(other.image, frame.image)
+
+
+def test_a_stream_that_changes_its_size_goes_on(name: str, tmp_path: Path) -> None:
+    folder = pictures(tmp_path, (32, 24), (48, 16))
+    with SharingSource(open_source(str(folder)), name) as source:
+        source.read()
+        with SharedFrameReader(name) as reader:
+            assert (reader.width, reader.height) == (32, 24)
+            source.read()
+            other = reader.latest()
+            assert other is not None
+            assert (other.width, other.height) == (48, 16)
+
+
+def test_a_name_that_another_writes_is_one_clear_line(name: str, tmp_path: Path) -> None:
+    folder = pictures(tmp_path, (32, 24))
+    with (
+        SharedFrameWriter(name, 8, 8, False),
+        SharingSource(open_source(str(folder)), name) as source,
+        pytest.raises(SourceError, match=f"shm://{name}: .*another process"),
+    ):
+        source.read()

@@ -1,0 +1,144 @@
+"""Frames looked at in tiles: nothing small is lost, nothing found twice, and small frames are as before."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from vision.detections import Detections
+from vision.pipeline import FrameDetector
+from vision.tiling import TiledDetector, TiledTiming, merge_passes, tiles_of
+
+NAMES = ("car", "dog")
+
+
+@dataclass
+class Patches:
+    """Finds the bright rectangles of a picture that are at least `smallest` of its width."""
+
+    class_names: tuple[str, ...] = NAMES
+    smallest: float = 0.0
+    asked: list[tuple[int, int]] = field(default_factory=list)
+    last_timing: TiledTiming | None = None
+
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        import cv2
+
+        height, width = image_bgr.shape[:2]
+        self.asked.append((width, height))
+        self.last_timing = TiledTiming(1.0, 10.0, 2.0)
+        _, _, boxes, _ = cv2.connectedComponentsWithStats((image_bgr[:, :, 0] > 128).astype(np.uint8))
+        found = [(x, y, x + w, y + h) for x, y, w, h, _ in boxes[1:] if w >= self.smallest * width]
+        xyxy = np.array(found, np.float32).reshape(-1, 4)
+        return Detections(
+            xyxy, np.full(len(xyxy), 0.8, np.float32), np.zeros(len(xyxy), np.int64), self.class_names
+        )
+
+
+def picture(width: int, height: int, *boxes: tuple[int, int, int, int]) -> NDArray[np.uint8]:
+    image = np.zeros((height, width, 3), np.uint8)
+    for left, top, right, bottom in boxes:
+        image[top:bottom, left:right] = 255
+    return image
+
+
+def same_boxes(found: Detections, boxes: list[tuple[int, int, int, int]]) -> bool:
+    return sorted(map(tuple, found.xyxy.round().astype(int).tolist())) == sorted(boxes)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(1, 4000), st.integers(1, 3000), st.integers(64, 1000), st.floats(0, 0.8))
+def test_tiles_cover_the_frame_and_overlap_as_asked(
+    width: int, height: int, size: int, overlap: float
+) -> None:
+    tiles = tiles_of(width, height, size, overlap)
+    for start, end, length in (
+        (lambda tile: tile.left, lambda tile: tile.right, width),
+        (lambda tile: tile.top, lambda tile: tile.bottom, height),
+    ):
+        spans = sorted({(start(tile), end(tile)) for tile in tiles})
+        assert spans[0][0] == 0
+        assert spans[-1][1] == length
+        assert all(b - a == min(size, length) for a, b in spans)
+        for (_, first_end), (second_start, _) in itertools.pairwise(spans):
+            assert first_end - second_start >= overlap * size - 1
+
+
+def test_full_hd_takes_eight_tiles_and_a_whole_frame() -> None:
+    detector = Patches()
+    tiled = TiledDetector(detector)
+    tiled.detect(picture(1920, 1080))
+    assert detector.asked == [(640, 640)] * 8 + [(1920, 1080)]
+    assert tiled.last_passes == 9
+    assert tiled.last_timing is not None
+    assert (tiled.last_timing.preprocess_ms, tiled.last_timing.inference_ms) == (9.0, 90.0)
+
+
+def test_a_frame_no_larger_than_a_tile_is_looked_at_once() -> None:
+    detector = Patches()
+    tiled: FrameDetector = TiledDetector(detector)
+    assert len(tiled.detect(picture(640, 480, (10, 10, 40, 40)))) == 1
+    assert detector.asked == [(640, 480)]
+    assert tiled.class_names == NAMES
+
+
+def test_what_the_whole_frame_is_too_coarse_for_is_found_in_a_tile() -> None:
+    small = (1500, 700, 1512, 712)
+    image = picture(1920, 1080, small)
+    coarse = Patches(smallest=0.015)
+    assert len(coarse.detect(image)) == 0
+    assert same_boxes(TiledDetector(coarse).detect(image), [small])
+
+
+def test_an_object_in_the_overlap_is_found_once() -> None:
+    boxes = [(440, 300, 520, 380), (560, 500, 630, 560), (100, 460, 180, 520)]
+    assert same_boxes(TiledDetector(Patches()).detect(picture(1920, 1080, *boxes)), boxes)
+
+
+def test_an_object_larger_than_a_tile_is_the_whole_frames() -> None:
+    box = (100, 100, 1800, 1000)
+    assert same_boxes(TiledDetector(Patches()).detect(picture(1920, 1080, box)), [box])
+
+
+def test_without_the_whole_frame_pieces_are_put_together() -> None:
+    box = (200, 300, 900, 400)
+    found = TiledDetector(Patches(), whole_frame=False).detect(picture(1280, 640, box))
+    assert same_boxes(found, [box])
+
+
+def test_objects_within_each_other_in_one_pass_stay_two() -> None:
+    one_pass = Detections(
+        np.array([[0, 0, 100, 100], [10, 10, 40, 90]], np.float32),
+        np.array([0.9, 0.8], np.float32),
+        np.array([0, 0]),
+        NAMES,
+    )
+    nothing = Detections.empty(NAMES)
+    assert len(merge_passes([one_pass, nothing], [np.zeros(2, np.bool_), np.zeros(0, np.bool_)])) == 2
+
+
+def test_a_whole_box_does_not_fall_to_a_surer_half() -> None:
+    half = Detections(
+        np.array([[0, 0, 50, 100]], np.float32), np.array([0.99], np.float32), np.array([0]), NAMES
+    )
+    whole = Detections(
+        np.array([[0, 0, 100, 100]], np.float32), np.array([0.5], np.float32), np.array([0]), NAMES
+    )
+    merged = merge_passes([half, whole], [np.array([True]), np.array([False])])
+    assert merged.xyxy.tolist() == [[0, 0, 100, 100]]
+    other = Detections(whole.xyxy, whole.confidence, np.array([1]), NAMES)
+    assert len(merge_passes([half, other], [np.array([True]), np.array([False])])) == 2
+
+
+@pytest.mark.parametrize(
+    ("values", "says"), [({"tile_size": 10}, "tile_size"), ({"overlap": 0.9}, "overlap")]
+)
+def test_senseless_tiles_are_refused(values: dict[str, float], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        TiledDetector(Patches(), **values)  # type: ignore[arg-type]

@@ -1,0 +1,96 @@
+"""The measures, on sequences small enough to count by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from vision.tracking.clear_mot import Labelled, MotScore, clear_mot
+
+Frame = tuple[dict[int, float], dict[int, float]]
+
+
+def score(*frames: Frame) -> MotScore:
+    """Of frames that say at which x each identity's box of 10 by 10 pixels stands."""
+    return clear_mot((labelled(truth), labelled(tracked)) for truth, tracked in frames)
+
+
+def labelled(places: dict[int, float]) -> Labelled:
+    boxes = np.array([[x, 0, x + 10, 10] for x in places.values()], np.float64).reshape(-1, 4)
+    return Labelled(list(places), boxes)
+
+
+def test_all_right_is_one() -> None:
+    result = score(({1: 0, 2: 50}, {7: 0, 8: 51}), ({1: 1, 2: 50}, {7: 1, 8: 50}))
+    assert result.mota == result.idf1 == 1.0
+    assert (result.objects, result.frames) == (4, 2)
+    assert result.misses == result.false_positives == result.switches == result.fragmentations == 0
+    assert result.iou == pytest.approx((3 + 9 / 11) / 4)
+
+
+def test_misses_and_false_positives_are_counted_each_frame() -> None:
+    result = score(({1: 0}, {}), ({1: 0}, {7: 0, 8: 100}), ({1: 0}, {7: 0, 8: 100}))
+    assert (result.misses, result.false_positives) == (1, 2)
+    assert result.mota == pytest.approx(0.0)
+
+
+def test_a_new_identity_is_one_switch_however_long_it_stays() -> None:
+    result = score(({1: 0}, {7: 0}), ({1: 0}, {8: 0}), ({1: 0}, {8: 0}))
+    assert (result.switches, result.fragmentations) == (1, 0)
+    assert result.mota == pytest.approx(2 / 3)
+    assert result.idf1 == pytest.approx(2 / 3)
+
+
+def test_a_swap_of_two_is_two_switches() -> None:
+    assert score(({1: 0, 2: 50}, {7: 0, 8: 50}), ({1: 0, 2: 50}, {8: 0, 7: 50})).switches == 2
+
+
+def test_a_gap_is_a_fragmentation_and_a_switch_only_with_another_identity() -> None:
+    same = score(({1: 0}, {7: 0}), ({1: 0}, {}), ({1: 0}, {7: 0}))
+    other = score(({1: 0}, {7: 0}), ({1: 0}, {}), ({1: 0}, {8: 0}))
+    assert (same.fragmentations, same.switches) == (1, 0)
+    assert (other.fragmentations, other.switches) == (1, 1)
+
+
+def test_an_object_that_was_away_itself_is_not_fragmented() -> None:
+    result = score(({1: 0}, {7: 0}), ({}, {}), ({1: 0}, {7: 0}))
+    assert (result.fragmentations, result.misses) == (0, 0)
+
+
+def test_a_pair_stays_together_though_another_box_fits_better() -> None:
+    result = score(({1: 0}, {7: 0}), ({1: 0}, {7: 2, 8: 0}))
+    assert (result.switches, result.false_positives) == (0, 1)
+
+
+def test_as_many_as_possible_are_paired() -> None:
+    # 7 fits both, 8 fits the first alone.
+    result = score(({1: 0, 2: 4}, {7: 1, 8: -3}))
+    assert (result.misses, result.false_positives) == (0, 0)
+
+
+def test_a_box_that_is_half_off_covers_nothing() -> None:
+    result = score(({1: 0}, {7: 4}))
+    assert (result.misses, result.false_positives) == (1, 1)
+    assert math.isnan(result.iou)
+
+
+def test_nothing_at_all_has_no_score() -> None:
+    result = score(({}, {}))
+    assert math.isnan(result.mota)
+    assert math.isnan(result.idf1)
+    assert score(({}, {7: 0})).idf1 == 0.0
+
+
+def test_the_sums_are_given_as_plain_values() -> None:
+    values = score(({1: 0}, {7: 0})).as_dict()
+    assert values["mota"] == 1.0
+    assert values["objects"] == 1
+
+
+def test_identities_must_differ_and_have_a_box_each() -> None:
+    with pytest.raises(ValueError, match=r"must differ, got \[1, 1\]"):
+        Labelled([1, 1], np.zeros((2, 4)))
+    with pytest.raises(ValueError, match=r"must be \(1, 4\), got \(2, 4\)"):
+        Labelled([1], np.zeros((2, 4)))

@@ -1,0 +1,49 @@
+"""The values of tracking."""
+
+from __future__ import annotations
+
+import pickle
+import statistics
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vision.tracking import Track, TrackerSettings, TrackEvent, TrackEventKind, TrackState
+from vision.tracking.tracks import SCORES_KEPT, ScoreHistory
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=3 * SCORES_KEPT))
+def test_the_median_is_that_of_the_newest_confidences(confidences: list[float]) -> None:
+    scores = ScoreHistory()
+    for confidence in confidences:
+        scores.add(confidence)
+    assert scores.median == pytest.approx(statistics.median(confidences[-SCORES_KEPT:]))
+
+
+def test_without_a_confidence_the_median_is_nothing() -> None:
+    assert ScoreHistory().median == 0.0
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"low_confidence": 0.5, "high_confidence": 0.4}, "low not above high, got 0.5 and 0.4"),
+        ({"high_confidence": 1.5}, "must be 0 to 1"),
+        ({"true_score": -0.1}, "true_score must be 0 to 1, got -0.1"),
+        ({"keep_confidence": 2.0}, "keep_confidence must be 0 to 1, got 2"),
+        ({"min_iou": float("nan")}, "min_iou must be 0 to 1, got nan"),
+        ({"true_frames": 0}, "true_frames must be at least 1, got 0"),
+        ({"lost_s": 0.0}, "lost_s must be above 0"),
+        ({"lost_s": 3.0, "end_s": 2.0}, "not above end_s, got 3 and 2"),
+    ],
+)
+def test_settings_that_contradict_themselves_are_refused(bad: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TrackerSettings(**bad)  # type: ignore[arg-type]
+
+
+def test_an_event_survives_pickling() -> None:
+    track = Track(3, 1, "car", TrackState.CONFIRMED, (1.0, 2.0, 3.0, 4.0), 0.8, 0.7, 5, 100, 200)
+    event = TrackEvent(TrackEventKind.LOST, 300, track)
+    assert pickle.loads(pickle.dumps(event)) == event

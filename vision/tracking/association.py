@@ -1,0 +1,135 @@
+"""Which detection is which track: the pairs that overlap most, all together.
+
+The assignment problem is solved exactly, by shortest augmenting paths (R. Jonker, A. Volgenant, "A shortest
+augmenting path algorithm for dense and sparse linear assignment problems", Computing 38, 1987). Without the
+pairs that are out of the question the graph is sparse, and its connected parts are solved one by one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pairs = list[tuple[int, int]]
+
+
+def overlaps(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(N, 4) and (M, 4) boxes xyxy → (N, M) intersection over union; 0 where both are empty."""
+    one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    sides = np.minimum(one[:, None, 2:], other[:, 2:]) - np.maximum(one[:, None, :2], other[:, :2])
+    np.maximum(sides, 0.0, out=sides)
+    common = sides[..., 0] * sides[..., 1]
+    union = _area(one)[:, None] + _area(other) - common
+    iou: NDArray[np.float64] = np.divide(common, union, out=np.zeros_like(common), where=union > 0.0)
+    return iou
+
+
+def _area(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    area: NDArray[np.float64] = np.maximum(boxes[:, 2] - boxes[:, 0], 0.0) * np.maximum(
+        boxes[:, 3] - boxes[:, 1], 0.0
+    )
+    return area
+
+
+def grown(boxes: NDArray[np.floating], share: float) -> NDArray[np.float64]:
+    """(N, 4) boxes xyxy, larger by `share` of their size (the geometric mean of the sides) on every side."""
+    corners = np.asarray(boxes, np.float64)
+    if not share:
+        return corners
+    margin = share * np.sqrt(_area(corners))[:, None]
+    larger: NDArray[np.float64] = np.concatenate([corners[:, :2] - margin, corners[:, 2:] + margin], axis=1)
+    return larger
+
+
+def match(similarity: NDArray[np.float64], least: float) -> Pairs:
+    """The pairs (row, column) with the largest sum of `similarity - least`, each row and column used once.
+
+    Args:
+        similarity: (N, M).
+        least: a pair not more alike than this is never made.
+
+    Returns:
+        In the order of rows.
+    """
+    gain = similarity - least
+    possible = gain > 0.0
+    # Nearly always a track overlaps one detection and that one no other track.
+    alone = possible & (possible.sum(axis=1) == 1)[:, None] & (possible.sum(axis=0) == 1)[None, :]
+    pairs = [(int(row), int(column)) for row, column in np.argwhere(alone)]
+    disputed = possible & ~alone
+    if not disputed.any():
+        return pairs
+    for rows, columns in _connected_parts(disputed):
+        part = gain[np.ix_(rows, columns)].clip(0.0)
+        pairs += [(rows[row], columns[column]) for row, column in assign(-part) if part[row, column] > 0.0]
+    return sorted(pairs)
+
+
+def _connected_parts(possible: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
+    """The connected parts of the bipartite graph, rows and columns of each; only those with a pair."""
+    parts: list[tuple[list[int], list[int]]] = []
+    waiting = set(np.flatnonzero(possible.any(axis=1)).tolist())
+    while waiting:
+        rows, columns = {waiting.pop()}, set[int]()
+        newest = list(rows)
+        while newest:
+            reached = set(np.flatnonzero(possible[newest].any(axis=0)).tolist()) - columns
+            columns |= reached
+            newest = list(set(np.flatnonzero(possible[:, list(reached)].any(axis=1)).tolist()) - rows)
+            rows.update(newest)
+        waiting -= rows
+        parts.append((sorted(rows), sorted(columns)))
+    return parts
+
+
+def assign(cost: NDArray[np.float64]) -> Pairs:
+    """The pairs (row, column) with the smallest sum of costs that use all rows or all columns, each once.
+
+    Args:
+        cost: (N, M), finite.
+
+    Returns:
+        min(N, M) pairs in the order of rows.
+
+    Raises:
+        ValueError: a cost is not finite.
+    """
+    cost = np.asarray(cost, np.float64)
+    if not np.isfinite(cost).all():
+        raise ValueError(
+            "every cost must be finite; leave out the pairs that cannot be, or give them a large one"
+        )
+    if cost.shape[0] > cost.shape[1]:
+        return sorted((row, column) for column, row in assign(cost.T))
+    rows, columns = cost.shape
+    row_price, column_price = np.zeros(rows), np.zeros(columns)
+    row_of, column_of = np.full(columns, -1), np.full(rows, -1)
+    for start in range(rows):
+        # The cheapest alternating path from this row to a free column (Dijkstra on reduced costs).
+        distance = np.full(columns, np.inf)
+        reached_from = np.full(columns, start)
+        done = np.zeros(columns, np.bool_)
+        row, travelled = start, 0.0
+        while True:
+            through = travelled + cost[row] - row_price[row] - column_price
+            nearer = (through < distance) & ~done
+            distance[nearer] = through[nearer]
+            reached_from[nearer] = row
+            column = int(np.argmin(np.where(done, np.inf, distance)))
+            travelled = float(distance[column])
+            if row_of[column] < 0:
+                break
+            done[column] = True
+            row = int(row_of[column])
+        # Prices that keep every reduced cost at or above zero, and those of the chosen pairs at zero.
+        row_price[start] += travelled
+        row_price[row_of[done]] += travelled - distance[done]
+        column_price[done] -= travelled - distance[done]
+        while True:
+            row = int(reached_from[column])
+            before = int(column_of[row])
+            row_of[column], column_of[row] = row, column
+            if row == start:
+                break
+            column = before
+    return [(row, int(column)) for row, column in enumerate(column_of)]

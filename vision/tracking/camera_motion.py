@@ -1,0 +1,136 @@
+"""What the turning of the camera does to boxes in its picture, and where it looked when.
+
+A pure rotation of the camera moves every pixel by the homography K R K⁻¹ whatever the depth there (Hartley,
+Zisserman, Multiple View Geometry, 8.4). The vehicle's attitude tells R.
+"""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_right
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.camera_model import CameraModel
+from vision.rotation import Quaternion, matrix_from_quaternion, slerp
+from vision.tracking.kalman import BoxStates
+
+Array = NDArray[np.float64]
+
+HISTORY_S = 3.0
+# Past its newest sample the history goes on turning as it did for so long: a link brings attitudes late.
+MAX_AHEAD_S = 0.1
+# Two samples farther apart than this say nothing of what was between them.
+MAX_GAP_S = 0.5
+# A box seen more obliquely than this (cosine to the optical axis) is out of every picture.
+MIN_COSINE = 0.17
+# Pixels to each side for the homography's derivative.
+_STEP_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """Where a camera looked when it took a frame.
+
+    Attributes:
+        camera: for frames of this size.
+        ned_from_optical: (3, 3) rotation from the optical frame to NED.
+    """
+
+    camera: CameraModel
+    ned_from_optical: Array
+
+    def turn_from(self, earlier: CameraView) -> Array:
+        """(3, 3) rotation of directions in the earlier optical frame into this one."""
+        turn: Array = self.ned_from_optical.T @ earlier.ned_from_optical
+        return turn
+
+
+def turned(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[BoxStates, NDArray[np.bool_]]:
+    """The boxes after the camera alone has turned.
+
+    To first order about each box's middle: the middle goes where the homography takes it, speeds are turned
+    with the picture, sides are stretched with it. Sides are not turned: an object that stands upright in the
+    world would grow its box by every roll and never lose that again.
+
+    Args:
+        turn: (3, 3), directions in the earlier optical frame into the later one.
+
+    Returns:
+        The boxes, and (N,) which of them a camera could still see; the others are as they were.
+    """
+    if not len(states):
+        return states, np.ones(0, np.bool_)
+    middle = states.mean[:, :2]
+    around = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STEP_PX], [0.0, -_STEP_PX]])
+    points = middle[:, None, :] + around
+    rays = camera.rays(points.reshape(-1, 2)) @ turn.T
+    ahead: NDArray[np.bool_] = (rays[:, 2] > MIN_COSINE).reshape(-1, 5).min(axis=1)
+    moved = camera.project(rays).reshape(-1, 5, 2)
+    # (N, 2, 2) derivative of the new pixel by the old one, columns x and y.
+    slope = np.stack([moved[:, 1] - moved[:, 2], moved[:, 3] - moved[:, 4]], axis=2) / (2 * _STEP_PX)
+    slope[~ahead] = np.eye(2)
+    # Its polar decomposition is a turn of the picture by `roll` after a stretch; a side grows by the stretch.
+    roll = np.arctan2(slope[:, 1, 0] - slope[:, 0, 1], slope[:, 0, 0] + slope[:, 1, 1])
+    cosine, sine = np.cos(roll), np.sin(roll)
+    step = np.zeros((len(states), 8, 8))
+    step[:, 0:2, 0:2] = step[:, 4:6, 4:6] = slope
+    step[:, 2, 2] = step[:, 6, 6] = cosine * slope[:, 0, 0] + sine * slope[:, 1, 0]
+    step[:, 3, 3] = step[:, 7, 7] = cosine * slope[:, 1, 1] - sine * slope[:, 0, 1]
+    mean = np.einsum("nij,nj->ni", step, states.mean)
+    mean[:, :2] = np.where(ahead[:, None], moved[:, 0], middle)
+    return BoxStates(mean, step @ states.covariance @ step.transpose(0, 2, 1)), ahead
+
+
+class AttitudeHistory:
+    """The attitudes of the last few seconds. One thread may add while another asks."""
+
+    def __init__(self, keep_s: float = HISTORY_S) -> None:
+        self._keep_ns = keep_s * 1e9
+        self._lock = threading.Lock()
+        self._samples: deque[tuple[int, Quaternion]] = deque()
+
+    def add(self, stamp_ns: int, attitude_wxyz: Quaternion) -> None:
+        """Remember one: body FRD to NED, CLOCK_MONOTONIC nanoseconds. One that is older is ignored."""
+        with self._lock:
+            if self._samples and stamp_ns <= self._samples[-1][0]:
+                return
+            self._samples.append((stamp_ns, attitude_wxyz))
+            while stamp_ns - self._samples[0][0] > self._keep_ns:
+                self._samples.popleft()
+
+    def at(self, stamp_ns: int) -> Array | None:
+        """(3, 3) `ned_from_body` at a moment, by slerp; None where the history does not reach."""
+        with self._lock:
+            samples = list(self._samples)
+        index = bisect_right(samples, stamp_ns, key=lambda sample: sample[0])
+        if index == 0:
+            return None
+        if samples[index - 1][0] == stamp_ns:
+            return matrix_from_quaternion(samples[index - 1][1])
+        if index == len(samples):
+            if stamp_ns - samples[-1][0] > MAX_AHEAD_S * 1e9:
+                return None
+            return self._ahead(samples, stamp_ns)
+        (before_ns, before), (after_ns, after) = samples[index - 1], samples[index]
+        if after_ns - before_ns > MAX_GAP_S * 1e9:
+            return None
+        return _between(before, before_ns, after, after_ns, stamp_ns)
+
+    @staticmethod
+    def _ahead(samples: list[tuple[int, Quaternion]], stamp_ns: int) -> Array | None:
+        """Turned on past the newest sample, as fast as over a while before it: two samples are too noisy."""
+        after_ns, after = samples[-1]
+        for before_ns, before in reversed(samples[:-1]):
+            if after_ns - before_ns > MAX_GAP_S * 1e9:
+                return None
+            if after_ns - before_ns >= MAX_AHEAD_S / 2 * 1e9:
+                return _between(before, before_ns, after, after_ns, stamp_ns)
+        return None
+
+
+def _between(before: Quaternion, before_ns: int, after: Quaternion, after_ns: int, stamp_ns: int) -> Array:
+    return matrix_from_quaternion(slerp(before, after, (stamp_ns - before_ns) / (after_ns - before_ns)))

@@ -1,0 +1,142 @@
+"""The values of tracking: a track, what happened to it, and how it was followed."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+
+from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
+
+XYXY = tuple[float, float, float, float]
+
+
+class TrackState(StrEnum):
+    """Whether a track counts as true."""
+
+    TENTATIVE = TRACK_TENTATIVE
+    """too short, or its median confidence is too low: it may be a mistake of the detector"""
+    CONFIRMED = TRACK_CONFIRMED
+    """it counts as true, once and for all"""
+
+
+class TrackEventKind(StrEnum):
+    """What happened to a track. Only what counts as true makes events."""
+
+    NEW = "new"
+    """it counts as true from now on"""
+    UPDATE = "update"
+    """it was seen in this frame"""
+    LOST = "lost"
+    """it has not been seen for `lost_s`; the next `update` ends that"""
+    END = "end"
+    """it will not come back: what is seen there later is another track"""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """One object through time, as it is known at one frame.
+
+    Attributes:
+        track_id: 1 or more; never used again.
+        class_id, class_name: as the detector says; a track never changes its class.
+        state: whether it counts as true.
+        xyxy: pixels of the frame: as detected where it was seen in it, as predicted where not.
+        confidence: of its newest detection, 0..1.
+        score: median of the confidences of its newest `SCORES_KEPT` detections, 0..1.
+        seen: in how many frames it was detected.
+        first_ns, last_ns: capture stamps of the first and the newest of these frames.
+    """
+
+    track_id: int
+    class_id: int
+    class_name: str
+    state: TrackState
+    xyxy: XYXY
+    confidence: float
+    score: float
+    seen: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TrackEvent:
+    """Something happened to a track at the frame captured at `stamp_ns`."""
+
+    kind: TrackEventKind
+    stamp_ns: int
+    track: Track
+
+
+SCORES_KEPT = 100
+
+
+class ScoreHistory:
+    """The newest `SCORES_KEPT` confidences of a track, and their median in constant time."""
+
+    __slots__ = ("_newest", "_sorted")
+
+    def __init__(self) -> None:
+        self._newest: deque[float] = deque()
+        self._sorted: list[float] = []
+
+    def add(self, confidence: float) -> None:
+        """Take one more; the oldest falls out when there are too many."""
+        self._newest.append(confidence)
+        insort(self._sorted, confidence)
+        if len(self._newest) > SCORES_KEPT:
+            del self._sorted[bisect_left(self._sorted, self._newest.popleft())]
+
+    @property
+    def median(self) -> float:
+        """The middle one; the mean of the two in the middle if their number is even. 0 if there is none."""
+        count = len(self._sorted)
+        if not count:
+            return 0.0
+        return (self._sorted[(count - 1) // 2] + self._sorted[count // 2]) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """What the tracker goes by. Confidences and overlaps (intersection over union) are in 0..1.
+
+    Attributes:
+        high_confidence: from here on a detection can begin a track, and is associated first.
+        low_confidence: weaker than that is not looked at; between the two a detection can only continue a
+            track that was seen a moment ago.
+        keep_confidence: a weaker detection is left out of the result if it belongs to no track.
+        true_score: a track counts as true when its median confidence reaches this,
+        true_frames: and it was seen in so many frames.
+        min_iou: a strong detection can be a track's if it overlaps its prediction by more than this,
+        min_iou_weak: and a weak one by more than this.
+        lost_s: unseen for so long, a track is lost.
+        end_s: unseen for so long, it has ended.
+    """
+
+    high_confidence: float = 0.35
+    low_confidence: float = 0.1
+    keep_confidence: float = 0.25
+    true_score: float = 0.4
+    true_frames: int = 3
+    min_iou: float = 0.2
+    min_iou_weak: float = 0.5
+    lost_s: float = 0.5
+    end_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.low_confidence <= self.high_confidence <= 1.0:
+            raise ValueError(
+                "low_confidence and high_confidence must be 0 to 1, low not above high, "
+                f"got {self.low_confidence:g} and {self.high_confidence:g}"
+            )
+        for name in ("keep_confidence", "true_score", "min_iou", "min_iou_weak"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be 0 to 1, got {getattr(self, name):g}")
+        if self.true_frames < 1:
+            raise ValueError(f"true_frames must be at least 1, got {self.true_frames}")
+        if not 0.0 < self.lost_s <= self.end_s:
+            raise ValueError(
+                f"lost_s must be above 0 and not above end_s, got {self.lost_s:g} and {self.end_s:g}"
+            )

@@ -1,0 +1,204 @@
+"""The published networks: YOLOv5u, YOLOv8, YOLOv10, YOLO11, YOLO12, YOLO26, every scale.
+
+All have one shape: a backbone that halves the picture five times, a path up that joins what it finds with
+finer maps, a path down again, and a head at strides 8, 16 and 32 (feature pyramid, Lin et al., 2017; path
+aggregation, Liu et al., 2018). They differ in the blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vision.yolo.description import YOLOV8_SCALES, ModelDescription, yolov8_description
+from vision.yolo.layer_row import ArchitectureError
+
+Scale = tuple[float, float, int]
+"""Depth multiple, width multiple, largest channel count before the width multiple."""
+
+Block = tuple[int, str, tuple[Any, ...]]
+"""Repeats, layer, its arguments after the channels."""
+
+_LATE_SCALES: dict[str, Scale] = {
+    "n": (0.50, 0.25, 1024),
+    "s": (0.50, 0.50, 1024),
+    "m": (0.50, 1.00, 512),
+    "l": (1.00, 1.00, 512),
+    "x": (1.00, 1.50, 512),
+}
+SCALES: Mapping[str, Mapping[str, Scale]] = {
+    "YOLOv5u": {
+        "n": (0.33, 0.25, 1024),
+        "s": (0.33, 0.50, 1024),
+        "m": (0.67, 0.75, 1024),
+        "l": (1.00, 1.00, 1024),
+        "x": (1.33, 1.25, 1024),
+    },
+    "YOLOv8": YOLOV8_SCALES,
+    "YOLOv10": {
+        "n": (0.33, 0.25, 1024),
+        "s": (0.33, 0.50, 1024),
+        "m": (0.67, 0.75, 768),
+        "b": (0.67, 1.00, 512),
+        "l": (1.00, 1.00, 512),
+        "x": (1.00, 1.25, 512),
+    },
+    "YOLO11": _LATE_SCALES,
+    "YOLO12": _LATE_SCALES,
+    "YOLO26": _LATE_SCALES,
+}
+"""Generation → scale letter → its multipliers, as published."""
+
+
+def published_description(generation: str, scale: str, class_names: Sequence[str]) -> ModelDescription:
+    """The published network of a generation and a scale, as a key of `SCALES` and of its table.
+
+    Raises `ArchitectureError` for an unknown one.
+    """
+    if generation not in SCALES:
+        raise ArchitectureError(f"unknown generation {generation!r:.100}; known are {', '.join(SCALES)}")
+    scales = SCALES[generation]
+    if scale not in scales:
+        raise ArchitectureError(f"{generation} has no scale {scale!r:.100}; known are {', '.join(scales)}")
+    if generation == "YOLOv8":
+        return yolov8_description(scale, class_names)
+    backbone, head = _rows(_blocks(generation, scale))
+    depth, width, most = scales[scale]
+    table = {
+        "backbone": backbone,
+        "head": head,
+        "scales": {scale: [depth, width, most]},
+        "scale": scale,
+        "reg_max": 1 if generation == "YOLO26" else 16,
+        "end2end": generation in ("YOLOv10", "YOLO26"),
+    }
+    return ModelDescription.from_plain(table, class_names)
+
+
+@dataclass(frozen=True, slots=True)
+class _Blocks:
+    """What stands at each place of the common shape.
+
+    Attributes:
+        stages: the blocks at strides 4, 8, 16, 32.
+        deepest: what follows the last of them.
+        up, down: the blocks at strides 16 and 8 on the path up, at 16 and 32 on the path down.
+        stem: arguments of the first convolution after its channels.
+        stage_channels: what the stages give, before scaling.
+        halving: how strides 16 and 32 are reached in the backbone, and 32 on the path down.
+        narrow_first: YOLOv5's: a 1×1 convolution halves the channels before each enlargement.
+        head: the name of the head's layer.
+    """
+
+    stages: tuple[Block, Block, Block, Block]
+    deepest: tuple[Block, ...]
+    up: tuple[Block, Block]
+    down: tuple[Block, Block]
+    stem: tuple[int, ...] = (3, 2)
+    stage_channels: tuple[int, int, int, int] = (256, 512, 512, 1024)
+    halving: str = "Conv"
+    narrow_first: bool = False
+    head: str = "Detect"
+
+
+def _blocks(generation: str, scale: str) -> _Blocks:
+    sppf: Block = (1, "SPPF", (5,))
+    if generation == "YOLOv5u":
+        c3: Block = (3, "C3", (False,))
+        return _Blocks(
+            stem=(6, 2, 2),
+            stages=((3, "C3", ()), (6, "C3", ()), (9, "C3", ()), (3, "C3", ())),
+            stage_channels=(128, 256, 512, 1024),
+            deepest=(sppf,),
+            up=(c3, c3),
+            down=(c3, c3),
+            narrow_first=True,
+        )
+    if generation == "YOLOv10":
+        return _yolov10(scale, sppf)
+    narrow: Block = (2, "C3k2", (False, 0.25))
+    usual: Block = (2, "C3k2", (False,))
+    deep: Block = (2, "C3k2", (True,))
+    attention: Block = (2, "C2PSA", ())
+    if generation == "YOLO11":
+        return _Blocks(
+            stages=(narrow, narrow, deep, deep),
+            deepest=(sppf, attention),
+            up=(usual, usual),
+            down=(usual, deep),
+        )
+    if generation == "YOLO12":
+        plain: Block = (2, "A2C2f", (False, -1))
+        return _Blocks(
+            stages=(narrow, narrow, (4, "A2C2f", (True, 4)), (4, "A2C2f", (True, 1))),
+            deepest=(),
+            up=(plain, plain),
+            down=(plain, deep),
+        )
+    return _Blocks(
+        stages=(narrow, narrow, deep, deep),
+        deepest=((1, "SPPF", (5, 3, True)), attention),
+        up=(deep, deep),
+        down=(deep, (1, "C3k2", (True, 0.5, True))),
+    )
+
+
+def _yolov10(scale: str, sppf: Block) -> _Blocks:
+    """The larger the scale, the more of its blocks are compact inverted ones; n and s have large kernels."""
+    usual: Block = (3, "C2f", ())
+    compact: Block = (3, "C2fCIB", (True,))
+    large: Block = (3, "C2fCIB", (True, True))
+    fourth = {"n": (3, "C2f", (True,)), "s": large}.get(scale, compact)
+    third: Block = (6, "C2fCIB", (True,)) if scale == "x" else (6, "C2f", (True,))
+    return _Blocks(
+        stages=((3, "C2f", (True,)), (6, "C2f", (True,)), third, fourth),
+        stage_channels=(128, 256, 512, 1024),
+        halving="SCDown",
+        deepest=(sppf, (1, "PSA", ())),
+        up=(compact if scale in ("b", "l", "x") else usual, usual),
+        down=(usual if scale in ("n", "s") else compact, large if scale in ("n", "s") else compact),
+        head="v10Detect",
+    )
+
+
+def _rows(blocks: _Blocks) -> tuple[list[Any], list[Any]]:
+    """Backbone and head, rows as `LayerRow.to_plain` writes them."""
+    rows: list[Any] = []
+
+    def add(layer: str, arguments: Sequence[Any], repeats: int = 1, source: int | list[int] = -1) -> int:
+        rows.append([source, repeats, layer, list(arguments)])
+        return len(rows) - 1
+
+    def block(channels: int, kind: Block) -> int:
+        repeats, layer, arguments = kind
+        return add(layer, (channels, *arguments), repeats)
+
+    add("Conv", (64, *blocks.stem))
+    stages = []
+    for index, (channels, reached, kind) in enumerate(
+        zip(blocks.stage_channels, (128, 256, 512, 1024), blocks.stages, strict=True)
+    ):
+        add("Conv" if index < 2 else blocks.halving, (reached, 3, 2))
+        stages.append(block(channels, kind))
+    for kind in blocks.deepest:
+        block(1024, kind)
+    deepest = len(rows) - 1
+    in_backbone = len(rows)
+    joined = []
+    for channels, finer, kind in zip((512, 256), (stages[2], stages[1]), blocks.up, strict=True):
+        joined.append(add("Conv", (channels, 1, 1)) if blocks.narrow_first else len(rows) - 1)
+        add("nn.Upsample", (None, 2, "nearest"))
+        add("Concat", (1,), source=[-1, finer])
+        finest = block(channels, kind)
+    # The path down joins what the path up started each enlargement from.
+    levels = [finest]
+    coarser = (joined[1], joined[0] if blocks.narrow_first else deepest)
+    for channels, halving, other, kind in zip(
+        (256, 512), ("Conv", blocks.halving), coarser, blocks.down, strict=True
+    ):
+        add(halving, (channels, 3, 2))
+        add("Concat", (1,), source=[-1, other])
+        levels.append(block(2 * channels, kind))
+    add(blocks.head, ("nc",), source=list(levels))
+    return rows[:in_backbone], rows[in_backbone:]
