@@ -45,8 +45,8 @@ def test_a_measurement_tells_all_its_figures_and_can_be_compared(small_model: Pa
     (tmp_path / "earlier.json").write_text(json.dumps(earlier))
     heading, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
     assert heading.split() == [
-        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "frames_per_s", "memory_mb",
-        "first_detection_s",
+        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "frames_per_s",
+        "memory_mb", "first_detection_s",
     ]  # fmt: skip
     assert f"p50 was {row['p50_ms']} ms" in line
 
