@@ -149,7 +149,12 @@ def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:
 
 
 def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelMaps]:
-    return [LevelMaps(level.sides.copy(), level.classes.copy()) for level in runtime.infer(pixels)]
+    """Copies, as a runtime's maps last until its next inference."""
+    copies = []
+    for level in runtime.infer(pixels):
+        assert level.sides is not None  # Nobody asked for boxes one by one.
+        copies.append(LevelMaps(classes=level.classes.copy(), sides=level.sides.copy()))
+    return copies
 
 
 class _Largest:
@@ -164,6 +169,8 @@ class _Largest:
     ) -> None:
         self.images += 1
         for a, b in zip(first, second, strict=True):
+            assert a.sides is not None
+            assert b.sides is not None
             for mine, its in ((a.sides, b.sides), (a.classes, b.classes)):
                 # Not a number differs from everything.
                 self.maps = max(self.maps, _worst(mine, its))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 import tempfile
@@ -19,6 +18,7 @@ from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
 from vision.yolo.checkpoint import load_checkpoint
+from vision.yolo.checkpoint_pair import file_sha256
 
 logger = logging.getLogger(__name__)
 
@@ -100,12 +100,6 @@ def export_network(network: Network, facts: ExportedFacts, to: ExportKind, path:
             os.replace(made, path.with_name(made.name))
     logger.info("%s: written for %s", path, to)
     return path
-
-
-def file_sha256(path: Path) -> str:
-    """Of a file's bytes, as hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _example(side: int, *, height: int | None = None, seed: int = 0) -> torch.Tensor:
