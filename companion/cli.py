@@ -48,6 +48,7 @@ EXIT_FAILED = 1
 def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
     from companion.bus.session import BusError
+    from companion.operator.metrics import MetricsError
     from companion.perception import PerceptionStartError
     from companion.service import Service
     from companion.vehicle.driver import LinkError
@@ -55,7 +56,7 @@ def run(settings: Settings) -> None:
     logging.basicConfig(
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
-    with plain_errors(LinkError, PerceptionStartError, BusError):
+    with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError):
         asyncio.run(_run_until_signal(settings, Service))
 
 

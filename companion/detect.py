@@ -85,7 +85,7 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         "height": frame.height,
         "inference_ms": round(timing.inference_ms, 2),
         "detections": [
-            {key: value for key, value in record.items() if key != "range_m"}
+            {key: value for key, value in record.items() if key != "range_m" and not key.startswith("track_")}
             for record in detections.records()
         ],
     }

@@ -31,9 +31,9 @@ from companion.perception_messages import (
 from companion.perception_process import PerceptionProcess
 from companion.perception_pulse import Pulse
 from companion.perception_status import PerceptionState, PerceptionStatus
+from companion.perception_timing import StageTimes
 from companion.perception_tracks import LiveTracks
 from companion.settings import Settings
-from companion.stage_timing import StageTimes
 from companion.standard_input import STANDARD_INPUT, StandardInput
 from vision.pipeline import PerceptionResult
 from vision.rotation import Quaternion

@@ -30,6 +30,7 @@ from companion.messages import (
     vehicle_message,
 )
 from companion.operator.console import run_console, terminal_is_free
+from companion.operator.metrics import MetricsServer
 from companion.perception import PerceptionKeeper, PerceptionStartError
 from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
@@ -105,6 +106,7 @@ class Service:
             views=tuple(settings.views),
         )
         self.ready = False
+        self._told: dict[str, Any] | None = None
         self._notifier = SystemdNotifier()
         self._history = StateHistory()
         self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
@@ -118,10 +120,15 @@ class Service:
 
         Raises:
             LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
+            MetricsError: its library or its address is missing.
         """
         unsubscribe = self.driver.subscribe(self._take_state)
         tasks: list[asyncio.Task[None]] = []
+        metrics: MetricsServer | None = None
         try:
+            if self.settings.metrics.listen is not None:
+                metrics = MetricsServer(self.settings.metrics.listen, lambda: self._told)
+                self._event("info", f"metrics on port {metrics.port}")
             await self._start()
             loops = [self._guide(), self.streamer.run(), self._tell_vehicle(), self._tell_status()]
             if self._console and all(terminal_is_free(view.settings.source.uri) for view in self.views):
@@ -143,6 +150,8 @@ class Service:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            if metrics is not None:
+                await asyncio.to_thread(metrics.close)
             await self.bus.close()  # first: it lets answers go out
             await asyncio.gather(*(view.keeper.stop() for view in self.views), self.driver.close())
             self._notifier.close()
@@ -278,7 +287,7 @@ class Service:
 
     async def _tell_status(self) -> None:
         while True:
-            status = self.status()
+            self._told = status = self.status()
             self.bus.publish(topics.STATUS, status)
             self._notifier.status(f"{status['vehicle']['mode']}, {status['pilot']['behaviour']}")
             await asyncio.sleep(1 / (topics.STATUS.rate_hz or 1.0))

@@ -32,6 +32,7 @@ class Section(BaseModel):
 _KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
 KeyWord = Annotated[str, _KEY_WORD]
 # The same without a dot, as `views.NAME.source` is a key.
+_HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
 _VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
 ViewName = Annotated[str, _VIEW_NAME]
 VehicleUrl = Annotated[
@@ -45,6 +46,7 @@ ZenohEndpoint = Annotated[
 # What a pattern means, in words, for a person whose value did not match it.
 PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
+    r"^[^\s:]+:[0-9]{1,5}$": "HOST:PORT such as 127.0.0.1:9100",
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
@@ -339,6 +341,13 @@ class RecordingSection(Section):
         return self
 
 
+class MetricsSection(Section):
+    """Numbers for a monitoring system."""
+
+    listen: Annotated[str | None, _HOST_AND_PORT] = None
+    """HOST:PORT that serves /metrics in Prometheus' format (extra `metrics`); unset: nothing listens"""
+
+
 class LogSection(Section):
     """What is said on standard error."""
 
@@ -367,6 +376,7 @@ class Settings(Section):
     guidance: GuidanceSection = GuidanceSection()
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()
+    metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     views: dict[ViewName, ViewSections] = {}
 

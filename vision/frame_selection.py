@@ -63,8 +63,8 @@ class FrameSelector:
             return TOO_OLD
         if asked.rate_hz is not None:
             period_ns = round(1e9 / asked.rate_hz)
-            # Frames jitter: one that comes a tenth of a period early is the one that was due.
-            if frame.captured_ns < self._due_ns - period_ns // 10:
+            # Frames jitter: one that comes a quarter of a period early is the one that was due.
+            if frame.captured_ns < self._due_ns - period_ns // 4:
                 return RATE
             # From the due time on, so that the rate holds on average; after a gap, from this frame on.
             next_ns = self._due_ns + period_ns

@@ -14,7 +14,7 @@ from companion.guidance.motion import (
     stopping_speed,
     towards,
 )
-from companion.guidance.target import Target
+from companion.guidance.target import DOUBTED, Target
 from companion.guidance.track import ObjectTrack
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -67,6 +67,7 @@ class ApproachBehaviour(Behaviour):
         self._confidence = confidence
         self._lost_timeout_s = lost_timeout_s
         self._track: ObjectTrack | None = None
+        self._doubted = False
         self._down_m = 0.0
         self._seen_ns = 0
         self._until_ns: float = math.inf
@@ -83,6 +84,7 @@ class ApproachBehaviour(Behaviour):
         self._started_ns = self._seen_ns = situation.now_ns
         self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
         self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
+        self._doubted = False
         self._arrived_since_ns = [None] * len(ARRIVALS)
         self._range_m = math.nan
 
@@ -143,6 +145,8 @@ class ApproachBehaviour(Behaviour):
                 self._find_again(self._track, fitting, position)
             return
         trusted = [target for target in fitting if target.trusted]
+        if fitting:
+            self._doubted = not trusted
         if not trusted:
             return
         chosen = min(trusted, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
@@ -203,6 +207,8 @@ class ApproachBehaviour(Behaviour):
         if unseen_s > self._lost_timeout_s:
             if not situation.perception_fresh:
                 why = "nothing comes from the detector"
+            elif self._doubted:
+                why = DOUBTED
             elif self._track is None:
                 why = "it was never seen with a known range"
             else:

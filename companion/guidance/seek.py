@@ -7,7 +7,7 @@ from collections import deque
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
-from companion.guidance.target import Target
+from companion.guidance.target import DOUBTED, Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.rotation import wrap_angle
@@ -58,6 +58,7 @@ class SeekBehaviour(Behaviour):
         self._look_until_ns: float = 0
         self._give_up_ns: float = 0
         self._blind_since_ns: int | None = None
+        self._doubted = False
         self._found: Target | None = None
         self._found_ns = 0
         self._facing_since_ns: int | None = None
@@ -65,6 +66,7 @@ class SeekBehaviour(Behaviour):
     def on_activate(self, situation: Situation) -> None:
         self._place, self._yaw_rad = position_and_yaw(situation.state)
         self._turned_rad = 0.0
+        self._doubted = False
         self._sightings.clear()
         self._found = self._blind_since_ns = self._facing_since_ns = None
         # Frames captured before the command do not count: they may be of another place.
@@ -89,7 +91,8 @@ class SeekBehaviour(Behaviour):
         if self._found is not None:
             return self._face(self._found, situation, yaw_rad, stay)
         if abs(self._turned_rad) >= self._laps * math.tau:
-            return Outcome(False, f"no {self._class_name} seen in {laps_text(self._laps)}")
+            why = f": {DOUBTED}" if self._doubted else ""
+            return Outcome(False, f"no {self._class_name} seen in {laps_text(self._laps)}{why}")
         waiting = now_ns < self._look_until_ns
         rate = 0.0 if waiting else self._turn * self._rate_radps
         return Setpoint.velocity(stay, now_ns, yaw_rate_radps=rate)
@@ -123,7 +126,11 @@ class SeekBehaviour(Behaviour):
         recent = [t for t in self._sightings if t.captured_ns >= oldest_ns]
         for target in sorted(seen, key=lambda t: -t.confidence):
             frames = {t.captured_ns for t in recent if _apart(t, target) <= SAME_BEARING_RAD}
-            if len(frames) >= FRAMES_NEEDED and target.trusted:
+            if len(frames) < FRAMES_NEEDED:
+                continue
+            if not target.trusted:
+                self._doubted = True
+            else:
                 self._found, self._found_ns = target, situation.now_ns
                 self._facing_since_ns = None
                 return

@@ -8,6 +8,9 @@ from enum import StrEnum
 
 from companion.vehicle.state import Vector3
 
+# What to say when only doubtful objects were seen.
+DOUBTED = "what was seen does not count as true (tracker.true_score)"
+
 
 class RangeSource(StrEnum):
     """Where a target's range comes from."""

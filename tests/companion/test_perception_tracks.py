@@ -176,48 +176,43 @@ async def until(condition: Callable[[], object]) -> None:
         await asyncio.sleep(0.01)
 
 
-async def test_a_worker_tracks_and_the_one_after_it_takes_other_numbers(settings: Settings) -> None:
+async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_takes_other_numbers(
+    settings: Settings,
+) -> None:
     results: list[PerceptionResult] = []
     keeper = PerceptionKeeper(settings, on_result=results.append, on_event=lambda *_: None)
+
+    def told(kind: TrackEventKind) -> list[int]:
+        return [e.track.track_id for r in results for e in r.track_events if e.kind is kind]
+
+    def spun() -> bool:
+        """Tell the attitude of a vehicle that turns so fast that nothing stays in the picture."""
+        now_ns = time.monotonic_ns()
+        keeper.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, 20.0 * now_ns / 1e9 % 6.28))
+        return bool(told(END))
+
     await keeper.start()
     try:
         await until(lambda: len(results) >= 5)
-        live = {t.track.track_id for r in results for t in r.track_events if t.kind is NEW}
-        assert live
-        assert keeper.status.tracks == len(live)
+        assert told(NEW)
+        assert told(END) == []
+        assert keeper.status.tracks == len(told(NEW))
         assert results[-1].timing_ms["track"] > 0
-        assert set(results[-1].detections.track_id.tolist()) >= live
+        assert set(results[-1].detections.track_id.tolist()) >= set(told(NEW))
+
+        await until(spun)
+
         pid = keeper.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
         await until(lambda: keeper.status.state is PerceptionState.RESTARTING)
-        before = len(results)
-        live |= {t.track.track_id for r in results for t in r.track_events if t.kind is NEW}
+        before, live = len(results), set(told(NEW)) - set(told(END))
         await until(lambda: len(results) > before + 3)
         after = results[before:]
-        ends = [t.track.track_id for t in after[0].track_events if t.kind is END]
+        ends = [e.track.track_id for e in after[0].track_events if e.kind is END]
         assert sorted(ends) == sorted(live)
         newer = [number for r in after for number in r.detections.track_id.tolist() if number != NO_TRACK]
-        assert min(newer) > max(live)
-    finally:
-        await keeper.stop()
-
-
-async def test_the_vehicles_attitude_reaches_the_tracker(settings: Settings) -> None:
-    results: list[PerceptionResult] = []
-    keeper = PerceptionKeeper(settings, on_result=results.append, on_event=lambda *_: None)
-    await keeper.start()
-    try:
-        await until(lambda: any(t.kind is NEW for r in results for t in r.track_events))
-        assert not any(t.kind is END for r in results for t in r.track_events)
-
-        def spun() -> bool:
-            """Tell the attitude of a vehicle that turns so fast that nothing stays in the picture."""
-            now_ns = time.monotonic_ns()
-            keeper.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, 20.0 * now_ns / 1e9 % 6.28))
-            return any(t.kind is END for r in results for t in r.track_events)
-
-        await until(spun)
+        assert min(newer) > max(number for r in results[:before] for number in r.detections.track_id)
     finally:
         await keeper.stop()
 

@@ -124,8 +124,9 @@ def test_frames_that_the_source_lost_are_counted() -> None:
 
 
 def test_a_frame_that_is_too_old_is_counted_as_lost_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    # The frames' stamps are from long ago.
-    pipeline = Pipeline(Frames(frame_of(0), frame_of(1)), BrightSpot(), selection=Selection(max_age_s=0.5))
+    second_ago_ns = time.monotonic_ns() - 1_000_000_000
+    frames = Frames(*(replace(frame_of(number), captured_ns=second_ago_ns) for number in range(2)))
+    pipeline = Pipeline(frames, BrightSpot(), selection=Selection(max_age_s=0.5))
     assert run(pipeline) == []
     assert pipeline.dropped == pipeline.left_out["too_old"] == 2
     (line,) = caplog.messages

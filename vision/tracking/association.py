@@ -1,8 +1,7 @@
 """Which detection is which track: the pairs that overlap most, all together.
 
 The assignment problem is solved exactly, by shortest augmenting paths (R. Jonker, A. Volgenant, "A shortest
-augmenting path algorithm for dense and sparse linear assignment problems", Computing 38, 1987). Without the
-pairs that are out of the question the graph is sparse, and its connected parts are solved one by one.
+augmenting path algorithm for dense and sparse linear assignment problems", Computing 38, 1987).
 """
 
 from __future__ import annotations
@@ -59,27 +58,12 @@ def match(similarity: NDArray[np.float64], least: float) -> Pairs:
     disputed = possible & ~alone
     if not disputed.any():
         return pairs
-    for rows, columns in _connected_parts(disputed):
-        part = gain[np.ix_(rows, columns)].clip(0.0)
-        pairs += [(rows[row], columns[column]) for row, column in assign(-part) if part[row, column] > 0.0]
+    rows, columns = disputed.any(axis=1).nonzero()[0], disputed.any(axis=0).nonzero()[0]
+    part = gain[rows[:, None], columns].clip(0.0)
+    pairs += [
+        (int(rows[row]), int(columns[column])) for row, column in assign(-part) if part[row, column] > 0.0
+    ]
     return sorted(pairs)
-
-
-def _connected_parts(possible: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
-    """The connected parts of the bipartite graph, rows and columns of each; only those with a pair."""
-    parts: list[tuple[list[int], list[int]]] = []
-    waiting = set(np.flatnonzero(possible.any(axis=1)).tolist())
-    while waiting:
-        rows, columns = {waiting.pop()}, set[int]()
-        newest = list(rows)
-        while newest:
-            reached = set(np.flatnonzero(possible[newest].any(axis=0)).tolist()) - columns
-            columns |= reached
-            newest = list(set(np.flatnonzero(possible[:, list(reached)].any(axis=1)).tolist()) - rows)
-            rows.update(newest)
-        waiting -= rows
-        parts.append((sorted(rows), sorted(columns)))
-    return parts
 
 
 def assign(cost: NDArray[np.float64]) -> Pairs:
@@ -102,9 +86,13 @@ def assign(cost: NDArray[np.float64]) -> Pairs:
     if cost.shape[0] > cost.shape[1]:
         return sorted((row, column) for column, row in assign(cost.T))
     rows, columns = cost.shape
-    row_price, column_price = np.zeros(rows), np.zeros(columns)
+    # To begin with each row has its cheapest column, if no row before it took that.
+    row_price, column_price = cost.min(axis=1, initial=np.inf), np.zeros(columns)
     row_of, column_of = np.full(columns, -1), np.full(rows, -1)
-    for start in range(rows):
+    for row, column in enumerate(cost.argmin(axis=1).tolist() if columns else ()):
+        if row_of[column] < 0:
+            row_of[column], column_of[row] = row, column
+    for start in (column_of < 0).nonzero()[0].tolist():
         # The cheapest alternating path from this row to a free column (Dijkstra on reduced costs).
         distance = np.full(columns, np.inf)
         reached_from = np.full(columns, start)

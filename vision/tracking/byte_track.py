@@ -144,7 +144,7 @@ class Tracker:
         return TrackedFrame(self._labelled(detections, lives), tuple(events))
 
     def _predict(self, captured_ns: int, view: CameraView | None, events: list[TrackEvent]) -> None:
-        """Move every box to where it should be in the frame of this moment."""
+        """Move every box to where it should be by now; end those that cannot be there any more."""
         before_ns, before = self._newest_ns, self._view
         self._newest_ns, self._view = captured_ns, view
         if before_ns is None or not self._lives:
@@ -153,12 +153,12 @@ class Tracker:
         unseen = np.array([life.last_ns != before_ns for life in self._lives])
         self._states.mean[unseen, 6:] = 0.0
         states = kalman.predicted(self._states, (captured_ns - before_ns) / 1e9)
+        ended = np.array([captured_ns - life.last_ns >= self.settings.end_s * 1e9 for life in self._lives])
         if view is not None and before is not None and view.camera == before.camera:
             states, visible = turned(states, view.camera, view.turn_from(before))
-            self._states = states
-            self._drop(~visible, captured_ns, events)
-        else:
-            self._states = states
+            ended |= ~visible
+        self._states = states
+        self._drop(ended, captured_ns, events)
 
     def _associate(self, detections: Detections, captured_ns: int, track_of: Indices) -> None:
         """Fill in `track_of` (N,): the place of each detection's track."""
@@ -202,20 +202,18 @@ class Tracker:
         events.append(TrackEvent(kind, captured_ns, self._track(life, (left, top, right, bottom))))
 
     def _forget_unseen(self, captured_ns: int, events: list[TrackEvent]) -> None:
-        ended = np.zeros(len(self._lives), np.bool_)
+        unfounded = np.zeros(len(self._lives), np.bool_)
         for place, life in enumerate(self._lives):
             if life.last_ns == captured_ns:
                 continue
             unseen_s = (captured_ns - life.last_ns) / 1e9
             if not life.confirmed:
                 # A rumour: the next frame confirms it, or soon after; else it was none.
-                ended[place] = life.seen == 1 or unseen_s >= self.settings.lost_s
-            elif unseen_s >= self.settings.end_s:
-                ended[place] = True
+                unfounded[place] = life.seen == 1 or unseen_s >= self.settings.lost_s
             elif unseen_s >= self.settings.lost_s and not life.lost:
                 life.lost = True
                 events.append(self._event(TrackEventKind.LOST, place, captured_ns))
-        self._drop(ended, captured_ns, events)
+        self._drop(unfounded, captured_ns, events)
 
     def _drop(self, ended: NDArray[np.bool_], captured_ns: int, events: list[TrackEvent]) -> None:
         if not ended.any():

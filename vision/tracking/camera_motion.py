@@ -27,8 +27,6 @@ MAX_AHEAD_S = 0.1
 MAX_GAP_S = 0.5
 # A box seen more obliquely than this (cosine to the optical axis) is out of every picture.
 MIN_COSINE = 0.17
-# Pixels to each side for the homography's derivative.
-_STEP_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,14 +62,16 @@ def turned(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[BoxStat
     """
     if not len(states):
         return states, np.ones(0, np.bool_)
-    middle = states.mean[:, :2]
-    around = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STEP_PX], [0.0, -_STEP_PX]])
-    points = middle[:, None, :] + around
-    rays = camera.rays(points.reshape(-1, 2)) @ turn.T
-    ahead: NDArray[np.bool_] = (rays[:, 2] > MIN_COSINE).reshape(-1, 5).min(axis=1)
-    moved = camera.project(rays).reshape(-1, 5, 2)
-    # (N, 2, 2) derivative of the new pixel by the old one, columns x and y.
-    slope = np.stack([moved[:, 1] - moved[:, 2], moved[:, 3] - moved[:, 4]], axis=2) / (2 * _STEP_PX)
+    rays = camera.rays(states.mean[:, :2])
+    towards = rays @ turn.T
+    ahead: NDArray[np.bool_] = towards[:, 2] > MIN_COSINE
+    moved = camera.project(towards)
+    # (N, 2, 2) derivative of the new pixel by the old one; what the lens adds to it is left out.
+    focal = np.array([camera.fx, camera.fy])
+    depth = np.where(ahead, towards[:, 2], 1.0)[:, None, None]
+    plane = towards[:, :2, None] / depth
+    slope = (turn[:2, :2] - plane * turn[2, :2]) * (rays[:, 2, None, None] / depth)
+    slope *= focal[:, None] / focal
     slope[~ahead] = np.eye(2)
     # Its polar decomposition is a turn of the picture by `roll` after a stretch; a side grows by the stretch.
     roll = np.arctan2(slope[:, 1, 0] - slope[:, 0, 1], slope[:, 0, 0] + slope[:, 1, 1])
@@ -80,8 +80,8 @@ def turned(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[BoxStat
     step[:, 0:2, 0:2] = step[:, 4:6, 4:6] = slope
     step[:, 2, 2] = step[:, 6, 6] = cosine * slope[:, 0, 0] + sine * slope[:, 1, 0]
     step[:, 3, 3] = step[:, 7, 7] = cosine * slope[:, 1, 1] - sine * slope[:, 0, 1]
-    mean = np.einsum("nij,nj->ni", step, states.mean)
-    mean[:, :2] = np.where(ahead[:, None], moved[:, 0], middle)
+    mean = (step @ states.mean[:, :, None])[:, :, 0]
+    mean[:, :2] = np.where(ahead[:, None], moved, states.mean[:, :2])
     return BoxStates(mean, step @ states.covariance @ step.transpose(0, 2, 1)), ahead
 
 

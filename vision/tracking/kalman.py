@@ -94,7 +94,7 @@ def corrected(states: BoxStates, xyxy: NDArray[np.floating]) -> BoxStates:
     measured = _measurement(xyxy)
     spread = states.covariance[:, :4, :4] + _diagonal(np.repeat((MEASURED * _size(measured)) ** 2, 4, 1))
     gain = np.linalg.solve(spread, states.covariance[:, :4, :]).transpose(0, 2, 1)
-    mean = states.mean + np.einsum("nij,nj->ni", gain, measured - states.mean[:, :4])
+    mean = states.mean + (gain @ (measured - states.mean[:, :4])[:, :, None])[:, :, 0]
     covariance = states.covariance - gain @ states.covariance[:, :4, :]
     return BoxStates(mean, (covariance + covariance.transpose(0, 2, 1)) / 2)
 

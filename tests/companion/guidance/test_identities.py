@@ -62,6 +62,7 @@ def test_approach_does_not_begin_with_what_does_not_count_as_true():
     outcome = Flight(ApproachBehaviour("car"), objects=[ghost]).run(20.0)
     assert outcome is not None
     assert outcome.reason.startswith("lost the car"), outcome.reason
+    assert outcome.reason.endswith("what was seen does not count as true (tracker.true_score)")
 
 
 def test_approach_prefers_the_true_one_to_the_one_before_its_nose():
@@ -108,7 +109,10 @@ def test_seek_does_not_end_with_what_does_not_count_as_true():
     ghost = SeenObject("car", 12.0, 4.0, track_id=1, track_score=0.6, trusted=False)
     outcome = Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0)
     assert outcome is not None
-    assert (outcome.success, outcome.reason) == (False, "no car seen in 1 lap")
+    assert not outcome.success
+    assert outcome.reason == (
+        "no car seen in 1 lap: what was seen does not count as true (tracker.true_score)"
+    )
 
 
 def test_seek_ends_when_what_it_sees_comes_to_count():

@@ -183,6 +183,23 @@ def test_a_life_is_told_in_events() -> None:
     assert end.track.class_name == "person"
 
 
+def test_a_long_time_without_frames_ends_what_was_followed_though_it_seems_to_be_still_there() -> None:
+    film = Film(end_s=2.0)
+    for _ in range(4):
+        film.show((100, 100, 0.8))
+    assert ids(film.show((100, 100, 0.8), after_s=1.9)) == [1]
+    assert ids(film.show((100, 100, 0.8), after_s=2.1)) == [2]
+    assert film.told[-1] == ("end", 1)
+
+
+def test_a_slow_detector_has_tracks_too() -> None:
+    film = Film(lost_s=0.5, end_s=2.0)
+    for _ in range(4):
+        frame = film.show((100, 100, 0.8), after_s=1.2)
+    assert ids(frame) == [1]
+    assert film.told == [("new", 1), ("update", 1)]
+
+
 def test_an_event_bears_the_box_that_was_seen_and_a_lost_one_where_it_should_be() -> None:
     film = Film(lost_s=0.3)
     for step in range(10):

@@ -1,4 +1,4 @@
-from companion.stage_timing import WINDOW, StageTimes
+from companion.perception_timing import WINDOW, StageTimes
 
 
 def test_the_median_and_the_slow_end_of_each_stage_are_those_of_the_newest_results() -> None:

@@ -1,0 +1,138 @@
+"""The service's status as numbers for Prometheus: `GET /metrics` on an address of one's own.
+
+Served by prometheus_client in a thread of its own, from the snapshot that was published last, so that whoever
+asks never holds the loop that steers.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from wsgiref.simple_server import WSGIServer
+
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+Status = dict[str, Any]
+
+
+class MetricsError(RuntimeError):
+    """The endpoint cannot be opened. One line for a person."""
+
+
+class MetricsServer:
+    """Serves `/metrics` until it is closed.
+
+    Args:
+        listen: HOST:PORT; port 0 for a free one.
+        snapshot: the newest status (`Service.status`), None before the first; called in the server's thread.
+
+    Raises:
+        MetricsError: the library is not installed, or the address cannot be had.
+    """
+
+    def __init__(self, listen: str, snapshot: Callable[[], Status | None]) -> None:
+        try:
+            from prometheus_client import CollectorRegistry, start_http_server
+        except ImportError as error:
+            raise MetricsError(
+                "metrics.listen needs prometheus_client: pip install 'mavlink-companion[metrics]'"
+            ) from error
+        host, _, port = listen.rpartition(":")
+        registry = CollectorRegistry()
+        registry.register(_Collector(snapshot))
+        self._server: WSGIServer
+        self._thread: threading.Thread
+        try:
+            self._server, self._thread = start_http_server(int(port), host, registry)
+        except (OSError, OverflowError) as error:
+            raise MetricsError(f"metrics cannot be served on {listen}: {error}") from error
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self._server.server_port)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Collector:
+    def __init__(self, snapshot: Callable[[], Status | None]) -> None:
+        self._snapshot = snapshot
+
+    def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+        status = self._snapshot()
+        if status is None:
+            return
+        yield from _of_service(status)
+        yield from _of_views({"": status["perception"], **status["views"]})
+
+
+def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    vehicle, pilot, bus = status["vehicle"], status["pilot"], status["bus"]
+    for name, meaning, value in (
+        ("healthy", "1 while every part is as it should be", status["healthy"]),
+        ("uptime_seconds", "since the service's start", status["uptime_s"]),
+        ("vehicle_connected", "1 while the autopilot is heard", vehicle["connected"]),
+        ("vehicle_armed", "1 while the vehicle is armed", vehicle["armed"]),
+        ("vehicle_failsafe", "1 while the autopilot is in a failsafe", vehicle["failsafe"]),
+        ("in_command", "1 while the vehicle does what the service asks", pilot["in_command"]),
+        ("bus_connected", "1 while zenoh's endpoints are reached", bus["connected"]),
+    ):
+        yield GaugeMetricFamily(f"companion_{name}", meaning, value=float(value or 0))
+    yield CounterMetricFamily(
+        "companion_setpoints_sent", "setpoints put on the link", value=float(pilot["setpoints_sent"])
+    )
+    published = CounterMetricFamily(
+        "companion_messages_published", "messages handed to zenoh", labels=["topic"]
+    )
+    for topic, count in bus["published"].items():
+        published.add_metric([topic], float(count))
+    yield published
+    yield CounterMetricFamily(
+        "companion_messages_unsent", "messages that zenoh did not take", value=float(bus["unsent"])
+    )
+
+
+def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    for key, name, meaning in (
+        ("frames", "frames_read", "frames read from the source"),
+        ("results", "results", "frames looked at"),
+        ("restarts", "perception_restarts", "perception processes replaced"),
+    ):
+        counter = CounterMetricFamily(f"companion_{name}", meaning, labels=["view"])
+        for view, state in views.items():
+            counter.add_metric([view], float(state[key]))
+        yield counter
+    left_out = CounterMetricFamily(
+        "companion_frames_left_out", "frames that led to no message", labels=["view", "reason"]
+    )
+    stages = GaugeMetricFamily(
+        "companion_stage_milliseconds",
+        "time of one stage, newest 200 results",
+        labels=["view", "stage", "quantile"],
+    )
+    age = GaugeMetricFamily("companion_newest_result_age_seconds", "from its capture", labels=["view"])
+    rate = GaugeMetricFamily("companion_results_per_second", "over the last two seconds", labels=["view"])
+    running = GaugeMetricFamily("companion_perception_running", "1 while its process works", labels=["view"])
+    for view, state in views.items():
+        for reason, count in state["left_out"].items():
+            left_out.add_metric([view, reason], float(count))
+        for quantile, key in (("0.5", "timing_p50_ms"), ("0.99", "timing_p99_ms")):
+            for stage, value in state[key].items():
+                stages.add_metric([view, stage, quantile], float(value))
+        if state["age_s"] is not None:
+            age.add_metric([view], float(state["age_s"]))
+        rate.add_metric([view], float(state["rate_hz"]))
+        running.add_metric([view], float(state["state"] == "running"))
+    yield from (left_out, stages, age, rate, running)

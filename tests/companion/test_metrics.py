@@ -1,0 +1,71 @@
+"""The service's numbers, as a monitoring system fetches them."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from service_process import free_tcp_port, running_service
+
+from companion.operator.metrics import MetricsError, MetricsServer
+from mavlink_sim.testing import running_simulator
+
+
+def fetch(port: int) -> dict[str, float]:
+    """Every line of the answer: name with its labels → value."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+        lines = answer.read().decode().splitlines()
+    pairs = (line.rpartition(" ") for line in lines if line and not line.startswith("#"))
+    return {name: float(value) for name, _, value in pairs}
+
+
+def test_a_running_service_tells_its_stages_and_what_became_of_every_frame(
+    seeing: list[str], tmp_path: Path
+) -> None:
+    port = free_tcp_port()
+    flags = [*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"]
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+    ):
+        service.wait_for_line("the autopilot is heard")
+        numbers = fetch(port)
+        while not numbers.get('companion_frames_left_out_total{reason="rate",view=""}'):
+            numbers = fetch(port)
+    assert numbers["companion_vehicle_armed"] == 0
+    assert numbers['companion_perception_running{view=""}'] == 1
+    assert numbers['companion_messages_published_total{topic="detections"}'] > 0
+    for stage in ("capture", "decode", "wait", "preprocess", "inference", "postprocess", "track", "publish"):
+        quantiles = [
+            numbers[f'companion_stage_milliseconds{{quantile="{q}",stage="{stage}",view=""}}']
+            for q in ("0.5", "0.99")
+        ]
+        assert 0 <= quantiles[0] <= quantiles[1]
+    with pytest.raises(OSError, match="refused"):
+        fetch(port)
+
+
+def test_before_the_first_status_the_answer_is_empty_and_afterwards_the_port_is_free() -> None:
+    server = MetricsServer("127.0.0.1:0", lambda: None)
+    port = server.port
+    assert fetch(port) == {}
+    server.close()
+    MetricsServer(f"127.0.0.1:{port}", lambda: None).close()
+
+
+def test_an_address_that_is_taken_is_one_clear_line() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        where = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(MetricsError, match=f"cannot be served on {where}: .*in use"):
+            MetricsServer(where, lambda: None)
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    with pytest.raises(MetricsError, match=r"pip install 'mavlink-companion\[metrics\]'"):
+        MetricsServer("127.0.0.1:0", lambda: None)
