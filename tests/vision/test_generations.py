@@ -13,8 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build
-from vision.yolo.end_to_end import best_pairs
+from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build, build_shapes
 from vision.yolo.generation import describe
 from vision.yolo.postprocess import select_boxes
 from vision.yolo.published import SCALES, published_description
@@ -106,8 +105,7 @@ def lively(generation: str = "YOLO26", scale: str = "n", **changes: object) -> Y
 
 @pytest.mark.parametrize(("generation", "scale"), EVERY)
 def test_each_scale_has_the_published_number_of_parameters(generation: str, scale: str) -> None:
-    with torch.device("meta"):
-        model = build(published_description(generation, scale, COCO_SIZED))
+    model = build_shapes(published_description(generation, scale, COCO_SIZED))
     assert sum(parameter.numel() for parameter in model.parameters()) == PARAMETERS[generation][scale]
 
 
@@ -154,14 +152,12 @@ def test_the_maps_are_those_of_the_reference(generation: str, scale: str) -> Non
 def test_the_parameters_bear_the_names_of_checkpoints_in_circulation(
     generation: str, scale: str, names: tuple[str, ...]
 ) -> None:
-    with torch.device("meta"):
-        state = build(published_description(generation, scale, COCO_SIZED)).state_dict()
+    state = build_shapes(published_description(generation, scale, COCO_SIZED)).state_dict()
     assert set(names) <= set(state)
 
 
 def test_a_head_without_distributions_has_no_bins() -> None:
-    with torch.device("meta"):
-        model = build(published_description("YOLO26", "n", COCO_SIZED))
+    model = build_shapes(published_description("YOLO26", "n", COCO_SIZED))
     assert model.reg_max == 1
     assert not any(".dfl." in name for name in model.state_dict())
 
@@ -193,9 +189,8 @@ def test_an_unpublished_network_is_refused_with_the_known_ones(
 @pytest.mark.parametrize("generation", SCALES)
 def test_generation_scale_and_work_are_recognised(generation: str) -> None:
     for scale in ("n", "x"):
-        with torch.device("meta"):
-            model = build(published_description(generation, scale, COCO_SIZED))
-        told = describe(model)
+        model = build_shapes(published_description(generation, scale, COCO_SIZED))
+        told = describe(model, 640 if scale == "n" else 64)
         assert (told.generation, told.scale) == (generation, scale)
         assert told.parameters == PARAMETERS[generation][scale]
         assert told.end_to_end == (generation in ("YOLOv10", "YOLO26"))
@@ -204,8 +199,7 @@ def test_generation_scale_and_work_are_recognised(generation: str) -> None:
 
 
 def test_the_work_grows_with_the_picture_and_not_with_folding() -> None:
-    with torch.device("meta"):
-        model = build(published_description("YOLOv8", "n", COCO_SIZED))
+    model = build_shapes(published_description("YOLOv8", "n", COCO_SIZED))
     whole, quarter = describe(model, 640), describe(model, 320)
     assert whole.gflops == pytest.approx(4 * quarter.gflops)
     folded = describe(model.fuse(), 640)
@@ -224,8 +218,7 @@ def test_folding_drops_the_branches_that_only_train() -> None:
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
     assert not any(".cv3." in name and "model.23." in name for name in model.state_dict())
     # The published count of YOLO26n as it runs.
-    with torch.device("meta"):
-        published = build(published_description("YOLO26", "n", COCO_SIZED)).fuse()
+    published = build_shapes(published_description("YOLO26", "n", COCO_SIZED)).fuse()
     assert sum(parameter.numel() for parameter in published.parameters()) == 2_408_932
 
 
@@ -241,7 +234,81 @@ def test_networks_of_ones_own_are_told_apart_from_the_published() -> None:
         rows = [*down[:2], [-1, 1, block, [16]], *down[2:]]
         table = {"backbone": rows, "head": [[list(source), *head[1:]]]}
         model = build(ModelDescription.from_plain(table, FEW))
-        assert describe(model, 64).generation == expected
+        assert describe(build_shapes(model.description), 64).generation == expected
         assert [tuple(level.shape[2:]) for level in model(torch.zeros(2, 3, 64, 64))] == [
             (64 // stride, 64 // stride) for stride in model.strides
         ]
+
+
+# End-to-end heads
+
+
+def reference_boxes(
+    model: YoloModel, maps: list[Tensor], confidence: float, most: int
+) -> list[tuple[int, int]]:
+    """(cell, class) of the boxes, by sorting every pair of the best cells; the plain way."""
+    scores = model.decode(maps)[0, :, 4:]
+    cells = scores.max(dim=1).values.argsort(descending=True, stable=True)[:most]
+    pairs = [(scores[cell, kind].item(), int(cell), kind) for cell in cells for kind in range(len(FEW))]
+    best = sorted(pairs, reverse=True)[:most]
+    return [(cell, kind) for score, cell, kind in best if score > confidence]
+
+
+@pytest.mark.parametrize("most", [5, 20, 300])
+def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
+    model = lively()
+    with torch.inference_mode():
+        maps = model(picture())
+        decoded = model.decode(maps)[0]
+    confidence = decoded[:, 4:].max(dim=1).values.median().item()
+    boxes = select_boxes(model, maps, confidence=confidence, most=most)
+    expected = reference_boxes(model, maps, confidence, most)
+    assert len(boxes) == len(expected) > 0
+    for index, (cell, kind) in enumerate(expected):
+        assert boxes.class_id[index] == kind
+        assert boxes.confidence[index] == pytest.approx(decoded[cell, 4 + kind].item(), abs=1e-6)
+        assert boxes.xyxy[index] == pytest.approx(decoded[cell, :4].numpy(), abs=1e-3)
+
+
+def test_overlapping_boxes_of_an_end_to_end_head_are_all_kept() -> None:
+    model = lively()
+    with torch.inference_mode():
+        maps = model(picture())
+    many = select_boxes(model, maps, confidence=0.0, iou=0.0, most=1000)
+    assert len(many) == sum(level.shape[2] * level.shape[3] for level in maps) * len(FEW)
+
+
+def test_a_class_filter_gives_what_filtering_afterwards_gives() -> None:
+    model = lively()
+    with torch.inference_mode():
+        maps = model(picture())
+    every = select_boxes(model, maps, confidence=0.3, most=1000)
+    only = select_boxes(model, maps, confidence=0.3, most=1000, class_ids=(0, 2))
+    kept = every.class_id != 1
+    assert 0 < len(only) < len(every)
+    np.testing.assert_array_equal(only.xyxy, every.xyxy[kept])
+    np.testing.assert_array_equal(only.class_id, every.class_id[kept])
+
+
+def test_no_box_above_the_confidence_is_an_empty_list() -> None:
+    model = lively()
+    with torch.inference_mode():
+        boxes = select_boxes(model, model(picture()), confidence=1.0)
+    assert (len(boxes), boxes.xyxy.shape) == (0, (0, 4))
+    assert (boxes.confidence.dtype, boxes.class_id.dtype) == (np.float32, np.int64)
+
+
+def test_an_end_to_end_head_learns_with_one_branch_and_answers_with_the_other() -> None:
+    model = lively()
+    x = picture()
+    with torch.inference_mode():
+        answered = model(x)
+        model.detect.train()  # The rest stays as it is, so that only the branches differ.
+        learnt = model(x)
+        model.detect.cv3, model.detect.one2one_cv3 = model.detect.one2one_cv3, model.detect.cv3
+        model.detect.cv2, model.detect.one2one_cv2 = model.detect.one2one_cv2, model.detect.cv2
+        exchanged = model(x)
+    assert model.end_to_end
+    for a, b, c in zip(answered, learnt, exchanged, strict=True):
+        assert not torch.equal(a, b)
+        assert torch.equal(a, c)
