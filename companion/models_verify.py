@@ -20,7 +20,7 @@ from vision.runtimes.source import ModelSource, read_source
 from vision.yolo.checkpoint_pair import file_sha256
 from vision.yolo.maps import LevelMaps
 from vision.yolo.metrics import box_iou
-from vision.yolo.postprocess import Boxes, boxes_of
+from vision.yolo.postprocess import Boxes, Candidates, boxes_of, sides_of
 
 CONFIDENCE = 0.25
 # A box so near the threshold may be said by one and not by the other without meaning anything.
@@ -149,7 +149,17 @@ def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:
 
 
 def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelMaps]:
-    return [LevelMaps(level.sides.copy(), level.classes.copy()) for level in runtime.infer(pixels)]
+    """With the sides of every cell, which a runtime may leave to be computed for the cells that matter."""
+    levels = runtime.infer(pixels)
+    everywhere = [
+        Candidates(np.arange(cells), np.zeros(cells, np.float32), np.zeros(cells, np.int64))
+        for cells in (level.classes[0].size for level in levels)
+    ]
+    sides = sides_of(runtime.head, levels, everywhere)
+    return [
+        LevelMaps(level.classes.copy(), np.asarray(side).reshape(-1, *level.classes.shape[1:]))
+        for level, side in zip(levels, sides, strict=True)
+    ]
 
 
 class _Largest:
@@ -164,6 +174,8 @@ class _Largest:
     ) -> None:
         self.images += 1
         for a, b in zip(first, second, strict=True):
+            assert a.sides is not None
+            assert b.sides is not None
             for mine, its in ((a.sides, b.sides), (a.classes, b.classes)):
                 # Not a number differs from everything.
                 self.maps = max(self.maps, _worst(mine, its))

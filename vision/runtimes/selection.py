@@ -23,11 +23,12 @@ from vision.runtimes.contract import (
     required,
     version,
 )
-from vision.runtimes.export import export_network, file_sha256
+from vision.runtimes.export import export_network
 from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.network import Network
 from vision.runtimes.source import ModelSource, cannot_run
 from vision.runtimes.torch_runtime import TorchRuntime
+from vision.yolo.checkpoint_pair import file_sha256
 from vision.yolo.maps import Head
 
 logger = logging.getLogger(__name__)

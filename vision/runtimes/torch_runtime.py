@@ -98,8 +98,10 @@ class TorchRuntime:
     def _any_size(self) -> Graph | None:
         """One graph for inputs of every size; None if the tracer took a size for a constant."""
         stride = max(self.head.strides)
+        # Noise, so that maps that were taken apart and joined wrongly are not the same by chance.
+        noise = torch.Generator().manual_seed(0)
         shown, tried = (
-            torch.full((1, high * stride, wide * stride, 3), 100, dtype=torch.uint8)
+            torch.randint(256, (1, high * stride, wide * stride, 3), generator=noise, dtype=torch.uint8)
             for high, wide in (_TRACED, _TRIED)
         )
         graph = traced(self._network, shown)

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, version
-from vision.runtimes.export import file_sha256
 from vision.runtimes.source import ModelSource, read_source
+from vision.yolo.checkpoint_pair import file_sha256
 
 logger = logging.getLogger(__name__)
 
