@@ -72,8 +72,13 @@ def installed(runtime: RuntimeName) -> bool:
 
 
 def version(runtime: RuntimeName) -> str:
-    """The installed runtime's version."""
-    return importlib.metadata.version(runtime)
+    """The installed runtime's version; `unknown` of one that was put there without a package."""
+    try:
+        return importlib.metadata.version(runtime)
+    except importlib.metadata.PackageNotFoundError:
+        # Another package may bring it, such as onnxruntime-gpu.
+        packages = importlib.metadata.packages_distributions().get(runtime, [])
+        return importlib.metadata.version(packages[0]) if packages else "unknown"
 
 
 def required(runtime: RuntimeName, *, also: str | None = None) -> Any:

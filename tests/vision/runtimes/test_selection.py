@@ -186,3 +186,18 @@ def test_a_trial_is_a_real_measurement_in_a_process_of_its_own(checkpoint: Path)
     assert answer["torch"] > 0
     if not installed("tensorrt"):
         assert "mavlink-companion[tensorrt]" in answer["tensorrt"]
+
+
+def test_a_runtime_that_another_package_brings_has_that_ones_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    def of_package(name: str) -> str:
+        if name == "onnxruntime":
+            raise contract.importlib.metadata.PackageNotFoundError(name)
+        return "1.2.3"
+
+    monkeypatch.setattr(contract.importlib.metadata, "version", of_package)
+    monkeypatch.setattr(
+        contract.importlib.metadata, "packages_distributions", lambda: {"onnxruntime": ["onnxruntime-gpu"]}
+    )
+    assert contract.version("onnxruntime") == "1.2.3"
+    monkeypatch.setattr(contract.importlib.metadata, "packages_distributions", dict)
+    assert contract.version("onnxruntime") == "unknown"
