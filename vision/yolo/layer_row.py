@@ -72,7 +72,8 @@ def settle_scale(row: LayerRow, scale: str) -> LayerRow:
     """
     if row.layer == "C3k2" and scale in ("m", "l", "x"):
         return row.with_argument(1, True, C3K2_DEFAULTS)
-    if row.layer == "A2C2f" and scale in ("l", "x") and len(row.arguments) <= 3:
+    attends = row.layer == "A2C2f" and row.arguments[1:2] != (False,)
+    if attends and scale in ("l", "x") and len(row.arguments) <= 3:
         return row.with_argument(3, True, A2C2F_DEFAULTS).with_argument(
             4, PUBLISHED_MLP_RATIOS[1], A2C2F_DEFAULTS
         )
