@@ -106,7 +106,9 @@ def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attribut
             stranger = nn.Module.__new__(classes[name])
             stranger.__dict__ = dict(module.__dict__)
             module = stranger
-        module.__dict__["_modules"] = {key: relabelled(child) for key, child in module._modules.items()}
+        module.__dict__["_modules"] = {
+            key: None if child is None else relabelled(child) for key, child in module._modules.items()
+        }
         return module
 
     model = copy.deepcopy(model)
@@ -413,7 +415,7 @@ def shrunk(generation: str, scale: str) -> ModelDescription:
 def terse(whole: nn.Module) -> None:
     """The table as it is published: what scale and layers imply is left unsaid."""
     for row in whole.yaml["backbone"] + whole.yaml["head"]:
-        if row[2] == "C3k2":
+        if row[2] == "C3k2" and len(row[3]) < 4:
             row[3][1:2] = [False]
         if row[2] == "A2C2f":
             del row[3][3:]

@@ -60,6 +60,7 @@ class LayerRow:
 # After the channels: what a row that leaves them out means.
 C3K2_DEFAULTS = (None, False, 0.5, False, 1, True)
 A2C2F_DEFAULTS = (None, True, 1, False, 2.0, 0.5, 1, True)
+PUBLISHED_MLP_RATIOS = (2.0, 1.2)
 SPPF_DEFAULTS = (None, 5, 3, False, True)
 
 
@@ -71,8 +72,11 @@ def settle_scale(row: LayerRow, scale: str) -> LayerRow:
     """
     if row.layer == "C3k2" and scale in ("m", "l", "x"):
         return row.with_argument(1, True, C3K2_DEFAULTS)
-    if row.layer == "A2C2f" and scale in ("l", "x") and len(row.arguments) <= 3:
-        return row.with_argument(3, True, A2C2F_DEFAULTS).with_argument(4, 1.2, A2C2F_DEFAULTS)
+    attends = row.layer == "A2C2f" and row.arguments[1:2] != (False,)
+    if attends and scale in ("l", "x") and len(row.arguments) <= 3:
+        return row.with_argument(3, True, A2C2F_DEFAULTS).with_argument(
+            4, PUBLISHED_MLP_RATIOS[1], A2C2F_DEFAULTS
+        )
     return row
 
 

@@ -14,7 +14,13 @@ from typing import Any
 from torch import Tensor
 
 from vision.yolo.description import ModelDescription
-from vision.yolo.layer_row import A2C2F_DEFAULTS, C3K2_DEFAULTS, SPPF_DEFAULTS, LayerRow
+from vision.yolo.layer_row import (
+    A2C2F_DEFAULTS,
+    C3K2_DEFAULTS,
+    PUBLISHED_MLP_RATIOS,
+    SPPF_DEFAULTS,
+    LayerRow,
+)
 from vision.yolo.safe_pickle import CheckpointError, Inert, shown
 
 Modules = Mapping[str, Inert]
@@ -52,8 +58,9 @@ def _tensor(modules: Modules, name: str, parameter: str = "weight") -> Tensor | 
 def _settle(row: LayerRow, name: str, modules: Modules) -> LayerRow:
     first = kind(modules, f"{name}.m.0")
     if row.layer == "C3k2" and first:
-        row = row.with_argument(1, first == "C3k", C3K2_DEFAULTS)
-        return row.with_argument(3, first == "Sequential", C3K2_DEFAULTS)
+        if first == "Sequential":
+            return row.with_argument(3, True, C3K2_DEFAULTS)
+        return row.with_argument(3, False, C3K2_DEFAULTS).with_argument(1, first == "C3k", C3K2_DEFAULTS)
     if row.layer == "A2C2f" and first == "Sequential":
         row = row.with_argument(1, True, A2C2F_DEFAULTS)
         row = row.with_argument(3, _tensor(modules, name, "gamma") is not None, A2C2F_DEFAULTS)
@@ -67,11 +74,12 @@ def _settle(row: LayerRow, name: str, modules: Modules) -> LayerRow:
 
 
 def _mlp_ratio(row: LayerRow, wide: Tensor) -> Any:
-    """The ratio the row gives where it fits what was trained, else the trained one."""
+    """The ratio the row gives, or a published one, where it fits what was trained; else the trained one."""
     outputs, inputs = wide.shape[:2]
     given = row.arguments[4] if len(row.arguments) > 4 else A2C2F_DEFAULTS[4]
-    if type(given) in (int, float) and 0 < given < 64 and int(inputs * given) == outputs:
-        return given
+    for ratio in (given, *PUBLISHED_MLP_RATIOS):
+        if type(ratio) in (int, float) and 0 < ratio < 64 and int(inputs * ratio) == outputs:
+            return ratio
     # A whole number of channels back from a ratio: half a channel keeps the rounding down from losing one.
     return (outputs + 0.5) / max(inputs, 1)
 
