@@ -142,7 +142,7 @@ def measure(
     threads: int | None,
     image_size: int,
 ) -> float:
-    """Milliseconds of one inference of a 4:3 input: the fastest, as what else runs now will not always run."""
+    """Milliseconds of one inference of a 4:3 input: the fastest, as other work will not always be there."""
     from vision.runtimes.selection import start_runtime
 
     started = start_runtime(
