@@ -20,7 +20,7 @@ from vision.runtimes.source import ModelSource, read_source
 from vision.yolo.checkpoint_pair import file_sha256
 from vision.yolo.maps import LevelMaps
 from vision.yolo.metrics import box_iou
-from vision.yolo.postprocess import Boxes, boxes_of
+from vision.yolo.postprocess import Boxes, Candidates, boxes_of, sides_of
 
 CONFIDENCE = 0.25
 # A box so near the threshold may be said by one and not by the other without meaning anything.
@@ -149,12 +149,17 @@ def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:
 
 
 def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelMaps]:
-    """Copies, as a runtime's maps last until its next inference."""
-    copies = []
-    for level in runtime.infer(pixels):
-        assert level.sides is not None  # Nobody asked for boxes one by one.
-        copies.append(LevelMaps(classes=level.classes.copy(), sides=level.sides.copy()))
-    return copies
+    """With the sides of every cell, which a runtime may leave to be computed for the cells that matter."""
+    levels = runtime.infer(pixels)
+    everywhere = [
+        Candidates(np.arange(cells), np.zeros(cells, np.float32), np.zeros(cells, np.int64))
+        for cells in (level.classes[0].size for level in levels)
+    ]
+    sides = sides_of(runtime.head, levels, everywhere)
+    return [
+        LevelMaps(level.classes.copy(), np.asarray(side).reshape(-1, *level.classes.shape[1:]))
+        for level, side in zip(levels, sides, strict=True)
+    ]
 
 
 class _Largest:

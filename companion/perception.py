@@ -23,6 +23,7 @@ from companion.perception_messages import (
     Hud,
     LogLine,
     Message,
+    Preview,
     ProtocolError,
     Ready,
     Report,
@@ -85,6 +86,7 @@ class PerceptionKeeper:
         settings: the sections source, detector, recording and log are the worker's.
         on_result: called with every result. Its sequence numbers go on when a worker is replaced.
         on_event: called with a level (`info`, `warning`, `error`) and a line for people.
+        on_preview: called with pictures, while `watch(True)`.
     """
 
     def __init__(
@@ -93,8 +95,11 @@ class PerceptionKeeper:
         *,
         on_result: Callable[[PerceptionResult], None],
         on_event: Callable[[str, str], None],
+        on_preview: Callable[[Preview], None] = lambda _: None,
     ) -> None:
         self._settings = settings
+        self._on_preview = on_preview
+        self._watched = False
         self._on_result = on_result
         self._on_event = on_event
         self._state = PerceptionState.STOPPED
@@ -171,6 +176,13 @@ class PerceptionKeeper:
         self._hud = Hud(tuple(lines), highlight)
         if self._process is not None and self._settings.recording.video is not None:
             self._process.show(self._hud)
+
+    def watch(self, watched: bool) -> None:
+        """Whether anybody wants pictures; until then none is made."""
+        if watched != self._watched:
+            self._watched = watched
+            if self._process is not None:
+                self._process.watch(watched)
 
     def send_attitude(self, stamp_ns: int, attitude: Quaternion) -> None:
         """Where the vehicle was turned to, for the tracker. At most 50 a second are sent on; never waits.
@@ -256,7 +268,8 @@ class PerceptionKeeper:
                 return
             self._state = PerceptionState.RESTARTING
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._stop_asked.wait(), pause_s)
+                async with asyncio.timeout(pause_s):
+                    await self._stop_asked.wait()
                 return
             self._restarts += 1
 
@@ -368,6 +381,8 @@ class PerceptionKeeper:
                     self._on_ready(message, process)
                     if not started.done():
                         started.set_result(None)
+                case Preview():
+                    self._on_preview(replace(message, sequence=message.sequence + self._first_sequence))
                 case StartFailed():
                     return _End(False, message.text)
                 case Ended():
@@ -380,6 +395,7 @@ class PerceptionKeeper:
         self._ready = ready
         self._state = PerceptionState.RUNNING
         self.send_hud(self._hud.lines, self._hud.highlight)
+        process.watch(self._watched)
         if self._lost_s is not None:
             self._on_event("info", f"perception is back after {time.monotonic() - self._lost_s:.1f} s")
             self._lost_s = None

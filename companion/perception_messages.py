@@ -51,6 +51,13 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
+class Watched:
+    """Whether anybody wants pictures."""
+
+    watched: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Finish the video and end."""
 
@@ -92,6 +99,15 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
+class Preview:
+    """One frame for people to look at, JPEG."""
+
+    sequence: int
+    captured_ns: int
+    jpeg: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class Heartbeat:
     """The loop turns, though no frame comes."""
 
@@ -117,7 +133,20 @@ class Ended:
     frames: int
 
 
-Message = Begin | Hud | Attitude | Stop | Ready | StartFailed | Report | Heartbeat | LogLine | Ended
+Message = (
+    Begin
+    | Hud
+    | Attitude
+    | Watched
+    | Stop
+    | Ready
+    | StartFailed
+    | Report
+    | Preview
+    | Heartbeat
+    | LogLine
+    | Ended
+)
 
 
 class ProtocolError(ConnectionError):

@@ -13,7 +13,16 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from companion.perception_messages import Ended, Heartbeat, LogLine, Message, Report, StartFailed, packed
+from companion.perception_messages import (
+    Ended,
+    Heartbeat,
+    LogLine,
+    Message,
+    Preview,
+    Report,
+    StartFailed,
+    packed,
+)
 from vision.tracking import TrackEventKind
 
 _QUEUED_LINES = 1000
@@ -35,6 +44,7 @@ class Outbox:
         self._changed = threading.Condition()
         self._queue: deque[Message] = deque(maxlen=_QUEUED_LINES)
         self._newest: Report | Heartbeat | None = None
+        self._preview: Preview | None = None
         self._replaced = 0
         self._last: Message | None = None
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
@@ -57,6 +67,12 @@ class Outbox:
             self._newest = message
             self._changed.notify()
 
+    def put_preview(self, preview: Preview) -> None:
+        """Send this when nothing else waits, unless a newer one comes before."""
+        with self._changed:
+            self._preview = preview
+            self._changed.notify()
+
     def close(self, last: Ended | StartFailed, timeout_s: float) -> None:
         """Send what waits and then `last`, for at most `timeout_s`."""
         with self._changed:
@@ -66,7 +82,7 @@ class Outbox:
 
     def _next(self) -> Message:
         with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._newest or self._last)
+            self._changed.wait_for(lambda: self._queue or self._newest or self._preview or self._last)
             if self._queue:
                 return self._queue.popleft()
             newest, self._newest = self._newest, None
@@ -74,8 +90,11 @@ class Outbox:
                 return replace(newest, replaced=self._replaced)
             if newest is not None:
                 return newest
-            assert self._last is not None
-            return self._last
+            if self._last is not None:
+                return self._last
+            preview, self._preview = self._preview, None
+            assert preview is not None
+            return preview
 
     def _run(self) -> None:
         try:

@@ -10,7 +10,7 @@ import socket
 import sys
 from typing import Self
 
-from companion.perception_messages import Attitude, Begin, Hud, Message, Stop, packed, read_message
+from companion.perception_messages import Attitude, Begin, Hud, Message, Stop, Watched, packed, read_message
 from companion.settings import Settings
 
 # Results that wait in the kernel are old before they are read: room for about ten, no more.
@@ -87,6 +87,10 @@ class PerceptionProcess:
         if not self._writer.transport.get_write_buffer_size():
             self._put(attitude)
 
+    def watch(self, watched: bool) -> None:
+        """Tell whether anybody wants pictures."""
+        self._put(Watched(watched))
+
     def ask_to_stop(self) -> None:
         self._put(Stop())
 
@@ -99,7 +103,8 @@ class PerceptionProcess:
     async def ends_within(self, timeout_s: float) -> bool:
         """Whether it is dead by then."""
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._process.wait(), timeout_s)
+            async with asyncio.timeout(timeout_s):
+                await self._process.wait()
             return True
         return False
 

@@ -30,10 +30,13 @@ from companion.perception_messages import (
     Report,
     StartFailed,
     Stop,
+    Watched,
     receive,
 )
 from companion.perception_outbox import Outbox, OutboxHandler
+from companion.perception_preview import PreviewEncoder
 from companion.settings import Settings
+from vision.detections import Detections
 from vision.frame import Frame
 from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
@@ -62,11 +65,13 @@ class Orders:
         stop: end now.
         hud: for the recorded video's next frames.
         attitudes: of the vehicle, the last few seconds.
+        watched: whether anybody wants pictures.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self.stop = threading.Event()
         self.hud = Hud((), None)
+        self.watched = False
         self.attitudes = AttitudeHistory()
         self._connection = connection
         self._finished = threading.Event()
@@ -82,6 +87,8 @@ class Orders:
                 self.hud = message
             elif isinstance(message, Attitude):
                 self.attitudes.add(message.stamp_ns, message.wxyz)
+            elif isinstance(message, Watched):
+                self.watched = message.watched
             elif isinstance(message, Stop):
                 self.stop.set()
         # The service is gone. Whoever is stuck in a driver by then will not come back from there.
@@ -97,6 +104,13 @@ class Perception:
     source: Source
     detector: Detector | None
     recording: Recording | None
+    preview: PreviewEncoder
+
+    def write(self, frame: Frame, detections: Detections) -> None:
+        """Give a frame, after its result has left, to all who keep or show pictures."""
+        if self.recording is not None:
+            self.recording.write(frame, detections)
+        self.preview.write(frame, detections)
 
 
 def main(arguments: list[str]) -> int:
@@ -136,7 +150,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
     frames = 0
     with contextlib.ExitStack() as stack:
         try:
-            perception = _open(settings, stack)
+            perception = _open(settings, stack, outbox)
         except (
             SourceError,
             VideoWriterError,
@@ -152,7 +166,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             perception.source,
             _looking(settings, perception.detector),
             selection=settings.detector.selection(),
-            recorder=perception.recording,
+            recorder=perception,
             tracker=_tracker(begin),
             view_at=_view_at(settings, orders.attitudes),
         )
@@ -169,7 +183,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
     return Ended(True, "asked to stop", frames)
 
 
-def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
+def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Perception:
     recording = None
     if settings.recording.video is not None:
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
@@ -182,7 +196,9 @@ def _open(settings: Settings, stack: contextlib.ExitStack) -> Perception:
     if recording is not None:
         # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)
-    return Perception(source, detector, recording)
+    preview = PreviewEncoder(settings.preview, outbox.put_preview)
+    stack.callback(preview.close)
+    return Perception(source, detector, recording, preview)
 
 
 def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | None:
@@ -258,6 +274,7 @@ def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Out
         if perception.recording is not None:
             perception.recording.lines = orders.hud.lines
             perception.recording.highlight = orders.hud.highlight
+        perception.preview.watched = orders.watched
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - said_s >= HEARTBEAT_S:
             outbox.put_newest(Heartbeat(pipeline.frames, perception.source.statistics))

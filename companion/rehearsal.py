@@ -90,7 +90,8 @@ async def _end(process: asyncio.subprocess.Process) -> None:
     if process.returncode is None:
         process.terminate()
     try:
-        await asyncio.wait_for(process.wait(), _SIMULATOR_END_S)
+        async with asyncio.timeout(_SIMULATOR_END_S):
+            await process.wait()
     except TimeoutError:
         process.kill()
         await process.wait()

@@ -32,6 +32,7 @@ from companion.messages import (
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception import PerceptionKeeper, PerceptionStartError
+from companion.perception_messages import Preview
 from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
@@ -96,7 +97,7 @@ class Service:
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
         )
-        self.views = open_views(settings, on_result=self._use, on_event=self._event)
+        self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
         self.bus = Bus(
             settings.zenoh,
@@ -271,6 +272,8 @@ class Service:
         while True:
             now_ns = time.monotonic_ns()
             self.bus.publish(topics.VEHICLE, vehicle_message(self.driver.state, now_ns))
+            for view in self.views:
+                view.keeper.watch(self.bus.watched(topics.IMAGE, view.name))
             if self.pilot.in_command:
                 self.bus.publish(
                     topics.SETPOINT,
@@ -366,6 +369,11 @@ class Service:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
         if view is self.steering:
             view.place(result, self._history)
+
+    def _show(self, view: View, preview: Preview) -> None:
+        """A picture for whoever watches; what it is of goes with it."""
+        stamps = {"view": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
+        self.bus.publish(topics.IMAGE, preview.jpeg, view.name, attachment=stamps)
 
     def _class_names(self) -> tuple[str, ...] | None:
         """What the steering detector knows; None while there is none to ask."""

@@ -341,6 +341,17 @@ class RecordingSection(Section):
         return self
 
 
+class PreviewSection(Section):
+    """Pictures on the network: JPEG, only while somebody subscribes to them."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """pictures a second, at most"""
+    quality: Annotated[int, Field(ge=1, le=100)] = 80
+    """of the JPEG, as its encoders count"""
+    annotate: bool = True
+    """draw what was detected"""
+
+
 class MetricsSection(Section):
     """Numbers for a monitoring system."""
 
@@ -376,6 +387,7 @@ class Settings(Section):
     guidance: GuidanceSection = GuidanceSection()
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()
+    preview: PreviewSection = PreviewSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     views: dict[ViewName, ViewSections] = {}

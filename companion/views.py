@@ -12,6 +12,7 @@ from collections.abc import Callable
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
 from companion.perception import PerceptionKeeper, PerceptionState
+from companion.perception_messages import Preview
 from companion.settings import Settings
 from vision.pipeline import PerceptionResult
 
@@ -38,6 +39,7 @@ class View:
         name: str | None,
         *,
         on_result: Callable[[View, PerceptionResult], None],
+        on_preview: Callable[[View, Preview], None],
         on_event: Callable[[str, str], None],
     ) -> None:
         self.name = name
@@ -47,7 +49,12 @@ class View:
         self.unplaced = ""
         self._on_result = on_result
         self._on_event = on_event
-        self.keeper = PerceptionKeeper(settings, on_result=self._take, on_event=self._tell)
+        self.keeper = PerceptionKeeper(
+            settings,
+            on_result=self._take,
+            on_event=self._tell,
+            on_preview=lambda preview: on_preview(self, preview),
+        )
 
     @property
     def class_names(self) -> tuple[str, ...] | None:
@@ -98,6 +105,7 @@ def open_views(
     settings: Settings,
     *,
     on_result: Callable[[View, PerceptionResult], None],
+    on_preview: Callable[[View, Preview], None],
     on_event: Callable[[str, str], None],
 ) -> tuple[View, ...]:
     """Every view there is, the first one first. None is started yet."""
@@ -109,7 +117,7 @@ def open_views(
         if own.detector.threads is None:
             detector = own.detector.model_copy(update={"threads": threads})
             own = own.model_copy(update={"detector": detector})
-        views.append(View(own, name, on_result=on_result, on_event=on_event))
+        views.append(View(own, name, on_result=on_result, on_preview=on_preview, on_event=on_event))
     return tuple(views)
 
 

@@ -109,10 +109,20 @@ def _wait_for_service(session: zenoh.Session, vehicle: str) -> None:
 def listen(
     session: zenoh.Session, key: str, on_message: Callable[[str, str], None]
 ) -> zenoh.Subscriber[None]:
-    """Call back, on a thread of zenoh's, with (key, text) of every message on `key` (wildcards allowed)."""
+    """Call back, on a thread of zenoh's, with (key, text) of every message on `key` (wildcards allowed).
+
+    Of what is no text, such as a picture, the text is what it is: its encoding, its length, its attachment.
+    """
     full = key if key.startswith(f"{ROOT}/") else f"{ROOT}/*/{key}"
 
     def receive(sample: zenoh.Sample) -> None:
-        on_message(str(sample.key_expr), sample.payload.to_string())
+        on_message(str(sample.key_expr), _text_of(sample))
 
     return session.declare_subscriber(full, receive)
+
+
+def _text_of(sample: zenoh.Sample) -> str:
+    if sample.encoding != zenoh.Encoding.IMAGE_JPEG:
+        return sample.payload.to_string()
+    attachment = "" if sample.attachment is None else f" {sample.attachment.to_string()}"
+    return f"<{sample.encoding}, {len(sample.payload)} bytes>{attachment}"

@@ -132,18 +132,30 @@ class Bus:
         self._publishers.clear()
         if session is not None:
             with suppress(TimeoutError):
-                await asyncio.wait_for(asyncio.to_thread(session.close), 3.0)
+                async with asyncio.timeout(3.0):
+                    await asyncio.to_thread(session.close)
 
-    def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
-        """Publish a JSON-able value, or a text as it is. Never blocks, never raises for the network."""
+    def watched(self, topic: Topic, view: str | None = None) -> bool:
+        """Whether anybody subscribes to this now."""
+        publisher = self._publishers.get(topic.path(view))
+        # zenoh's stubs call this a bool.
+        return publisher is not None and bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
+
+    def publish(
+        self, topic: Topic, value: Any, view: str | None = None, attachment: dict[str, Any] | None = None
+    ) -> None:
+        """Publish a JSON-able value, or a text or bytes as they are. Never blocks or raises for the network.
+
+        `attachment` goes with it as JSON, for payloads that cannot hold it themselves.
+        """
         path = topic.path(view)
         publisher = self._publishers.get(path)
         if publisher is None:
             self.unsent += 1
             return
-        payload = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+        payload = value if isinstance(value, str | bytes) else json.dumps(value, separators=(",", ":"))
         try:
-            publisher.put(payload)
+            publisher.put(payload, attachment=None if attachment is None else json.dumps(attachment))
         except zenoh.ZError as error:
             self.unsent += 1
             logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))

@@ -80,10 +80,20 @@ EVENTS: Final = Topic(
     "what happened: modes, behaviours, parts lost and found",
 )
 
-# What every view publishes of its own.
-VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS)
+IMAGE: Final = Topic(
+    "image",
+    5.0,
+    1.0,
+    zenoh.Encoding.IMAGE_JPEG,
+    zenoh.Priority.BACKGROUND,
+    False,
+    "a frame with its detections drawn, JPEG; made only while somebody subscribes",
+)
 
-TOPICS: Final = (DETECTIONS, LABELS, TRACKS, VEHICLE, SETPOINT, STATUS, EVENTS)
+# What every view publishes of its own.
+VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE)
+
+TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE, VEHICLE, SETPOINT, STATUS, EVENTS)
 
 # The last name of the queryable that takes a command and answers with its outcome.
 COMMAND: Final = "command"

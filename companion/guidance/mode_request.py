@@ -39,7 +39,9 @@ async def _ready_to_arm(driver: Driver) -> None:
     ready = asyncio.Event()
     unsubscribe = driver.subscribe(lambda state: ready.set() if state.ready_to_arm else None)
     try:
-        await asyncio.wait_for(ready.wait(), READY_TIMEOUT_S)
+        # Not `wait_for`: on Python 3.11 it may lose a cancellation, and a dropped request would still arm.
+        async with asyncio.timeout(READY_TIMEOUT_S):
+            await ready.wait()
     except TimeoutError:
         return
     finally:

@@ -113,7 +113,7 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
         ("detector.image_size", "330", "must be a whole number, 32 to 4096, a multiple of 32, got 330"),
         ("detector.image_size", "64.5", "must be a whole number, 32 to 4096, a multiple of 32, got '64.5'"),
         ("tracker.lost_s", "0", "must be a number, above 0, at most 60, got 0.0"),
-        ("detector.precision", "int8", 'must be auto, float32 or bfloat16, got "int8"'),
+        ("detector.precision", "int8", 'must be auto, float32, bfloat16 or float16, got "int8"'),
         ("source.loop", "maybe", "must be true or false, got 'maybe'"),
         ("source.uri", "", 'must be a text, not empty, got ""'),
         ("source.width", "3", "must be a whole number, 16 to 16384, or unset, got 3"),

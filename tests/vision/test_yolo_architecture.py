@@ -140,15 +140,31 @@ def test_a_channel_count_that_is_declared_unscaled_stays() -> None:
         pytest.param(1, [-1, 1, "Conv"], r"row 1 must be", id="short row"),
         pytest.param(1, [-1, 1, "Conv", [64, 2, 2]], r"row 1 \(Conv\): the kernel must be odd", id="even"),
         pytest.param(
-            1, [-1, 1, "Conv", [64, 3, 1]], r"different sizes|must read maps", id="no longer halves"
+            10, [-1, 1, "C2f", [64]], r"row 11 \(Concat\) joins maps of different sizes", id="not enlarged"
         ),
+        pytest.param(
+            21, [[18, 15, 12], 1, "Detect", ["nc"]], r"row 21: Detect must read maps each smaller", id="order"
+        ),
+        pytest.param(1, [-1, 1, "Conv", [64, 3, 2, 3]], r"does not divide by its stride", id="padding"),
+        pytest.param(1, [-1, 1, "C3k2", [64, 1]], r"row 1 \(C3k2\): the choice of C3k", id="C3k"),
+        pytest.param(1, [-1, 1, "C3k2", [64, False, 0]], r"expansion must be a number in 0..1", id="ratio"),
+        pytest.param(1, [-1, 1, "C3k2", [64, False, 0.5, False, 2]], r"knows no groups", id="groups"),
+        pytest.param(1, [-1, 1, "A2C2f", [8]], r"multiples of 32 channels, got 4", id="area heads"),
+        pytest.param(12, [-1, 1, "C2PSA", [64]], r"as many channels as it reads, 16, got 8", id="attended"),
+        pytest.param(2, [-1, 1, "PSA", [64, 1]], r"takes at most 1", id="PSA"),
         pytest.param(1, [-1, 1, "Detect", ["nc"]], r"row 1 is 'Detect': the last row", id="early head"),
-        pytest.param(9, [-1, 1, "SPPF", [64, 5, 1, 1]], r"row 9 \(SPPF\): takes at most 2", id="arguments"),
+        pytest.param(
+            9, [-1, 1, "SPPF", [64, 5, 1, 1, 1, 1]], r"row 9 \(SPPF\): takes at most 5", id="arguments"
+        ),
     ],
 )
 def test_a_row_that_cannot_be_built_is_named(position: int, row: list[Any], expected: str) -> None:
     table = small_table()
-    table["backbone"][position] = row
+    rows = table["backbone"] + table["head"]
+    if position == 21:
+        rows = rows[:21]
+    rows[position : position + 1] = [row]
+    table |= {"backbone": rows, "head": []}
     with torch.device("meta"):
         if not expected:
             build(ModelDescription.from_plain(table))
@@ -175,7 +191,9 @@ def test_a_row_that_cannot_be_built_is_named(position: int, row: list[Any], expe
         {"scales": {"n": [1, 2]}},
         {"scales": {"n": [0.3, 0.3, 64]}, "scale": "q"},
         {"scales": 3},
-        {"end2end": True},
+        {"end2end": "yes"},
+        {"light_classes": 1},
+        {"class_width": 0},
         {"unscaled_channels": 3},
         {"unscaled_channels": ["x"]},
     ],

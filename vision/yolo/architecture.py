@@ -21,6 +21,7 @@ __all__ = [
     "YoloModel",
     "anchor_points",
     "build",
+    "build_shapes",
     "decode_boxes",
     "yolov8_description",
 ]
@@ -105,6 +106,12 @@ class YoloModel(nn.Module):
 def build(description: ModelDescription) -> YoloModel:
     """A network with fresh weights. Raises `ArchitectureError` naming the row that cannot be built."""
     return YoloModel(description)
+
+
+def build_shapes(description: ModelDescription) -> YoloModel:
+    """The network on the meta device: shapes alone, however large, cost no memory. Raises as `build` does."""
+    with torch.device("meta"):
+        return YoloModel(description)
 
 
 def anchor_points(maps: Sequence[Tensor], strides: Sequence[int]) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel
+from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build_shapes
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
 from vision.yolo.pickled_layers import as_trained
 from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line, shown
@@ -149,14 +149,10 @@ def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedMode
     modules = dict(_modules(record))
     description = ModelDescription.from_plain(table, _class_names(record, table))
     description = as_trained(description, modules)
-    weights = dict(_weights(modules))
-    if not description.end_to_end:
-        # A checkpoint of two heads whose user chose the one with NMS: the other is not part of this network.
-        weights = {name: tensor for name, tensor in weights.items() if ".one2one_" not in name}
-    model = _with_weights(description, weights)
+    model = _with_weights(description, dict(_weights(modules)))
     stride = modules[f"model.{len(description.rows) - 1}"].state.get("stride")
     # The first few: as a list of numbers a large tensor would be many times as large.
-    if isinstance(stride, Tensor) and (found := tuple(stride.flatten()[:9].tolist())) != model.strides:
+    if isinstance(stride, Tensor) and (found := stride.flatten()[:9].tolist()) != list(model.strides):
         raise CheckpointError(f"its head has strides {found!r:.100}, not {model.strides}")
     for name, module in model.named_modules():
         trained = modules.get(name)
@@ -236,10 +232,9 @@ def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> 
     """
     _check_sizes(description, weights)
     # Shapes only: a description that promises more than the file holds must not cost memory.
-    with torch.device("meta"):
-        model = YoloModel(description)
-        if not any(name.endswith(".bn.weight") for name in weights):
-            model.fuse()
+    model = build_shapes(description)
+    if not any(name.endswith(".bn.weight") for name in weights):
+        model.fuse()
     expected = model.state_dict()
     missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
     if missing or unknown:

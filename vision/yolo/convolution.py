@@ -59,13 +59,16 @@ class Conv(nn.Module):
         norm, conv = self.bn, self.conv
         if norm.running_mean is None or norm.running_var is None:
             raise ValueError("a batch normalisation without running statistics cannot be folded")
+        self.bn = nn.Identity()
+        if conv.weight.is_meta:  # Shapes alone: nothing to compute, and torch would import much to do so.
+            conv.bias = nn.Parameter(norm.bias.detach().clone())
+            return
         with torch.no_grad():
             scale = norm.weight.double() / (norm.running_var.double() + norm.eps).sqrt()
             weight = conv.weight.double() * scale[:, None, None, None]
             bias = norm.bias.double() - norm.running_mean.double() * scale
             conv.weight.copy_(weight.to(conv.weight.dtype))
             conv.bias = nn.Parameter(bias.to(conv.weight.dtype), requires_grad=conv.weight.requires_grad)
-        self.bn = nn.Identity()
 
 
 class DWConv(Conv):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from vision.yolo.architecture import YoloModel, build
+from vision.yolo.architecture import YoloModel, build_shapes
 from vision.yolo.description import ModelDescription
 from vision.yolo.published import SCALES
 
@@ -90,8 +90,8 @@ def _scale(description: ModelDescription, generation: str) -> str | None:
 
 def _gflops(description: ModelDescription, image_size: int) -> float:
     # Shapes alone tell the work; nothing is computed, and the caller's network is left as it is.
+    model = build_shapes(description).fuse()
     with torch.device("meta"):
-        model = build(description).fuse()
         picture = torch.empty(1, description.channels, image_size, image_size)
     counter = FlopCounterMode(display=False)
     with torch.inference_mode(), counter:

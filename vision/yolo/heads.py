@@ -26,10 +26,9 @@ class DFL(nn.Module):
         super().__init__()
         self.bins = bins
         self.conv = nn.Conv2d(bins, 1, 1, bias=False).requires_grad_(False)
-        # Not `arange`: on the meta device, where checkpoints are built, it would load torch's compiler.
-        self.conv.weight.data.copy_(
-            torch.tensor([float(number) for number in range(bins)]).view(1, bins, 1, 1)
-        )
+        # On the processor, whatever the default: counting on the meta device makes torch import sympy.
+        distances = torch.arange(bins, dtype=torch.float32, device="cpu")
+        self.conv.weight.data.copy_(distances.view(1, bins, 1, 1))
 
     def forward(self, logits: Tensor) -> Tensor:
         """(…, 4 · bins) logits → (…, 4) distances, in cells, of left, top, right, bottom."""

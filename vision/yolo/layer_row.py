@@ -46,7 +46,12 @@ class LayerRow:
         return [source, self.repeats, self.layer, list(self.arguments)]
 
     def with_argument(self, position: int, value: Any, defaults: Sequence[Any]) -> LayerRow:
-        """The row with one argument set; those before it that it left out are filled from `defaults`."""
+        """The row with one argument set; those before it that it left out are filled from `defaults`.
+
+        A row that says so already, or leaves it out because `defaults` does, stays as it is.
+        """
+        if value == (*self.arguments, *defaults[len(self.arguments) :])[position]:
+            return self
         arguments = [*self.arguments, *defaults[len(self.arguments) :]]
         arguments[position] = value
         return replace(self, arguments=tuple(arguments[: max(len(self.arguments), position + 1)]))

@@ -82,9 +82,6 @@ def _with_head(description: ModelDescription, name: str, modules: Modules) -> Mo
         return description
     branches = "cv3" if kind(modules, f"{name}.cv3.0") else "one2one_cv3"
     light = kind(modules, f"{name}.{branches}.0.0") == "Sequential"
-    two_heads = bool(kind(modules, f"{name}.one2one_cv3"))
-    # Whoever trained it may have chosen the other head of the two; without a choice the end-to-end one is it.
-    chosen = head.state.get("_end2end")
     last = _tensor(modules, f"{name}.{branches}.0.2")
     width = last.shape[1] if last is not None and last.dim() == 4 else None
     bins = head.state.get("reg_max", description.reg_max)
@@ -94,7 +91,8 @@ def _with_head(description: ModelDescription, name: str, modules: Modules) -> Mo
         description,
         reg_max=bins,
         light_classes=light,
-        end_to_end=two_heads and chosen is not False,
+        # Late releases also note which head answered last, often the other one, after a validation with NMS.
+        end_to_end=bool(kind(modules, f"{name}.one2one_cv3")),
         class_width=width,
     )
 

@@ -16,7 +16,14 @@ import torch
 from torch import Tensor
 
 from vision.yolo.admitted_names import INERT
-from vision.yolo.safe_pickle import Admitted, CheckpointError, UnsafeCheckpointError, one_line, unpickle
+from vision.yolo.safe_pickle import (
+    Admitted,
+    CheckpointError,
+    Inert,
+    UnsafeCheckpointError,
+    one_line,
+    unpickle,
+)
 
 _STORAGES: dict[str, torch.dtype] = {
     "torch.DoubleStorage": torch.float64,
@@ -167,6 +174,8 @@ class _Archive:
             "collections.defaultdict": _default_dictionary,
             "__builtin__.set": _set,
             "builtins.set": _set,
+            "__builtin__.getattr": _folded_forward,
+            "builtins.getattr": _folded_forward,
             # Releases from 8.0.200 to 8.2 wrote with dill where it was installed, which names types this way.
             "dill._dill._load_type": _type_by_name,
         }
@@ -268,6 +277,13 @@ def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     ):
         raise CheckpointError("its pickle has a set of something else than names and numbers")
     return frozenset(values)
+
+
+def _folded_forward(arguments: tuple[Any, ...]) -> Inert:
+    """A layer saved with its normalisation folded names its own method; it becomes one more inert record."""
+    if len(arguments) != 2 or not isinstance(arguments[0], Inert) or arguments[1] != "forward_fuse":
+        raise UnsafeCheckpointError("its pickle calls getattr; nothing was run. Do not use this file")
+    return Inert("forward_fuse")
 
 
 def _type_by_name(arguments: tuple[Any, ...]) -> Admitted:
