@@ -147,6 +147,8 @@ def detect(
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )
+        if runtime == "auto":
+            typer.echo(f"companion: on {detector.runtime} ({detector.runtime_reason})", err=True)
         looking: FrameDetector = detector
         if tiles:
             looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
