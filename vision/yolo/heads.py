@@ -71,9 +71,7 @@ class Detect(nn.Module):
         box_width = max(16, inputs[0] // 4, 4 * reg_max)
         class_width = max(inputs[0], min(classes, 100)) if class_width is None else class_width
         class_branch = _light_branch if light else _branch
-        self.cv2 = nn.ModuleList(
-            _branch(channels, box_width, 4 * reg_max, activation) for channels in inputs
-        )
+        self.cv2 = nn.ModuleList(_branch(channels, box_width, 4 * reg_max, activation) for channels in inputs)
         self.cv3 = nn.ModuleList(
             class_branch(channels, class_width, classes, activation) for channels in inputs
         )
