@@ -303,7 +303,7 @@ def test_an_end_to_end_head_learns_with_one_branch_and_answers_with_the_other() 
     x = picture()
     with torch.inference_mode():
         answered = model(x)
-        model.detect.train()  # The rest stays as it is, so that only the branches differ.
+        model.detect.training = True  # Normalisation stays as it is, so that only the branches differ.
         learnt = model(x)
         model.detect.cv3, model.detect.one2one_cv3 = model.detect.one2one_cv3, model.detect.cv3
         model.detect.cv2, model.detect.one2one_cv2 = model.detect.one2one_cv2, model.detect.cv2

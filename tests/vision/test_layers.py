@@ -8,7 +8,19 @@ import pytest
 import torch
 from torch import nn
 
-from vision.yolo.layers import DFL, SPPF, Bottleneck, C2f, Concat, Conv, Detect
+from vision.yolo.layers import (
+    C2PSA,
+    DFL,
+    SPPF,
+    AreaAttention,
+    Bottleneck,
+    C2f,
+    Concat,
+    Conv,
+    Detect,
+    LargeKernelDWConv,
+    SCDown,
+)
 
 
 def with_lively_statistics(module: nn.Module, seed: int = 0) -> nn.Module:
@@ -33,6 +45,8 @@ def with_lively_statistics(module: nn.Module, seed: int = 0) -> nn.Module:
         pytest.param(Conv(8, 12), (2, 12, 16, 20), id="a 1x1 convolution keeps the size"),
         pytest.param(C2f(8, 24, 2, True), (2, 24, 16, 20), id="C2f keeps the size"),
         pytest.param(SPPF(8, 12, 5), (2, 12, 16, 20), id="SPPF keeps the size"),
+        pytest.param(SCDown(8, 12), (2, 12, 8, 10), id="SCDown halves the map"),
+        pytest.param(C2PSA(8, 2), (2, 8, 16, 20), id="attention keeps size and channels"),
         pytest.param(Bottleneck(8, 8, True), (2, 8, 16, 20), id="a bottleneck keeps the size"),
     ],
 )
@@ -93,3 +107,33 @@ def test_the_head_starts_with_rare_objects() -> None:
         # 5 objects spread over the cells of a 640-pixel picture and over the classes.
         assert torch.all((probability - 5 / 7 / (640 / stride) ** 2).abs() < 1e-4)
     assert all(math.isclose(value, 1.0) for value in head.cv2[0][-1].bias.tolist())
+
+
+def test_two_depthwise_convolutions_fold_into_one() -> None:
+    layer = with_lively_statistics(LargeKernelDWConv(6))
+    x = torch.rand(2, 6, 9, 11)
+    before = layer(x)
+    layer.fuse()
+    torch.testing.assert_close(layer(x), before, rtol=1e-4, atol=1e-5)
+    assert set(layer.state_dict()) == {"conv.weight", "conv.bias"}
+    layer.fuse()
+    torch.testing.assert_close(layer(x), before, rtol=1e-4, atol=1e-5)
+
+
+def test_a_cell_sees_its_own_area_and_no_other() -> None:
+    layer = with_lively_statistics(AreaAttention(64, 2, areas=4))
+    x = torch.rand(1, 64, 32, 4)
+    changed = x.clone()
+    changed[:, :, 20, 1] += 5.0  # In the third area, rows 16 to 23.
+    difference = (layer(changed) - layer(x)).abs().amax(dim=(0, 1, 3))
+    assert bool((difference[16:24] > 1e-6).all())
+    # Beyond it only the 7×7 convolution of the values reaches, and not past its area's end by more than 3.
+    assert bool((difference[:16] < 1e-6).all())
+    assert bool((difference[24:] < 1e-6).all())
+
+
+def test_an_sppf_without_its_first_activation_lets_negative_values_through() -> None:
+    x = torch.rand(1, 8, 6, 6) - 0.5
+    for activated in (True, False):
+        layer = with_lively_statistics(SPPF(8, 8, 5, 3, True, activated))
+        assert bool((layer.cv1(x) < -0.3).any()) != activated
