@@ -34,7 +34,8 @@ format: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "companion needs Python 3.11 or newer, this is %d.%d; set PYTHON=" % sys.version_info[:2])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(if $(ALLOW_CUDA),,$(BIN)/python -m pip install --quiet --dry-run --report - $(TORCH) | $(BIN)/python -c '$(REFUSE_CUDA)')
+	$(if $(ALLOW_CUDA),,$(BIN)/python -m pip install --quiet --dry-run --report $(VENV)/torch.json $(TORCH))
+	$(if $(ALLOW_CUDA),,$(BIN)/python -c '$(REFUSE_CUDA)' < $(VENV)/torch.json)
 	$(BIN)/python -m pip install --quiet $(TORCH)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@

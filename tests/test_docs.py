@@ -31,7 +31,8 @@ def commands(document: Path) -> Iterator[list[str]]:
     """Each command of the document's shell blocks and of its `code` in running text, split into words."""
     for line in shell_lines(document):
         for part in line.split(" | "):
-            yield shlex.split(part, comments=True)
+            words = shlex.split(part, comments=True)
+            yield words[: words.index(">")] if ">" in words else words
     for code in re.findall(r"`([^`\n]+)`", document.read_text()):
         if code.startswith(("companion ", "mavlink-sim ")):
             yield shlex.split(code)
