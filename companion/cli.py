@@ -105,7 +105,9 @@ def _say_with_time() -> Callable[[str], None]:
 @app.command()
 def detect(
     source: Annotated[str, typer.Argument(help="file, folder, /dev/video0, FIFO, - or network address")],
-    model: Annotated[str, typer.Option(help="a YOLOv8 checkpoint (.pt)")] = "default",
+    model: Annotated[
+        str, typer.Option(help="a checkpoint, an exported file, or a name in the models folder")
+    ] = "default",
     classes: Annotated[str | None, typer.Option(help="only these: names or ids, comma separated")] = None,
     confidence: Annotated[float, typer.Option(min=0, max=1)] = 0.25,
     iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,

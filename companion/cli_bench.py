@@ -1,4 +1,4 @@
-"""The command line of measurements: `companion bench detector|latency|setpoints`."""
+"""The command line of measurements: `companion bench detector|tracking|latency|setpoints`."""
 
 from __future__ import annotations
 

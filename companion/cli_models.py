@@ -113,7 +113,8 @@ def export(
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
         facts = describe(load_checkpoint(path).model, image_size)
         written = export(path, to, output, image_size, generation=facts.generation)  # type: ignore[arg-type]
-    typer.echo(f"{written} ({written.stat().st_size} bytes), for --model")
+    reader = {"onnx": "onnxruntime", "torchscript": "torch"}.get(to, to)
+    typer.echo(f"{written} ({written.stat().st_size} bytes), for --model with --runtime {reader}")
 
 
 @models.command()

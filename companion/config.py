@@ -193,6 +193,8 @@ class _Reading:
                 f"({origin})"
             )
             return
+        # An empty table is a view, too: all defaults.
+        self._values.setdefault(f"views.{view}", {})
         for section, content in sections.items():
             self._take_table(f"views.{view}.{section}", content, origin)
 
@@ -205,8 +207,6 @@ class _Reading:
         elif not isinstance(content, dict):
             self._problems.append(f"{table}: must be a section [{table}], got {shown(content)} ({origin})")
         else:
-            # An empty table is a view, too: all defaults.
-            self._values.setdefault(table, {})
             for name, value in content.items():
                 self._take(table, name, value, origin)
 

@@ -10,7 +10,7 @@ from companion.models_catalog import KNOWN, known_by_digest
 from vision.model_files import kept_models
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint
-from vision.yolo.checkpoint_pair import file_sha256, is_pair, pair_paths
+from vision.yolo.checkpoint_pair import is_pair, pair_paths, weights_sha256
 from vision.yolo.generation import describe
 
 
@@ -58,7 +58,7 @@ def model_info(path: Path, image_size: int = 640) -> ModelInfo:
         raise ValueError(f"the image size must be a multiple of 32, got {image_size}")
     loaded = load_checkpoint(path)
     weights = pair_paths(path)[0] if is_pair(path) else path
-    digest = file_sha256(weights)
+    digest = weights_sha256(path)
     facts = describe(loaded.model, image_size)
     official = known_by_digest(digest)
     stated = dict(loaded.metadata)

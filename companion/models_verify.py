@@ -17,7 +17,7 @@ from vision.runtimes.contract import Precision, Runtime, RuntimeUnusableError
 from vision.runtimes.exported import KEY
 from vision.runtimes.selection import start_runtime
 from vision.runtimes.source import ModelSource, read_source
-from vision.yolo.checkpoint_pair import file_sha256
+from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.maps import LevelMaps
 from vision.yolo.metrics import box_iou
 from vision.yolo.postprocess import Boxes, Candidates, boxes_of, sides_of
@@ -121,7 +121,7 @@ def verify(
         box_difference_px=largest.boxes_px,
         boxes=largest.boxes,
         unmatched=largest.unmatched,
-        same_source=exported.facts.source_sha256 == file_sha256(source_path),
+        same_source=exported.facts.source_sha256 == weights_sha256(source_path),
     )
 
 

@@ -12,7 +12,7 @@ import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -203,6 +203,11 @@ class PerceptionKeeper:
         self._process.turn(Attitude(stamp_ns, attitude))
 
     @property
+    def state(self) -> PerceptionState:
+        """What it is doing now."""
+        return self._state
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """What the model knows, id → name; empty before the start and without a detector."""
         return () if self._ready is None else self._ready.class_names
@@ -227,6 +232,8 @@ class PerceptionKeeper:
             left_out=_sum(self._before.left_out, self._now.left_out),
             stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
             class_names=self.class_names,
+            runtime=None if self._ready is None else self._ready.runtime,
+            runtime_reason="" if self._ready is None else self._ready.reason,
             tracks=len(self._tracks),
             problem=self._problem,
         )
@@ -375,7 +382,7 @@ class PerceptionKeeper:
             match message:
                 case Report():
                     self._take(message)
-                    pulse.resulted()
+                    pulse.resulted(message.result.timing_ms.get("total", 0.0) / 1e3)
                 case Ready():
                     pulse.ready()
                     self._on_ready(message, process)
@@ -402,16 +409,18 @@ class PerceptionKeeper:
             return
         model = "no detector"
         if ready.model is not None:
-            model = f"model {ready.model} with {len(ready.class_names)} classes in {ready.precision}"
+            model = (
+                f"model {ready.model} with {len(ready.class_names)} classes by {ready.runtime} "
+                f"in {ready.precision}"
+            )
         self._on_event("info", f"perception sees {ready.source}, {model} (process {process.pid})")
 
     def _take(self, report: Report) -> None:
         result = self._tracks.take(
             replace(report.result, sequence=report.result.sequence + self._first_sequence)
         )
-        self._now.frames = report.frames
-        self._now.dropped = result.dropped + report.replaced
-        self._now.left_out = {**result.left_out, "unsent": report.replaced}
+        self._count(report.frames, result.dropped, result.left_out, report.replaced)
+        result = replace(result, dropped=self._before.dropped + self._now.dropped)
         self._newest = result
         self._results += 1
         self._arrivals_s.append(time.monotonic())
@@ -421,9 +430,14 @@ class PerceptionKeeper:
         publish_ms = (time.monotonic_ns() - result.inferred_ns) / 1e6
         self._times.add({**result.timing_ms, "publish": publish_ms})
 
+    def _count(self, frames: int, dropped: int, left_out: Mapping[str, int], unsent: int) -> None:
+        """What the present worker has read and lost so far."""
+        self._now = _Counts(frames, dropped + unsent, {**left_out, "unsent": unsent})
+
     def _note(self, message: Message) -> None:
         if isinstance(message, Heartbeat):
-            self._now.frames = message.frames
+            unsent = self._now.left_out.get("unsent", 0)
+            self._count(message.frames, message.dropped, message.left_out, unsent)
         elif isinstance(message, LogLine):
             # What a person should know is an event; the rest is only for the log. Never both.
             if message.level >= logging.WARNING:

@@ -10,13 +10,13 @@ import asyncio
 import pickle
 import socket
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from companion.settings import Settings
 from vision.pipeline import PerceptionResult
 from vision.rotation import Quaternion
-from vision.sources import SourceStatistics
 
 _LENGTH = struct.Struct(">I")
 # Far above any message: a result is a few kilobytes. What claims to be longer is not one of ours.
@@ -69,13 +69,16 @@ class Stop:
 class Ready:
     """The model is loaded and the source has given its first frame.
 
-    `model`, and `precision`, which the network computes in, are None without a detector.
+    `model`, `precision`, which the network computes in, and `runtime`, what computes it, are None without a
+    detector. `reason`: why these, in words.
     """
 
     source: str
     model: str | None
     class_names: tuple[str, ...]
     precision: str | None
+    runtime: str | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +112,11 @@ class Preview:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The loop turns, though no frame comes."""
+    """The loop turns, though nothing is looked at. `dropped` and `left_out` are as a result has them."""
 
     frames: int
-    statistics: SourceStatistics
+    dropped: int = 0
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 
 import cv2
+import numpy as np
 
 from companion.perception_messages import Preview
 from companion.settings import PreviewSection
@@ -18,11 +19,11 @@ from vision.frame import Frame
 logger = logging.getLogger(__name__)
 
 # The network, in the same process, comes first.
-_NICENESS = 10
+_NICER = 5
 
 
 class PreviewEncoder:
-    """Encodes at most `rate_hz` frames a second; one that comes while another is at work is left out.
+    """Encodes at most `rate_hz` frames a second; of those that come meanwhile only the newest waits.
 
     Attributes:
         watched: whether anybody wants pictures; while not, a frame costs nothing.
@@ -59,7 +60,8 @@ class PreviewEncoder:
         self._thread.join()
 
     def _run(self) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(nice + _NICER, 19))
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._closed)
@@ -68,11 +70,14 @@ class PreviewEncoder:
                 (frame, detections), self._waiting = self._waiting, None
             try:
                 self._deliver(self._encoded(frame, detections))
-            except cv2.error as error:
-                # A picture that cannot be shown must not end what steers.
-                logger.warning("a preview of %dx%d failed: %s", frame.width, frame.height, error)
+            except Exception:  # one picture that cannot be made must not end those that follow
+                logger.exception("a preview of %dx%d failed", frame.width, frame.height)
 
     def _encoded(self, frame: Frame, detections: Detections) -> Preview:
         image = annotate(frame.image, detections) if self._settings.annotate else frame.image
+        if frame.width > self._settings.width:
+            height = max(1, round(frame.height * self._settings.width / frame.width))
+            smaller = cv2.resize(image, (self._settings.width, height), interpolation=cv2.INTER_AREA)
+            image = smaller.astype(np.uint8, copy=False)
         _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self._settings.quality])
         return Preview(frame.sequence, frame.captured_ns, jpeg.tobytes())

@@ -10,7 +10,7 @@ START_S = 90.0
 # The first inference is slow, and nothing is known yet of how long one takes here.
 FIRST_RESULT_S = 30.0
 # From then on: so many times what is usual here, but not less and not more than these.
-USUAL_INTERVALS, SHORTEST_S, LONGEST_S = 20.0, 3.0, 30.0
+USUAL_STEPS, SHORTEST_S, LONGEST_S = 20.0, 3.0, 30.0
 
 
 class Pulse:
@@ -20,7 +20,7 @@ class Pulse:
         """`open_timeout_s`: what the source may take to open."""
         self._heard_s = now_s
         self._limit_s = START_S + open_timeout_s
-        self._intervals_s: deque[float] = deque(maxlen=50)
+        self._steps_s: deque[float] = deque(maxlen=50)
 
     def ready(self) -> None:
         """The worker has loaded and opened everything."""
@@ -28,13 +28,13 @@ class Pulse:
 
     def heard(self, now_s: float) -> None:
         """A message of any kind came."""
-        self._intervals_s.append(now_s - self._heard_s)
         self._heard_s = now_s
 
-    def resulted(self) -> None:
-        """The message was a result: from now on the intervals tell what is usual."""
-        usual_s = statistics.median(self._intervals_s) if self._intervals_s else 0.0
-        self._limit_s = min(max(USUAL_INTERVALS * usual_s, SHORTEST_S), LONGEST_S)
+    def resulted(self, step_s: float) -> None:
+        """The message was a result that took so long to make: the worker is silent no longer than that."""
+        self._steps_s.append(step_s)
+        usual_s = statistics.median(self._steps_s)
+        self._limit_s = min(max(USUAL_STEPS * usual_s, SHORTEST_S), LONGEST_S)
 
     def forgive(self, now_s: float) -> None:
         """We did not listen until now, so nobody can be blamed for silence."""

@@ -42,6 +42,8 @@ class PerceptionStatus:
         stuck_after_s: the silence after which the worker counts as stuck.
         class_names: what the model knows; empty before the start and without a detector.
         tracks: objects that are followed now and count as true.
+        runtime: what computes the network; None before the start and without a detector.
+        runtime_reason: why that, and why in its precision, in words.
         problem: the last thing that went wrong, empty if nothing did.
     """
 
@@ -61,6 +63,8 @@ class PerceptionStatus:
     stuck_after_s: float | None = None
     class_names: tuple[str, ...] = ()
     tracks: int = 0
+    runtime: str | None = None
+    runtime_reason: str = ""
     problem: str = ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -82,6 +86,8 @@ class PerceptionStatus:
             "stuck_after_s": self.stuck_after_s,
             "class_names": list(self.class_names),
             "tracks": self.tracks,
+            "runtime": self.runtime,
+            "runtime_reason": self.runtime_reason,
             "problem": self.problem,
         }
 

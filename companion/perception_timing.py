@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 
@@ -25,4 +26,4 @@ class StageTimes:
 
 
 def _nearest_rank(ascending: list[float], share: float) -> float:
-    return ascending[min(int(share * len(ascending)), len(ascending) - 1)]
+    return ascending[math.ceil(share * len(ascending)) - 1]

@@ -16,9 +16,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+import cv2
 
 from companion.perception_messages import (
     Attitude,
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 HEARTBEAT_S = 0.25
 # How long the last messages may take to leave, and everything may take to end once the service is gone.
 FAREWELL_S = 2.0
+_LOADING_PERIOD_S = 2.0
 GRACE_S = 5.0
 # The service's loop, which steers, comes first where they share a core.
 NICENESS = 5
@@ -150,7 +153,8 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
     frames = 0
     with contextlib.ExitStack() as stack:
         try:
-            perception = _open(settings, stack, outbox)
+            with _saying_that_it_loads(settings, outbox):
+                perception = _open(settings, stack, outbox)
         except (
             SourceError,
             VideoWriterError,
@@ -181,6 +185,23 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             return Ended(False, f"{type(error).__name__}: {_one_line(error)}", pipeline.frames)
         frames = pipeline.frames
     return Ended(True, "asked to stop", frames)
+
+
+@contextlib.contextmanager
+def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
+    """To convert a model for another runtime, and to try which is the fastest, may take minutes."""
+    loaded = threading.Event()
+
+    def say() -> None:
+        while not loaded.wait(_LOADING_PERIOD_S):
+            outbox.put_newest(Heartbeat(0))
+
+    if settings.detector.runtime != "torch":
+        threading.Thread(target=say, name="loading", daemon=True).start()
+    try:
+        yield
+    finally:
+        loaded.set()
 
 
 def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Perception:
@@ -216,6 +237,9 @@ def _load(settings: Settings) -> Detector:
     from vision.detector import Detector
 
     wanted = settings.detector
+    if wanted.threads is not None:
+        # Else its resizing takes every core, whatever the network was given.
+        cv2.setNumThreads(wanted.threads)
     return Detector(
         wanted.model,
         classes=wanted.classes or None,
@@ -259,7 +283,14 @@ def _ready(settings: Settings, perception: Perception) -> Ready:
     detector = perception.detector
     if detector is None:
         return Ready(perception.source.uri, None, (), None)
-    return Ready(perception.source.uri, settings.detector.model, detector.class_names, detector.precision)
+    return Ready(
+        perception.source.uri,
+        settings.detector.model,
+        detector.class_names,
+        detector.precision,
+        detector.runtime,
+        f"{detector.runtime_reason}; {detector.precision}: {detector.precision_reason}",
+    )
 
 
 def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Outbox) -> None:
@@ -277,7 +308,7 @@ def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Out
         perception.preview.watched = orders.watched
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - said_s >= HEARTBEAT_S:
-            outbox.put_newest(Heartbeat(pipeline.frames, perception.source.statistics))
+            outbox.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.left_out))
             said_s = time.monotonic()
 
 

@@ -263,7 +263,8 @@ class Service:
                 self._notifier.alive()
             if now_s >= next_hud_s:
                 next_hud_s = now_s + _HUD_PERIOD_S
-                self.perception.send_hud(self._hud())
+                for view in self.views:
+                    view.keeper.send_hud(self._hud())
             due_s = max(due_s + period_s, time.monotonic())
             await asyncio.sleep(due_s - time.monotonic())
 
@@ -373,7 +374,7 @@ class Service:
     def _show(self, view: View, preview: Preview) -> None:
         """A picture for whoever watches; what it is of goes with it."""
         stamps = {"view": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
-        self.bus.publish(topics.IMAGE, preview.jpeg, view.name, attachment=stamps)
+        self.bus.publish_picture(topics.IMAGE, preview.jpeg, stamps, view.name)
 
     def _class_names(self) -> tuple[str, ...] | None:
         """What the steering detector knows; None while there is none to ask."""

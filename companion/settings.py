@@ -31,8 +31,8 @@ class Section(BaseModel):
 # One word of a zenoh key expression: no `/`, and none of its wildcards and separators `* $ ? # @`.
 _KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
 KeyWord = Annotated[str, _KEY_WORD]
-# The same without a dot, as `views.NAME.source` is a key.
 _HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
+# The same without a dot, as `views.NAME.source` is a key.
 _VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
 ViewName = Annotated[str, _VIEW_NAME]
 VehicleUrl = Annotated[
@@ -348,6 +348,8 @@ class PreviewSection(Section):
     """pictures a second, at most"""
     quality: Annotated[int, Field(ge=1, le=100)] = 80
     """of the JPEG, as its encoders count"""
+    width: Annotated[int, Field(ge=16, le=4096)] = 1280
+    """larger frames are shrunk to this width, pixels"""
     annotate: bool = True
     """draw what was detected"""
 
@@ -398,13 +400,43 @@ class Settings(Section):
             known = ", ".join(self.views) or "none"
             raise ValueError(f"guidance.view: there is no view {self.guidance.view!r} (views: {known})")
         openers: dict[str, str] = {}
+        sharers: dict[str, str] = {}
         for key, source in self.sources().items():
-            if source.uri in openers and _opens_once(source.uri):
+            uri = f"/dev/video{int(source.uri)}" if source.uri.isdecimal() else source.uri
+            if uri in openers and _opens_once(uri):
                 raise ValueError(
-                    f"{key}.uri and {openers[source.uri]}.uri are both {source.uri}, which can be "
+                    f"{key}.uri and {openers[uri]}.uri are both {uri}, which can be "
                     f'opened once: give one of them share = "NAME" and the other uri = "shm://NAME"'
                 )
-            openers[source.uri] = key
+            openers[uri] = key
+            if source.share is None:
+                continue
+            if uri == f"shm://{source.share}":
+                raise ValueError(f"{key}.share: {source.share!r} is where its own frames come from")
+            if source.share in sharers:
+                raise ValueError(f"{key}.share and {sharers[source.share]}.share are both {source.share!r}")
+            sharers[source.share] = key
+        return self
+
+    @model_validator(mode="after")
+    def _films_are_files_of_their_own(self) -> Self:
+        films = [self.recording.video, *(sections.recording.video for sections in self.views.values())]
+        named = [film for film in films if film is not None]
+        if len(set(named)) < len(named):
+            raise ValueError(f"every view needs a recording.video of its own, got {', '.join(named)}")
+        return self
+
+    @model_validator(mode="after")
+    def _tracks_outlive_the_pause_between_frames(self) -> Self:
+        views: dict[str, Settings | ViewSections] = {"": self}
+        views |= {f"views.{name}.": sections for name, sections in self.views.items()}
+        for prefix, view in views.items():
+            rate_hz, end_s = view.detector.rate_hz, view.tracker.end_s
+            if view.tracker.enabled and rate_hz is not None and 1 / rate_hz >= end_s:
+                raise ValueError(
+                    f"{prefix}tracker.end_s must be longer than one period of {prefix}detector.rate_hz "
+                    f"({1 / rate_hz:.3g} s), got {end_s:g}: every track would end before the next frame"
+                )
         return self
 
     def sources(self) -> dict[str, SourceSection]:
@@ -423,4 +455,4 @@ class Settings(Section):
 
 
 def _opens_once(uri: str) -> bool:
-    return uri == "-" or uri.isdecimal() or uri.startswith("/dev/")
+    return uri == "-" or uri.startswith("/dev/")

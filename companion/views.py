@@ -7,18 +7,21 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+import statistics
+from collections import deque
+from collections.abc import Callable, Sequence
 
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
 from companion.perception import PerceptionKeeper, PerceptionState
 from companion.perception_messages import Preview
-from companion.settings import Settings
+from companion.perception_pulse import START_S
+from companion.settings import DetectorSection, Section, Settings
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
 
-# A view is unwell when its newest result is older than this, and than its own rate allows.
+# A view is unwell when its newest result is older than this, and than what is usual for it.
 _SEEING_S = 1.0
 
 
@@ -47,6 +50,7 @@ class View:
         self.newest: PerceptionResult | None = None
         self.targets: tuple[Target, ...] = ()
         self.unplaced = ""
+        self._between_s: deque[float] = deque(maxlen=9)
         self._on_result = on_result
         self._on_event = on_event
         self.keeper = PerceptionKeeper(
@@ -59,7 +63,7 @@ class View:
     @property
     def class_names(self) -> tuple[str, ...] | None:
         """What the detector knows; None while there is none to ask."""
-        return self.keeper.status.class_names or None
+        return self.keeper.class_names or None
 
     def age_s(self, now_ns: int) -> float | None:
         """Of the newest result, from its capture; None before the first."""
@@ -67,11 +71,13 @@ class View:
 
     def seeing(self, now_ns: int) -> bool:
         """Results come as they should, or none are to be expected."""
-        if not self.settings.detector.enabled or self.keeper.status.state is PerceptionState.FINISHED:
+        if not self.settings.detector.enabled or self.keeper.state is PerceptionState.FINISHED:
             return True
-        age_s, rate_hz = self.age_s(now_ns), self.settings.detector.rate_hz
+        age_s = self.age_s(now_ns)
         allowed_s = max(_SEEING_S, self.settings.guidance.perception_max_age_s)
-        return age_s is not None and age_s <= allowed_s + (1 / rate_hz if rate_hz else 0.0)
+        # Just before the next result the newest is as old as its own latency and one interval.
+        usual_s = statistics.median(self._between_s) if self._between_s else 0.0
+        return age_s is not None and age_s <= allowed_s + 2 * usual_s
 
     def place(self, result: PerceptionResult, history: StateHistory) -> None:
         """Work out where what a result shows is."""
@@ -89,6 +95,8 @@ class View:
             self.targets, self.unplaced = (), str(error)
 
     def _take(self, result: PerceptionResult) -> None:
+        if self.newest is not None:
+            self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
         self.newest = result
         try:
             self._on_result(self, result)
@@ -109,18 +117,30 @@ def open_views(
     on_event: Callable[[str, str], None],
 ) -> tuple[View, ...]:
     """Every view there is, the first one first. None is started yet."""
-    names = (None, *settings.views)
-    threads = threads_each(len(names))
+    own_settings = {name: settings.of_view(name) for name in (None, *settings.views)}
+    threads = threads_each([own.detector for own in own_settings.values()])
+    shared = {f"shm://{source.share}" for source in settings.sources().values() if source.share}
     views = []
-    for name in names:
-        own = settings.of_view(name)
+    for name, own in own_settings.items():
+        changes: dict[str, Section] = {}
         if own.detector.threads is None:
-            detector = own.detector.model_copy(update={"threads": threads})
-            own = own.model_copy(update={"detector": detector})
+            changes["detector"] = own.detector.model_copy(update={"threads": threads})
+        if own.source.uri in shared:
+            # Whoever shares it loads a model first.
+            patient_s = own.source.open_timeout_s + START_S
+            changes["source"] = own.source.model_copy(update={"open_timeout_s": patient_s})
+        own = own.model_copy(update=changes)
         views.append(View(own, name, on_result=on_result, on_preview=on_preview, on_event=on_event))
     return tuple(views)
 
 
-def threads_each(views: int) -> int:
-    """All processors but one, shared out: the service, and whoever talks to it, must not wait for them."""
-    return max(1, (len(os.sched_getaffinity(0)) - 1) // views)
+def threads_each(detectors: Sequence[DetectorSection]) -> int:
+    """What every network gets that was not given a number of threads; 1 or more.
+
+    All processors but one, less what the others were given, shared out: the service, and whoever talks to it,
+    must not wait for them.
+    """
+    working = [detector for detector in detectors if detector.enabled]
+    asking = [detector for detector in working if detector.threads is None]
+    taken = sum(detector.threads or 0 for detector in working)
+    return max(1, (len(os.sched_getaffinity(0)) - 1 - taken) // max(1, len(asking)))

@@ -35,6 +35,9 @@ def find_model(name: str | Path) -> Path:
         return path
     kept = models_folder() / path.name
     for candidate in (kept, *(kept.with_name(kept.name + suffix) for suffix in MODEL_SUFFIXES)):
-        if candidate.is_file():
-            return candidate
+        try:
+            if candidate.is_file():
+                return candidate
+        except OSError:  # a folder that we may not look into holds nothing for us
+            return path
     return path

@@ -118,6 +118,7 @@ class Pipeline:
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self._missing = 0
+        self._replaced = 0
         self._say_again_ns = 0
         self.frames = 0
 
@@ -125,8 +126,9 @@ class Pipeline:
     def left_out(self) -> dict[str, int]:
         """Reason → frames so far that were not looked at; see `PerceptionResult`."""
         unreadable = self._source.statistics.unreadable
-        replaced = max(self._missing - unreadable, 0)
-        return {"replaced": replaced, "unreadable": unreadable, **self._selector.left_out}
+        # The source counts the unreadable ahead of the gap that they leave; a count never goes back.
+        self._replaced = max(self._replaced, self._missing - unreadable)
+        return {"replaced": self._replaced, "unreadable": unreadable, **self._selector.left_out}
 
     @property
     def dropped(self) -> int:

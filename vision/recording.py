@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 # Frames that wait for the encoder. More would only be memory: an encoder that is too slow stays too slow.
 _QUEUED_FRAMES = 4
 # The network, in the same process, comes first.
-_NICENESS = 10
+_NICER = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,8 @@ class Recording:
             )
 
     def _run(self) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(nice + _NICER, 19))
         writer: VideoWriter | None = None
         while (picture := self._queue.get()) is not None:
             if self._failed.is_set():

@@ -79,6 +79,7 @@ class Bus:
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._sending: set[str] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._connected = False
         self._watching: asyncio.Task[None] | None = None
@@ -141,21 +142,45 @@ class Bus:
         # zenoh's stubs call this a bool.
         return publisher is not None and bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
 
-    def publish(
-        self, topic: Topic, value: Any, view: str | None = None, attachment: dict[str, Any] | None = None
+    def publish_picture(
+        self, topic: Topic, picture: bytes, attachment: dict[str, Any], view: str | None = None
     ) -> None:
-        """Publish a JSON-able value, or a text or bytes as they are. Never blocks or raises for the network.
+        """Publish bytes that are too large for one packet, with an attachment as JSON.
 
-        `attachment` goes with it as JSON, for payloads that cannot hold it themselves.
+        zenoh waits a little for room for each piece of such a message, so that is done in a thread. One that
+        comes while the one before is still on its way is not sent.
+        """
+        path = topic.path(view)
+        publisher = self._publishers.get(path)
+        if publisher is None or path in self._sending:
+            self.unsent += 1
+            return
+        self._sending.add(path)
+        self._spawn(self._send(path, publisher, picture, json.dumps(attachment)))
+
+    async def _send(self, path: str, publisher: zenoh.Publisher, picture: bytes, attachment: str) -> None:
+        try:
+            await asyncio.to_thread(publisher.put, picture, attachment=attachment)
+            self.published[path] += 1
+        except zenoh.ZError as error:
+            self.unsent += 1
+            logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))
+        finally:
+            self._sending.discard(path)
+
+    def publish(self, topic: Topic, value: Any, view: str | None = None) -> None:
+        """Publish a JSON-able value, or a text as it is. Never raises for the network.
+
+        Where a reader takes nothing zenoh drops the message, after a millisecond at most.
         """
         path = topic.path(view)
         publisher = self._publishers.get(path)
         if publisher is None:
             self.unsent += 1
             return
-        payload = value if isinstance(value, str | bytes) else json.dumps(value, separators=(",", ":"))
+        payload = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
         try:
-            publisher.put(payload, attachment=None if attachment is None else json.dumps(attachment))
+            publisher.put(payload)
         except zenoh.ZError as error:
             self.unsent += 1
             logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))

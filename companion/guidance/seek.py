@@ -110,7 +110,7 @@ class SeekBehaviour(Behaviour):
             self._newest_ns = max(t.captured_ns for t in fresh)
         seen = [t for t in fresh if t.class_name == self._class_name and t.score >= self._confidence]
         if self._found is not None:
-            same = [t for t in seen if _apart(t, self._found) <= SAME_BEARING_RAD]
+            same = [t for t in seen if t.trusted and _apart(t, self._found) <= SAME_BEARING_RAD]
             if same:
                 found = self._found
                 self._found = min(

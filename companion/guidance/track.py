@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.state import Vector3
+from vision.rotation import wrap_angle
 
 # How far an object may wander: 1 m in a second, one sigma. A walking person's pace.
 WANDER_M2_PER_S = 1.0
@@ -108,12 +109,18 @@ class ObjectTrack:
         return True
 
     def _same_identity(self, targets: list[Target]) -> list[Target]:
-        """Those that can be this object: the one that bears its identity, or else strangers."""
+        """Those that can be this object: the one with its identity, or else strangers that count as true."""
         own = [t for t in targets if t.track_id is not None and t.track_id == self._track_id]
         if own:
-            self._others |= {t.track_id for t in targets if t.track_id not in (None, self._track_id)}
+            # A second box on the object itself is not another object.
+            self._others |= {
+                t.track_id
+                for t in targets
+                if t.track_id not in (None, self._track_id)
+                and abs(wrap_angle(t.bearing_rad - own[0].bearing_rad)) > BEARING_SIGMA_RAD
+            }
             return own
-        return [t for t in targets if not self.is_another(t)]
+        return [t for t in targets if t.trusted and not self.is_another(t)]
 
     def _innovation(
         self, target: Target, vehicle: Vector3

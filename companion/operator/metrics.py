@@ -107,7 +107,7 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
 
     for key, name, meaning in (
         ("frames", "frames_read", "frames read from the source"),
-        ("results", "results", "frames looked at"),
+        ("results", "results", "results that reached the service"),
         ("restarts", "perception_restarts", "perception processes replaced"),
     ):
         counter = CounterMetricFamily(f"companion_{name}", meaning, labels=["view"])

@@ -15,6 +15,7 @@ from service_process import running_service
 
 from companion.bus.client import listen
 from companion.config import ConfigurationError, load_settings, to_toml
+from companion.settings import DetectorSection
 from companion.views import threads_each
 from mavlink_sim.testing import running_simulator
 
@@ -94,6 +95,19 @@ def test_the_view_that_steers_is_the_one_that_is_named(
             ["views.up.source.uri", "opened once", "shm://NAME"],
         ),
         ('[guidance]\nview = "up"', ["guidance.view", "'up'", "views: none"]),
+        ('[views.a.source]\nuri = "shm://f"\nshare = "f"', ["views.a.source.share", "its own frames"]),
+        (
+            '[views.a.source]\nuri = "a.mp4"\nshare = "f"\n[views.b.source]\nuri = "b.mp4"\nshare = "f"',
+            ["views.b.source.share", "views.a.source.share", "'f'"],
+        ),
+        (
+            '[recording]\nvideo = "f.webm"\n[views.a.recording]\nvideo = "f.webm"',
+            ["recording.video of its own"],
+        ),
+        (
+            '[views.a.source]\nuri = "a.mp4"\n[views.a.detector]\nrate_hz = 0.5',
+            ["views.a.tracker.end_s", "views.a.detector.rate_hz", "2 s"],
+        ),
         ("[views]\ndown = 1", ["views.down", "must hold sections", "got 1"]),
     ],
 )
@@ -120,6 +134,10 @@ def test_views_are_printed_as_they_are_read(tmp_path: Path) -> None:
 
 def test_every_network_has_a_thread_and_together_they_leave_a_processor_free() -> None:
     processors = len(os.sched_getaffinity(0))
+    asking, off = DetectorSection(), DetectorSection(enabled=False)
     for views in range(1, 9):
-        assert threads_each(views) >= 1
-        assert threads_each(views) == 1 or views * threads_each(views) < processors
+        each = threads_each([asking] * views)
+        assert each == 1 or (each > 1 and views * each < processors)
+    # What runs no network takes no thread, and what was given some is given no more.
+    assert threads_each([off, asking, off]) == threads_each([asking])
+    assert threads_each([DetectorSection(threads=processors), asking]) == 1

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, required
+from vision.runtimes.contract import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
 from vision.yolo.checkpoint import load_checkpoint
-from vision.yolo.checkpoint_pair import file_sha256
+from vision.yolo.checkpoint_pair import weights_sha256
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def export(
         reg_max=model.reg_max,
         end_to_end=model.end_to_end,
         image_size=image_size,
-        source_sha256=file_sha256(model_path),
+        source_sha256=weights_sha256(model_path),
         generation=generation,
         metadata=loaded.metadata,
     )
@@ -120,7 +120,12 @@ def _quietly() -> Iterator[None]:
 
 
 def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
-    onnx = required("onnxruntime", also="onnx") and __import__("onnx")
+    try:
+        import onnx
+    except ImportError as error:
+        raise RuntimeMissingError(
+            "exporting needs the package onnx: pip install 'mavlink-companion[onnxruntime]', or [tensorrt]"
+        ) from error
     with _quietly():
         torch.onnx.export(
             network,

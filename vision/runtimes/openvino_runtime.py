@@ -46,6 +46,7 @@ class OpenVinoRuntime:
         self._model = _read(self._core, path)
         self.head = head if head is not None else openvino_facts(path, self._model).head()
         native = contract.bfloat16_instructions()
+        self._automatic = precision == "auto"
         if precision == "auto":
             self.precision = "bfloat16" if native else "float32"
             self.precision_reason = (
@@ -92,6 +93,11 @@ class OpenVinoRuntime:
             ) from error
         used = str(compiled.get_property("INFERENCE_PRECISION_HINT"))
         if _HINTS[self.precision] not in used.replace("float", "f"):
+            if self._automatic and _HINTS["float32"] in used.replace("float", "f"):
+                self.precision = "float32"
+                self.precision_reason = "openvino does not use this processor's bfloat16"
+                self._settings["INFERENCE_PRECISION_HINT"] = _HINTS["float32"]
+                return self._compiled(size)
             raise RuntimeUnusableError(
                 f"openvino computes in {used} on this processor, not in {self.precision}"
             )

@@ -28,7 +28,7 @@ from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.network import Network
 from vision.runtimes.source import ModelSource, cannot_run
 from vision.runtimes.torch_runtime import TorchRuntime
-from vision.yolo.checkpoint_pair import file_sha256
+from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.maps import Head
 
 logger = logging.getLogger(__name__)
@@ -85,7 +85,8 @@ def start_runtime(
 
     candidates = [name for name in source.runners() if installed(name)]
     if not candidates:
-        raise cannot_run(source, "auto")  # type: ignore[arg-type]
+        # Says what to install.
+        required(source.runners()[0])
     if len(candidates) == 1:
         name, reason = candidates[0], "no other that runs this model is installed"
     else:
@@ -166,7 +167,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     assert source.description is not None
     kind = _EXPORTS[name]
     head = network.head
-    digest = file_sha256(source.path)
+    digest = weights_sha256(source.path)
     # A plan is made for a largest side; the others leave the size open.
     side = image_size if kind == "tensorrt" else 640
     plain = source.description.to_plain()
@@ -174,22 +175,22 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     key = json.dumps([*made_of, torch.__version__, version(name)])
     stem = f"{source.path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
     path = cache_folder() / f"{stem}{SUFFIXES[kind]}"
-    if not path.is_file():
-        logger.info("converting %s for %s, once; kept at %s", source.path.name, name, path)
-        facts = ExportedFacts(
-            tuple(source.class_names[index] for index in head.class_ids),
-            head.strides,
-            head.reg_max,
-            head.end_to_end,
-            max(side, 2 * max(head.strides)),
-            digest,
-            metadata=source.metadata,
-        )
-        try:
+    facts = ExportedFacts(
+        tuple(source.class_names[index] for index in head.class_ids),
+        head.strides,
+        head.reg_max,
+        head.end_to_end,
+        max(side, 2 * max(head.strides)),
+        digest,
+        metadata=source.metadata,
+    )
+    try:
+        if not path.is_file():
+            logger.info("converting %s for %s, once; kept at %s", source.path.name, name, path)
             export_network(network, facts, kind, path)
-        except OSError as error:
-            raise RuntimeUnusableError(
-                f"{path}: the converted network cannot be written ({error.strerror}); "
-                "set XDG_CACHE_HOME to a folder that can"
-            ) from error
+    except OSError as error:
+        raise RuntimeUnusableError(
+            f"{path}: the converted network cannot be kept ({error.strerror}); "
+            "set XDG_CACHE_HOME to a folder that can be written"
+        ) from error
     return path

@@ -112,6 +112,11 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def weights_sha256(path: Path) -> str:
+    """What tells one model from another: the SHA-256 of the checkpoint, of a pair that of its weights."""
+    return file_sha256(pair_paths(path)[0] if is_pair(path) else path)
+
+
 def _read_description(path: Path, weights_path: Path) -> dict[str, Any]:
     try:
         size = path.stat().st_size

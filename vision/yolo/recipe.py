@@ -17,9 +17,9 @@ DEFAULT_RECIPE = TrainingSettings(
     max_channels=1024,
     # First smaller than the frames it is for, with the same field of view: a step costs a quarter, and
     # objects have about half the pixels. Then the frames' own size. Scenes come round, augmented anew.
-    stages=(Stage(320, 256, 16, 9000, scenes=12_000), Stage(640, 480, 8, 2200, scenes=4_000)),
+    stages=(Stage(320, 256, 16, 3970, scenes=12_000), Stage(640, 480, 8, 3900, scenes=6_000)),
     learning_rate=3e-3,
-    decay_steps=6000,
+    decay_steps=3900,
     seed=1,
     threads=1,
     workers=1,

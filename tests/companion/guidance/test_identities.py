@@ -136,3 +136,21 @@ def test_seek_faces_the_one_it_found_and_not_its_neighbour():
 
     Flight(SeekBehaviour("car"), vehicle, [car, neighbour]).run(60.0, each)
     assert abs(vehicle.yaw_rad) < math.radians(4.5)
+
+
+def test_a_doubtful_box_does_not_take_the_place_of_an_object_that_is_missing_for_a_frame():
+    track = ObjectTrack(seen((20.0, 0.0), 0, 3), VEHICLE)
+    assert track.update([seen((20.0, 0.0), 1, 3)], VEHICLE)
+    ghost = replace(seen((20.0, 0.1), 2, 9), trusted=False)
+    assert not track.update([ghost], VEHICLE)
+    assert track.update([seen((20.0, 0.0), 3, 3), replace(ghost, captured_ns=T0 + 3 * FRAME_NS)], VEHICLE)
+    assert track.track_id == 3
+
+
+def test_a_second_box_on_the_object_is_not_held_to_be_another_object():
+    track = ObjectTrack(seen((20.0, 0.0), 0, 3), VEHICLE)
+    double = seen((20.0, 0.05), 1, 8)
+    assert track.update([seen((20.0, 0.0), 1, 3), double], VEHICLE)
+    assert not track.is_another(double)
+    # The first identity ends and the second lives on: it is the same object.
+    assert track.update([seen((20.0, 0.05), 2, 8)], VEHICLE)

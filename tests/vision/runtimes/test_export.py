@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from vision.runtimes.contract import (
     installed,
 )
 from vision.runtimes.export import export
-from vision.runtimes.exported import SUFFIXES, ExportKind
+from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind
+from vision.runtimes.network import Network
 from vision.runtimes.selection import runtime_of_file
 from vision.runtimes.source import read_source
 from vision.runtimes.torch_runtime import TorchRuntime
@@ -161,3 +163,19 @@ def test_an_export_for_what_is_not_installed_names_the_extra(
     kind = {"onnxruntime": "onnx", "openvino": "openvino", "tensorrt": "tensorrt"}[runtime]
     with pytest.raises(RuntimeMissingError, match=rf"mavlink-companion\[{runtime}\]"):
         export(checkpoint, kind, tmp_path / f"net{SUFFIXES[kind]}")  # type: ignore[arg-type,index]
+
+
+def test_writing_onnx_needs_onnx_alone_as_a_board_with_tensorrt_has_no_onnxruntime(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs("onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    loaded = read_source(checkpoint)
+    network = Network(loaded.take_model())
+    facts = ExportedFacts(NAMES, network.head.strides, network.head.reg_max, False, 96, "0" * 64)
+    path = tmp_path / "net.onnx"
+    export_module._write_onnx(network, facts, path)
+    assert path.stat().st_size > 0
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[onnxruntime\]"):
+        export_module._write_onnx(network, facts, path)

@@ -134,8 +134,10 @@ def test_auto_takes_the_fastest_and_says_why(
     assert all(f"{key} {value:.1f} ms" in reason for key, value in answer.items() if value != str(value))
     assert f"runtime auto: {best}" in caplog.text
     again = trial.fastest_runtime(source, list(answer), **CHOICE)
-    assert again == (best, reason.replace("measured now", "measured before"))
-    assert asked.asked == 1
+    # One that failed may run next time: that is asked again.
+    failed = any(isinstance(value, str) for value in answer.values())
+    assert again == (best, reason if failed else reason.replace("measured now", "measured before"))
+    assert asked.asked == (2 if failed else 1)
 
 
 def test_a_choice_is_measured_again_when_what_it_hangs_on_changes(
