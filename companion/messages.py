@@ -20,14 +20,8 @@ def detections_message(
 ) -> dict[str, Any]:
     """One frame's detections, with the three stamps: captured, inferred, published."""
     return {
-        "vehicle": vehicle,
-        "view": view,
-        "sequence": result.sequence,
-        "captured_ns": result.captured_ns,
+        **_of_frame(result, vehicle, published_ns, view),
         "inferred_ns": result.inferred_ns,
-        "published_ns": published_ns,
-        "width": result.width,
-        "height": result.height,
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
         "detections": result.detections.records(),
@@ -39,6 +33,14 @@ def tracks_message(
 ) -> dict[str, Any]:
     """What happened to tracks at one frame; every track in it counts as true, or did so until now."""
     return {
+        **_of_frame(result, vehicle, published_ns, view),
+        "events": [_track_event(event) for event in result.track_events],
+    }
+
+
+def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: str | None) -> dict[str, Any]:
+    """What every message about one frame begins with."""
+    return {
         "vehicle": vehicle,
         "view": view,
         "sequence": result.sequence,
@@ -46,7 +48,6 @@ def tracks_message(
         "published_ns": published_ns,
         "width": result.width,
         "height": result.height,
-        "events": [_track_event(event) for event in result.track_events],
     }
 
 
