@@ -186,9 +186,13 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         return [e.track.track_id for r in results for e in r.track_events if e.kind is kind]
 
     def spun() -> bool:
-        """Tell the attitude of a vehicle that turns so fast that nothing stays in the picture."""
+        """Tell the attitude of a vehicle that looks the other way at once, again and again.
+
+        Whatever the time between two frames, a step of 143 degrees between them leaves nothing in view.
+        """
         now_ns = time.monotonic_ns()
-        keeper.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, 20.0 * now_ns / 1e9 % 6.28))
+        yaw_rad = 2.5 * (now_ns // 500_000_000 % 2)
+        keeper.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, yaw_rad))
         return bool(told(END))
 
     await keeper.start()

@@ -128,7 +128,7 @@ def test_stages_of_different_sizes_follow_each_other():
 
 def test_the_rate_warms_up_stays_and_falls():
     settings = replace(
-        SMALL, stages=(Stage(64, 64, 1, 100),), warmup_steps=10, decay_steps=20, final_rate=0.1
+        SMALL, stages=(Stage(64, 64, 1, 100, decay_steps=20),), warmup_steps=10, final_rate=0.1
     )
     rates = [settings.rate_at(step) / settings.learning_rate for step in range(101)]
     assert rates[0] == pytest.approx(0.1)
@@ -138,16 +138,38 @@ def test_the_rate_warms_up_stays_and_falls():
 
 
 def test_prolonging_the_constant_stretch_leaves_the_earlier_rates_alone():
-    settings = replace(SMALL, stages=(Stage(64, 64, 1, 100),), warmup_steps=10, decay_steps=20)
-    longer = replace(settings, stages=(Stage(64, 64, 1, 300),))
+    settings = replace(SMALL, stages=(Stage(64, 64, 1, 100, decay_steps=20),), warmup_steps=10)
+    longer = replace(settings, stages=(Stage(64, 64, 1, 300, decay_steps=20),))
     assert [settings.rate_at(step) for step in range(80)] == [longer.rate_at(step) for step in range(80)]
 
 
 def test_a_compressed_course_keeps_its_stages():
-    settings = replace(SMALL, stages=(Stage(64, 64, 1, 90), Stage(96, 96, 1, 10)), decay_steps=20)
+    settings = replace(SMALL, stages=(Stage(64, 64, 1, 90, decay_steps=20), Stage(96, 96, 1, 10)))
     short = settings.with_steps(10)
-    assert [stage.steps for stage in short.stages] == [9, 1]
-    assert short.decay_steps == 2
+    assert [(stage.steps, stage.decay_steps) for stage in short.stages] == [(9, 2), (1, 0)]
+    one = settings.with_steps(1)
+    assert [(stage.steps, stage.decay_steps) for stage in one.stages] == [(1, 1), (1, 0)]
+
+
+def test_each_stage_has_its_own_fall_of_the_rate():
+    stages = (
+        Stage(64, 64, 1, 50, decay_steps=10),
+        Stage(96, 96, 1, 30),
+        Stage(64, 64, 1, 20, decay_steps=20),
+    )
+    settings = replace(SMALL, stages=stages, warmup_steps=5, final_rate=0.1)
+    rates = [settings.rate_at(step) / settings.learning_rate for step in range(101)]
+    assert rates[5:41] == pytest.approx([1.0] * 36)
+    assert rates[49] == pytest.approx(0.19)
+    assert rates[50:81] == pytest.approx([1.0] * 31)
+    assert rates[90] == pytest.approx(0.55)
+    assert rates[100] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("decay_steps", [-1, 101])
+def test_a_stage_cannot_fall_for_longer_than_it_lasts(decay_steps: int):
+    with pytest.raises(ValueError, match="decay_steps of a stage must be from 0 to its steps"):
+        Stage(64, 64, 1, 100, decay_steps=decay_steps)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +260,7 @@ def test_a_longer_stage_begins_like_a_shorter_one():
     train(settings, rectangles, lambda progress: seen.append(progress.box_loss))
     longer: list[float] = []
     train(
-        replace(settings, stages=(Stage(64, 64, 2, 5, scenes=4),), decay_steps=1),
+        replace(settings, stages=(Stage(64, 64, 2, 5, scenes=4, decay_steps=1),)),
         rectangles,
         lambda progress: longer.append(progress.box_loss),
     )

@@ -32,6 +32,9 @@ class Stage:
 
     `scenes` is how many different scenes are drawn; they come round, shuffled and augmented anew each time.
     None: every picture is a new scene.
+
+    Over the last `decay_steps` the learning rate falls; before, it is constant, so that this stretch can be
+    prolonged without changing what went before. The next stage begins at the full rate again.
     """
 
     width: int
@@ -39,6 +42,7 @@ class Stage:
     batch_size: int
     steps: int
     scenes: int | None = None
+    decay_steps: int = 0
 
     def __post_init__(self) -> None:
         if self.width % 32 or self.height % 32 or self.width <= 0 or self.height <= 0:
@@ -47,6 +51,13 @@ class Stage:
             )
         if self.batch_size < 1 or self.steps < 1 or (self.scenes is not None and self.scenes < 1):
             raise ValueError(f"a stage needs a batch size, steps and scenes of 1 or more, got {self}")
+        if not 0 <= self.decay_steps <= self.steps:
+            raise ValueError(f"decay_steps of a stage must be from 0 to its steps, got {self}")
+
+    def with_steps(self, ratio: float) -> Stage:
+        """The same stage with `ratio` times as many steps, at least one."""
+        steps = max(1, round(self.steps * ratio))
+        return replace(self, steps=steps, decay_steps=min(steps, math.ceil(self.decay_steps * ratio)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +66,14 @@ class TrainingSettings:
 
     Attributes:
         class_names: id → name, as the scene source numbers them.
-        stages: run one after the other; the learning rate's course spans them all.
+        stages: run one after the other, each with its own course of the learning rate.
         depth_multiple, width_multiple, max_channels: the network's scale (`yolov8_description`).
         optimiser: AdamW, or SGD with Nesterov momentum.
         learning_rate: the highest, reached after the warm-up.
         weight_decay: of convolution weights; biases and normalisations have none.
         momentum: of SGD.
         warmup_steps: the rate rises linearly over these.
-        decay_steps: the rate falls over the last so many steps, and is constant before. None: from the end of
-            the warm-up on. A constant stretch can be prolonged without changing what went before.
-        decay: the shape of the fall.
+        decay: the shape of a stage's fall of the rate.
         final_rate: where it ends, as a fraction of `learning_rate`.
         normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03
             lags behind the weights in a short training.
@@ -88,7 +97,6 @@ class TrainingSettings:
     weight_decay: float = 0.02
     momentum: float = 0.937
     warmup_steps: int = 100
-    decay_steps: int | None = None
     decay: Literal["linear", "cosine"] = "linear"
     final_rate: float = 0.01
     normalisation_momentum: float = 0.1
@@ -122,17 +130,22 @@ class TrainingSettings:
         ratio = steps / self.steps
         return replace(
             self,
-            stages=tuple(replace(s, steps=max(1, round(s.steps * ratio))) for s in self.stages),
+            stages=tuple(stage.with_steps(ratio) for stage in self.stages),
             warmup_steps=max(1, round(self.warmup_steps * min(ratio, 1.0))),
-            decay_steps=None if self.decay_steps is None else max(1, round(self.decay_steps * ratio)),
         )
 
     def rate_at(self, step: int) -> float:
         """The learning rate of a step, counted from 0."""
         if step < self.warmup_steps:
             return self.learning_rate * (step + 1) / self.warmup_steps
-        falling = self.steps - self.warmup_steps if self.decay_steps is None else self.decay_steps
-        fallen = min(max((step - (self.steps - falling)) / max(falling, 1), 0.0), 1.0)
+        stage = self.stages[-1]
+        for stage in self.stages:
+            if step < stage.steps:
+                break
+            step -= stage.steps
+        else:
+            step += stage.steps
+        fallen = min(max((step - (stage.steps - stage.decay_steps)) / max(stage.decay_steps, 1), 0.0), 1.0)
         if self.decay == "cosine":
             fallen = (1 - math.cos(math.pi * fallen)) / 2
         return self.learning_rate * (1 - fallen * (1 - self.final_rate))
