@@ -53,7 +53,9 @@ class Estimate(Multirotor):
 
     Attributes:
         position, velocity, acceleration, quaternion, rates…: the estimates, as `Multirotor`'s.
-        offset: NED metres that the position is wrong by on top (a drifting GPS, an estimator that was reset).
+        offset: NED metres that the position is wrong by on top (a drifting GPS, an estimator that was reset);
+            velocity_offset: m/s, yaw_offset_rad: the same of velocity and heading. Nothing by default, and in
+            force without noise too.
         gps_error: NED metres, of the receiver's newest fix. gps_velocity_error: m/s.
         baro_error_m: of the pressure altitude.
         accelerometer_noise: body FRD m/s².
@@ -74,7 +76,9 @@ class Estimate(Multirotor):
         "gps_velocity_error",
         "offset",
         "truth",
+        "velocity_offset",
         "velocity_error",
+        "yaw_offset_rad",
     )
 
     def __init__(self, truth: Multirotor, seed: int = 0, noise: bool = True) -> None:
@@ -85,6 +89,8 @@ class Estimate(Multirotor):
         self._fast_left_s = self._slow_left_s = self._gps_left_s = 0.0
         self.drift: Vector = _ZERO
         self.offset: Vector = _ZERO
+        self.velocity_offset: Vector = _ZERO
+        self.yaw_offset_rad = 0.0
         self.velocity_error: Vector = _ZERO
         self.attitude_error: Vector = _ZERO
         self.gps_error: Vector = _ZERO
@@ -113,12 +119,15 @@ class Estimate(Multirotor):
             self.position = (x + dx + ox, y + dy + oy, z + dz + oz)
             ex, ey, ez = self.velocity_error
             vx, vy, vz = truth.velocity
-            self.velocity = (vx + ex, vy + ey, vz + ez)
+            ox, oy, oz = self.velocity_offset
+            self.velocity = (vx + ex + ox, vy + ey + oy, vz + ez + oz)
         else:
             x, y, z = truth.position
             ox, oy, oz = self.offset
             self.position = (x + ox, y + oy, z + oz)
-            self.velocity = truth.velocity
+            x, y, z = truth.velocity
+            ox, oy, oz = self.velocity_offset
+            self.velocity = (x + ox, y + oy, z + oz)
             self.rates = truth.rates
 
     def _drift(self, rates: Vector) -> None:
@@ -176,6 +185,14 @@ class Estimate(Multirotor):
     def quaternion(self) -> Quaternion:  # type: ignore[override]
         """The attitude with its error, a small turn about the body axes (to first order)."""
         w, x, y, z = self.truth.quaternion
+        if self.yaw_offset_rad:
+            cosine, sine = math.cos(self.yaw_offset_rad / 2), math.sin(self.yaw_offset_rad / 2)
+            w, x, y, z = (
+                cosine * w - sine * z,
+                cosine * x - sine * y,
+                cosine * y + sine * x,
+                cosine * z + sine * w,
+            )
         if not self._noise:
             return (w, x, y, z)
         a, b, c = (0.5 * error for error in self.attitude_error)
@@ -192,8 +209,7 @@ class Estimate(Multirotor):
 
     @property
     def roll_rad(self) -> float:
-        a, b, _ = self.attitude_error
-        c = self.attitude_error[2]
+        a, b, c = self.attitude_error
         _, _, _, _, _, _, x, y, z = self.truth.matrix
         return math.atan2(y + z * a - x * c, z + x * b - y * a)
 
@@ -207,7 +223,9 @@ class Estimate(Multirotor):
     def yaw_rad(self) -> float:
         _, pitch, yaw = self.attitude_error
         a, b, c, d, e, f, _, _, _ = self.truth.matrix
-        return math.atan2(d + e * yaw - f * pitch, a + b * yaw - c * pitch)
+        return math.remainder(
+            math.atan2(d + e * yaw - f * pitch, a + b * yaw - c * pitch) + self.yaw_offset_rad, math.tau
+        )
 
     @property
     def specific_force(self) -> Vector:
@@ -241,6 +259,16 @@ class Estimate(Multirotor):
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
         self.truth.command_rates(thrust_mps2, rates_radps)
+
+    def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
+        """`command_rates` alone, as `step`."""
+        self.truth.command_rates(thrust_mps2, rates)
+
+    def advance(self, dt_s: float) -> None:
+        """Nothing: only the true airframe moves."""
+
+    def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
+        self.truth.fail_motor(index, effectiveness)
 
     def step(
         self, dt_s: float, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float

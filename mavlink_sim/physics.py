@@ -181,9 +181,10 @@ class Multirotor:
         self._rate_demand = None
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
-        """What to fly from now on: collective thrust and body rates, the attitude left to whoever asks."""
+        """What to fly from now on: collective thrust and body rates; NaN: go on turning as now."""
         self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
-        self._rate_demand = rates_radps
+        p, q, r = (now if math.isnan(rate) else rate for rate, now in zip(rates_radps, self.rates, strict=True))
+        self._rate_demand = (p, q, r)
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
         """Let a rotor (0 to 3) give only this share of what it is asked for; 1 makes it whole again.
@@ -205,6 +206,11 @@ class Multirotor:
     ) -> None:
         """`command`, then `advance`."""
         self.command(thrust_mps2, roll_rad, pitch_rad, yaw_rate_radps)
+        self.advance(dt_s)
+
+    def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
+        """`command_rates`, then `advance`."""
+        self.command_rates(thrust_mps2, rates)
         self.advance(dt_s)
 
     # ---- time -------------------------------------------------------------------------------------------

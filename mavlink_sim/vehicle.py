@@ -49,7 +49,8 @@ class Vehicle:
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
-        airframe: the motion (truth). estimate: what the vehicle knows of it. autopilot: the decisions. parameters: the parameter set. links: by name.
+        airframe: the motion (truth). estimate: what the vehicle knows of it. autopilot: the decisions.
+        parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         event_sequence: number of the newest EVENT.
     """
@@ -219,8 +220,9 @@ class Vehicle:
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
         for link in self.links.values():
-            for name in link.streams.due(self._boot_us):
-                self.send_built(link, name)
+            if link.streams.next_us <= self._boot_us:
+                for name in link.streams.due(self._boot_us):
+                    self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
 
