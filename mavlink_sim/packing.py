@@ -75,7 +75,7 @@ class Packed:
 class Form:
     """What is to be known of one kind of message to pack it."""
 
-    __slots__ = ("crc_extra", "high", "identifier", "low", "name", "_class")
+    __slots__ = ("_class", "crc_extra", "high", "identifier", "low", "name")
 
     def __init__(self, message_class: Any) -> None:
         self._class = message_class

@@ -1,10 +1,10 @@
 """The motion of a multirotor: a rigid body under four rotors, drag, wind, gravity and the ground.
 
-World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag and
-rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated quaternion, so
-no tilt is special; the attitude and rate loops (`rate_loop`) and the mixer run at every step, as on the real
-vehicle. Plain floats in local names throughout: numpy's scalars, or an object for a vector, would make the
-step several times dearer, and with it everything that is tested in lockstep.
+World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag
+and rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated
+quaternion, so no tilt is special; the attitude and rate loops (`rate_loop`) and the mixer run at every step,
+as on the real vehicle. Plain floats in local names throughout: numpy's scalars, or an object for a vector,
+would make the step several times dearer, and with it everything that is tested in lockstep.
 """
 
 from __future__ import annotations
@@ -165,10 +165,8 @@ class Multirotor:
 
     # ---- demands ----------------------------------------------------------------------------------------
 
-    def command(
-        self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float
-    ) -> None:
-        """What to fly from now on: collective thrust, tilt relative to the heading, turn about the vertical."""
+    def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
+        """What to fly from now on: collective thrust, tilt seen from the heading, turn about the vertical."""
         cosine = math.cos(roll_rad)
         yaw_rate = min(max(yaw_rate_radps, -MAX_YAW_RATE_RADPS), MAX_YAW_RATE_RADPS)
         self._demand = (
@@ -183,7 +181,9 @@ class Multirotor:
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
         """What to fly from now on: collective thrust and body rates; NaN: go on turning as now."""
         self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
-        p, q, r = (now if math.isnan(rate) else rate for rate, now in zip(rates_radps, self.rates, strict=True))
+        p, q, r = (
+            now if math.isnan(rate) else rate for rate, now in zip(rates_radps, self.rates, strict=True)
+        )
         self._rate_demand = (p, q, r)
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:

@@ -1,8 +1,8 @@
 """From a wanted tilt to four rotors: PX4's attitude and rate controllers, and its mixer with saturation.
 
-The gains are PX4's defaults. Integral parts are left out: this airframe is balanced, they would stay zero. The
-attitude loop compares thrust axes (the "reduced attitude" of Brescianini, Hehn, D'Andrea, 2013, which PX4 uses),
-so it knows no gimbal lock; the heading is held by the yaw rate that the caller derives.
+The gains are PX4's defaults. Integral parts are left out: this airframe is balanced, they would stay zero.
+The attitude loop compares thrust axes (the "reduced attitude" of Brescianini, Hehn, D'Andrea, 2013, which PX4
+uses), so it knows no gimbal lock; the heading is held by the yaw rate that the caller derives.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Rotors = tuple[float, float, float, float]
 ATTITUDE_GAIN_PER_S = 4.0  # MC_ROLL_P, MC_PITCH_P
 MAX_TILT_RATE_RADPS = math.radians(220.0)  # MC_ROLLRATE_MAX, MC_PITCHRATE_MAX
 MAX_YAW_RATE_RADPS = math.radians(200.0)  # MC_YAWRATE_MAX
-# Share of full thrust per rad/s: MC_ROLLRATE_P 0.15 through PX4's allocation of a roll to four rotors (1/sqrt 2).
+# Share of full thrust per rad/s: MC_ROLLRATE_P 0.15 through PX4's allocation of a roll to rotors (1/sqrt 2).
 RATE_P = 0.15 * math.sqrt(0.5)
 RATE_D = 0.003 * math.sqrt(0.5)
-# MC_YAWRATE_P 0.2 alone turns SIH's weak rotor torque into 0.4 s of lag; with its integral the recorded vehicle
-# follows in about 0.15 s, which this gain gives without one.
+# MC_YAWRATE_P 0.2 alone turns SIH's weak rotor torque into 0.4 s of lag, which PX4's integral part shortens;
+# this gain gives a lag of 0.15 s without one.
 YAW_RATE_P = 0.5
 # Yaw is served last, but PX4 keeps this share of the range for it by lowering the thrust.
 YAW_MARGIN = 0.15

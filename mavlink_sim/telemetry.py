@@ -34,9 +34,7 @@ def _heartbeat(vehicle: Vehicle) -> Any:
 
 def _attitude(vehicle: Vehicle) -> Any:
     frame = vehicle.estimate
-    return packing.attitude(
-        vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates
-    )
+    return packing.attitude(vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates)
 
 
 def _attitude_quaternion(vehicle: Vehicle) -> Any:
@@ -137,9 +135,7 @@ def _attitude_target(vehicle: Vehicle) -> Any:
     yaw = vehicle.autopilot.controller.yaw_rad
     q = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, yaw)
     thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
-    return packing.attitude_target(
-        vehicle.boot_ms, 0, list(q), 0.0, 0.0, demand.yaw_rate_radps, thrust
-    )
+    return packing.attitude_target(vehicle.boot_ms, 0, list(q), 0.0, 0.0, demand.yaw_rate_radps, thrust)
 
 
 def _type_mask(*groups: tuple[float, float, float]) -> int:

@@ -26,7 +26,9 @@ from mavlink_sim.streams import ONBOARD_RATES_HZ
 
 STEP_S = 0.004
 STEP_US = 4000
-CONTROL_STEP_S = 0.008  # PX4 runs its position control at about 100 Hz, its attitude control at every step
+# PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
+STEPS_PER_CONTROL = 3
+CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
@@ -86,7 +88,7 @@ class Vehicle:
             self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
         self._boot_us = 0
-        self._control_is_due = False
+        self._steps_to_control = 0
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
@@ -163,10 +165,11 @@ class Vehicle:
 
     def send_built(self, link: Link, name: str) -> bool:
         """Send one telemetry message by name; False if it has nothing to say now."""
-        if name == "LINK_NODE_STATUS":
+        builder = telemetry.BUILDERS.get(name)
+        if builder is not None:
+            message = builder(self)
+        elif name == "LINK_NODE_STATUS":
             message = link_node_status(self.boot_ms, link.sent, link.received, 0)
-        elif name in telemetry.BUILDERS:
-            message = telemetry.BUILDERS[name](self)
         else:
             message = telemetry.REQUESTED[name](self)
         if message is not None:
@@ -196,7 +199,7 @@ class Vehicle:
 
     def _step(self) -> None:
         self._boot_us += STEP_US
-        while self._later and self._later[0][0] <= self.now_s + 1e-9:
+        while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self._wind_revision = self.parameters.revision
@@ -205,12 +208,13 @@ class Vehicle:
                 for name in ("SIH_WIND_N", "SIH_WIND_E")
             )
             self.airframe.wind = (north, east, 0.0)
-        self._control_is_due = not self._control_is_due
-        if self._control_is_due:
+        self._steps_to_control -= 1
+        if self._steps_to_control <= 0:
+            self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
-        if self.autopilot.sensors_ready and not self._origin_told:
+        if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
