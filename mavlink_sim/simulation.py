@@ -81,6 +81,7 @@ class Simulation:
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns
+        self.vehicle.utc_ns = time.time_ns
         self._stopped = False
         self._started_ns = time.monotonic_ns()
         self._simulated_s = 0.0
