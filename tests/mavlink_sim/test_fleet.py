@@ -108,7 +108,7 @@ def heard(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[
     try:
         while time.monotonic() < deadline:
             message = link.recv_match(blocking=True, timeout=1)
-            if message is not None:
+            if message is not None and not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):
                 newest[message.get_srcSystem()][message.get_type()] = message
             if all({"HEARTBEAT", "GLOBAL_POSITION_INT"} <= set(newest[system]) for system in wanted):
                 return dict(newest)
