@@ -1,8 +1,9 @@
 """From a wanted tilt to four rotors: PX4's attitude and rate controllers, and its mixer with saturation.
 
-The gains are PX4's defaults. Integral parts are left out: this airframe is balanced, they would stay zero.
-The attitude loop compares thrust axes (the "reduced attitude" of Brescianini, Hehn, D'Andrea, 2013, which PX4
-uses), so it knows no gimbal lock; the heading is held by the yaw rate that the caller derives.
+The gains are PX4's defaults. In place of integral parts stands what they would learn here, which is known:
+the torque against the drag of turning. The attitude loop compares thrust axes (the "reduced attitude" of
+Brescianini, Hehn, D'Andrea, 2013, which PX4 uses), so it knows no gimbal lock; the heading is held by the yaw
+rate that the caller derives.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ MAX_YAW_RATE_RADPS = math.radians(200.0)  # MC_YAWRATE_MAX
 # Share of full thrust per rad/s: MC_ROLLRATE_P 0.15 through PX4's allocation of a roll to rotors (1/sqrt 2).
 RATE_P = 0.15 * math.sqrt(0.5)
 RATE_D = 0.003 * math.sqrt(0.5)
+# Share of full thrust per rad/s against SIH_KDW 0.025 N m s; a full share is 4 N m about x, y and 0.4 about z.
+TILT_DRAG, YAW_DRAG = 0.025 / 4.0, 0.025 / 0.4
 # MC_YAWRATE_P 0.2 alone turns SIH's weak rotor torque into 0.4 s of lag, which PX4's integral part shortens;
 # this gain gives a lag of 0.15 s without one.
 YAW_RATE_P = 0.5
@@ -51,9 +54,13 @@ def demanded_rates(
     y = b * north + e * east + h * tilt_z
     z = c * north + f * east + i * tilt_z
     # 2 sin(angle / 2) about the axis e_z × wanted, as PX4 takes it from the error quaternion
-    gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + z)) if z > -0.98 else 10.0 * ATTITUDE_GAIN_PER_S
-    p = -gain * y
-    q = gain * x
+    if z > -0.98:
+        gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + z))
+        p = -gain * y
+        q = gain * x
+    else:  # upside down: any way round will do, and standing on the head it must choose one
+        p = MAX_TILT_RATE_RADPS if y <= 0.0 else -MAX_TILT_RATE_RADPS
+        q = 10.0 * ATTITUDE_GAIN_PER_S * x
     limit = MAX_TILT_RATE_RADPS
     p = (limit if p > limit else -limit if p < -limit else p) + yaw_rate_radps * g
     q = (limit if q > limit else -limit if q < -limit else q) + yaw_rate_radps * h
@@ -70,9 +77,10 @@ def mixed_thrusts(collective: float, wanted: Vector, rates: Vector, spin: Vector
         collective: wanted thrust, 0..1.
         wanted, rates: body rates, rad/s; spin: angular acceleration, rad/s².
     """
-    roll = RATE_P * (wanted[0] - rates[0]) - RATE_D * spin[0]
-    pitch = RATE_P * (wanted[1] - rates[1]) - RATE_D * spin[1]
-    yaw = YAW_RATE_P * (wanted[2] - rates[2])
+    p, q, r = wanted
+    roll = RATE_P * (p - rates[0]) - RATE_D * spin[0] + TILT_DRAG * p
+    pitch = RATE_P * (q - rates[1]) - RATE_D * spin[1] + TILT_DRAG * q
+    yaw = YAW_RATE_P * (r - rates[2]) + YAW_DRAG * r
     base = 0.0 if collective < 0.0 else 1.0 if collective > 1.0 else collective
     spread = (roll if roll >= 0.0 else -roll) + (pitch if pitch >= 0.0 else -pitch)
     if spread > 0.5:

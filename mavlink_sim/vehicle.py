@@ -22,7 +22,7 @@ from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor
+from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
@@ -85,6 +85,7 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        self.airframe.on_touch = self._touched
         self.estimate = Estimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.event_sequence = 0
@@ -211,6 +212,13 @@ class Vehicle:
             self._companion_lost = False
             self.autopilot.texts.append(Text(INFO, "Onboard controller regained\t"))
             self._on_event("the companion's heartbeat is back")
+
+    def _touched(self, down_mps: float) -> None:
+        """The airframe met the ground."""
+        if self.airframe.crashed:
+            self._on_event(f"crashed at {down_mps:.1f} m/s")
+        elif down_mps > HARD_LANDING_MPS:
+            self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
     def _step(self) -> None:
         self._boot_us += STEP_US
