@@ -7,11 +7,13 @@ the checks and their messages (`config.py`) all come from that declaration.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from vision.camera_model import CameraModel, CameraMount
+from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
@@ -103,9 +105,9 @@ class SourceSection(Section):
         self.opening()
         return self
 
-    def opening(self) -> SourceSettings:
+    def opening(self, on_frame: Callable[[Frame], None] | None = None) -> SourceSettings:
         """The same, as `vision.sources.open_source` takes it. Raises ValueError for a bad pixel format."""
-        return SourceSettings(**self.model_dump(exclude={"uri", "share"}))
+        return SourceSettings(**self.model_dump(exclude={"uri", "share"}), on_frame=on_frame)
 
 
 class CameraSection(Section):
