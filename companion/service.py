@@ -450,4 +450,5 @@ def _limits(settings: Settings) -> Limits:
         min_altitude_m=guidance.min_altitude_m,
         max_altitude_m=guidance.max_altitude_m,
         max_distance_m=guidance.max_distance_m,
+        fence=guidance.fence(),
     )

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
-from companion.guidance.points import points_from
+from companion.points import points_from
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0

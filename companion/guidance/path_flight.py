@@ -118,7 +118,7 @@ class PathFlight(Behaviour):
         left = "" if follower.path.closed else f", {follower.left_m:.0f} m before its end"
         return (
             f"{self.name} came no further for {STUCK_S:g} s, {follower.off_m:.1f} m beside the path{left}: "
-            f"a limit of [envelope] or the wind holds the vehicle"
+            f"a limit of [guidance] or the wind holds the vehicle"
         )
 
     @property

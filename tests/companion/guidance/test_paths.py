@@ -99,7 +99,7 @@ def test_a_goal_beyond_a_limit_is_given_up_with_the_reason():
     assert outcome is not None
     assert not outcome.success
     assert "came no further" in outcome.reason
-    assert "envelope" in outcome.reason
+    assert "guidance" in outcome.reason
 
 
 def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners():
