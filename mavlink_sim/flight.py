@@ -59,7 +59,8 @@ class Trajectory:
         lag = math.dist(self.position, self._airframe.position)
         pace = max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
         braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
-        dx, dy, dz = (goal[axis] - self.position[axis] for axis in range(3))
+        x, y, z = self.position
+        dx, dy, dz = goal[0] - x, goal[1] - y, goal[2] - z
         far = math.hypot(dx, dy)
         speed = min(value("MPC_XY_CRUISE"), max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
         wanted_x, wanted_y = (dx / far * speed, dy / far * speed) if far > 0.0 else (0.0, 0.0)
