@@ -76,6 +76,12 @@ def simulate(
     truth: Annotated[
         Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the traffic of each link into this folder, as LINK.tlog.")
+    ] = None,
+    ready_after: Annotated[
+        float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
+    ] = 3.0,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
@@ -99,6 +105,7 @@ def simulate(
     _check("system-id", system_id, 1, 255)
     _check("wind", wind, 0.0, MAX_WIND_MPS)
     _check("camera-rate", camera_rate, 1.0, 120.0)
+    _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     options = SimulationOptions(
         host=host,
@@ -112,6 +119,8 @@ def simulate(
         camera=camera,
         camera_rate_hz=camera_rate,
         truth=truth,
+        record=record,
+        ready_after_s=ready_after,
         speed=speed,
         parameters=_parameters(param or []),
     )
