@@ -16,6 +16,7 @@ import typer
 
 from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.parameters import UnknownParameterError
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.simulation import Simulation, SimulationOptions
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
@@ -82,6 +83,7 @@ def simulate(
     ready_after: Annotated[
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
     ] = 3.0,
+    px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
@@ -121,6 +123,7 @@ def simulate(
         truth=truth,
         record=record,
         ready_after_s=ready_after,
+        px4=px4,
         speed=speed,
         parameters=_parameters(param or []),
     )

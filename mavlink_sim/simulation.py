@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S, Vehicle
@@ -47,6 +48,7 @@ class SimulationOptions:
         truth: file for the truth, one JSON object a line; None for none.
         record: folder for the traffic of each link, `<link>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
         parameters: PX4 parameters that differ from the defaults.
     """
@@ -64,6 +66,7 @@ class SimulationOptions:
     truth: Path | None = None
     record: Path | None = None
     ready_after_s: float = 3.0
+    px4: str = NEWEST
     speed: float = 1.0
     parameters: dict[str, float] = field(default_factory=dict)
 
@@ -84,6 +87,7 @@ class Simulation:
             wind_mps=options.wind_mps,
             parameters=options.parameters,
             ready_after_s=options.ready_after_s,
+            px4=options.px4,
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns
