@@ -190,6 +190,9 @@ class Autopilot:
                 f"Using default takeoff altitude: {altitude_m:.1f} m\t",
                 (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
             )
+        elif altitude_m < self.home[2] - self._airframe.position[2]:
+            # what becomes of a height above ground in a field that is above the sea; it does not descend
+            self._say(CRITICAL, "Already higher than takeoff altitude\t")
         self._takeoff_height_m = altitude_m
         self._intend(Mode.TAKEOFF)
         return ACCEPTED

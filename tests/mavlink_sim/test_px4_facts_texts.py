@@ -107,6 +107,17 @@ def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Any, velocit
     ]
 
 
+def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(heard: Any) -> None:
+    heard.wait_ready()
+    heard.command(400, 1)
+    assert heard.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
+    heard.until(lambda: not heard.armed, 15.0)
+    heard.fly(0.1)
+    assert (CRITICAL, "Already higher than takeoff altitude\t") in said(heard)
+    assert heard.height_m < 0.1
+    assert said(heard)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
+
+
 def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: Any) -> None:
     heard.fly(0.1)
     heard.command(400, 1)
