@@ -30,7 +30,7 @@ def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
     command = commands.command_of(message)
-    if command.identifier in commands.ANSWERED_TWICE:
+    if command.identifier in commands.ANSWERED_TWICE and vehicle.release.acknowledges_modes_twice:
         _acknowledge(link, message, command.identifier, ACCEPTED)
     if command.identifier in commands.ANSWERED_BY_RECEIVER:
         _execute(vehicle, link, message, command)

@@ -386,8 +386,8 @@ def _gps_global_origin(vehicle: Vehicle) -> Any:
 def _autopilot_version(vehicle: Vehicle) -> Any:
     return dialect.MAVLink_autopilot_version_message(
         capabilities=59647,
-        flight_sw_version=0x01110040,
-        middleware_sw_version=0x01110040,
+        flight_sw_version=vehicle.release.software_version,
+        middleware_sw_version=vehicle.release.software_version,
         os_sw_version=0,
         board_version=1,
         flight_custom_version=[0, 0, 0, 253, 175, 214, 222, 89],

@@ -22,6 +22,7 @@ from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor
+from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 
 STEP_S = 0.004
@@ -48,6 +49,7 @@ class Vehicle:
         noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
@@ -67,9 +69,11 @@ class Vehicle:
         noise: bool = True,
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
+        px4: str = NEWEST,
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
+        self.release = release_named(px4)
         self.parameters = Parameters(parameters)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
@@ -139,6 +143,7 @@ class Vehicle:
         rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
         # links start out of step, so that they do not all send everything in the same millisecond
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link.tells_parameter_errors = self.release.has_parameter_errors
         return link
 
     def outgoing(self, link: str) -> list[Outgoing]:
