@@ -80,6 +80,9 @@ def simulate(
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
+    set_mode_acks: Annotated[
+        int, typer.Option(help="Answers to DO_SET_MODE: 2 as PX4 since v1.16, 1 as v1.14 and v1.15.")
+    ] = 2,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
     ] = None,
@@ -100,6 +103,7 @@ def simulate(
     _check("wind", wind, 0.0, MAX_WIND_MPS)
     _check("camera-rate", camera_rate, 1.0, 120.0)
     _check("speed", speed, 0.05, 20.0)
+    _check("set-mode-acks", set_mode_acks, 1, 2)
     options = SimulationOptions(
         host=host,
         onboard_port=onboard_port,
@@ -114,6 +118,7 @@ def simulate(
         truth=truth,
         speed=speed,
         parameters=_parameters(param or []),
+        set_mode_acks=set_mode_acks,
     )
     try:
         simulation = Simulation(options, on_event=_say)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 import random
 
+from mavlink_sim.body_rates import turned
+
 Vector = tuple[float, float, float]
 
 GRAVITY_MPS2 = 9.80665
@@ -84,6 +86,24 @@ class Multirotor:
     ) -> None:
         """Advance by `dt_s` (at most ~10 ms) towards the demanded thrust, tilt and yaw rate."""
         self._turn(dt_s, roll_rad, pitch_rad, yaw_rate_radps)
+        self._push(dt_s, thrust_mps2)
+
+    def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
+        """Advance towards demanded thrust and body rates (FRD, rad/s); NaN: go on turning as now."""
+        if self.on_ground:
+            self._turn(dt_s, 0.0, 0.0, 0.0)
+        else:
+            lags = (RATE_TIME_CONSTANT_S, RATE_TIME_CONSTANT_S, YAW_RATE_TIME_CONSTANT_S)
+            p, q, r = (
+                now if math.isnan(wanted) else now + (wanted - now) * min(1.0, dt_s / lag)
+                for now, wanted, lag in zip(self.rates, rates, lags, strict=True)
+            )
+            self.rates = (p, q, r)
+            attitude = (self.roll_rad, self.pitch_rad, self.yaw_rad)
+            self.roll_rad, self.pitch_rad, self.yaw_rad = turned(attitude, self.rates, dt_s)
+        self._push(dt_s, thrust_mps2)
+
+    def _push(self, dt_s: float, thrust_mps2: float) -> None:
         demanded = min(max(thrust_mps2, 0.0), MAX_THRUST_MPS2)
         self.thrust_mps2 += (demanded - self.thrust_mps2) * min(1.0, dt_s / THRUST_TIME_CONSTANT_S)
         self._move(dt_s)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.geography import HOME_ALTITUDE_M, HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
+from mavlink_sim.orbit import orbit_execution_status
 from mavlink_sim.physics import MAX_THRUST_MPS2
-from vision.rotation import quaternion_from_euler
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
@@ -132,12 +132,10 @@ def _distance_sensor(vehicle: Vehicle) -> Any:
 
 
 def _attitude_target(vehicle: Vehicle) -> Any:
-    demand = vehicle.autopilot.demand
-    yaw = vehicle.autopilot.controller.yaw_rad
-    q = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, yaw)
-    thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
+    autopilot = vehicle.autopilot
+    target = autopilot.attitude.target(autopilot.demand, autopilot.controller.yaw_rad)
     return dialect.MAVLink_attitude_target_message(
-        vehicle.boot_ms, 0, list(q), 0.0, 0.0, demand.yaw_rate_radps, thrust
+        vehicle.boot_ms, 0, list(target.quaternion), *target.rates, target.thrust
     )
 
 
@@ -151,6 +149,8 @@ def _type_mask(*groups: tuple[float, float, float]) -> int:
 
 def _position_target_local_ned(vehicle: Vehicle) -> Any:
     inner = vehicle.autopilot.controller
+    if vehicle.autopilot.attitude.active:
+        return None  # PX4's position controller rests meanwhile
     return dialect.MAVLink_position_target_local_ned_message(
         vehicle.boot_ms,
         1,
@@ -419,6 +419,7 @@ BUILDERS: dict[str, Builder] = {
     "ATTITUDE_TARGET": _attitude_target,
     "POSITION_TARGET_LOCAL_NED": _position_target_local_ned,
     "POSITION_TARGET_GLOBAL_INT": _position_target_global_int,
+    "ORBIT_EXECUTION_STATUS": orbit_execution_status,
     "SERVO_OUTPUT_RAW": _servo_output_raw,
     "VFR_HUD": _vfr_hud,
     "GPS_RAW_INT": _gps_raw_int,

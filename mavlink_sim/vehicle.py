@@ -44,6 +44,8 @@ class Vehicle:
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
+        set_mode_acks: answers to DO_SET_MODE: 2 as in PX4 v1.16 and later (the first always ACCEPTED), 1 as
+            in v1.14 and v1.15 (the real result alone).
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
@@ -61,9 +63,13 @@ class Vehicle:
         gusts_mps: float | None = None,
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
+        set_mode_acks: int = 2,
         on_event: Callable[[str], None] | None = None,
     ) -> None:
+        if set_mode_acks not in (1, 2):
+            raise ValueError(f"set_mode_acks: expected 1 or 2 answers to DO_SET_MODE, got {set_mode_acks}")
         self.system_id = system_id
+        self.set_mode_acks = set_mode_acks
         self.parameters = Parameters(parameters)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
