@@ -275,14 +275,14 @@ def test_the_controller_turns_any_attitude_into_any_other(
     controller = AttitudeController(Parameters())
     airframe = Multirotor()
     airframe.on_ground = False
-    airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad = start
+    airframe.set_attitude(*start)
     wanted = quaternion_from_euler(*goal)
     setpoint = AttitudeSetpoint(wanted, math.nan, 0.5)
     for _ in range(600):
         demanded = controller.rates(setpoint, airframe)
         assert all(abs(rate) <= math.radians(220.0) + 1e-9 for rate in demanded)
         now = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
-        airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad = turned(now, demanded, 0.01)
+        airframe.set_attitude(*turned(now, demanded, 0.01))
     reached = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
     assert abs(product(inverse(reached), wanted)[0]) > 0.9999
 
