@@ -133,7 +133,7 @@ def _distance_sensor(vehicle: Vehicle) -> Any:
 
 def _attitude_target(vehicle: Vehicle) -> Any:
     autopilot = vehicle.autopilot
-    target = autopilot.attitude.target(autopilot.demand, autopilot.controller.yaw_rad)
+    target = autopilot.attitude.target(vehicle.airframe, autopilot.controller, autopilot.demand)
     return dialect.MAVLink_attitude_target_message(
         vehicle.boot_ms, 0, list(target.quaternion), *target.rates, target.thrust
     )
