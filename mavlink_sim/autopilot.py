@@ -39,6 +39,9 @@ TEMPORARILY_REJECTED = 1
 
 # Measured: a vehicle that does not take off is disarmed 11.2 s after arming with COM_DISARM_PRFLT = 10.
 PREFLIGHT_DISARM_MARGIN_S = 1.2
+# Measured with COM_OF_LOSS_T = 1: OFFBOARD is left 1.05-1.15 s after the last setpoint; a stream of 0.9 Hz is
+# lost for 50 ms at a time.
+OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
 TAKEOFF_DETECTION_HEIGHT_M = 0.12
@@ -95,7 +98,8 @@ class Autopilot:
     @property
     def has_setpoints(self) -> bool:
         """The offboard stream is alive (COM_OF_LOSS_T)."""
-        return self.now_s - self._last_setpoint_s <= self._parameters.number("COM_OF_LOSS_T")
+        limit = self._parameters.number("COM_OF_LOSS_T") + OFFBOARD_LOSS_MARGIN_S
+        return self.now_s - self._last_setpoint_s <= limit
 
     @property
     def sensors_ready(self) -> bool:
@@ -191,6 +195,9 @@ class Autopilot:
                 f"Using default takeoff altitude: {altitude_m:.1f} m\t",
                 (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
             )
+        elif altitude_m < self.home[2] - self._airframe.position[2]:
+            # what becomes of a height above ground in a field that is above the sea; it does not descend
+            self._say(CRITICAL, "Already higher than takeoff altitude\t")
         self._takeoff_height_m = altitude_m
         self._intend(Mode.TAKEOFF)
         return ACCEPTED

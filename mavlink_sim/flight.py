@@ -63,7 +63,8 @@ class Trajectory:
         lag = math.dist(self.position, self._airframe.position)
         pace = max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
         braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
-        dx, dy, dz = (goal[axis] - self.position[axis] for axis in range(3))
+        x, y, z = self.position
+        dx, dy, dz = goal[0] - x, goal[1] - y, goal[2] - z
         far = math.hypot(dx, dy)
         cruise = self.cruise_mps if self.cruise_mps > 0.0 else value("MPC_XY_CRUISE")
         cruise = min(cruise, value("MPC_XY_VEL_MAX"))

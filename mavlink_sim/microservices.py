@@ -40,7 +40,7 @@ def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
         _acknowledge(link, message, message.command, commands.DENIED)
         return
     command = commands.command_of(message)
-    if command.identifier in commands.ANSWERED_TWICE and vehicle.set_mode_acks == 2:
+    if command.identifier in commands.ANSWERED_TWICE and vehicle.release.acknowledges_modes_twice:
         _acknowledge(link, message, command.identifier, ACCEPTED)
     if command.identifier in commands.ANSWERED_BY_RECEIVER:
         _execute(vehicle, link, message, command)

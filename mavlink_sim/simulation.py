@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
+from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from vision.shared_frame import segment_path
 
@@ -44,9 +46,11 @@ class SimulationOptions:
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
         camera: name of the shared-memory segment the camera's frames go to; None for no camera.
         truth: file for the truth, one JSON object a line; None for none.
+        record: folder for the traffic of each link, `<link>.tlog`; None for none.
+        ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
         parameters: PX4 parameters that differ from the defaults.
-        set_mode_acks: answers to DO_SET_MODE, 2 as PX4 since v1.16 or 1 as before.
     """
 
     host: str = "127.0.0.1"
@@ -60,9 +64,11 @@ class SimulationOptions:
     camera: str | None = None
     camera_rate_hz: float = 30.0
     truth: Path | None = None
+    record: Path | None = None
+    ready_after_s: float = 3.0
+    px4: str = NEWEST
     speed: float = 1.0
     parameters: dict[str, float] = field(default_factory=dict)
-    set_mode_acks: int = 2
 
 
 class Simulation:
@@ -70,7 +76,7 @@ class Simulation:
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
-        OSError: the truth file cannot be written.
+        OSError: the truth file or the record cannot be written.
     """
 
     def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
@@ -80,7 +86,8 @@ class Simulation:
             seed=options.seed,
             wind_mps=options.wind_mps,
             parameters=options.parameters,
-            set_mode_acks=options.set_mode_acks,
+            ready_after_s=options.ready_after_s,
+            px4=options.px4,
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns
@@ -106,6 +113,8 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            if options.record is not None:
+                self._resources.enter_context(recording(self.endpoints, options.record))
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:

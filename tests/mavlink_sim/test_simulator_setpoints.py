@@ -33,7 +33,7 @@ def distance_m(update: Any, north: float, east: float) -> float:
 
 
 async def test_mavsdk_flies_every_kind_of_setpoint() -> None:
-    with running_simulator(speed=SPEED, set_mode_acks=1) as simulator:
+    with running_simulator(speed=SPEED, px4="1.15") as simulator:
         configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
         async with Mavsdk(configuration) as mavsdk:
             await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.onboard_port}")
