@@ -85,17 +85,17 @@ class AttitudeController:
         """The vehicle is flown by attitude or rates, so there is no position target."""
         return self._target is not None
 
-    def target(self, demand: Demand, yaw_rad: float) -> AttitudeTarget:
-        """For ATTITUDE_TARGET; `demand` and `yaw_rad` are the position controller's, if that one flies.
+    def target(self, airframe: Multirotor, outer: PositionController, demand: Demand) -> AttitudeTarget:
+        """For ATTITUDE_TARGET; `demand` is what the position controller `outer` wants, if that one flies.
 
         While rates are flown, attitude and thrust stay those of the last attitude setpoint, as in PX4.
         """
         if self._target is not None:
             return self._target
-        quaternion = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, yaw_rad)
-        return AttitudeTarget(
-            quaternion, (0.0, 0.0, demand.yaw_rate_radps), demand.thrust_mps2 / MAX_THRUST_MPS2
-        )
+        quaternion = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, outer.yaw_rad)
+        thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
+        setpoint = AttitudeSetpoint(quaternion, outer.yaw_rate_radps, thrust)
+        return AttitudeTarget(quaternion, self.rates(setpoint, airframe), thrust)
 
     def fly(
         self,
@@ -106,9 +106,7 @@ class AttitudeController:
         demand: Demand,
     ) -> Demand:
         """One step of control and of the airframe. Returns the new demand; `demand` is the one before."""
-        if self._revision != self._parameters.revision:
-            self._load()
-        before = self.target(demand, outer.yaw_rad)
+        before = self.target(airframe, outer, demand)
         if isinstance(setpoint, AttitudeSetpoint):
             rates = self.rates(setpoint, airframe)
             self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, rates, abs(setpoint.thrust))
@@ -122,6 +120,8 @@ class AttitudeController:
 
     def rates(self, setpoint: AttitudeSetpoint, airframe: Multirotor) -> Vector:
         """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation."""
+        if self._revision != self._parameters.revision:
+            self._load()
         wanted = unit(setpoint.quaternion)
         if wanted is None:
             return (NAN, NAN, NAN)

@@ -132,7 +132,7 @@ def _distance_sensor(vehicle: Vehicle) -> Any:
 
 def _attitude_target(vehicle: Vehicle) -> Any:
     autopilot = vehicle.autopilot
-    target = autopilot.attitude.target(autopilot.demand, autopilot.controller.yaw_rad)
+    target = autopilot.attitude.target(vehicle.estimate, autopilot.controller, autopilot.demand)
     return packing.attitude_target(vehicle.boot_ms, 0, list(target.quaternion), *target.rates, target.thrust)
 
 

@@ -250,6 +250,20 @@ def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
     assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 0
 
 
+def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_attitude(
+    cockpit: Any, position_setpoint: Any
+) -> None:
+    cockpit.take_off(5.0)
+    facing_north = position_setpoint(0, 0, -5, 0.0)
+    cockpit.offboard(facing_north)
+    cockpit.fly(1.0, facing_north)
+    cockpit.forget()
+    cockpit.fly(0.11, position_setpoint(0, 0, -5, 1.4))
+    echo = cockpit.received("ATTITUDE_TARGET")[0]
+    assert echo.q[3] == pytest.approx(math.sin(0.7), abs=0.01)
+    assert echo.body_yaw_rate > 1.0  # a PX4 told 2.5 rad/s at the beginning of such a turn
+
+
 @pytest.mark.parametrize(("setpoint", "base"), [(attitude(), 145), (rates(0, 0, 0), 129)])
 def test_the_heartbeat_is_stabilized_unless_rates_alone_are_flown(
     cockpit: Any, setpoint: Any, base: int
