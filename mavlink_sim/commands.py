@@ -11,6 +11,7 @@ from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.geography import geographic, local
 from mavlink_sim.messages import dialect, protocol_version
+from mavlink_sim.mission_start import mission_start
 from mavlink_sim.modes import CUSTOM_MODE_ENABLED, mode_of
 from mavlink_sim.telemetry import MESSAGE_IDS
 
@@ -123,8 +124,13 @@ def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _deny(vehicle: Vehicle, link: Link, command: Command) -> int:
-    return DENIED
+def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
+    vehicle.autopilot.navigator.change_speed(command.parameters[1])
+    return ACCEPTED
+
+
+def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return mission_start(vehicle.autopilot, command.parameters[0])
 
 
 def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -189,12 +195,12 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     NAV_LAND: _land,
     NAV_TAKEOFF: _takeoff,
     DO_SET_MODE: _do_set_mode,
-    178: _accept,  # DO_CHANGE_SPEED
+    178: _change_speed,  # DO_CHANGE_SPEED
     179: _set_home,  # DO_SET_HOME
     185: _flight_termination,  # DO_FLIGHTTERMINATION
     DO_REPOSITION: _reposition,
     245: _accept,  # PREFLIGHT_STORAGE
-    300: _deny,  # MISSION_START: there is no mission
+    300: _mission_start,
     ARM_DISARM: _arm,
     401: _accept,  # RUN_PREARM_CHECKS
     GET_MESSAGE_INTERVAL: _get_message_interval,

@@ -31,6 +31,7 @@ class Trajectory:
         self.position = airframe.position
         self.velocity = airframe.velocity
         self.yaw_rad = airframe.yaw_rad
+        self.cruise_mps: float | None = None  # DO_CHANGE_SPEED; None: MPC_XY_CRUISE
 
     def keep_within(self, lead_m: float) -> None:
         """Let the planned height lead the vehicle's by at most this much."""
@@ -61,7 +62,8 @@ class Trajectory:
         braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
         dx, dy, dz = (goal[axis] - self.position[axis] for axis in range(3))
         far = math.hypot(dx, dy)
-        speed = min(value("MPC_XY_CRUISE"), max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
+        cruise = value("MPC_XY_CRUISE") if self.cruise_mps is None else self.cruise_mps
+        speed = min(cruise, max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
         wanted_x, wanted_y = (dx / far * speed, dy / far * speed) if far > 0.0 else (0.0, 0.0)
         limit = (
             min(value("MPC_Z_V_AUTO_UP"), max_up_mps)
@@ -94,6 +96,7 @@ class Task(ABC):
 
     landing = False  # on the final descent
     finished = False
+    taking_off = False  # climbing from the ground in a mode other than TAKEOFF
     goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
 
     @abstractmethod
@@ -178,7 +181,7 @@ class Return(Task):
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
         self._home = home
-        self._land: Land | None = None
+        self._land: Task | None = None
         self._phase = "climb"
         x, y, z = self._trajectory.stopping_point()
         self.return_height_m = self._return_height(math.hypot(x - home[0], y - home[1]), home[2] - z)
@@ -213,11 +216,15 @@ class Return(Task):
                 descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
                 self.goal = (home_x, home_y, home_z - descend)
         if self._phase == "descend" and self.goal[2] - z < value("NAV_MC_ALT_RAD"):
-            self._land = Land(self._airframe, self._parameters, (home_x, home_y, home_z))
+            self._land = self.landing_task((home_x, home_y, home_z))
             self.goal = self._land.goal
             self.landing = True
             return self._land.update(dt_s)
         return self._trajectory.towards(self.goal, dt_s, yaw)
+
+    def landing_task(self, place: Vector) -> Task:
+        """The descent at a place."""
+        return Land(self._airframe, self._parameters, place)
 
 
 class Offboard(Task):

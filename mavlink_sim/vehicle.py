@@ -13,7 +13,7 @@ import random
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mavlink_sim import parameter_protocol, telemetry
+from mavlink_sim import mission_link, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
@@ -201,6 +201,7 @@ class Vehicle:
             )
             self.airframe.wind = (north, east, 0.0)
         self.autopilot.update(STEP_S)
+        mission_link.update(self)
         if self.autopilot.sensors_ready and not self._origin_told:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
