@@ -171,11 +171,14 @@ class MissionFlight(flight.Task):
             self._trajectory = flight.Trajectory(self._airframe, self._parameters)
 
     def _end(self) -> None:
+        self._finish()
+        self.ended = True
+
+    def _finish(self) -> None:
         where = "landed" if self._navigator.landed else "loitering"
         self._navigator.say(INFO, f"Mission finished, {where}\t")
         self._mission.jumps.clear()
         self._mission.finished = True
-        self.ended = True
 
     def _act(self, item: MissionItem) -> None:
         command = item.command
@@ -191,6 +194,11 @@ class MissionFlight(flight.Task):
             self._roi, self._roi_is_next = None, False
         if command != mission_items.NAV_DELAY:
             self._navigator.command(item)
+        if command == mission_items.RETURN_TO_LAUNCH:
+            # reached as it begins (since PX4 v1.17): in a moment another mode flies the vehicle
+            self._navigator.reached(self._mission.current)
+            if self._mission.current + 1 == len(self._mission.items):
+                self._finish()
 
     def _replay_speed(self) -> None:
         """A mission that is resumed has the speed of the last change before its current item."""
