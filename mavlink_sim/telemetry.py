@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim import packing
 from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
+from mavlink_sim.mission_messages import mission_current
 from mavlink_sim.orbit import orbit_execution_status
 from mavlink_sim.physics import MAX_THRUST_MPS2
 
@@ -319,7 +320,7 @@ def _system_time(vehicle: Vehicle) -> Any:
 
 
 def _mission_current(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_mission_current_message(0, 65535, 1, 2)
+    return mission_current(vehicle)
 
 
 def _battery_status(vehicle: Vehicle) -> Any:

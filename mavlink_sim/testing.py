@@ -210,7 +210,8 @@ def running_simulator(
         parameters: PX4 parameters.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
-            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None for none.
+            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None
+            for none.
     """
     count = int(options.get("vehicles") or 1)  # type: ignore[arg-type]
     ports = free_udp_ports(2)

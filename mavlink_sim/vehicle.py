@@ -13,7 +13,7 @@ import random
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mavlink_sim import parameter_protocol, telemetry
+from mavlink_sim import mission_link, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
 from mavlink_sim.estimator import Estimate
@@ -232,6 +232,7 @@ class Vehicle:
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
+        mission_link.update(self)
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:
