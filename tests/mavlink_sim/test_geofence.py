@@ -79,7 +79,8 @@ def test_a_fence_without_home_is_left_out_and_said(cockpit: Any) -> None:
     assert cockpit.vehicle.autopilot.can_arm
 
 
-def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpit: Any) -> None:
+def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(noise=False)
     listen(cockpit)
     cockpit.take_off(4.0)
     cockpit.vehicle.airframe.position = (0.0, 40.0, -4.0)
