@@ -69,7 +69,7 @@ def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
     try:
-        setpoint = trajectory_setpoint(message, vehicle.airframe.yaw_rad)
+        setpoint = trajectory_setpoint(message, vehicle.estimate.yaw_rad)
     except SetpointRejectedError as error:
         vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
         return

@@ -103,6 +103,12 @@ class Streams:
             self._due_us.pop(name, None)
         self._next_us = 0
 
+    def restart(self, now_us: int) -> None:
+        """The default rates again, as after a reboot."""
+        self._interval_us = dict(self._default_us)
+        self._due_us = {name: now_us + us for name, us in self._interval_us.items() if us > 0}
+        self._next_us = 0
+
     def due(self, now_us: int) -> list[str]:
         """The messages to send now. A stream that fell behind by more than an interval skips."""
         if now_us < self._next_us:
