@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mavlink_sim.announcements import Text
 from mavlink_sim.autopilot import TEMPORARILY_REJECTED, Autopilot
-from mavlink_sim.estimate import ZERO
+from mavlink_sim.estimate_errors import ZERO
 from mavlink_sim.fault_grammar import FaultError
 from mavlink_sim.flight import Trajectory
 from mavlink_sim.modes import Mode, mode_of
@@ -47,22 +47,21 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
         if since_s < DEAD_RECKONING_S:
             drift = since_s * since_s / 2.0
             error = (north * drift, east * drift, 0.0)
-            faults.set_error(one.number, error, (north * since_s, east * since_s, 0.0))
+            vehicle.estimate.set_error(one.number, error, (north * since_s, east * since_s, 0.0))
         elif estimate.held_xy_m is None:
             x, y, _ = estimate.position
             estimate.held_xy_m = (x, y)  # EKF2 fuses a made-up standstill from here on
             estimate.count_reset(2)
-            estimate.refresh()
             estimate.position_valid = vehicle.autopilot.position_valid = False
 
     def fuse_again() -> None:
         if estimate.fix_lost:
             return
-        faults.set_error(one.number, None)
+        vehicle.estimate.set_error(one.number, None)
         if estimate.held_xy_m is not None:
             estimate.held_xy_m = None
             estimate.position_valid = vehicle.autopilot.position_valid = True
-        estimate.refresh()
+        estimate.update(0.0)
         _jumped(vehicle, 2)
         vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
 
@@ -76,7 +75,7 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
 
 def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
     """The receiver's position wanders; the estimate follows it, and the vehicle holds the estimate."""
-    values, faults = one.fault.values, vehicle.faults
+    values = one.fault.values
     angle = _direction(values["towards"], one.seed)
     drifted_m = 0.0
 
@@ -86,12 +85,12 @@ def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
         drifted_m = min(drifted_m + speed * dt_s, values["limit"])
         north, east = math.cos(angle), math.sin(angle)
         error = (drifted_m * north, drifted_m * east, 0.0)
-        vehicle.estimate.gps_error_m[one.number] = error
-        faults.set_error(one.number, error, (speed * north, speed * east, 0.0))
+        vehicle.estimate.gps_drift[one.number] = error
+        vehicle.estimate.set_error(one.number, error, (speed * north, speed * east, 0.0))
 
     def undo() -> None:
-        vehicle.estimate.gps_error_m.pop(one.number, None)
-        faults.set_error(one.number, None)
+        vehicle.estimate.gps_drift.pop(one.number, None)
+        vehicle.estimate.set_error(one.number, None)
         _jumped(vehicle)
 
     one.each_step = each_step
@@ -103,11 +102,11 @@ def ekf_reset(vehicle: Vehicle, one: ActiveFault) -> None:
     values = one.fault.values
     error = (values["north"], values["east"], values["down"])
     yaw_rad = math.radians(values["yaw"])
-    vehicle.faults.set_error(one.number, error, ZERO, yaw_rad)
+    vehicle.estimate.set_error(one.number, error, ZERO, yaw_rad)
     _jumped(vehicle, (error != ZERO) + (yaw_rad != 0.0), yaw_rad)
 
     def undo() -> None:
-        vehicle.faults.set_error(one.number, None)
+        vehicle.estimate.set_error(one.number, None)
         _jumped(vehicle, (error != ZERO) + (yaw_rad != 0.0), -yaw_rad)
 
     one.undo.append(undo)
@@ -162,12 +161,9 @@ def battery(vehicle: Vehicle, one: ActiveFault) -> None:
 def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
     """The rotor stops; it turns again when the fault ends."""
     motor = one.fault.values["motor"]
-    vehicle.estimate.failed_motors |= {motor}
+    vehicle.airframe.fail_motor(motor - 1)
 
-    def undo() -> None:
-        vehicle.estimate.failed_motors -= {motor}
-
-    one.undo.append(undo)
+    one.undo.append(lambda: vehicle.airframe.fail_motor(motor - 1, 1.0))
 
 
 # ---- air
@@ -275,7 +271,7 @@ def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
     # the same object starts anew: others hold on to it
     Autopilot.__init__(
         vehicle.autopilot,
-        vehicle.flown,
+        vehicle.estimate,
         vehicle.parameters,
         ready_after_s=vehicle.ready_after_s,
         on_event=vehicle.autopilot._on_event,

@@ -51,9 +51,8 @@ class Kind:
     def usage(self) -> str:
         words = [self.name]
         for one in self.fields:
-            words.append(
-                one.name.upper() if one.default is REQUIRED else f"[{one.name}={_shown(one.default)}]"
-            )
+            optional = f"[{one.name}]" if one.default is None else f"[{one.name}={_shown(one.default)}]"
+            words.append(one.name.upper() if one.default is REQUIRED else optional)
         return " ".join(words)
 
 

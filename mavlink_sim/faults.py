@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.estimate import ZERO
-from mavlink_sim.estimate_telemetry import as_estimated
+from mavlink_sim.estimate_errors import as_told
 from mavlink_sim.fault_effects_flight import refused_for_position
+from mavlink_sim.fault_effects_link import chosen_links
 from mavlink_sim.fault_effects_messages import shifted
 from mavlink_sim.fault_grammar import Fault, FaultError, parse_fault
 from mavlink_sim.fault_kinds import EFFECTS, KINDS
@@ -107,7 +107,6 @@ class Faults:
         self._count = 0
         self._all: dict[int, ActiveFault] = {}
         self._stages: dict[str, LinkStage] = {}
-        self._errors: dict[int, tuple[Vector, Vector, float]] = {}
         self._held: list[tuple[str, Any]] = []
 
     # ---- for whoever makes faults -----------------------------------------------------------------------
@@ -156,6 +155,8 @@ class Faults:
             words += [f"{name}={value}" for name, value in options.items()]
             words += [f"{name}={value}" for name, value in timing.items() if value is not None]
             fault = parse_fault(" ".join([fault, *words]), KINDS)
+        if "link" in fault.values:
+            chosen_links(self.vehicle, fault.values["link"])
         self._count += 1
         number = self._count
         begins_s = self.now_s if fault.at_s is None else fault.at_s
@@ -270,30 +271,11 @@ class Faults:
             message = gate(link, message)
             if message is None:
                 return None
-        if self._estimate_differs:
-            message = as_estimated(self.vehicle, message)
+        if self.vehicle.estimate.spoiled:
+            message = as_told(self.vehicle.estimate, message)
         if self.boot_offset_us or self.stalled_us:
             message = shifted(message, self.boot_offset_us, self.boot_offset_us - self.stalled_us)
         return message
-
-    @property
-    def _estimate_differs(self) -> bool:
-        estimate = self.vehicle.estimate
-        return bool(not estimate.exact or estimate.reset_counter or estimate.fix_lost)
-
-    def set_error(
-        self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
-    ) -> None:
-        """What a fault adds to the estimate (NED; None: nothing any more)."""
-        if position_m is None:
-            self._errors.pop(number, None)
-        else:
-            self._errors[number] = (position_m, velocity_mps, yaw_rad)
-        estimate = self.vehicle.estimate
-        estimate.position_error_m = _sum(error[0] for error in self._errors.values())
-        estimate.velocity_error_mps = _sum(error[1] for error in self._errors.values())
-        estimate.yaw_error_rad = sum(error[2] for error in self._errors.values())
-        estimate.refresh()
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:
         """The MAV_RESULT that a command is refused with before anybody looks at it."""
@@ -341,13 +323,6 @@ class Faults:
             for undo in reversed(one.undo):
                 undo()
             self._on_event(f"fault {one} ends")
-
-
-def _sum(vectors: Iterable[Vector]) -> Vector:
-    north = east = down = 0.0
-    for x, y, z in vectors:
-        north, east, down = north + x, east + y, down + z
-    return (north, east, down)
 
 
 def _help(words: list[str]) -> list[str]:

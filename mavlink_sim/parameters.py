@@ -66,6 +66,7 @@ class Parameters:
         """Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be."""
         self._parameters = {parameter.name: parameter for parameter in default_parameters()}
         self._names = list(self._parameters)
+        self._values = {name: parameter.value for name, parameter in self._parameters.items()}
         self.revision = 0
         for name, value in (values or {}).items():
             self.set(name, value)
@@ -91,11 +92,14 @@ class Parameters:
         return self._parameters.get(name)
 
     def number(self, name: str) -> float:
-        return self[name].value
+        try:
+            return self._values[name]
+        except KeyError:
+            return self[name].value  # which says what is wrong
 
     def positive(self, name: str) -> float:
         """A value to divide by or to take a root of: PX4 accepts any, this stays above zero."""
-        return max(self[name].value, 0.01)
+        return max(self.number(name), 0.01)
 
     def at(self, index: int) -> Parameter | None:
         """The parameter at an index of the list, None outside it."""
@@ -117,6 +121,7 @@ class Parameters:
             value = _single(float(value))
         changed = replace(parameter, value=value)
         self._parameters[name] = changed
+        self._values[name] = value
         self.revision += 1
         return changed
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.fault_room import fault_room
 from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from vision.shared_frame import segment_path
@@ -46,6 +47,9 @@ class SimulationOptions:
         truth: file for the truth, one JSON object a line; None for none.
         speed: simulated seconds per real second.
         parameters: PX4 parameters that differ from the defaults.
+        faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
+        console: read faults from standard input; None: if that is a terminal.
+        control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
     """
 
     host: str = "127.0.0.1"
@@ -61,6 +65,9 @@ class SimulationOptions:
     truth: Path | None = None
     speed: float = 1.0
     parameters: dict[str, float] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
+    console: bool | None = None
+    control: str | None = None
 
 
 class Simulation:
@@ -68,6 +75,7 @@ class Simulation:
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
+        FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
         OSError: the truth file cannot be written.
     """
 
@@ -103,6 +111,9 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            self._faults = self._resources.enter_context(
+                fault_room(self.vehicle, self.endpoints, options, on_event)
+            )
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:
@@ -166,6 +177,7 @@ class Simulation:
                 for key, _ in ready:
                     self._receive(key.data)
                 self._advance()
+                self._faults.poll()
 
     def _receive(self, name: str) -> None:
         for message in self.endpoints[name].receive():
@@ -185,6 +197,8 @@ class Simulation:
         for _ in range(steps):
             self.vehicle.step(STEP_S)
             self._simulated_s += STEP_S
+            for name in self._faults.delivered():
+                self._receive(name)
         if steps:
             self._flush()
             self._show()

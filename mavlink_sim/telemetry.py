@@ -32,7 +32,7 @@ def _heartbeat(vehicle: Vehicle) -> Any:
 
 
 def _attitude(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     return dialect.MAVLink_attitude_message(
         vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates
     )
@@ -40,12 +40,12 @@ def _attitude(vehicle: Vehicle) -> Any:
 
 def _attitude_quaternion(vehicle: Vehicle) -> Any:
     return dialect.MAVLink_attitude_quaternion_message(
-        vehicle.boot_ms, *vehicle.quaternion, *vehicle.airframe.rates, repr_offset_q=[0.0] * 4
+        vehicle.boot_ms, *vehicle.estimate.quaternion, *vehicle.estimate.rates, repr_offset_q=[0.0] * 4
     )
 
 
 def _global_position_int(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     latitude, longitude, altitude = geographic(frame.position)
     vx, vy, vz = frame.velocity
     return dialect.MAVLink_global_position_int_message(
@@ -66,7 +66,7 @@ def _pressure_hpa(altitude_m: float) -> float:
 
 
 def _highres_imu(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     altitude = HOME_ALTITUDE_M - frame.position[2]
     cosine, sine = math.cos(frame.yaw_rad), math.sin(frame.yaw_rad)
     return dialect.MAVLink_highres_imu_message(
@@ -85,7 +85,7 @@ def _highres_imu(vehicle: Vehicle) -> Any:
 
 
 def _local_position_ned(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     return dialect.MAVLink_local_position_ned_message(vehicle.boot_ms, *frame.position, *frame.velocity)
 
 
@@ -94,13 +94,13 @@ _VELOCITY_COVARIANCE = [0.011, 0, 0, 0, 0, 0, 0.012, 0, 0, 0, 0, 0.005, *([0] * 
 
 
 def _odometry(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     return dialect.MAVLink_odometry_message(
         vehicle.boot_us,
         1,
         1,
         *frame.position,
-        list(vehicle.quaternion),
+        list(frame.quaternion),
         *frame.velocity,
         *frame.rates,
         _POSE_COVARIANCE,
@@ -116,7 +116,7 @@ def _timesync(vehicle: Vehicle) -> Any:
 
 
 def _altitude(vehicle: Vehicle) -> Any:
-    height = -vehicle.airframe.position[2]
+    height = -vehicle.estimate.position[2]
     relative = height + vehicle.autopilot.home[2]
     return dialect.MAVLink_altitude_message(
         vehicle.boot_us, HOME_ALTITUDE_M + height, HOME_ALTITUDE_M + height, height, relative, 0.0, height
@@ -124,7 +124,7 @@ def _altitude(vehicle: Vehicle) -> Any:
 
 
 def _distance_sensor(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     slant = -frame.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
     return dialect.MAVLink_distance_sensor_message(
         vehicle.boot_ms, 0, 10000, min(round(max(slant, 0.0) * 100), 65534), 0, 0, 25, 0
@@ -186,7 +186,7 @@ def _position_target_global_int(vehicle: Vehicle) -> Any:
 def _servo_output_raw(vehicle: Vehicle) -> Any:
     power = 900
     if vehicle.autopilot.armed:
-        power = 1000 + round(1000 * vehicle.airframe.thrust_mps2 / MAX_THRUST_MPS2)
+        power = 1000 + round(1000 * vehicle.estimate.thrust_mps2 / MAX_THRUST_MPS2)
     rest = {f"servo{number}_raw": 900 for number in range(9, 17)}
     return dialect.MAVLink_servo_output_raw_message(
         vehicle.boot_us & 0xFFFFFFFF, 0, power, power, power, power, 900, 900, 900, 900, **rest
@@ -194,7 +194,7 @@ def _servo_output_raw(vehicle: Vehicle) -> Any:
 
 
 def _vfr_hud(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     vx, vy, vz = frame.velocity
     throttle = round(100 * frame.thrust_mps2 / MAX_THRUST_MPS2) if vehicle.autopilot.armed else 0
     heading = round(math.degrees(frame.yaw_rad) % 360.0) % 360
@@ -204,8 +204,8 @@ def _vfr_hud(vehicle: Vehicle) -> Any:
 
 
 def _gps_raw_int(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.airframe.position)
-    vx, vy, _ = vehicle.airframe.velocity
+    latitude, longitude, altitude = geographic(vehicle.estimate.position)
+    vx, vy, _ = vehicle.estimate.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
     height_mm = round(altitude * 1000)
     return dialect.MAVLink_gps_raw_int_message(
@@ -260,7 +260,7 @@ def _estimator_status(vehicle: Vehicle) -> Any:
 
 
 def _open_drone_id_location(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     latitude, longitude, altitude = geographic(frame.position)
     vx, vy, vz = frame.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
@@ -314,7 +314,7 @@ def _ping(vehicle: Vehicle) -> Any:
 
 
 def _scaled_pressure(vehicle: Vehicle) -> Any:
-    altitude = HOME_ALTITUDE_M - vehicle.airframe.position[2]
+    altitude = HOME_ALTITUDE_M - vehicle.estimate.position[2]
     return dialect.MAVLink_scaled_pressure_message(vehicle.boot_ms, _pressure_hpa(altitude), 0.0, 1182)
 
 
@@ -365,7 +365,7 @@ def _time_estimate(vehicle: Vehicle) -> Any:
     if vehicle.autopilot.landed:
         return time_estimate_to_target(-1, -1)
     home = vehicle.autopilot.home
-    position = vehicle.airframe.position
+    position = vehicle.estimate.position
     away = math.hypot(position[0] - home[0], position[1] - home[1])
     positive = vehicle.parameters.positive
     seconds = away / positive("MPC_XY_CRUISE") + (home[2] - position[2]) / positive("MPC_LAND_SPEED")

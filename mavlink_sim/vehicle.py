@@ -11,12 +11,12 @@ import itertools
 import math
 import random
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, cast
+from typing import Any
 
 from mavlink_sim import parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
-from mavlink_sim.estimate import Estimate
+from mavlink_sim.estimate_errors import FallibleEstimate
 from mavlink_sim.faults import Faults
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
@@ -24,10 +24,10 @@ from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor, Vector
 from mavlink_sim.streams import ONBOARD_RATES_HZ
-from vision.rotation import quaternion_from_euler
 
 STEP_S = 0.004
 STEP_US = 4000
+CONTROL_STEP_S = 0.008  # PX4 runs its position control at about 100 Hz, its attitude control at every step
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
@@ -44,12 +44,13 @@ class Vehicle:
         seed: of wind direction and gusts.
         wind_mps: steady horizontal wind, from a direction that the seed chooses.
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
+        noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
-        airframe: the motion (truth). estimate: what the autopilot believes of it. faults: what goes wrong.
+        airframe: the motion (truth). estimate: what the vehicle knows of it. faults: what goes wrong.
         autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         event_sequence: number of the newest EVENT.
@@ -62,6 +63,7 @@ class Vehicle:
         seed: int = 0,
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
+        noise: bool = True,
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
         on_event: Callable[[str], None] | None = None,
@@ -76,18 +78,18 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.event_sequence = 0
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
         self._on_event = on_event or (lambda text: None)
-        self.estimate = Estimate(self.airframe)
-        self.flown = cast(Multirotor, self.estimate)  # it has all of an airframe's face
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
         self.autopilot = Autopilot(
-            self.flown, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
+            self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
         self._boot_us = 0
+        self._control_is_due = False
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
@@ -114,9 +116,8 @@ class Vehicle:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """`ned_from_body`, (w, x, y, z)."""
-        frame = self.airframe
-        return quaternion_from_euler(frame.roll_rad, frame.pitch_rad, frame.yaw_rad)
+        """The true `ned_from_body`, (w, x, y, z)."""
+        return self.airframe.quaternion
 
     @property
     def battery_remaining(self) -> float:
@@ -228,7 +229,11 @@ class Vehicle:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self.reload_wind(self.faults.winds.values())
-        self.autopilot.update(STEP_S)
+        self._control_is_due = not self._control_is_due
+        if self._control_is_due:
+            self.autopilot.update(CONTROL_STEP_S)
+        self.airframe.advance(STEP_S)
+        self.estimate.update(STEP_S)
         if self.autopilot.sensors_ready and not self._origin_told:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
