@@ -48,15 +48,16 @@ class FaultControl:
             raise ControlError("--control needs zenoh: pip install eclipse-zenoh") from error
         self._faults = faults
         self._waiting: queue.Queue[Any] = queue.Queue(MAX_WAITING)
-        config = zenoh.Config()
-        for key, value in {
+        settings = {
             "mode": "peer",
             "listen/endpoints": [endpoint],
             "connect/endpoints": [],
             "scouting/multicast/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
+        }
+        config = zenoh.Config()
         try:
+            for key, value in settings.items():
+                config.insert_json5(key, json.dumps(value))
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             reason = str(error).splitlines()[0]
