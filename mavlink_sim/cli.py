@@ -16,6 +16,7 @@ import typer
 
 from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.parameters import UnknownParameterError
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.simulation import Simulation, SimulationOptions
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
@@ -76,6 +77,13 @@ def simulate(
     truth: Annotated[
         Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the traffic of each link into this folder, as LINK.tlog.")
+    ] = None,
+    ready_after: Annotated[
+        float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
+    ] = 3.0,
+    px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
@@ -110,6 +118,7 @@ def simulate(
     _check("system-id", system_id, 1, 255)
     _check("wind", wind, 0.0, MAX_WIND_MPS)
     _check("camera-rate", camera_rate, 1.0, 120.0)
+    _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     options = SimulationOptions(
         host=host,
@@ -123,6 +132,9 @@ def simulate(
         camera=camera,
         camera_rate_hz=camera_rate,
         truth=truth,
+        record=record,
+        ready_after_s=ready_after,
+        px4=px4,
         speed=speed,
         parameters=_parameters(param or []),
         faults=tuple(fault or ()),

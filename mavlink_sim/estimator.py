@@ -1,4 +1,4 @@
-"""What the vehicle believes of its own motion: the truth with a navigation filter's errors, and noisy sensors.
+"""What the vehicle believes of its motion: the truth with a navigation filter's errors, and noisy sensors.
 
 The autopilot flies by the estimate and telemetry tells it; only the truth file and the camera see the truth.
 Magnitudes were taken from a PX4 on its own SIH physics: standing and flying telemetry, and the covariances of
@@ -30,16 +30,20 @@ BAROMETER_TIME_CONSTANT_S = 20.0
 # At rest on the ground the filter knows that it does not move.
 SHARE_ON_GROUND = 0.1
 
-FAST_STEP_S = 0.008  # velocity, position, rates
+RATE_STEP_S = 0.008
+DRIFT_STEP_S = 0.024  # velocity and position: steps of a millimetre
 SLOW_STEP_S = 0.048  # attitude, barometer
 GPS_STEP_S = 0.096  # a receiver of 10 Hz
+# White noise is taken from a table, over and over: 8 s of it, which nothing in a flight remembers.
+_TABLE_LENGTH = 1009
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
-# What drives the velocity's error, a step and metre of drift: makes the low-passed drift as wide as named above.
+# What drives the velocity's error, a step and metre of drift, so that the drift is as wide as named above.
+_VELOCITY_KEEP = 1.0 - DRIFT_STEP_S / VELOCITY_TIME_CONSTANT_S
 _VELOCITY_SPREAD = math.sqrt(
     (VELOCITY_TIME_CONSTANT_S + POSITION_TIME_CONSTANT_S)
     / (VELOCITY_TIME_CONSTANT_S * POSITION_TIME_CONSTANT_S**2)
-    * (2.0 * FAST_STEP_S / VELOCITY_TIME_CONSTANT_S)
+    * (1.0 - _VELOCITY_KEEP * _VELOCITY_KEEP)
 )
 
 
@@ -53,19 +57,23 @@ class Estimate(Multirotor):
 
     Attributes:
         position, velocity, acceleration, quaternion, rates…: the estimates, as `Multirotor`'s.
-        offset: NED metres that the position is wrong by on top (a drifting GPS, an estimator that was reset).
+        offset: NED metres that the position is wrong by on top (a drifting GPS, an estimator that was reset);
+            velocity_offset: m/s, yaw_offset_rad: the same of velocity and heading. Nothing by default, and in
+            force without noise too.
         gps_error: NED metres, of the receiver's newest fix. gps_velocity_error: m/s.
         baro_error_m: of the pressure altitude.
         accelerometer_noise: body FRD m/s².
     """
 
     __slots__ = (
-        "_drift_rate",
-        "_fast_left_s",
+        "_drift_left_s",
         "_gps_left_s",
         "_noise",
         "_noise_source",
+        "_place",
+        "_rate_left_s",
         "_slow_left_s",
+        "_table",
         "accelerometer_noise",
         "attitude_error",
         "baro_error_m",
@@ -73,8 +81,11 @@ class Estimate(Multirotor):
         "gps_error",
         "gps_velocity_error",
         "offset",
+        "rate_error",
         "truth",
         "velocity_error",
+        "velocity_offset",
+        "yaw_offset_rad",
     )
 
     def __init__(self, truth: Multirotor, seed: int = 0, noise: bool = True) -> None:
@@ -82,16 +93,24 @@ class Estimate(Multirotor):
         super().__init__(seed)
         self._noise = noise
         self._noise_source = random.Random(f"estimator {seed}")
-        self._fast_left_s = self._slow_left_s = self._gps_left_s = 0.0
+        self._rate_left_s = self._drift_left_s = self._slow_left_s = self._gps_left_s = 0.0
+        gauss = self._noise_source.gauss
+        p, q, r = RATE_NOISE_RADPS
+        self._place = 0
+        self._table = (
+            [(gauss(0.0, p), gauss(0.0, q), gauss(0.0, r)) for _ in range(_TABLE_LENGTH)] if noise else []
+        )
+        self.rate_error: Vector = _ZERO
         self.drift: Vector = _ZERO
         self.offset: Vector = _ZERO
+        self.velocity_offset: Vector = _ZERO
+        self.yaw_offset_rad = 0.0
         self.velocity_error: Vector = _ZERO
         self.attitude_error: Vector = _ZERO
         self.gps_error: Vector = _ZERO
         self.gps_velocity_error = 0.0
         self.baro_error_m = 0.0
         self.accelerometer_noise: Vector = _ZERO
-        self._drift_rate: Vector = _ZERO
         self.update(0.0)
 
     # ---- time -------------------------------------------------------------------------------------------
@@ -104,42 +123,50 @@ class Estimate(Multirotor):
         self.rotor_thrusts = truth.rotor_thrusts
         self.crashed = truth.crashed
         if self._noise:
-            self._fast_left_s -= dt_s
-            if self._fast_left_s <= 1e-9:
-                self._drift(truth.rates)
+            self._rate_left_s -= dt_s
+            if self._rate_left_s <= 1e-9:
+                self._shake()
+            p, q, r = truth.rates
+            dx, dy, dz = self.rate_error
+            self.rates = (p + dx, q + dy, r + dz)
             dx, dy, dz = self.drift
             x, y, z = truth.position
             ox, oy, oz = self.offset
             self.position = (x + dx + ox, y + dy + oy, z + dz + oz)
             ex, ey, ez = self.velocity_error
             vx, vy, vz = truth.velocity
-            self.velocity = (vx + ex, vy + ey, vz + ez)
+            ox, oy, oz = self.velocity_offset
+            self.velocity = (vx + ex + ox, vy + ey + oy, vz + ez + oz)
         else:
             x, y, z = truth.position
             ox, oy, oz = self.offset
             self.position = (x + ox, y + oy, z + oz)
-            self.velocity = truth.velocity
+            x, y, z = truth.velocity
+            ox, oy, oz = self.velocity_offset
+            self.velocity = (x + ox, y + oy, z + oz)
             self.rates = truth.rates
 
-    def _drift(self, rates: Vector) -> None:
-        """The errors a little later; the position's error is a low-passed velocity error, so it has no steps."""
-        dt = FAST_STEP_S
-        self._fast_left_s += dt
-        gauss = self._noise_source.gauss
-        p, q, r = rates
-        sp, sq, sr = RATE_NOISE_RADPS
+    def _shake(self) -> None:
+        """White noise on the rates; every third time the errors of velocity and position move on."""
+        self._rate_left_s += RATE_STEP_S
+        self._place = place = (self._place + 1) % _TABLE_LENGTH
         share = SHARE_ON_GROUND if self.on_ground else 1.0
-        if self.on_ground:
-            self.rates = (p + gauss(0.0, 0.3 * sp), q + gauss(0.0, 0.3 * sq), r + gauss(0.0, 0.3 * sr))
-        else:
-            self.rates = (p + gauss(0.0, sp), q + gauss(0.0, sq), r + gauss(0.0, sr))
-        keep = 1.0 - dt / VELOCITY_TIME_CONSTANT_S
-        spread = share * _VELOCITY_SPREAD
+        self.rate_error = self._table[place] if share == 1.0 else _scaled(self._table[place], share)
+        self._drift_left_s -= RATE_STEP_S
+        if self._drift_left_s <= 1e-9:
+            self._drift(share)
+
+    def _drift(self, share: float) -> None:
+        """The position's error is a low-passed velocity error, so that it has no steps."""
+        dt = DRIFT_STEP_S
+        self._drift_left_s += dt
+        gauss = self._noise_source.gauss
         ex, ey, ez = self.velocity_error
         nx, ny, nz = POSITION_DRIFT_M
-        ex = keep * ex + gauss(0.0, spread * nx)
-        ey = keep * ey + gauss(0.0, spread * ny)
-        ez = keep * ez + gauss(0.0, spread * nz)
+        spread = share * _VELOCITY_SPREAD
+        ex = _VELOCITY_KEEP * ex + gauss(0.0, spread * nx)
+        ey = _VELOCITY_KEEP * ey + gauss(0.0, spread * ny)
+        ez = _VELOCITY_KEEP * ez + gauss(0.0, spread * nz)
         self.velocity_error = (ex, ey, ez)
         dx, dy, dz = self.drift
         hold = 1.0 - dt / POSITION_TIME_CONSTANT_S
@@ -173,9 +200,17 @@ class Estimate(Multirotor):
     # ---- what it reads ----------------------------------------------------------------------------------
 
     @property
-    def quaternion(self) -> Quaternion:  # type: ignore[override]
+    def quaternion(self) -> Quaternion:
         """The attitude with its error, a small turn about the body axes (to first order)."""
         w, x, y, z = self.truth.quaternion
+        if self.yaw_offset_rad:
+            cosine, sine = math.cos(self.yaw_offset_rad / 2), math.sin(self.yaw_offset_rad / 2)
+            w, x, y, z = (
+                cosine * w - sine * z,
+                cosine * x - sine * y,
+                cosine * y + sine * x,
+                cosine * z + sine * w,
+            )
         if not self._noise:
             return (w, x, y, z)
         a, b, c = (0.5 * error for error in self.attitude_error)
@@ -192,8 +227,7 @@ class Estimate(Multirotor):
 
     @property
     def roll_rad(self) -> float:
-        a, b, _ = self.attitude_error
-        c = self.attitude_error[2]
+        a, b, c = self.attitude_error
         _, _, _, _, _, _, x, y, z = self.truth.matrix
         return math.atan2(y + z * a - x * c, z + x * b - y * a)
 
@@ -207,7 +241,13 @@ class Estimate(Multirotor):
     def yaw_rad(self) -> float:
         _, pitch, yaw = self.attitude_error
         a, b, c, d, e, f, _, _, _ = self.truth.matrix
-        return math.atan2(d + e * yaw - f * pitch, a + b * yaw - c * pitch)
+        return math.remainder(
+            math.atan2(d + e * yaw - f * pitch, a + b * yaw - c * pitch) + self.yaw_offset_rad, math.tau
+        )
+
+    @yaw_rad.setter
+    def yaw_rad(self, yaw_rad: float) -> None:
+        self.truth.yaw_rad = yaw_rad
 
     @property
     def specific_force(self) -> Vector:
@@ -230,9 +270,7 @@ class Estimate(Multirotor):
 
     # ---- what it is asked -------------------------------------------------------------------------------
 
-    def command(
-        self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float
-    ) -> None:
+    def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
         """Demand this of the airframe, whose attitude is taken for the estimated one."""
         if self._noise:
             a, b, _ = self.attitude_error
@@ -242,8 +280,23 @@ class Estimate(Multirotor):
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
         self.truth.command_rates(thrust_mps2, rates_radps)
 
+    def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
+        """`command_rates` alone, as `step`."""
+        self.truth.command_rates(thrust_mps2, rates)
+
+    def advance(self, dt_s: float) -> None:
+        """Nothing: only the true airframe moves."""
+
+    def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
+        self.truth.fail_motor(index, effectiveness)
+
     def step(
         self, dt_s: float, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float
     ) -> None:
         """`command` alone: it is the vehicle that lets time pass for the true airframe."""
         self.command(thrust_mps2, roll_rad, pitch_rad, yaw_rate_radps)
+
+
+def _scaled(vector: Vector, share: float) -> Vector:
+    x, y, z = vector
+    return (x * share, y * share, z * share)

@@ -112,6 +112,24 @@ def shifted(message: Any, boot_offset_us: int, clock_offset_us: int) -> Any:
     return moved
 
 
+class _Spoken:
+    """A message of the second autopilot with its packet, numbered as that autopilot numbers."""
+
+    def __init__(self, message: Any, packet: bytes, system: int) -> None:
+        self._message = message
+        self._packet = packet
+        self._system = system
+
+    def get_msgbuf(self) -> bytes:
+        return self._packet
+
+    def get_srcSystem(self) -> int:  # noqa: N802 - pymavlink's name
+        return self._system
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._message, name)
+
+
 def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
     """Another vehicle's autopilot speaks and listens on every link of this one, disarmed on the ground."""
     system = one.fault.values["system"] or vehicle.system_id
@@ -128,9 +146,8 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
         for name, codec in codecs.items():
             for item in other.outgoing(name):
                 if not item.forwarded:  # what it would pass on has been on these links already
-                    item.pack(codec)  # numbered as its own autopilot numbers
-                    again = Outgoing(item.message, item.system, item.component, True)
-                    vehicle.links[name].outbox.append(again)
+                    spoken = _Spoken(item.message, item.pack(codec), system)
+                    vehicle.links[name].outbox.append(Outgoing(spoken, system, item.component, True))
 
     vehicle.faults.second[one.number] = other
     one.each_step = speak

@@ -66,7 +66,6 @@ class Parameters:
         """Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be."""
         self._parameters = {parameter.name: parameter for parameter in default_parameters()}
         self._names = list(self._parameters)
-        self._values = {name: parameter.value for name, parameter in self._parameters.items()}
         self.revision = 0
         for name, value in (values or {}).items():
             self.set(name, value)
@@ -93,7 +92,7 @@ class Parameters:
 
     def number(self, name: str) -> float:
         try:
-            return self._values[name]
+            return self._parameters[name].value
         except KeyError:
             return self[name].value  # which says what is wrong
 
@@ -121,7 +120,6 @@ class Parameters:
             value = _single(float(value))
         changed = replace(parameter, value=value)
         self._parameters[name] = changed
-        self._values[name] = value
         self.revision += 1
         return changed
 

@@ -1,10 +1,10 @@
 """The motion of a multirotor: a rigid body under four rotors, drag, wind, gravity and the ground.
 
-World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag and
-rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated quaternion, so
-no tilt is special; the attitude and rate loops (`rate_loop`) and the mixer run at every step, as on the real
-vehicle. Plain floats in local names throughout: numpy's scalars, or an object for a vector, would make the
-step several times dearer, and with it everything that is tested in lockstep.
+World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag
+and rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated
+quaternion, so no tilt is special; the attitude and rate loops (`rate_loop`) and the mixer run at every step,
+as on the real vehicle. Plain floats in local names throughout: numpy's scalars, or an object for a vector,
+would make the step several times dearer, and with it everything that is tested in lockstep.
 """
 
 from __future__ import annotations
@@ -165,10 +165,8 @@ class Multirotor:
 
     # ---- demands ----------------------------------------------------------------------------------------
 
-    def command(
-        self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float
-    ) -> None:
-        """What to fly from now on: collective thrust, tilt relative to the heading, turn about the vertical."""
+    def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
+        """What to fly from now on: collective thrust, tilt seen from the heading, turn about the vertical."""
         cosine = math.cos(roll_rad)
         yaw_rate = min(max(yaw_rate_radps, -MAX_YAW_RATE_RADPS), MAX_YAW_RATE_RADPS)
         self._demand = (
@@ -181,9 +179,13 @@ class Multirotor:
         self._rate_demand = None
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
-        """What to fly from now on: collective thrust and body rates, the attitude left to whoever asks."""
+        """What to fly from now on: collective thrust and body rates; NaN: go on turning as asked before."""
         self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
-        self._rate_demand = rates_radps
+        before = self._rate_demand or self.rates
+        p, q, r = (
+            asked if math.isnan(rate) else rate for rate, asked in zip(rates_radps, before, strict=True)
+        )
+        self._rate_demand = (p, q, r)
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
         """Let a rotor (0 to 3) give only this share of what it is asked for; 1 makes it whole again.
@@ -205,6 +207,11 @@ class Multirotor:
     ) -> None:
         """`command`, then `advance`."""
         self.command(thrust_mps2, roll_rad, pitch_rad, yaw_rate_radps)
+        self.advance(dt_s)
+
+    def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
+        """`command_rates`, then `advance`."""
+        self.command_rates(thrust_mps2, rates)
         self.advance(dt_s)
 
     # ---- time -------------------------------------------------------------------------------------------

@@ -18,7 +18,9 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
 from mavlink_sim.fault_room import fault_room
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
+from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from vision.shared_frame import segment_path
 
@@ -45,6 +47,9 @@ class SimulationOptions:
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
         camera: name of the shared-memory segment the camera's frames go to; None for no camera.
         truth: file for the truth, one JSON object a line; None for none.
+        record: folder for the traffic of each link, `<link>.tlog`; None for none.
+        ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
         parameters: PX4 parameters that differ from the defaults.
         faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
@@ -63,6 +68,9 @@ class SimulationOptions:
     camera: str | None = None
     camera_rate_hz: float = 30.0
     truth: Path | None = None
+    record: Path | None = None
+    ready_after_s: float = 3.0
+    px4: str = NEWEST
     speed: float = 1.0
     parameters: dict[str, float] = field(default_factory=dict)
     faults: tuple[str, ...] = ()
@@ -76,7 +84,7 @@ class Simulation:
     Raises (when made):
         PortInUseError: a port to bind is taken.
         FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
-        OSError: the truth file cannot be written.
+        OSError: the truth file or the record cannot be written.
     """
 
     def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
@@ -86,6 +94,8 @@ class Simulation:
             seed=options.seed,
             wind_mps=options.wind_mps,
             parameters=options.parameters,
+            ready_after_s=options.ready_after_s,
+            px4=options.px4,
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns
@@ -111,6 +121,8 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            if options.record is not None:
+                self._resources.enter_context(recording(self.endpoints, options.record))
             self._faults = self._resources.enter_context(
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )

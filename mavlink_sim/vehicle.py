@@ -23,11 +23,14 @@ from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor, Vector
+from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 
 STEP_S = 0.004
 STEP_US = 4000
-CONTROL_STEP_S = 0.008  # PX4 runs its position control at about 100 Hz, its attitude control at every step
+# PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
+STEPS_PER_CONTROL = 3
+CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
@@ -47,6 +50,7 @@ class Vehicle:
         noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
@@ -66,9 +70,11 @@ class Vehicle:
         noise: bool = True,
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
+        px4: str = NEWEST,
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
+        self.release = release_named(px4)
         self.parameters = Parameters(parameters)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
@@ -89,7 +95,7 @@ class Vehicle:
             self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
         self._boot_us = 0
-        self._control_is_due = False
+        self._steps_to_control = 0
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
@@ -143,6 +149,7 @@ class Vehicle:
         # links start out of step, so that they do not all send everything in the same millisecond
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
         link.gate = self.faults.gate
+        link.tells_parameter_errors = self.release.has_parameter_errors
         return link
 
     def outgoing(self, link: str) -> list[Outgoing]:
@@ -171,10 +178,11 @@ class Vehicle:
 
     def send_built(self, link: Link, name: str) -> bool:
         """Send one telemetry message by name; False if it has nothing to say now."""
-        if name == "LINK_NODE_STATUS":
+        builder = telemetry.BUILDERS.get(name)
+        if builder is not None:
+            message = builder(self)
+        elif name == "LINK_NODE_STATUS":
             message = link_node_status(self.boot_ms, link.sent, link.received, 0)
-        elif name in telemetry.BUILDERS:
-            message = telemetry.BUILDERS[name](self)
         else:
             message = telemetry.REQUESTED[name](self)
         if message is not None:
@@ -225,16 +233,17 @@ class Vehicle:
         if self.faults.step(STEP_S):
             return
         self._boot_us += STEP_US
-        while self._later and self._later[0][0] <= self.now_s + 1e-9:
+        while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self.reload_wind(self.faults.winds.values())
-        self._control_is_due = not self._control_is_due
-        if self._control_is_due:
+        self._steps_to_control -= 1
+        if self._steps_to_control <= 0:
+            self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
-        if self.autopilot.sensors_ready and not self._origin_told:
+        if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
@@ -244,8 +253,9 @@ class Vehicle:
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
         for link in self.links.values():
-            for name in link.streams.due(self._boot_us):
-                self.send_built(link, name)
+            if link.streams.next_us <= self._boot_us:
+                for name in link.streams.due(self._boot_us):
+                    self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
 
