@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from mavlink_sim.estimator import Estimate
-from mavlink_sim.geography import geographic
 from mavlink_sim.physics import Multirotor, Quaternion, Vector
 
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -61,7 +60,7 @@ class FallibleEstimate(Estimate):
     @property
     def spoiled(self) -> bool:
         """Telemetry has to tell of a fault, now or for ever (the reset counter)."""
-        return bool(self.reset_counter or self.fix_lost or self.gps_drift)
+        return bool(self.reset_counter or self.fix_lost)
 
     def set_error(
         self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
@@ -89,6 +88,11 @@ class FallibleEstimate(Estimate):
             vx, vy, vz = self.velocity
             ex, ey, ez = _sum(error[1] for error in self._errors.values())
             self.velocity = (vx + ex, vy + ey, vz + ez)
+
+    @property
+    def gps_position(self) -> Vector:
+        """Where the GPS receiver believes to be, NED metres: it knows nothing of the filter's errors."""
+        return _sum((self.truth.position, self.gps_error, *self.gps_drift.values()))
 
     @property
     def quaternion(self) -> Quaternion:  # type: ignore[override, misc, unused-ignore]
@@ -144,15 +148,6 @@ def _odometry(estimate: FallibleEstimate, message: Any) -> None:
 
 
 def _gps_raw_int(estimate: FallibleEstimate, message: Any) -> None:
-    north, east, down = _sum((estimate.truth.position, estimate.gps_error))
-    if not estimate.fix_lost:
-        north, east, down = _sum(((north, east, down), *estimate.gps_drift.values()))
-    latitude, longitude, altitude = geographic((north, east, down))
-    message.lat, message.lon, message.alt = (
-        round(latitude * 1e7),
-        round(longitude * 1e7),
-        round(altitude * 1000),
-    )
     if estimate.fix_lost:
         message.fix_type, message.satellites_visible = NO_FIX, 0
         message.eph = message.epv = message.cog = message.vel = _U16_UNKNOWN

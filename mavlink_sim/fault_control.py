@@ -48,17 +48,9 @@ class FaultControl:
             raise ControlError("--control needs zenoh: pip install eclipse-zenoh") from error
         self._faults = faults
         self._waiting: queue.Queue[Any] = queue.Queue(MAX_WAITING)
-        settings = {
-            "mode": "peer",
-            "listen/endpoints": [endpoint],
-            "connect/endpoints": [],
-            "scouting/multicast/enabled": False,
-        }
-        config = zenoh.Config()
+        self._endpoint = endpoint
         try:
-            for key, value in settings.items():
-                config.insert_json5(key, json.dumps(value))
-            self._session = zenoh.open(config)
+            self._session = _shared_session(endpoint)
         except zenoh.ZError as error:
             reason = str(error).splitlines()[0]
             raise ControlError(f"--control {endpoint}: zenoh cannot listen there: {reason}") from error
@@ -93,5 +85,35 @@ class FaultControl:
         query.reply(self.key, json.dumps(reply).encode(), encoding="application/json")
 
     def close(self) -> None:
-        """End the session."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        """Answer no more; the last of the vehicles in this process ends the session."""
+        self._queryable.undeclare()
+        session, users = _sessions[self._endpoint]
+        if users > 1:
+            _sessions[self._endpoint] = (session, users - 1)
+            return
+        del _sessions[self._endpoint]
+        session.close()
+
+
+# The vehicles of one process share the session of an endpoint: (session, how many use it).
+_sessions: dict[str, tuple[Any, int]] = {}
+
+
+def _shared_session(endpoint: str) -> Any:
+    """A session that listens at the endpoint and nowhere else. Raises zenoh.ZError."""
+    import zenoh
+
+    session, users = _sessions.get(endpoint, (None, 0))
+    if session is None:
+        settings = {
+            "mode": "peer",
+            "listen/endpoints": [endpoint],
+            "connect/endpoints": [],
+            "scouting/multicast/enabled": False,
+        }
+        config = zenoh.Config()
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        session = zenoh.open(config)
+    _sessions[endpoint] = (session, users + 1)
+    return session

@@ -261,13 +261,14 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
 def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
     """Power was lost for a moment: disarmed, deaf and silent for a while, then a new boot.
 
-    Kept: parameters, position, battery. Forgotten: modes, home, stream intervals, who was heard.
+    Kept: parameters, mission, fence, rally points, position, battery. Forgotten: modes, home, stream intervals, who was heard.
     """
     faults = vehicle.faults
     one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])
     faults.deaf = True
     faults.boot_offset_us = -vehicle.boot_us
     vehicle.forget_boot()
+    stored = vehicle.autopilot.navigator
     # the same object starts anew: others hold on to it
     Autopilot.__init__(
         vehicle.autopilot,
@@ -277,6 +278,8 @@ def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
         on_event=vehicle.autopilot._on_event,
     )
     vehicle.autopilot.position_valid = vehicle.estimate.position_valid
+    navigator = vehicle.autopilot.navigator
+    navigator.plans, navigator.mission, navigator.fence = stored.plans, stored.mission, stored.fence
 
     def undo() -> None:
         faults.deaf = any(each.fault.kind.name == "reboot" for each in faults.active)
