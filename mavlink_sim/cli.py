@@ -17,6 +17,7 @@ import typer
 from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.parameters import UnknownParameterError
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.simulation import SimulationOptions
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
@@ -77,6 +78,13 @@ def simulate(
     truth: Annotated[
         Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the traffic of each link into this folder, as LINK.tlog.")
+    ] = None,
+    ready_after: Annotated[
+        float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
+    ] = 3.0,
+    px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     noise: Annotated[
         str, typer.Option(help="Sensors and estimates that err as a real vehicle's do: on or off.")
@@ -88,6 +96,17 @@ def simulate(
     camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="Let something go wrong, e.g. 'link_delay 0.2 at=20 for=5'; may be repeated."),
+    ] = None,
+    console: Annotated[
+        bool | None,
+        typer.Option(help="Read faults from standard input; by default if that is a terminal."),
+    ] = None,
+    control: Annotated[
+        str | None, typer.Option(help="Take faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
     ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
@@ -108,6 +127,7 @@ def simulate(
     _check("system-id", system_id, 1, 255)
     _check("wind", wind, 0.0, MAX_WIND_MPS)
     _check("camera-rate", camera_rate, 1.0, 120.0)
+    _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     _check("spacing", spacing, 0.5, 1000.0)
     if noise not in ("on", "off"):
@@ -124,9 +144,15 @@ def simulate(
         camera=camera,
         camera_rate_hz=camera_rate,
         truth=truth,
+        record=record,
+        ready_after_s=ready_after,
+        px4=px4,
         speed=speed,
         noise=noise == "on",
         parameters=_parameters(param or []),
+        faults=tuple(fault or ()),
+        console=console,
+        control=control,
     )
     try:
         fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)

@@ -146,9 +146,8 @@ class PositionController:
             forward = z if z == z else 0.0
             z = gain_z * (target_z - position[2]) + forward
         if x == x and y == y:
-            speed = math.hypot(x, y)
-            if speed > self._max_xy:
-                x, y = x / speed * self._max_xy, y / speed * self._max_xy
+            if math.hypot(x, y) > self._max_xy:
+                x, y = _limited(setpoint.velocity[:2], x, y, self._max_xy)
         else:
             x, y = (
                 min(max(value, -self._max_xy), self._max_xy) if value == value else NAN for value in (x, y)
@@ -193,6 +192,21 @@ class PositionController:
             self.yaw_rad = yaw_rad
             return rate
         return rate + self._yaw_p * math.remainder(self.yaw_rad - yaw_rad, math.tau)
+
+
+def _limited(feed_forward: tuple[float, float], x: float, y: float, limit: float) -> tuple[float, float]:
+    """A horizontal velocity cut to a limit, the part that leads to the position before the feed-forward."""
+    ahead_x, ahead_y = (value if value == value else 0.0 for value in feed_forward)
+    to_x, to_y = x - ahead_x, y - ahead_y
+    to, ahead = math.hypot(to_x, to_y), math.hypot(ahead_x, ahead_y)
+    if to >= limit:
+        return to_x / to * limit, to_y / to * limit
+    if ahead == 0.0:
+        return x, y
+    # the share of the feed-forward at which the sum has just the length of the limit
+    along = (to_x * ahead_x + to_y * ahead_y) / ahead
+    share = (math.sqrt(along * along + limit * limit - to * to) - along) / ahead
+    return to_x + share * ahead_x, to_y + share * ahead_y
 
 
 def _tilt(ax: float, ay: float, yaw_rad: float) -> tuple[float, float]:

@@ -16,7 +16,10 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.fault_room import fault_room
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
+from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from vision.shared_frame import segment_path
 
@@ -43,10 +46,16 @@ class SimulationOptions:
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
         camera: name of the shared-memory segment the camera's frames go to; None for no camera.
         truth: file for the truth, one JSON object a line; None for none.
+        record: folder for the traffic of each link, `<link>.tlog`; None for none.
+        ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
         parameters: PX4 parameters that differ from the defaults.
+        faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
+        console: read faults from standard input; None: if that is a terminal.
+        control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
     """
 
     host: str = "127.0.0.1"
@@ -60,10 +69,16 @@ class SimulationOptions:
     camera: str | None = None
     camera_rate_hz: float = 30.0
     truth: Path | None = None
+    record: Path | None = None
+    ready_after_s: float = 3.0
+    px4: str = NEWEST
     speed: float = 1.0
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
+    console: bool | None = None
+    control: str | None = None
 
 
 class Simulation:
@@ -71,7 +86,8 @@ class Simulation:
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
-        OSError: the truth file cannot be written.
+        FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
+        OSError: the truth file or the record cannot be written.
     """
 
     def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
@@ -81,6 +97,8 @@ class Simulation:
             seed=options.seed,
             wind_mps=options.wind_mps,
             parameters=options.parameters,
+            ready_after_s=options.ready_after_s,
+            px4=options.px4,
             noise=options.noise,
             start_ned_m=options.start_ned_m,
             on_event=on_event,
@@ -109,6 +127,11 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            if options.record is not None:
+                self._resources.enter_context(recording(self.endpoints, options.record))
+            self._faults = self._resources.enter_context(
+                fault_room(self.vehicle, self.endpoints, options, on_event)
+            )
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:
@@ -198,9 +221,12 @@ class Simulation:
         for _ in range(steps):
             self.vehicle.step(STEP_S)
             self._simulated_s += STEP_S
+            for name in self._faults.delivered():
+                self.receive(name)
         if steps:
             self.flush()
             self._show()
+        self._faults.poll()
 
     def _show(self) -> None:
         """The pose to the camera and the truth to its file, each at its rate."""

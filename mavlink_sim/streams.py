@@ -23,6 +23,7 @@ ONBOARD_RATES_HZ: dict[str, float] = {
     "ATTITUDE_TARGET": 9.85,
     "POSITION_TARGET_LOCAL_NED": 9.85,
     "POSITION_TARGET_GLOBAL_INT": 9.85,
+    "ORBIT_EXECUTION_STATUS": 4.95,  # as configured in PX4; sent while orbiting
     "SERVO_OUTPUT_RAW": 9.85,
     "VFR_HUD": 9.85,
     "GPS_RAW_INT": 7.9,
@@ -58,6 +59,7 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "EXTENDED_SYS_STATE": 1.0,
     "ESTIMATOR_STATUS": 0.5,
     "POSITION_TARGET_GLOBAL_INT": 1.0,
+    "ORBIT_EXECUTION_STATUS": 2.0,
     "SCALED_PRESSURE": 1.0,
     "SYSTEM_TIME": 1.0,
     "SYS_STATUS": 1.0,
@@ -110,6 +112,15 @@ class Streams:
         self._due = [entry for entry in self._due if entry[2] != name]
         if interval > 0:
             self._due.append((now_us + interval, self._order[name], name))
+        heapq.heapify(self._due)
+        self.next_us = self._due[0][0] if self._due else NEVER_US
+
+    def restart(self, now_us: int) -> None:
+        """The default rates again, as after a reboot."""
+        self._interval_us = dict(self._default_us)
+        self._due = [
+            (now_us + us, self._order[name], name) for name, us in self._interval_us.items() if us > 0
+        ]
         heapq.heapify(self._due)
         self.next_us = self._due[0][0] if self._due else NEVER_US
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim import packing
 from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
+from mavlink_sim.mission_messages import mission_current
+from mavlink_sim.orbit import orbit_execution_status
 from mavlink_sim.physics import MAX_THRUST_MPS2
-from vision.rotation import quaternion_from_euler
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
@@ -130,11 +131,9 @@ def _distance_sensor(vehicle: Vehicle) -> Any:
 
 
 def _attitude_target(vehicle: Vehicle) -> Any:
-    demand = vehicle.autopilot.demand
-    yaw = vehicle.autopilot.controller.yaw_rad
-    q = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, yaw)
-    thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
-    return packing.attitude_target(vehicle.boot_ms, 0, list(q), 0.0, 0.0, demand.yaw_rate_radps, thrust)
+    autopilot = vehicle.autopilot
+    target = autopilot.attitude.target(vehicle.estimate, autopilot.controller, autopilot.demand)
+    return packing.attitude_target(vehicle.boot_ms, 0, list(target.quaternion), *target.rates, target.thrust)
 
 
 def _type_mask(*groups: tuple[float, float, float]) -> int:
@@ -147,6 +146,8 @@ def _type_mask(*groups: tuple[float, float, float]) -> int:
 
 def _position_target_local_ned(vehicle: Vehicle) -> Any:
     inner = vehicle.autopilot.controller
+    if vehicle.autopilot.attitude.active:
+        return None  # PX4's position controller rests meanwhile
     return packing.position_target_local_ned(
         vehicle.boot_ms,
         1,
@@ -319,7 +320,7 @@ def _system_time(vehicle: Vehicle) -> Any:
 
 
 def _mission_current(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_mission_current_message(0, 65535, 1, 2)
+    return mission_current(vehicle)
 
 
 def _battery_status(vehicle: Vehicle) -> Any:
@@ -386,8 +387,8 @@ def _gps_global_origin(vehicle: Vehicle) -> Any:
 def _autopilot_version(vehicle: Vehicle) -> Any:
     return dialect.MAVLink_autopilot_version_message(
         capabilities=59647,
-        flight_sw_version=0x01110040,
-        middleware_sw_version=0x01110040,
+        flight_sw_version=vehicle.release.software_version,
+        middleware_sw_version=vehicle.release.software_version,
         os_sw_version=0,
         board_version=1,
         flight_custom_version=[0, 0, 0, 253, 175, 214, 222, 89],
@@ -416,6 +417,7 @@ BUILDERS: dict[str, Builder] = {
     "ATTITUDE_TARGET": _attitude_target,
     "POSITION_TARGET_LOCAL_NED": _position_target_local_ned,
     "POSITION_TARGET_GLOBAL_INT": _position_target_global_int,
+    "ORBIT_EXECUTION_STATUS": orbit_execution_status,
     "SERVO_OUTPUT_RAW": _servo_output_raw,
     "VFR_HUD": _vfr_hud,
     "GPS_RAW_INT": _gps_raw_int,

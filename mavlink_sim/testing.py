@@ -1,11 +1,14 @@
 """A vehicle in a process of its own, for integration tests.
 
 >>> with running_simulator(seed=3, speed=4.0) as simulator:      # doctest: +SKIP
-...     connect(f"udpin://127.0.0.1:{simulator.onboard_port}")
+...     connect(simulator.mavsdk_url)
+
+In asyncio code `async with vehicle(seed=3) as simulator:` does the same without blocking the loop.
 """
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -13,10 +16,12 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
 
@@ -73,6 +78,7 @@ class RunningSimulator:
         onboard_bind, gcs_bind: the ports the vehicle itself is bound to.
         vehicles: every vehicle of a fleet in order (the ports above are the first one's).
         events: every line it printed so far, in order, without the ready line.
+        transcript: every line it printed, each after the seconds since it was started.
     """
 
     def __init__(self, process: subprocess.Popen[str], count: int = 1) -> None:
@@ -80,6 +86,8 @@ class RunningSimulator:
         self.vehicles: list[FleetMember] = []
         self._count = count
         self.events: list[str] = []
+        self.transcript: list[str] = []
+        self._started_s = time.monotonic()
         self.onboard_port = self.onboard_bind = self.gcs_port = self.gcs_bind = 0
         self._ready = False
         self._ended = False
@@ -90,6 +98,21 @@ class RunningSimulator:
     @property
     def pid(self) -> int:
         return self.process.pid
+
+    @property
+    def mavsdk_url(self) -> str:
+        """What MAVSDK's `add_any_connection` takes, for a companion."""
+        return f"udpin://127.0.0.1:{self.onboard_port}"
+
+    @property
+    def pymavlink_device(self) -> str:
+        """What pymavlink's `mavlink_connection` takes, for a companion."""
+        return f"udpin:127.0.0.1:{self.onboard_port}"
+
+    @property
+    def gcs_pymavlink_device(self) -> str:
+        """What pymavlink and MAVProxy's `--master` take, for a ground station."""
+        return f"udpin:127.0.0.1:{self.gcs_port}"
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -102,6 +125,7 @@ class RunningSimulator:
     def _take(self, line: str) -> None:
         found = READY.match(line)
         with self._changed:
+            self.transcript.append(f"{time.monotonic() - self._started_s:9.3f} {line}")
             if found:
                 self.vehicles.append(FleetMember(*map(int, found.groups())))
                 first = self.vehicles[0]
@@ -153,6 +177,12 @@ class RunningSimulator:
     def resume(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
 
+    def fault(self, line: str) -> None:
+        """Type a line of the faults' grammar on the simulator's console: `link_loss for=3`, `end all`…"""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
     def stop(self, timeout_s: float = 10.0) -> int:
         """End it in good order (SIGTERM; SIGKILL if it does not). Returns the exit code."""
         if self.process.poll() is None:
@@ -175,8 +205,9 @@ def running_simulator(
     onboard_bind: int = 0,
     gcs_bind: int = 0,
     parameters: dict[str, float] | None = None,
+    faults: Sequence[str] = (),
     timeout_s: float = 60.0,
-    **options: float | str | Path,
+    **options: float | str | Path | None,
 ) -> Iterator[RunningSimulator]:
     """Start a vehicle, wait until it is up, end it afterwards.
 
@@ -184,9 +215,11 @@ def running_simulator(
         onboard_port, gcs_port: where it sends to; None for ports that are free now.
         onboard_bind, gcs_bind: what it binds; give a former run's port to start it anew in the same place.
         parameters: PX4 parameters.
+        faults: each as `mavlink-sim --fault` takes it; `RunningSimulator.fault` brings more while it flies.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
-            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`).
+            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None
+            for none.
     """
     count = int(options.get("vehicles") or 1)  # type: ignore[arg-type]
     ports = free_udp_ports(2)
@@ -201,11 +234,16 @@ def running_simulator(
     }
     command = [sys.executable, "-m", "mavlink_sim"]
     for name, value in arguments.items():
-        command += [f"--{name.replace('_', '-')}", str(value)]
+        if value is None or value is False:
+            continue
+        command += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     for name, value in (parameters or {}).items():
         command += ["--param", f"{name}={value}"]
+    for fault in faults:
+        command += ["--fault", fault]
+    command += ["--console"]
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     simulator = RunningSimulator(process, count)
     try:
@@ -213,5 +251,31 @@ def running_simulator(
         yield simulator
     finally:
         simulator.stop()
+        assert process.stdin is not None
         assert process.stdout is not None
+        with suppress(BrokenPipeError):
+            process.stdin.close()
         process.stdout.close()
+
+
+class vehicle:  # noqa: N801 - it is used as a function, like the context managers of the standard library
+    """A vehicle that is up and can be armed at once: `with vehicle() as v:` or `async with vehicle() as v:`.
+
+    Args:
+        options: those of `running_simulator`. `ready_after` is 0 here: no wait for the estimator.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self._running = running_simulator(**{"ready_after": 0.0, **options})
+
+    def __enter__(self) -> RunningSimulator:
+        return self._running.__enter__()
+
+    def __exit__(self, *exception: Any) -> None:
+        self._running.__exit__(*exception)
+
+    async def __aenter__(self) -> RunningSimulator:
+        return await asyncio.to_thread(self.__enter__)
+
+    async def __aexit__(self, *exception: Any) -> None:
+        await asyncio.to_thread(self.__exit__, *exception)
