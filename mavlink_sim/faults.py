@@ -224,7 +224,7 @@ class Faults:
 
     def step(self, dt_s: float) -> bool:
         """Time passes: begin and end what is due. True: the vehicle itself stands still in this step."""
-        self._elapsed_us += round(dt_s * 1e6)
+        self._elapsed_us += int(dt_s * 1e6 + 0.5)
         if not self._all:
             return False
         now_s = self.now_s + 1e-9

@@ -32,7 +32,7 @@ ROTOR_TORQUE_NM = 0.1  # SIH_Q_MAX
 ANGULAR_DRAG_NMS = 0.025  # SIH_KDW
 
 GUST_TIME_CONSTANT_S = 1.5
-GUST_STEP_S = 0.016  # a hundredth of the time constant: between two values nothing would be seen
+GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
 
 # The ground. A multirotor's legs take a landing at a walking pace; at 5 m/s something breaks.
 GEAR_TIME_CONSTANT_S = 0.1

@@ -264,16 +264,16 @@ class Vehicle:
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
-        mission_link.update(self)
+            mission_link.update(self)
+            if self.autopilot.armed:
+                self._used_charge += CONTROL_STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
+            self._watch_companion()
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
-        if self.autopilot.armed:
-            self._used_charge += STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
-        self._watch_companion()
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
         for link in self.links.values():
