@@ -271,8 +271,9 @@ class Faults:
             message = gate(link, message)
             if message is None:
                 return None
-        if self.vehicle.estimate.spoiled:
-            message = as_told(self.vehicle.estimate, message)
+        estimate = self.vehicle.estimate
+        if estimate.reset_counter or estimate.fix_lost:
+            message = as_told(estimate, message)
         if self.boot_offset_us or self.stalled_us:
             message = shifted(message, self.boot_offset_us, self.boot_offset_us - self.stalled_us)
         return message
