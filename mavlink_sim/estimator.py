@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import random
 
+from mavlink_sim.normal_numbers import BITS, NORMAL
 from mavlink_sim.physics import Multirotor, Quaternion, Vector
 
 # Standard deviations. Position: metres, the smoothed drift of the filter, (north, east, down).
@@ -160,17 +161,18 @@ class Estimate(Multirotor):
         """The position's error is a low-passed velocity error, so that it has no steps."""
         dt = DRIFT_STEP_S
         self._drift_left_s += dt
-        gauss = self._noise_source.gauss
+        bits = self._noise_source.getrandbits
         ex, ey, ez = self.velocity_error
         nx, ny, nz = POSITION_DRIFT_M
         spread = share * _VELOCITY_SPREAD
-        ex = _VELOCITY_KEEP * ex + gauss(0.0, spread * nx)
-        ey = _VELOCITY_KEEP * ey + gauss(0.0, spread * ny)
-        ez = _VELOCITY_KEEP * ez + gauss(0.0, spread * nz)
+        ex = _VELOCITY_KEEP * ex + spread * nx * NORMAL[bits(BITS)]
+        ey = _VELOCITY_KEEP * ey + spread * ny * NORMAL[bits(BITS)]
+        ez = _VELOCITY_KEEP * ez + spread * nz * NORMAL[bits(BITS)]
         self.velocity_error = (ex, ey, ez)
         dx, dy, dz = self.drift
         hold = 1.0 - dt / POSITION_TIME_CONSTANT_S
         self.drift = (hold * dx + ex * dt, hold * dy + ey * dt, hold * dz + ez * dt)
+        gauss = self._noise_source.gauss
         self._slow_left_s -= dt
         if self._slow_left_s <= 1e-9:
             self._slow_left_s += SLOW_STEP_S

@@ -13,6 +13,7 @@ import math
 import random
 from collections.abc import Callable
 
+from mavlink_sim.normal_numbers import BITS, NORMAL
 from mavlink_sim.rate_loop import MAX_YAW_RATE_RADPS, demanded_rates, mixed_thrusts
 
 Vector = tuple[float, float, float]
@@ -331,12 +332,12 @@ class Multirotor:
         self._gust_left_s += GUST_STEP_S
         keep = 1.0 - GUST_STEP_S / GUST_TIME_CONSTANT_S
         spread = self.gusts_mps * math.sqrt(1.0 - keep * keep)
-        gauss = self._random.gauss
+        bits = self._random.getrandbits
         gx, gy, gz = self._gust
         self._gust = (
-            keep * gx + gauss(0.0, spread),
-            keep * gy + gauss(0.0, spread),
-            keep * gz + gauss(0.0, spread),
+            keep * gx + spread * NORMAL[bits(BITS)],
+            keep * gy + spread * NORMAL[bits(BITS)],
+            keep * gz + spread * NORMAL[bits(BITS)],
         )
 
     # ---- the ground -------------------------------------------------------------------------------------
