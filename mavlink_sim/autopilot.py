@@ -27,7 +27,6 @@ from mavlink_sim.announcements import (
     Text,
 )
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
-from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
 from mavlink_sim.navigator import Navigator
 from mavlink_sim.parameters import Parameters
@@ -436,11 +435,7 @@ class Autopilot:
         elif self.mode is Mode.LAND:
             self.task = flight.Land(airframe, parameters)
         elif self.mode is Mode.RTL:
-            task = self.navigator.return_task()
-            self.task = task
-            height = task.return_height_m
-            above_sea = HOME_ALTITUDE_M - task.destination[2] + height
-            self._say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+            self.task = self.navigator.return_task()
         else:
             self.task = flight.Hold(airframe, parameters)
 
