@@ -28,6 +28,7 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
+        self.tells_parameter_errors = True
         self.sent = 0
         self.received = 0
         self._system_id = system_id

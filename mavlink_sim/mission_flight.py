@@ -56,7 +56,7 @@ class MissionFlight(flight.Task):
         self._airframe = airframe
         self._parameters = parameters
         self._trajectory = flight.Trajectory(airframe, parameters)
-        self._descent: flight.Task | None = None
+        self._descent: flight.TrajectoryTask | None = None
         self._since_check_s = 0.0
         self._arrived_s: float | None = None
         self._turned = False
@@ -202,7 +202,7 @@ class MissionFlight(flight.Task):
 
     def _replay_speed(self) -> None:
         """A mission that is resumed has the speed of the last change before its current item."""
-        self._navigator.cruise_mps = None
+        self._navigator.change_speed(0.0)
         for item in self._mission.items[: self._mission.current]:
             if item.command == mission_items.DO_CHANGE_SPEED:
                 self._navigator.change_speed(item.parameters[1])
@@ -329,7 +329,9 @@ class MissionFlight(flight.Task):
         if math.hypot(*ahead) < 1e-3 or math.hypot(*onward) < 1e-3:
             return 0.0
         turn = math.remainder(math.atan2(onward[1], onward[0]) - math.atan2(ahead[1], ahead[0]), math.tau)
-        cruise = self._navigator.cruise_mps or self._parameters.number("MPC_XY_CRUISE")
+        cruise = self._navigator.cruise_mps
+        if math.isnan(cruise):
+            cruise = self._parameters.number("MPC_XY_CRUISE")
         if abs(turn) < STRAIGHT_ON_RAD:
             return cruise
         radius = self._acceptance() / math.tan(abs(turn) / 2.0)

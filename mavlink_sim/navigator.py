@@ -61,7 +61,7 @@ class Navigator:
     Attributes:
         plans: what is stored, by type. mission: the mission and the progress in it.
         fence: what the vehicle is held to. obstacles: for collision prevention.
-        target: the newest landing target. cruise_mps: speed by DO_CHANGE_SPEED, None for MPC_XY_CRUISE.
+        target: the newest landing target.
         uploading: name of the link over which a client uploads. sessions: the mission protocol, by link.
     """
 
@@ -81,7 +81,6 @@ class Navigator:
         self.fence = Geofence(parameters)
         self.obstacles = ObstacleMap()
         self.target: LandingTarget | None = None
-        self.cruise_mps: float | None = None
         self.uploading: str | None = None
         self.sessions: dict[str, Any] = {}
         self.announcements: deque[Current | Reached] = deque()
@@ -104,6 +103,11 @@ class Navigator:
     @property
     def landed(self) -> bool:
         return self._autopilot.landed
+
+    @property
+    def cruise_mps(self) -> float:
+        """Of DO_CHANGE_SPEED; NaN: MPC_XY_CRUISE."""
+        return self._autopilot.cruise_mps
 
     @property
     def home(self) -> Vector:
@@ -184,7 +188,7 @@ class Navigator:
 
     def change_speed(self, speed_mps: float) -> None:
         """DO_CHANGE_SPEED; not above zero: the usual speed again."""
-        self.cruise_mps = speed_mps if speed_mps > 1e-6 else None
+        self._autopilot.change_speed(speed_mps if speed_mps > 1e-6 else 0.0, at_once=False)
 
     def forget_reached(self) -> None:
         """A new mission begins to arrive: nothing of it is reached."""
@@ -264,11 +268,11 @@ class Navigator:
         climb_to_z = found.position[2] - height
         return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
 
-    def _return_landing(self) -> Callable[[Vector], flight.Task]:
+    def _return_landing(self) -> Callable[[Vector], flight.TrajectoryTask]:
         """Makes the task of RTL's last descent."""
         mode = int(self._parameters.number("RTL_PLD_MD"))
 
-        def landing(place: Vector) -> flight.Task:
+        def landing(place: Vector) -> flight.TrajectoryTask:
             if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
                 return flight.Land(self._airframe, self._parameters, place)
             z = self._airframe.position[2]

@@ -49,7 +49,7 @@ class Phase(enum.Enum):
     FALLBACK = "fallback"
 
 
-class PrecisionLanding(flight.Task):
+class PrecisionLanding(flight.TrajectoryTask):
     """Land on the target.
 
     Args:

@@ -117,17 +117,17 @@ class ReturnFlight(flight.Return):
         airframe: Multirotor,
         parameters: Parameters,
         place: Vector,
-        make_landing: Callable[[Vector], flight.Task],
+        make_landing: Callable[[Vector], flight.TrajectoryTask],
     ) -> None:
         super().__init__(airframe, parameters, place)
         self._make_landing = make_landing
 
-    def landing_task(self, place: Vector) -> flight.Task:
+    def landing_task(self, place: Vector) -> flight.TrajectoryTask:
         """The descent at a place."""
         return self._make_landing(place)
 
 
-class RouteReturn(flight.Task):
+class RouteReturn(flight.TrajectoryTask):
     """RTL along the places of a mission, then down at the last one.
 
     Args:
@@ -141,7 +141,7 @@ class RouteReturn(flight.Task):
         parameters: Parameters,
         places: list[Vector],
         landing: Vector,
-        make_landing: Callable[[Vector], flight.Task],
+        make_landing: Callable[[Vector], flight.TrajectoryTask],
         climb_to_z: float | None = None,
     ) -> None:
         self._airframe = airframe
@@ -149,7 +149,7 @@ class RouteReturn(flight.Task):
         self._make_landing = make_landing
         self._trajectory = flight.Trajectory(airframe, parameters)
         self._landing = landing
-        self._descent: flight.Task | None = None
+        self._descent: flight.TrajectoryTask | None = None
         x, y, z = self._trajectory.stopping_point()
         self._ahead = [*places, (landing[0], landing[1], math.nan)]
         if climb_to_z is not None:
