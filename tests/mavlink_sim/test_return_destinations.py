@@ -106,6 +106,7 @@ def test_rtl_lands_at_the_nearer_rally_point(make: Any) -> None:
     upload(cockpit, [rally(14, 0)], 2)
     cockpit.take_off(4.0)
     cockpit.vehicle.airframe.position = (12.0, 3.0, -4.0)
+    cockpit.fly(0.01)  # until the estimate knows
     assert cockpit.command(20) == [0]
     lands_at(cockpit, 14, 0)
     assert any("m above destination)" in text for text in cockpit.texts())
@@ -128,6 +129,7 @@ def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: An
     upload(cockpit, [takeoff(4.0), waypoint(30, 0, 4), item(189), waypoint(20, 5, 4), land(20, 12)])
     cockpit.take_off(4.0)
     cockpit.vehicle.airframe.position = (16.0, 8.0, -4.0)
+    cockpit.fly(0.01)  # until the estimate knows
     cockpit.command(20)
     lands_at(cockpit, 20, 12)
 
