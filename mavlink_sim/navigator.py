@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim import flight, mission_items
 from mavlink_sim.announcements import CRITICAL, INFO, Text
-from mavlink_sim.collision_prevention import ObstacleMap
+from mavlink_sim.collision_prevention import ObstacleMap, Plane, limited_acceleration
 from mavlink_sim.geofence import Action, Geofence
 from mavlink_sim.geography import geographic
 from mavlink_sim.mission_feasibility import complaints
@@ -91,6 +91,7 @@ class Navigator:
         self._disarmed_since_flown = False
         self._breaches: list[str] = []
         self._next_fence_check_s = 0.0
+        self._held_for_obstacles = False
         self._next_reached_s = 0.0
         self._repetitions = 0
 
@@ -145,6 +146,20 @@ class Navigator:
     def allows_goal(self, place: Vector) -> bool:
         """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
         return self.fence.allows_goal(place, self._known_home())
+
+    def allowed_acceleration(self, acceleration: Plane, velocity: Plane) -> Plane:
+        """Collision prevention for Position mode: what is allowed of the acceleration the sticks ask for.
+
+        Both m/s² and m/s, (north, east). Without data for 5 s the vehicle is put into HOLD, as PX4 does.
+        """
+        limited = limited_acceleration(
+            acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
+        )
+        if limited.hold and not self._held_for_obstacles:
+            self._on_event("no obstacle data: HOLD")
+            self._autopilot.set_mode(Mode.HOLD)
+        self._held_for_obstacles = limited.hold
+        return limited.acceleration
 
     # ---- what clients do --------------------------------------------------------------------------------
 

@@ -90,14 +90,15 @@ def mission_route(
     if kind not in (2, 4) or not mission.valid:
         return None
     start, landing = mission.land_start(), mission.landing()
+    if landing is not None and not all(map(math.isfinite, mission.items[landing].place(home))):
+        landing = None
     forward = start is not None and landing is not None and mission.current <= landing
     if forward and start is not None and kind == 4:
         forward = start - mission.current < mission.current  # PX4's measure: items left against items flown
     if forward and landing is not None:
-        items = [item for item in mission.items[mission.current : landing] if item.has_position]
-        return [item.place(home) for item in items], mission.items[landing].place(home)
-    flown = [item for item in mission.items[: mission.current] if item.has_position]
-    return [item.place(home) for item in reversed(flown)], home
+        places = _places(mission.items[mission.current : landing], home)
+        return places, mission.items[landing].place(home)
+    return _places(mission.items[: mission.current], home)[::-1], home
 
 
 def landing_route(mission: Mission, home: Vector) -> tuple[list[Vector], Vector]:
@@ -105,8 +106,13 @@ def landing_route(mission: Mission, home: Vector) -> tuple[list[Vector], Vector]
     start, landing = mission.land_start(), mission.landing()
     assert start is not None  # called for a mission's landing alone
     assert landing is not None
-    places = [item.place(home) for item in mission.items[start:landing] if item.has_position]
-    return places, mission.items[landing].place(home)
+    return _places(mission.items[start:landing], home), mission.items[landing].place(home)
+
+
+def _places(items: tuple[MissionItem, ...], home: Vector) -> list[Vector]:
+    """Where the items with a place are; those that leave some of it open are left out."""
+    places = [item.place(home) for item in items if item.has_position]
+    return [place for place in places if all(map(math.isfinite, place))]
 
 
 class ReturnFlight(flight.Return):
