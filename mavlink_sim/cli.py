@@ -16,6 +16,7 @@ import typer
 
 from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.parameters import UnknownParameterError
+from mavlink_sim.signing import ALWAYS, key_of
 from mavlink_sim.simulation import Simulation, SimulationOptions
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
@@ -80,6 +81,10 @@ def simulate(
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
+    signing_key: Annotated[
+        str | None,
+        typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
+    ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
     ] = None,
@@ -100,6 +105,13 @@ def simulate(
     _check("wind", wind, 0.0, MAX_WIND_MPS)
     _check("camera-rate", camera_rate, 1.0, 120.0)
     _check("speed", speed, 0.05, 20.0)
+    parameters = _parameters(param or [])
+    try:
+        key = None if signing_key is None else key_of(signing_key)
+    except ValueError as error:
+        _fail(f"--signing-key: {error}")
+    if key is not None:
+        parameters.setdefault("MAV_SIGN_CFG", ALWAYS)
     options = SimulationOptions(
         host=host,
         onboard_port=onboard_port,
@@ -113,7 +125,8 @@ def simulate(
         camera_rate_hz=camera_rate,
         truth=truth,
         speed=speed,
-        parameters=_parameters(param or []),
+        parameters=parameters,
+        signing_key=key,
     )
     try:
         simulation = Simulation(options, on_event=_say)

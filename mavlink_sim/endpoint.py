@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from mavlink_sim.messages import Outgoing, parser
+from mavlink_sim.signing import Signing
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +50,7 @@ class UdpEndpoint:
         self.peer: tuple[str, int] = (host, peer_port)
         self._peer_heard_s: float | None = None
         self._codec = parser(system_id)
+        self.signing = Signing()
         self._refused = False
 
     @property
@@ -72,7 +74,7 @@ class UdpEndpoint:
             found = [
                 message
                 for message in self._codec.parse_buffer(datagram) or []
-                if message.get_type() != "BAD_DATA"
+                if message.get_type() != "BAD_DATA" and self.signing.accepts(message.get_msgbuf())
             ]
             if found:
                 self._hear(sender)
@@ -91,6 +93,8 @@ class UdpEndpoint:
         """Send each message; what the network cannot take now is dropped, as a radio would."""
         for item in outgoing:
             packet = item.pack(self._codec)
+            if self.signing.has_key and not item.forwarded:
+                packet = self.signing.signed(packet)
             try:
                 self.socket.sendto(packet, self.peer)
             except (BlockingIOError, ConnectionRefusedError):

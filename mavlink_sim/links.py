@@ -8,8 +8,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from mavlink_sim.announcements import Text
+from mavlink_sim.file_transfer import Server
 from mavlink_sim.messages import Outgoing, dialect
 from mavlink_sim.parameters import Parameter
+from mavlink_sim.signing import Signing
 from mavlink_sim.streams import Streams
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -28,6 +30,8 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
+        self.file_transfer: Server | None = None  # made when somebody asks
+        self.signing = Signing()
         self.sent = 0
         self.received = 0
         self._system_id = system_id

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import commands, parameter_protocol
+from mavlink_sim import commands, event_protocol, file_transfer, parameter_protocol, signing
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED
 from mavlink_sim.messages import dialect
@@ -111,4 +111,7 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_READ": parameter_protocol.request_read,
     "PARAM_SET": parameter_protocol.set_parameter,
     "MISSION_REQUEST_LIST": _mission_request_list,
+    "FILE_TRANSFER_PROTOCOL": file_transfer.handle,
+    "SETUP_SIGNING": signing.setup_signing,
+    "UNKNOWN_412": event_protocol.request,
 }

@@ -46,6 +46,7 @@ class SimulationOptions:
         truth: file for the truth, one JSON object a line; None for none.
         speed: simulated seconds per real second.
         parameters: PX4 parameters that differ from the defaults.
+        signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG says what is refused.
     """
 
     host: str = "127.0.0.1"
@@ -61,6 +62,7 @@ class SimulationOptions:
     truth: Path | None = None
     speed: float = 1.0
     parameters: dict[str, float] = field(default_factory=dict)
+    signing_key: bytes | None = field(default=None, repr=False)
 
 
 class Simulation:
@@ -103,6 +105,10 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            for name, endpoint in self.endpoints.items():
+                endpoint.signing = self.vehicle.links[name].signing
+            if options.signing_key is not None:
+                self.vehicle.sign_everything(options.signing_key)
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.geography import HOME_ALTITUDE_M, HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
 from mavlink_sim.physics import MAX_THRUST_MPS2
+from mavlink_sim.vehicle_files import metadata_message
 from vision.rotation import quaternion_from_euler
 
 if TYPE_CHECKING:
@@ -374,7 +375,7 @@ def _time_estimate(vehicle: Vehicle) -> Any:
 
 
 def _current_event_sequence(vehicle: Vehicle) -> Any:
-    return current_event_sequence(vehicle.event_sequence)
+    return current_event_sequence(vehicle.events.sequence)
 
 
 def _gps_global_origin(vehicle: Vehicle) -> Any:
@@ -440,10 +441,18 @@ BUILDERS: dict[str, Builder] = {
     "GPS_GLOBAL_ORIGIN": _gps_global_origin,
 }
 # Built on request alone.
-REQUESTED: dict[str, Builder] = {"AUTOPILOT_VERSION": _autopilot_version}
+REQUESTED: dict[str, Builder] = {
+    "AUTOPILOT_VERSION": _autopilot_version,
+    "COMPONENT_METADATA": metadata_message,
+}
 
 MESSAGE_IDS: dict[int, str] = {
     identifier: message.msgname
     for identifier, message in dialect.mavlink_map.items()
     if message.msgname in BUILDERS or message.msgname in REQUESTED
-} | {8: "LINK_NODE_STATUS", 380: "TIME_ESTIMATE_TO_TARGET", 411: "CURRENT_EVENT_SEQUENCE"}
+} | {
+    8: "LINK_NODE_STATUS",
+    380: "TIME_ESTIMATE_TO_TARGET",
+    397: "COMPONENT_METADATA",
+    411: "CURRENT_EVENT_SEQUENCE",
+}

@@ -13,15 +13,18 @@ import random
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mavlink_sim import parameter_protocol, telemetry
+from mavlink_sim import file_transfer, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
+from mavlink_sim.event_protocol import EventBuffer
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
-from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
+from mavlink_sim.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor
+from mavlink_sim.signing import Signing, Streams, timestamp_now
 from mavlink_sim.streams import ONBOARD_RATES_HZ
+from mavlink_sim.vehicle_files import vehicle_files
 from vision.rotation import quaternion_from_euler
 
 STEP_S = 0.004
@@ -49,7 +52,7 @@ class Vehicle:
     Attributes:
         airframe: the motion (truth). autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
-        event_sequence: number of the newest EVENT.
+        events: the newest EVENTs. files: what MAVLink FTP reaches.
     """
 
     def __init__(
@@ -74,7 +77,9 @@ class Vehicle:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
         self.links: dict[str, Link] = {}
-        self.event_sequence = 0
+        self.events = EventBuffer()
+        self.files = vehicle_files(self.parameters)
+        self._signing_streams: Streams = {}
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
         self._on_event = on_event or (lambda text: None)
         self.autopilot = Autopilot(
@@ -131,8 +136,20 @@ class Vehicle:
         """Attach a link with the onboard link's rates, or others (`streams.GCS_RATES_HZ`)."""
         rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
         # links start out of step, so that they do not all send everything in the same millisecond
-        link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link.signing = Signing(
+            link_id=len(self.links),
+            streams=self._signing_streams,
+            policy=lambda: int(self.parameters.number("MAV_SIGN_CFG")),
+            is_usb=name == "gcs",  # the ground station's link stands for the USB port
+        )
+        self.links[name] = link
         return link
+
+    def sign_everything(self, key: bytes, timestamp: int | None = None) -> None:
+        """Give every link a signing key; `timestamp` counts 10 us since 2015, None for now."""
+        for link in self.links.values():
+            link.signing.set_up(key, timestamp_now() if timestamp is None else timestamp)
 
     def outgoing(self, link: str) -> list[Outgoing]:
         """Take everything that waits to be sent on a link."""
@@ -215,6 +232,7 @@ class Vehicle:
                 self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
+            file_transfer.continue_transfer(link, self.now_s)
 
     def _watch_companion(self) -> None:
         seen = self._companion_seen_s
@@ -233,10 +251,8 @@ class Vehicle:
             for link in self.links.values():
                 link.send_text(text, self.now_s)
             if text.event is not None:
-                self.event_sequence = (self.event_sequence + 1) & 0xFFFF
                 identifier, levels, arguments = text.event
-                for link in self.links.values():
-                    link.send(event(identifier, self.boot_ms, self.event_sequence, levels, arguments))
+                self.events.emit(self.links.values(), identifier, self.boot_ms, levels, arguments)
         while autopilot.gimbal_commands:
             command, confirmation, values = autopilot.gimbal_commands.popleft()
             for link in self.links.values():
