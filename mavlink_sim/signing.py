@@ -105,7 +105,7 @@ class Signing:
         self._timestamp = (self._timestamp + 1) & 0xFFFFFFFFFFFF
         marked = bytearray(frame)
         marked[2] |= SIGNED
-        change = _checksum_change(len(frame) - 4)
+        change = _checksum_change(len(frame) - 3)
         marked[-2] ^= change & 0xFF
         marked[-1] ^= change >> 8
         marked.append(self._link_id)
