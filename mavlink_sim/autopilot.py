@@ -101,7 +101,7 @@ class Autopilot:
         """PX4's prearm check of the current mode (SYS_STATUS' bit MAV_SYS_STATUS_PREARM_CHECK)."""
         return (
             self.sensors_ready
-            and self.mode not in MODES_PREVENTING_ARMING
+            and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # no matter once it is
             and self.mode is not Mode.MISSION
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
             and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
@@ -117,7 +117,8 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        return base_mode(self.mode, self.armed, self.has_setpoints)
+        # PX4 goes by the newest setpoint, however old
+        return base_mode(self.mode, self.armed, math.isfinite(self._last_setpoint_s))
 
     @property
     def landed_state(self) -> LandedState:
@@ -416,6 +417,8 @@ class Autopilot:
         self.failsafe = False
         self.task = None
         self._takeoff_height_m = None
+        if self.landed:
+            self.home = self._airframe.position
         self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))
         self._on_event(f"disarmed ({reason})")
         self.intended_mode = self._mode_after_disarming

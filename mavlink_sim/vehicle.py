@@ -95,6 +95,7 @@ class Vehicle:
         self._origin_told = False
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._later_count = itertools.count()
+        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
 
     # ---- what is known of it ----------------------------------------------------------------------------
 
@@ -197,6 +198,10 @@ class Vehicle:
     def after(self, delay_s: float, action: Callable[[], None]) -> None:
         """Do something in a later step."""
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
+
+    def _tell_parameters(self) -> None:
+        """What differs from the defaults is told to everyone shortly after the start."""
+        parameter_protocol.tell_everyone(self, [item.name for item in self.parameters.customised()])
 
     def companion_heard(self) -> None:
         """An onboard controller's heartbeat arrived."""
