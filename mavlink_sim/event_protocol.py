@@ -64,13 +64,14 @@ def request(vehicle: Vehicle, link: Link, message: Any) -> None:
     The range may run over 65535. More than 65535 errors nobody asks for: the answers end with the first
     gap longer than the buffer, each missing event before it having its own error.
     """
-    fields = _request_of(bytes(message.get_msgbuf()))
+    frame = bytes(message.get_msgbuf())
+    fields = _request_of(frame)
     if fields is None:
         return
     first, last, system, component = fields
     if system not in (0, vehicle.system_id) or component not in (0, 1):
         return
-    source = (message.get_srcSystem(), message.get_srcComponent())
+    source = (frame[5], frame[6])  # pymavlink does not tell whom an unknown message is from
     missing = 0
     for ahead in range(((last - first) & 0xFFFF) + 1):
         sequence = (first + ahead) & 0xFFFF
