@@ -77,6 +77,8 @@ def forward(message: Any, source: Link, links: Iterable[Link], system_id: int) -
     system, component = target_of(message)
     if system not in (0, system_id) or component == AUTOPILOT_COMPONENT:
         return
+    if message.get_type() == "SETUP_SIGNING":
+        return  # a key is for the one it was told
     for link in links:
         if link is not source and link.knows(system, component):
             link.outbox.append(Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True))

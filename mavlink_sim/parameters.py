@@ -161,9 +161,6 @@ class Parameters:
         """The parameters whose value is not that of `parameters.txt`: what PX4 keeps in its file."""
         return [item for item in self if item.value != self._defaults[item.name].value]
 
-    def default(self, name: str) -> float:
-        return self._defaults[name].value
-
     def hash(self) -> int:
         """The set's _HASH_CHECK."""
         return parameter_hash(self)

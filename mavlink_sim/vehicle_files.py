@@ -18,7 +18,7 @@ from mavlink_sim import announcements
 from mavlink_sim.file_system import FileSystem
 from mavlink_sim.file_transfer import checksum
 from mavlink_sim.messages import component_metadata
-from mavlink_sim.parameters import INT32, Parameter, Parameters, is_volatile
+from mavlink_sim.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
@@ -40,8 +40,8 @@ def vehicle_files(parameters: Parameters) -> FileSystem:
     files = FileSystem()
     files.provide("parameters.bson", lambda: bson(parameters.customised()))
     files.provide("parameters_backup.bson", lambda: bson(parameters.customised()))
-    files.provide(GENERAL, lambda: _compressed(general_metadata(parameters)))
-    files.provide(PARAMETERS, lambda: _compressed(parameter_metadata(parameters)))
+    files.provide(GENERAL, lambda: _compressed(general_metadata()))
+    files.provide(PARAMETERS, lambda: _compressed(parameter_metadata()))
     files.provide(EVENTS, lambda: _compressed(event_metadata()))
     files.make_directory("log")
     return files
@@ -88,15 +88,16 @@ def packed_parameters(parameters: Iterable[Parameter]) -> bytes:
 # ---- metadata
 
 
-def parameter_metadata(parameters: Parameters) -> bytes:
+@cache
+def parameter_metadata() -> bytes:
     """JSON by MAVLink's parameter schema: name, type, group and default of each."""
     listed = []
-    for parameter in parameters:
+    for parameter in default_parameters():
         name = parameter.name
         entry: dict[str, Any] = {
             "name": name,
             "type": "Int32" if parameter.kind == INT32 else "Float",
-            "default": parameters.default(name),
+            "default": parameter.value,
             "group": name.split("_")[0],
             "category": "System" if is_volatile(name) else "Standard",
             "shortDesc": name,
@@ -107,6 +108,7 @@ def parameter_metadata(parameters: Parameters) -> bytes:
     return _json({"version": 1, "parameters": listed})
 
 
+@cache
 def event_metadata() -> bytes:
     """JSON by MAVLink's events schema: what the vehicle's events are called and say."""
     events = {
@@ -127,10 +129,11 @@ def event_metadata() -> bytes:
     )
 
 
-def general_metadata(parameters: Parameters) -> bytes:
+@cache
+def general_metadata() -> bytes:
     """JSON by MAVLink's general schema: which other metadata there is, where, with which checksum."""
     files: list[tuple[int, str, Callable[[], bytes]]] = [
-        (PARAMETER_TYPE, PARAMETERS, lambda: parameter_metadata(parameters)),
+        (PARAMETER_TYPE, PARAMETERS, parameter_metadata),
         (EVENTS_TYPE, EVENTS, event_metadata),
     ]
     types = [
@@ -142,9 +145,7 @@ def general_metadata(parameters: Parameters) -> bytes:
 
 def metadata_message(vehicle: Vehicle) -> Any:
     """COMPONENT_METADATA: where the general metadata is."""
-    return component_metadata(
-        vehicle.boot_ms, checksum(general_metadata(vehicle.parameters)), f"mftp://{GENERAL}"
-    )
+    return component_metadata(vehicle.boot_ms, checksum(general_metadata()), f"mftp://{GENERAL}")
 
 
 def _json(value: dict[str, Any]) -> bytes:

@@ -186,6 +186,8 @@ def test_setup_signing_is_taken_on_the_usb_link_alone(cockpit: Any) -> None:
     cockpit.send(message, "gcs", (245, 190))
     assert cockpit.vehicle.links["gcs"].signing.has_key
     assert not cockpit.vehicle.links["onboard"].signing.has_key
+    cockpit.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    cockpit.send(dialect.MAVLink_setup_signing_message(0, 0, KEY, START), "gcs", (245, 190))
     cockpit.fly(0.1)
     assert not cockpit.received("SETUP_SIGNING")  # a key is passed on to nobody
     cockpit.send(dialect.MAVLink_setup_signing_message(1, 1, bytes(32), 0), "gcs", (245, 190))
