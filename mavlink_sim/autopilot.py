@@ -121,7 +121,7 @@ class Autopilot:
         return (
             self.sensors_ready
             and (self.position_valid or not position_failsafe.needs_position(self.mode))
-            and self.mode not in MODES_PREVENTING_ARMING
+            and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # no matter once it is
             and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
             and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
@@ -140,7 +140,9 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        return base_mode(self.mode, self.armed, self.has_setpoints and not self._rates_alone)
+        # PX4 goes by the newest setpoint, however old
+        has_setpoint = math.isfinite(self._last_setpoint_s) and not self._rates_alone
+        return base_mode(self.mode, self.armed, has_setpoint)
 
     @property
     def landed_state(self) -> LandedState:
@@ -500,6 +502,8 @@ class Autopilot:
         self.failsafe = self.failsafe_is_latched = self.terminated = self.blind = False
         self.task = None
         self._takeoff_height_m = None
+        if self.landed:
+            self.home = self._airframe.position
         self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))
         self._on_event(f"disarmed ({reason})")
         self.intended_mode = self._mode_after_disarming

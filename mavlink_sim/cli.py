@@ -18,6 +18,7 @@ from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.parameters import UnknownParameterError
 from mavlink_sim.releases import NEWEST
+from mavlink_sim.signing import ALWAYS, key_of
 from mavlink_sim.simulation import SimulationOptions
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
@@ -108,6 +109,10 @@ def simulate(
     control: Annotated[
         str | None, typer.Option(help="Take faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
     ] = None,
+    signing_key: Annotated[
+        str | None,
+        typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
+    ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
     ] = None,
@@ -132,6 +137,13 @@ def simulate(
     _check("spacing", spacing, 0.5, 1000.0)
     if noise not in ("on", "off"):
         _fail(f"--noise {noise!r}: expected on or off")
+    parameters = _parameters(param or [])
+    try:
+        key = None if signing_key is None else key_of(signing_key)
+    except ValueError as error:
+        _fail(f"--signing-key: {error}")
+    if key is not None:
+        parameters.setdefault("MAV_SIGN_CFG", ALWAYS)
     options = SimulationOptions(
         host=host,
         onboard_port=onboard_port,
@@ -149,10 +161,11 @@ def simulate(
         px4=px4,
         speed=speed,
         noise=noise == "on",
-        parameters=_parameters(param or []),
         faults=tuple(fault or ()),
         console=console,
         control=control,
+        parameters=parameters,
+        signing_key=key,
     )
     try:
         fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)

@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from mavlink_sim.announcements import Text
+from mavlink_sim.file_transfer import Server
 from mavlink_sim.messages import Outgoing, dialect
 from mavlink_sim.parameters import Parameter
+from mavlink_sim.signing import Signing
 from mavlink_sim.streams import Streams
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -29,6 +31,8 @@ class Link:
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
         self.tells_parameter_errors = True
+        self.file_transfer: Server | None = None  # made when somebody asks
+        self.signing = Signing()
         self.sent = 0
         self.received = 0
         self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
@@ -87,6 +91,8 @@ def forward(message: Any, source: Link, links: Iterable[Link], system_id: int) -
     system, component = target_of(message)
     if system not in (0, system_id) or component == AUTOPILOT_COMPONENT:
         return
+    if message.get_type() == "SETUP_SIGNING":
+        return  # a key is for the one it was told
     for link in links:
         if link is not source and link.knows(system, component):
             link.outbox.append(Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True))

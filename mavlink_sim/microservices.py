@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import commands, mission_link, mission_transfer, parameter_protocol
+from mavlink_sim import (
+    commands,
+    event_protocol,
+    file_transfer,
+    mission_link,
+    mission_transfer,
+    parameter_protocol,
+    signing,
+)
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED
 from mavlink_sim.geography import geographic
@@ -137,4 +145,7 @@ HANDLERS: dict[str, Handler] = {
     **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
     "LANDING_TARGET": mission_link.landing_target,
     "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
+    "FILE_TRANSFER_PROTOCOL": file_transfer.handle,
+    "SETUP_SIGNING": signing.setup_signing,
+    "UNKNOWN_412": event_protocol.request,
 }

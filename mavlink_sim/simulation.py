@@ -56,6 +56,7 @@ class SimulationOptions:
         faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
         console: read faults from standard input; None: if that is a terminal.
         control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
+        signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG says what is refused.
     """
 
     host: str = "127.0.0.1"
@@ -79,6 +80,7 @@ class SimulationOptions:
     faults: tuple[str, ...] = ()
     console: bool | None = None
     control: str | None = None
+    signing_key: bytes | None = field(default=None, repr=False)
 
 
 class Simulation:
@@ -132,6 +134,10 @@ class Simulation:
             self._faults = self._resources.enter_context(
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )
+            for name, endpoint in self.endpoints.items():
+                endpoint.signing = self.vehicle.links[name].signing
+            if options.signing_key is not None:
+                self.vehicle.sign_everything(options.signing_key)
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:
