@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from mavlink_sim import flight
+from mavlink_sim import flight, reposition
 from mavlink_sim.announcements import (
     ARMED_EVENT,
     ARMING_DENIED_EVENT,
@@ -26,9 +26,11 @@ from mavlink_sim.announcements import (
     GimbalCommand,
     Text,
 )
+from mavlink_sim.attitude_control import AttitudeController, RatesSetpoint
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
 from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
+from mavlink_sim.orbit import Orbit, OrbitRequest
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
 
@@ -66,6 +68,8 @@ class Autopilot:
         self._on_event = on_event
         self.controller = PositionController(parameters)
         self.controller.reset(airframe.yaw_rad)
+        self.attitude = AttitudeController(parameters)
+        self.cruise_mps = math.nan  # of DO_CHANGE_SPEED; it ends with the mode
         self.now_s = 0.0
         self.armed = False
         self.mode = Mode.HOLD
@@ -82,6 +86,7 @@ class Autopilot:
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
         self._last_setpoint_s = -math.inf
+        self._rates_alone = False  # the newest offboard setpoint was of body rates
         self._armed_since_s = 0.0
         self._landed_since_s = 0.0
         self._contact_since_s: float | None = None
@@ -121,7 +126,7 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        return base_mode(self.mode, self.armed, self.has_setpoints)
+        return base_mode(self.mode, self.armed, self.has_setpoints and not self._rates_alone)
 
     @property
     def landed_state(self) -> LandedState:
@@ -207,15 +212,32 @@ class Autopilot:
         self._intend(Mode.RTL)
         return ACCEPTED
 
-    def reposition(self, goal: Vector, yaw_rad: float) -> int:
-        """Fly to a local NED position and hold there; NaN components stay as they are."""
+    def reposition(self, goal: Vector, yaw_rad: float, speed_mps: float = math.nan) -> int:
+        """Fly to a local NED position and hold there; NaN components as in `reposition_goal`."""
+        airframe, parameters = self._airframe, self._parameters
+        former = None if self.task is None else self.task.goal
         self._intend(Mode.HOLD)
-        if self.armed and not self.landed:
-            here = flight.Trajectory(self._airframe, self._parameters).stopping_point()
-            x, y, z = (
-                wanted if math.isfinite(wanted) else own for wanted, own in zip(goal, here, strict=True)
-            )
-            self.task = flight.Hold(self._airframe, self._parameters, (x, y, z), yaw_rad)
+        if self.armed:
+            goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+            self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
+            self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
+        return ACCEPTED
+
+    def change_speed(self, speed_mps: float, at_once: bool) -> None:
+        """Another cruise speed for auto modes until the mode ends; zero or less: MPC_XY_CRUISE again.
+
+        `at_once`: for the goal that is being flown to as well, else from the next one on.
+        """
+        self.cruise_mps = speed_mps if speed_mps > 0.0 else math.nan
+        if at_once and speed_mps > 0.0 and self.task is not None:
+            self.task.cruise_at(speed_mps)
+
+    def orbit(self, request: OrbitRequest) -> int:
+        """Mode ORBIT; a radius that cannot be is accepted too, and then the vehicle hovers in that mode."""
+        if self.mode is not Mode.ORBIT or not isinstance(self.task, Orbit):
+            self._intend(Mode.ORBIT)
+        if isinstance(self.task, Orbit) and not self.task.apply(request):
+            self._say(CRITICAL, "Orbit radius limit exceeded\t")
         return ACCEPTED
 
     def pilot_takes_over(self, mode: Mode = Mode.POSCTL) -> int:
@@ -223,9 +245,10 @@ class Autopilot:
         self.pilot_has_sticks = True
         return self.set_mode(mode)
 
-    def offboard_setpoint(self, setpoint: TrajectorySetpoint) -> None:
+    def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
         """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
         self._last_setpoint_s = self.now_s
+        self._rates_alone = isinstance(setpoint, RatesSetpoint)
         if self.mode is Mode.OFFBOARD and isinstance(self.task, flight.Offboard):
             self.task.setpoint = setpoint
 
@@ -249,9 +272,12 @@ class Autopilot:
         setpoint = task.update(dt_s)
         if task.landing and not was_landing:
             self._say(INFO, "RTL: land at destination\t")
-        if self._on_ground_and_idle(setpoint):
+        if not isinstance(setpoint, TrajectorySetpoint):
+            self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
+        elif self._on_ground_and_idle(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
+            self.attitude.release()
             demand = self.demand = self.controller.update(
                 dt_s,
                 setpoint,
@@ -271,6 +297,7 @@ class Autopilot:
 
     def _idle(self, dt_s: float, thrust_mps2: float) -> None:
         airframe = self._airframe
+        self.attitude.release()
         self.controller.reset(airframe.yaw_rad)
         self.demand = Demand(thrust_mps2, 0.0, 0.0, 0.0)
         airframe.step(dt_s, thrust_mps2, 0.0, 0.0, 0.0)
@@ -313,7 +340,7 @@ class Autopilot:
         rise = (progress - RAMP_THRUST_SHARE) / (1.0 - RAMP_THRUST_SHARE)
         return min(max(speed * rise, RAMP_CREEP_MPS), speed)
 
-    def _detect_landing(self, setpoint: TrajectorySetpoint) -> None:
+    def _detect_landing(self, setpoint: flight.Setpoint) -> None:
         airframe = self._airframe
         if self.landed:
             if -airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
@@ -388,6 +415,7 @@ class Autopilot:
     def _enter(self, mode: Mode) -> None:
         if mode is not self.mode:
             self._on_event(f"mode {mode.name}")
+            self.cruise_mps = math.nan
         self.mode = mode
         if not self.armed:
             return
@@ -401,6 +429,8 @@ class Autopilot:
         if self.mode is Mode.OFFBOARD:
             if not isinstance(self.task, flight.Offboard):
                 self.task = flight.Offboard()
+        elif self.mode is Mode.ORBIT:
+            self.task = Orbit(airframe, parameters)
         elif self.mode is Mode.TAKEOFF:
             self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
         elif self.mode in (Mode.LAND, Mode.PRECLAND):

@@ -16,6 +16,7 @@ from typing import Any
 from mavlink_sim import parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
+from mavlink_sim.estimator import Estimate
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
@@ -23,10 +24,12 @@ from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor
 from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.streams import ONBOARD_RATES_HZ
-from vision.rotation import quaternion_from_euler
 
 STEP_S = 0.004
 STEP_US = 4000
+# PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
+STEPS_PER_CONTROL = 3
+CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
@@ -43,13 +46,15 @@ class Vehicle:
         seed: of wind direction and gusts.
         wind_mps: steady horizontal wind, from a direction that the seed chooses.
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
+        noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
         px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
-        airframe: the motion (truth). autopilot: the decisions. parameters: the parameter set. links: by name.
+        airframe: the motion (truth). estimate: what the vehicle knows of it. autopilot: the decisions.
+        parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         event_sequence: number of the newest EVENT.
     """
@@ -61,6 +66,7 @@ class Vehicle:
         seed: int = 0,
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
+        noise: bool = True,
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
         px4: str = NEWEST,
@@ -77,14 +83,16 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        self.estimate = Estimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.event_sequence = 0
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
         self._on_event = on_event or (lambda text: None)
         self.autopilot = Autopilot(
-            self.airframe, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
+            self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
         self._boot_us = 0
+        self._steps_to_control = 0
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
@@ -111,9 +119,8 @@ class Vehicle:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """`ned_from_body`, (w, x, y, z)."""
-        frame = self.airframe
-        return quaternion_from_euler(frame.roll_rad, frame.pitch_rad, frame.yaw_rad)
+        """The true `ned_from_body`, (w, x, y, z)."""
+        return self.airframe.quaternion
 
     @property
     def battery_remaining(self) -> float:
@@ -163,10 +170,11 @@ class Vehicle:
 
     def send_built(self, link: Link, name: str) -> bool:
         """Send one telemetry message by name; False if it has nothing to say now."""
-        if name == "LINK_NODE_STATUS":
+        builder = telemetry.BUILDERS.get(name)
+        if builder is not None:
+            message = builder(self)
+        elif name == "LINK_NODE_STATUS":
             message = link_node_status(self.boot_ms, link.sent, link.received, 0)
-        elif name in telemetry.BUILDERS:
-            message = telemetry.BUILDERS[name](self)
         else:
             message = telemetry.REQUESTED[name](self)
         if message is not None:
@@ -196,7 +204,7 @@ class Vehicle:
 
     def _step(self) -> None:
         self._boot_us += STEP_US
-        while self._later and self._later[0][0] <= self.now_s + 1e-9:
+        while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self._wind_revision = self.parameters.revision
@@ -205,8 +213,13 @@ class Vehicle:
                 for name in ("SIH_WIND_N", "SIH_WIND_E")
             )
             self.airframe.wind = (north, east, 0.0)
-        self.autopilot.update(STEP_S)
-        if self.autopilot.sensors_ready and not self._origin_told:
+        self._steps_to_control -= 1
+        if self._steps_to_control <= 0:
+            self._steps_to_control = STEPS_PER_CONTROL
+            self.autopilot.update(CONTROL_STEP_S)
+        self.airframe.advance(STEP_S)
+        self.estimate.update(STEP_S)
+        if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
@@ -216,8 +229,9 @@ class Vehicle:
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
         for link in self.links.values():
-            for name in link.streams.due(self._boot_us):
-                self.send_built(link, name)
+            if link.streams.next_us <= self._boot_us:
+                for name in link.streams.due(self._boot_us):
+                    self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
 
