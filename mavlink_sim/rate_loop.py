@@ -23,7 +23,7 @@ RATE_D = 0.003 * math.sqrt(0.5)
 # MC_YAWRATE_P 0.2 alone turns SIH's weak rotor torque into 0.4 s of lag, which PX4's integral part shortens;
 # this gain gives a lag of 0.15 s without one.
 YAW_RATE_P = 0.5
-# Share of full thrust per rad/s that angular drag (SIH_KDW) takes: of four rotors on their arms, and by torque.
+# Share of full thrust per rad/s that angular drag (SIH_KDW) takes, of rotors on their arms and by torque.
 RATE_DRAG = 0.025 / (4 * 5.0 * 0.2)
 YAW_RATE_DRAG = 0.025 / (4 * 0.1)
 # Yaw is served last, but PX4 keeps this share of the range for it by lowering the thrust.
