@@ -44,7 +44,8 @@ def test_every_command_of_the_vehicle_starts_it(line: str, tmp_path: Path) -> No
         cwd=tmp_path,
         env=environment(),
     )
-    simulator = RunningSimulator(process)
+    count = int(words[words.index("--vehicles") + 1]) if "--vehicles" in words else 1
+    simulator = RunningSimulator(process, count)
     try:
         simulator.wait_until_ready(60.0)
     finally:
