@@ -80,7 +80,7 @@ def simulate(
         Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(help="Record the traffic of each link into this folder, as LINK.tlog.")
+        Path | None, typer.Option(help="Record each link's traffic into this folder, as LINK-SYSTEM.tlog.")
     ] = None,
     ready_after: Annotated[
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")

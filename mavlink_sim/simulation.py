@@ -46,7 +46,7 @@ class SimulationOptions:
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
         camera: name of the shared-memory segment the camera's frames go to; None for no camera.
         truth: file for the truth, one JSON object a line; None for none.
-        record: folder for the traffic of each link, `<link>.tlog`; None for none.
+        record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
         px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
@@ -130,7 +130,8 @@ class Simulation:
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
             if options.record is not None:
-                self._resources.enter_context(recording(self.endpoints, options.record))
+                files = {f"{name}-{options.system_id}": link for name, link in self.endpoints.items()}
+                self._resources.enter_context(recording(files, options.record))
             self._faults = self._resources.enter_context(
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )
