@@ -19,6 +19,8 @@ from vision.rotation import Quaternion, quaternion_from_euler
 
 NAN = math.nan
 MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may ask for any number
+RATE_AXES = ("ROLL", "PITCH", "YAW")
+MAX_RATE_INTEGRAL = 0.3  # MC_RR_INT_LIM, MC_PR_INT_LIM, MC_YR_INT_LIM: share of full torque
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +29,7 @@ class AttitudeSetpoint:
 
     Attributes:
         quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation leaves the vehicle
-            turning as it turns, as in PX4, where it makes the torques nothing.
+            turning as it turns, slowed by drag alone, as in PX4, where it makes the torques nothing.
         yaw_rate_radps: feed-forward about the world's down axis; NaN for none.
         thrust: collective, 0..1.
     """
@@ -39,7 +41,10 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class RatesSetpoint:
-    """Body rates (FRD, rad/s) to turn at; NaN: go on as the vehicle turns now. `thrust`: collective, 0..1."""
+    """Body rates (FRD, rad/s) to turn at; NaN: as the vehicle turned when the setpoint came.
+
+    `thrust`: collective, 0..1.
+    """
 
     rates: Vector
     thrust: float
@@ -61,6 +66,9 @@ class AttitudeController:
         self._parameters = parameters
         self._revision = -1
         self._target: AttitudeTarget | None = None
+        self._setpoint: AttitudeSetpoint | RatesSetpoint | None = None
+        self._rates: Vector = (0.0, 0.0, 0.0)
+        self._integral: Vector = (0.0, 0.0, 0.0)
         self._load()
 
     def _load(self) -> None:
@@ -73,12 +81,20 @@ class AttitudeController:
         self._gains = (value("MC_ROLL_P"), value("MC_PITCH_P"), yaw_gain)
         self._limits = tuple(
             min(math.radians(self._parameters.positive(name)), MAX_RATE_RADPS)
-            for name in ("MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX")
+            for name in (f"MC_{axis}RATE_MAX" for axis in RATE_AXES)
         )
+        # the integral part of the rate loop as rate per rate error, so that it adds to what is asked for
+        proportional = [self._parameters.positive(f"MC_{axis}RATE_P") for axis in RATE_AXES]
+        self._integral_gains = tuple(
+            value(f"MC_{axis}RATE_I") / gain for axis, gain in zip(RATE_AXES, proportional, strict=True)
+        )
+        self._integral_limits = tuple(MAX_RATE_INTEGRAL / gain for gain in proportional)
 
     def release(self) -> None:
         """Another controller has the vehicle."""
-        self._target = None
+        if self._target is not None:
+            self._target = self._setpoint = None
+            self._integral = (0.0, 0.0, 0.0)
 
     @property
     def active(self) -> bool:
@@ -111,12 +127,34 @@ class AttitudeController:
             rates = self.rates(setpoint, airframe)
             self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, rates, abs(setpoint.thrust))
         else:
-            rates = _possible(setpoint.rates)
-            self._target = AttitudeTarget(before.quaternion, rates, before.thrust)
+            if setpoint is not self._setpoint:
+                self._rates = _possible(setpoint.rates, airframe.rates)
+            rates = self._rates
+            self._target = AttitudeTarget(before.quaternion, setpoint.rates, before.thrust)
+        self._setpoint = setpoint
         outer.reset(airframe.yaw_rad)  # so that it begins afresh, with the heading of that moment
         thrust_mps2 = min(max(setpoint.thrust, 0.0), 1.0) * MAX_THRUST_MPS2
-        airframe.step_rates(dt_s, thrust_mps2, rates)
+        airframe.step_rates(dt_s, thrust_mps2, self._without_lasting_error(dt_s, rates, airframe))
         return Demand(thrust_mps2, airframe.roll_rad, airframe.pitch_rad, airframe.rates[2])
+
+    def _without_lasting_error(self, dt_s: float, rates: Vector, airframe: Multirotor) -> Vector:
+        """The rates to ask the airframe for, so that drag leaves no error: PX4's integral part."""
+        if airframe.on_ground:
+            self._integral = (0.0, 0.0, 0.0)
+            return rates
+        x, y, z = (
+            min(max(known + gain * (wanted - now) * dt_s, -limit), limit) if wanted == wanted else known
+            for known, gain, wanted, now, limit in zip(
+                self._integral,
+                self._integral_gains,
+                rates,
+                airframe.rates,
+                self._integral_limits,
+                strict=True,
+            )
+        )
+        self._integral = (x, y, z)
+        return (rates[0] + x, rates[1] + y, rates[2] + z)
 
     def rates(self, setpoint: AttitudeSetpoint, airframe: Multirotor) -> Vector:
         """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation."""
@@ -137,9 +175,10 @@ class AttitudeController:
         return (p, q, r)
 
 
-def _possible(rates: Vector) -> Vector:
+def _possible(rates: Vector, now: Vector) -> Vector:
     p, q, r = (
-        min(max(rate, -MAX_RATE_RADPS), MAX_RATE_RADPS) if math.isfinite(rate) else NAN for rate in rates
+        min(max(rate, -MAX_RATE_RADPS), MAX_RATE_RADPS) if math.isfinite(rate) else present
+        for rate, present in zip(rates, now, strict=True)
     )
     return (p, q, r)
 
