@@ -19,8 +19,6 @@ from vision.rotation import Quaternion, quaternion_from_euler
 
 NAN = math.nan
 MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may ask for any number
-RATE_AXES = ("ROLL", "PITCH", "YAW")
-MAX_RATE_INTEGRAL = 0.3  # MC_RR_INT_LIM, MC_PR_INT_LIM, MC_YR_INT_LIM: share of full torque
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +27,7 @@ class AttitudeSetpoint:
 
     Attributes:
         quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation leaves the vehicle
-            turning as it turns, slowed by drag alone, as in PX4, where it makes the torques nothing.
+            turning as it turned; PX4 makes no torque then.
         yaw_rate_radps: feed-forward about the world's down axis; NaN for none.
         thrust: collective, 0..1.
     """
@@ -68,7 +66,6 @@ class AttitudeController:
         self._target: AttitudeTarget | None = None
         self._setpoint: AttitudeSetpoint | RatesSetpoint | None = None
         self._rates: Vector = (0.0, 0.0, 0.0)
-        self._integral: Vector = (0.0, 0.0, 0.0)
         self._load()
 
     def _load(self) -> None:
@@ -81,20 +78,13 @@ class AttitudeController:
         self._gains = (value("MC_ROLL_P"), value("MC_PITCH_P"), yaw_gain)
         self._limits = tuple(
             min(math.radians(self._parameters.positive(name)), MAX_RATE_RADPS)
-            for name in (f"MC_{axis}RATE_MAX" for axis in RATE_AXES)
+            for name in ("MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX")
         )
-        # the integral part of the rate loop as rate per rate error, so that it adds to what is asked for
-        proportional = [self._parameters.positive(f"MC_{axis}RATE_P") for axis in RATE_AXES]
-        self._integral_gains = tuple(
-            value(f"MC_{axis}RATE_I") / gain for axis, gain in zip(RATE_AXES, proportional, strict=True)
-        )
-        self._integral_limits = tuple(MAX_RATE_INTEGRAL / gain for gain in proportional)
 
     def release(self) -> None:
         """Another controller has the vehicle."""
         if self._target is not None:
             self._target = self._setpoint = None
-            self._integral = (0.0, 0.0, 0.0)
 
     @property
     def active(self) -> bool:
@@ -124,8 +114,9 @@ class AttitudeController:
         """One step of control and of the airframe. Returns the new demand; `demand` is the one before."""
         before = self.target(airframe, outer, demand)
         if isinstance(setpoint, AttitudeSetpoint):
-            rates = self.rates(setpoint, airframe)
-            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, rates, abs(setpoint.thrust))
+            told = self.rates(setpoint, airframe)
+            rates = _possible(told, airframe.rates)
+            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, told, abs(setpoint.thrust))
         else:
             if setpoint is not self._setpoint:
                 self._rates = _possible(setpoint.rates, airframe.rates)
@@ -134,27 +125,8 @@ class AttitudeController:
         self._setpoint = setpoint
         outer.reset(airframe.yaw_rad)  # so that it begins afresh, with the heading of that moment
         thrust_mps2 = min(max(setpoint.thrust, 0.0), 1.0) * MAX_THRUST_MPS2
-        airframe.step_rates(dt_s, thrust_mps2, self._without_lasting_error(dt_s, rates, airframe))
+        airframe.step_rates(dt_s, thrust_mps2, rates)
         return Demand(thrust_mps2, airframe.roll_rad, airframe.pitch_rad, airframe.rates[2])
-
-    def _without_lasting_error(self, dt_s: float, rates: Vector, airframe: Multirotor) -> Vector:
-        """The rates to ask the airframe for, so that drag leaves no error: PX4's integral part."""
-        if airframe.on_ground:
-            self._integral = (0.0, 0.0, 0.0)
-            return rates
-        x, y, z = (
-            min(max(known + gain * (wanted - now) * dt_s, -limit), limit) if wanted == wanted else known
-            for known, gain, wanted, now, limit in zip(
-                self._integral,
-                self._integral_gains,
-                rates,
-                airframe.rates,
-                self._integral_limits,
-                strict=True,
-            )
-        )
-        self._integral = (x, y, z)
-        return (rates[0] + x, rates[1] + y, rates[2] + z)
 
     def rates(self, setpoint: AttitudeSetpoint, airframe: Multirotor) -> Vector:
         """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation."""

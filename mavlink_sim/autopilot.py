@@ -30,9 +30,11 @@ from mavlink_sim.attitude_control import AttitudeController, RatesSetpoint
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
 from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
+from mavlink_sim.navigator import Navigator
 from mavlink_sim.orbit import Orbit, OrbitRequest
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.precision_landing import Precision
 
 ACCEPTED = 0  # MAV_RESULT
 TEMPORARILY_REJECTED = 1
@@ -92,6 +94,9 @@ class Autopilot:
         self._contact_since_s: float | None = None
         self._lifting_since_s: float | None = None
         self._has_flown = False
+        self.failsafe_is_latched = False  # it stays until the mode is changed by a user
+        self.terminated = False
+        self.navigator = Navigator(self, airframe, parameters, on_event)
 
     # ---- what others read -------------------------------------------------------------------------------
 
@@ -111,13 +116,16 @@ class Autopilot:
         return (
             self.sensors_ready
             and self.mode not in MODES_PREVENTING_ARMING
-            and self.mode is not Mode.MISSION
+            and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
+            and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
             and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
         )
 
     @property
     def system_status(self) -> SystemState:
+        if self.terminated:
+            return SystemState.FLIGHT_TERMINATION
         if self.failsafe and self.armed:
             return SystemState.CRITICAL
         if self.armed:
@@ -132,7 +140,7 @@ class Autopilot:
     def landed_state(self) -> LandedState:
         if self.landed:
             return LandedState.ON_GROUND
-        if self.mode is Mode.TAKEOFF:
+        if self.mode is Mode.TAKEOFF or (self.task is not None and self.task.taking_off):
             return LandedState.TAKEOFF
         if self.task is not None and self.task.landing:
             return LandedState.LANDING
@@ -184,7 +192,7 @@ class Autopilot:
             return self.has_setpoints
         if mode in MANUAL_MODES:
             return self.pilot_has_sticks
-        return mode is not Mode.MISSION  # there is never a mission on board
+        return mode is not Mode.MISSION or self.navigator.mission.valid
 
     def takeoff(self, altitude_m: float | None) -> int:
         """Mode TAKEOFF to a height above home (None: MIS_TAKEOFF_ALT). It never arms."""
@@ -245,6 +253,28 @@ class Autopilot:
         self.pilot_has_sticks = True
         return self.set_mode(mode)
 
+    def hold_at(self, place: Vector) -> None:
+        """Change to HOLD, and stay at a local NED position rather than where braking ends."""
+        self._intend(Mode.HOLD)
+        self.task = flight.Hold(self._airframe, self._parameters, place)
+
+    def restart_task(self) -> None:
+        """Begin the current mode's task anew."""
+        self._start_task()
+
+    def enter_failsafe(self, mode: Mode) -> None:
+        """A failsafe takes the vehicle until somebody changes the mode or it is disarmed."""
+        self.failsafe = self.failsafe_is_latched = True
+        self._say(CRITICAL, "Failsafe activated\t")
+        self._on_event(f"failsafe: {mode.name}")
+        self._enter(mode)
+
+    def terminate(self) -> None:
+        """Stop the motors in flight, for good: flight termination."""
+        self.terminated = self.failsafe = self.failsafe_is_latched = True
+        self._say(CRITICAL, "Failsafe activated\t")
+        self._on_event("flight terminated")
+
     def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
         """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
         self._last_setpoint_s = self.now_s
@@ -258,10 +288,11 @@ class Autopilot:
         """Check failsafes and detectors, run the flight task, move the airframe."""
         self.now_s += dt_s
         self._check_offboard()
+        self.navigator.update()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
         airframe = self._airframe
-        if not self.armed:
+        if not self.armed or self.terminated:
             self._idle(dt_s, 0.0)
             if not self.landed and airframe.on_ground:
                 self._has_landed()
@@ -270,7 +301,7 @@ class Autopilot:
         assert task is not None
         was_landing = task.landing
         setpoint = task.update(dt_s)
-        if task.landing and not was_landing:
+        if task.landing and not was_landing and self.mode is Mode.RTL:
             self._say(INFO, "RTL: land at destination\t")
         if not isinstance(setpoint, TrajectorySetpoint):
             self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
@@ -368,6 +399,8 @@ class Autopilot:
     def _disarm_automatically(self) -> None:
         if not self.landed:
             return
+        if self._has_flown and self.navigator.in_progress:
+            return
         if self._has_flown:
             delay = self._parameters.number("COM_DISARM_LAND")
             if delay >= 0.0 and self.now_s - self._landed_since_s >= delay:
@@ -379,7 +412,7 @@ class Autopilot:
 
     def _check_offboard(self) -> None:
         """Loss of the setpoint stream, and its return, while OFFBOARD is what the user wants."""
-        if self.intended_mode is not Mode.OFFBOARD or not self.armed:
+        if self.intended_mode is not Mode.OFFBOARD or not self.armed or self.failsafe_is_latched:
             return
         if self.failsafe and self.has_setpoints:
             self.failsafe = False
@@ -409,7 +442,7 @@ class Autopilot:
         self.intended_mode = mode
         if mode not in MODES_PREVENTING_ARMING:
             self._mode_after_disarming = mode
-        self.failsafe = False
+        self.failsafe = self.failsafe_is_latched = False
         self._enter(mode)
 
     def _enter(self, mode: Mode) -> None:
@@ -433,13 +466,17 @@ class Autopilot:
             self.task = Orbit(airframe, parameters)
         elif self.mode is Mode.TAKEOFF:
             self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
-        elif self.mode in (Mode.LAND, Mode.PRECLAND):
+        elif self.mode is Mode.MISSION:
+            self.task = self.navigator.mission_task()
+        elif self.mode is Mode.PRECLAND:
+            self.task = self.navigator.precision_landing(Precision.REQUIRED)
+        elif self.mode is Mode.LAND:
             self.task = flight.Land(airframe, parameters)
         elif self.mode is Mode.RTL:
-            task = flight.Return(airframe, parameters, self.home)
+            task = self.navigator.return_task()
             self.task = task
             height = task.return_height_m
-            above_sea = HOME_ALTITUDE_M - self.home[2] + height
+            above_sea = HOME_ALTITUDE_M - task.destination[2] + height
             self._say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
         else:
             self.task = flight.Hold(airframe, parameters)
@@ -450,7 +487,7 @@ class Autopilot:
 
     def _disarm(self, text: str, reason: str) -> None:
         self.armed = False
-        self.failsafe = False
+        self.failsafe = self.failsafe_is_latched = self.terminated = False
         self.task = None
         self._takeoff_height_m = None
         self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))

@@ -15,9 +15,10 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from mavlink_sim.endpoint import PortInUseError
+from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.parameters import UnknownParameterError
 from mavlink_sim.releases import NEWEST
-from mavlink_sim.simulation import Simulation, SimulationOptions
+from mavlink_sim.simulation import SimulationOptions
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
 MAX_WIND_MPS = 8.0
@@ -85,6 +86,14 @@ def simulate(
     ] = 3.0,
     px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
+    noise: Annotated[
+        str, typer.Option(help="Sensors and estimates that err as a real vehicle's do: on or off.")
+    ] = "on",
+    vehicles: Annotated[
+        int, typer.Option(help="A fleet of so many: system ids and ports count up from those given.")
+    ] = 1,
+    spacing: Annotated[float, typer.Option(help="Metres between the vehicles of a fleet, on a grid.")] = 5.0,
+    camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
@@ -109,6 +118,9 @@ def simulate(
     _check("camera-rate", camera_rate, 1.0, 120.0)
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
+    _check("spacing", spacing, 0.5, 1000.0)
+    if noise not in ("on", "off"):
+        _fail(f"--noise {noise!r}: expected on or off")
     options = SimulationOptions(
         host=host,
         onboard_port=onboard_port,
@@ -125,49 +137,69 @@ def simulate(
         ready_after_s=ready_after,
         px4=px4,
         speed=speed,
+        noise=noise == "on",
         parameters=_parameters(param or []),
     )
     try:
-        simulation = Simulation(options, on_event=_say)
+        fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)
     except PortInUseError as error:
         _fail(str(error))
     except UnknownParameterError as error:
         _fail(str(error.args[0]))
     except (OSError, ValueError) as error:
         _fail(str(error))
-    with simulation:
-        _run(simulation, ready_file)
+    with fleet:
+        _run(fleet, ready_file)
 
 
-def _run(simulation: Simulation, ready_file: Path | None) -> None:
+def _run(fleet: Fleet, ready_file: Path | None) -> None:
     def stop(number: int, frame: FrameType | None) -> None:
-        simulation.stop()
+        fleet.stop()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    ports = {name: endpoint.port for name, endpoint in simulation.endpoints.items()}
-    options = simulation.options
+    reports = [
+        {
+            "system_id": one.options.system_id,
+            **{f"{name}_bind": end.port for name, end in one.endpoints.items()},
+        }
+        for one in fleet
+    ]
     if ready_file is not None:
-        report = {"pid": os.getpid(), "onboard_bind": ports["onboard"], "gcs_bind": ports["gcs"]}
+        report: dict[str, Any] = {
+            "pid": os.getpid(),
+            **{name: reports[0][name] for name in ("onboard_bind", "gcs_bind")},
+        }
+        if len(reports) > 1:
+            report["vehicles"] = reports
         partial = ready_file.with_name(ready_file.name + ".partial")
         try:
             partial.write_text(json.dumps(report) + "\n", encoding="utf-8")
             partial.replace(ready_file)  # whoever waits for the file finds it whole
         except OSError as error:
             _fail(f"--ready-file: {error}")
-    _say(
-        f"ready: system {options.system_id}, "
-        f"onboard {options.host}:{ports['onboard']} -> {options.onboard_port}, "
-        f"ground station {options.host}:{ports['gcs']} -> {options.gcs_port}"
-    )
-    simulation.run()
+    for one, bound in zip(fleet, reports, strict=True):
+        options = one.options
+        _say(
+            f"ready: system {options.system_id}, "
+            f"onboard {options.host}:{bound['onboard_bind']} -> {options.onboard_port}, "
+            f"ground station {options.host}:{bound['gcs_bind']} -> {options.gcs_port}"
+        )
+    if len(reports) > 1:
+        _say(f"ready: {len(reports)} vehicles")
+    fleet.run()
     _say("stopped")
 
 
 def main() -> None:
     """The console script's entry: what cannot be is said in one line, with exit code 2."""
     try:
-        code = app(standalone_mode=False)
+        if sys.argv[1:2] == ["bench"]:
+            from mavlink_sim.bench import app as bench_app
+
+            code = bench_app(sys.argv[2:], prog_name="mavlink-sim bench", standalone_mode=False)
+        else:
+            code = app(standalone_mode=False)
     except _USAGE_ERROR as error:
         print(f"mavlink-sim: {error.format_message()}", file=sys.stderr)
         code = 2

@@ -11,6 +11,7 @@ from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.geography import geographic, local
 from mavlink_sim.messages import dialect, protocol_version
+from mavlink_sim.mission_start import mission_start
 from mavlink_sim.modes import CUSTOM_MODE_ENABLED, mode_of
 from mavlink_sim.orbit import OrbitRequest
 from mavlink_sim.telemetry import MESSAGE_IDS
@@ -159,8 +160,8 @@ def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _deny(vehicle: Vehicle, link: Link, command: Command) -> int:
-    return DENIED
+def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return mission_start(vehicle.autopilot, command.parameters[0])
 
 
 def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -232,7 +233,7 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     DO_CHANGE_ALTITUDE: _change_altitude,
     DO_REPOSITION: _reposition,
     245: _accept,  # PREFLIGHT_STORAGE
-    300: _deny,  # MISSION_START: there is no mission
+    300: _mission_start,
     ARM_DISARM: _arm,
     401: _accept,  # RUN_PREARM_CHECKS
     GET_MESSAGE_INTERVAL: _get_message_interval,

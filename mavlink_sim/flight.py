@@ -101,6 +101,7 @@ class Task(ABC):
 
     landing = False  # on the final descent
     finished = False
+    taking_off = False  # climbing from the ground in a mode other than TAKEOFF
     goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
 
     @abstractmethod
@@ -109,6 +110,14 @@ class Task(ABC):
 
     def cruise_at(self, speed_mps: float) -> None:  # noqa: B027 - a task without a route has no cruise speed
         """Fly the rest of the route at this horizontal speed (DO_CHANGE_SPEED, DO_REPOSITION)."""
+
+
+class TrajectoryTask(Task):
+    """A task that asks for positions and velocities, never for attitudes."""
+
+    @abstractmethod
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        """Where to be and how to move after another `dt_s` seconds."""
 
 
 class Hold(Task):
@@ -152,7 +161,7 @@ class Takeoff(Task):
         return self._trajectory.towards(self.goal, dt_s, max_up_mps=climb)
 
 
-class Land(Task):
+class Land(TrajectoryTask):
     """Descend at one place until the ground: MPC_LAND_SPEED low down, MPC_LAND_CRWL in the last metre."""
 
     landing = True
@@ -191,7 +200,7 @@ class Return(Task):
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
         self._home = home
-        self._land: Land | None = None
+        self._land: TrajectoryTask | None = None
         self._phase = "climb"
         x, y, z = self._trajectory.stopping_point()
         self.return_height_m = self._return_height(math.hypot(x - home[0], y - home[1]), home[2] - z)
@@ -229,11 +238,15 @@ class Return(Task):
                 descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
                 self.goal = (home_x, home_y, home_z - descend)
         if self._phase == "descend" and self.goal[2] - z < value("NAV_MC_ALT_RAD"):
-            self._land = Land(self._airframe, self._parameters, (home_x, home_y, home_z))
+            self._land = self.landing_task((home_x, home_y, home_z))
             self.goal = self._land.goal
             self.landing = True
             return self._land.update(dt_s)
         return self._trajectory.towards(self.goal, dt_s, yaw)
+
+    def landing_task(self, place: Vector) -> TrajectoryTask:
+        """The descent at a place."""
+        return Land(self._airframe, self._parameters, place)
 
 
 class Offboard(Task):

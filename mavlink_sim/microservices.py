@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import commands, parameter_protocol
+from mavlink_sim import commands, mission_link, mission_transfer, parameter_protocol
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED
 from mavlink_sim.geography import geographic
@@ -119,13 +119,6 @@ def _ping(vehicle: Vehicle, link: Link, message: Any) -> None:
         )
 
 
-def _mission_request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
-    kind = getattr(message, "mission_type", 0)
-    link.send(
-        dialect.MAVLink_mission_count_message(message.get_srcSystem(), message.get_srcComponent(), 0, kind)
-    )
-
-
 Handler = Callable[["Vehicle", "Link", Any], None]
 
 HANDLERS: dict[str, Handler] = {
@@ -141,5 +134,7 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_LIST": parameter_protocol.request_list,
     "PARAM_REQUEST_READ": parameter_protocol.request_read,
     "PARAM_SET": parameter_protocol.set_parameter,
-    "MISSION_REQUEST_LIST": _mission_request_list,
+    **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
+    "LANDING_TARGET": mission_link.landing_target,
+    "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
 }

@@ -31,6 +31,7 @@ class SystemState(IntEnum):
     STANDBY = 3
     ACTIVE = 4
     CRITICAL = 5
+    FLIGHT_TERMINATION = 8
 
 
 class Mode(Enum):

@@ -179,10 +179,11 @@ class Multirotor:
         self._rate_demand = None
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
-        """What to fly from now on: collective thrust and body rates; NaN: go on turning as now."""
+        """What to fly from now on: collective thrust and body rates; NaN: go on turning as asked before."""
         self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
+        before = self._rate_demand or self.rates
         p, q, r = (
-            now if math.isnan(rate) else rate for rate, now in zip(rates_radps, self.rates, strict=True)
+            asked if math.isnan(rate) else rate for rate, asked in zip(rates_radps, before, strict=True)
         )
         self._rate_demand = (p, q, r)
 

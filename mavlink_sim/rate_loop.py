@@ -1,6 +1,7 @@
 """From a wanted tilt to four rotors: PX4's attitude and rate controllers, and its mixer with saturation.
 
-The gains are PX4's defaults. Integral parts are left out: this airframe is balanced, they would stay zero.
+The gains are PX4's defaults. In the place of its integral parts stands what they come to on this airframe,
+which is balanced: the thrust that keeps a turn going against the drag.
 The attitude loop compares thrust axes (the "reduced attitude" of Brescianini, Hehn, D'Andrea, 2013, which PX4
 uses), so it knows no gimbal lock; the heading is held by the yaw rate that the caller derives.
 """
@@ -22,6 +23,9 @@ RATE_D = 0.003 * math.sqrt(0.5)
 # MC_YAWRATE_P 0.2 alone turns SIH's weak rotor torque into 0.4 s of lag, which PX4's integral part shortens;
 # this gain gives a lag of 0.15 s without one.
 YAW_RATE_P = 0.5
+# Share of full thrust per rad/s that angular drag (SIH_KDW) takes, of rotors on their arms and by torque.
+RATE_DRAG = 0.025 / (4 * 5.0 * 0.2)
+YAW_RATE_DRAG = 0.025 / (4 * 0.1)
 # Yaw is served last, but PX4 keeps this share of the range for it by lowering the thrust.
 YAW_MARGIN = 0.15
 
@@ -70,9 +74,9 @@ def mixed_thrusts(collective: float, wanted: Vector, rates: Vector, spin: Vector
         collective: wanted thrust, 0..1.
         wanted, rates: body rates, rad/s; spin: angular acceleration, rad/s².
     """
-    roll = RATE_P * (wanted[0] - rates[0]) - RATE_D * spin[0]
-    pitch = RATE_P * (wanted[1] - rates[1]) - RATE_D * spin[1]
-    yaw = YAW_RATE_P * (wanted[2] - rates[2])
+    roll = RATE_P * (wanted[0] - rates[0]) - RATE_D * spin[0] + RATE_DRAG * wanted[0]
+    pitch = RATE_P * (wanted[1] - rates[1]) - RATE_D * spin[1] + RATE_DRAG * wanted[1]
+    yaw = YAW_RATE_P * (wanted[2] - rates[2]) + YAW_RATE_DRAG * wanted[2]
     base = 0.0 if collective < 0.0 else 1.0 if collective > 1.0 else collective
     spread = (roll if roll >= 0.0 else -roll) + (pitch if pitch >= 0.0 else -pitch)
     if spread > 0.5:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim import packing
-from mavlink_sim.geography import HOME_ALTITUDE_M, HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG, geographic
+from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
+from mavlink_sim.mission_messages import mission_current
 from mavlink_sim.orbit import orbit_execution_status
 from mavlink_sim.physics import MAX_THRUST_MPS2
 
@@ -286,7 +286,7 @@ def _open_drone_id_location(vehicle: Vehicle) -> Any:
 
 def _open_drone_id_system(vehicle: Vehicle) -> Any:
     latitude, longitude, altitude = geographic(vehicle.autopilot.home)
-    since_2019 = max(int(time.time()) - 1546300800, 0)  # the standard counts from 2019-01-01
+    since_2019 = max(vehicle.utc_ns() // 10**9 - 1546300800, 0)  # the standard counts from 2019-01-01
     return dialect.MAVLink_open_drone_id_system_message(
         0,
         0,
@@ -316,11 +316,11 @@ def _scaled_pressure(vehicle: Vehicle) -> Any:
 
 
 def _system_time(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_system_time_message(time.time_ns() // 1000, vehicle.boot_ms)
+    return dialect.MAVLink_system_time_message(vehicle.utc_ns() // 1000, vehicle.boot_ms)
 
 
 def _mission_current(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_mission_current_message(0, 65535, 1, 2)
+    return mission_current(vehicle)
 
 
 def _battery_status(vehicle: Vehicle) -> Any:
@@ -375,10 +375,11 @@ def _current_event_sequence(vehicle: Vehicle) -> Any:
 
 
 def _gps_global_origin(vehicle: Vehicle) -> Any:
+    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
     return dialect.MAVLink_gps_global_origin_message(
-        round(HOME_LATITUDE_DEG * 1e7),
-        round(HOME_LONGITUDE_DEG * 1e7),
-        round(HOME_ALTITUDE_M * 1000),
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        round(altitude * 1000),
         vehicle.boot_us,
     )
 

@@ -19,10 +19,32 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
+
+FLEET_READY = re.compile(r"^ready: \d+ vehicles")
+
+
+def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
+    """The first of so many consecutive UDP ports that nobody is bound to at this moment.
+
+    Raises:
+        OSError: none were found in a hundred places.
+    """
+    for _ in range(100):
+        (start,) = free_udp_ports(1, host)
+        try:
+            with ExitStack() as stack:
+                for port in range(start, start + count):
+                    candidate = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                    candidate.bind((host, port))
+        except (OSError, OverflowError):
+            continue
+        return start
+    raise OSError(f"no {count} consecutive UDP ports are free on {host}")
 
 
 def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
@@ -36,6 +58,17 @@ def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
         return ports
 
 
+@dataclass(frozen=True, slots=True)
+class FleetMember:
+    """One vehicle of a running fleet: its system id, and the ports as `RunningSimulator` names them."""
+
+    system_id: int
+    onboard_bind: int
+    onboard_port: int
+    gcs_bind: int
+    gcs_port: int
+
+
 class RunningSimulator:
     """A `python -m mavlink_sim` that is up.
 
@@ -43,12 +76,15 @@ class RunningSimulator:
         onboard_port: the UDP port a companion listens on (`udpin:127.0.0.1:<port>`); the vehicle sends there.
         gcs_port: the same for a ground station.
         onboard_bind, gcs_bind: the ports the vehicle itself is bound to.
+        vehicles: every vehicle of a fleet in order (the ports above are the first one's).
         events: every line it printed so far, in order, without the ready line.
         transcript: every line it printed, each after the seconds since it was started.
     """
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: subprocess.Popen[str], count: int = 1) -> None:
         self.process = process
+        self.vehicles: list[FleetMember] = []
+        self._count = count
         self.events: list[str] = []
         self.transcript: list[str] = []
         self._started_s = time.monotonic()
@@ -91,10 +127,13 @@ class RunningSimulator:
         with self._changed:
             self.transcript.append(f"{time.monotonic() - self._started_s:9.3f} {line}")
             if found:
-                _, self.onboard_bind, self.onboard_port, self.gcs_bind, self.gcs_port = map(
-                    int, found.groups()
-                )
-                self._ready = True
+                self.vehicles.append(FleetMember(*map(int, found.groups())))
+                first = self.vehicles[0]
+                self.onboard_bind, self.onboard_port = first.onboard_bind, first.onboard_port
+                self.gcs_bind, self.gcs_port = first.gcs_bind, first.gcs_port
+                self._ready = len(self.vehicles) == self._count
+            elif FLEET_READY.match(line):
+                pass  # each of them has said so
             else:
                 self.events.append(line)
             self._changed.notify_all()
@@ -171,9 +210,13 @@ def running_simulator(
         parameters: PX4 parameters.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
-            `truth=path`, `wind=3.0`, `system_id=2`); True for an option without a value, None for none.
+            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None
+            for none.
     """
+    count = int(options.get("vehicles") or 1)  # type: ignore[arg-type]
     ports = free_udp_ports(2)
+    if count > 1 and onboard_port is None:
+        ports[0] = free_udp_port_range(count)
     arguments = {
         "onboard_port": ports[0] if onboard_port is None else onboard_port,
         "gcs_port": ports[1] if gcs_port is None else gcs_port,
@@ -191,7 +234,7 @@ def running_simulator(
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
-    simulator = RunningSimulator(process)
+    simulator = RunningSimulator(process, count)
     try:
         simulator.wait_until_ready(timeout_s)
         yield simulator

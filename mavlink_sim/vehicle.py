@@ -13,10 +13,11 @@ import random
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mavlink_sim import parameter_protocol, telemetry
+from mavlink_sim import mission_link, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
 from mavlink_sim.estimator import Estimate
+from mavlink_sim.geography import geographic, start_of_vehicle
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
@@ -25,6 +26,8 @@ from mavlink_sim.physics import Multirotor
 from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 
+# When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
+BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12
 STEP_S = 0.004
 STEP_US = 4000
 # PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
@@ -50,12 +53,14 @@ class Vehicle:
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
         px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
+        start_ned_m: where it starts, north and east of SIH's home; its local NED frame begins there.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
         airframe: the motion (truth). estimate: what the vehicle knows of it. autopilot: the decisions.
         parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
+        utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
         event_sequence: number of the newest EVENT.
     """
 
@@ -70,6 +75,7 @@ class Vehicle:
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
         px4: str = NEWEST,
+        start_ned_m: tuple[float, float] = (0.0, 0.0),
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
@@ -87,6 +93,8 @@ class Vehicle:
         self.links: dict[str, Link] = {}
         self.event_sequence = 0
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
+        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self._boot_us * 1000
+        self.start_ned_m = start_ned_m
         self._on_event = on_event or (lambda text: None)
         self.autopilot = Autopilot(
             self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
@@ -123,6 +131,11 @@ class Vehicle:
         return self.airframe.quaternion
 
     @property
+    def home_altitude_m(self) -> float:
+        """Of home above mean sea level."""
+        return geographic(self.autopilot.home)[2]
+
+    @property
     def battery_remaining(self) -> float:
         """0..1. Half of it goes in SIM_BAT_DRAIN seconds of armed time; never below SIM_BAT_MIN_PCT."""
         lowest = self.parameters.number("SIM_BAT_MIN_PCT") / 100.0
@@ -155,6 +168,7 @@ class Vehicle:
 
     def handle(self, link_name: str, message: Any) -> None:
         """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
+        start_of_vehicle.set(self.start_ned_m)
         link = self.links[link_name]
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self.system_id, AUTOPILOT_COMPONENT):
@@ -185,6 +199,7 @@ class Vehicle:
 
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
+        start_of_vehicle.set(self.start_ned_m)
         self._leftover_s += dt_s
         while self._leftover_s >= STEP_S - 1e-9:
             self._leftover_s -= STEP_S
@@ -217,6 +232,7 @@ class Vehicle:
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
+        mission_link.update(self)
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:

@@ -34,6 +34,7 @@ def rates(p: float, q: float, r: float, thrust: float = HOVER, mask: int = 128) 
 # ---- what counts
 
 
+@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 255))
 def test_the_type_mask_decides_between_attitude_rates_and_nothing(mask: int) -> None:
     message = dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, [1, 0, 0, 0], 0.1, 0.2, 0.3, 0.6)
@@ -101,7 +102,7 @@ def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpi
     cockpit.fly(4.0, tilted)
     airframe = cockpit.vehicle.airframe
     seen = [math.degrees(angle) for angle in (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)]
-    assert seen == pytest.approx([20.0, -10.0, 60.0], abs=1.5)
+    assert seen == pytest.approx([20.0, -10.0, 60.0], abs=1.0)
     down = third_axis(quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad))
     drag = LINEAR_DRAG_PER_S
     expected = [-GRAVITY_MPS2 * axis - drag * v for axis, v in zip(down, airframe.velocity, strict=True)]
@@ -147,14 +148,12 @@ def test_a_tumbling_vehicle_comes_upright(cockpit: Any) -> None:
 def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(cockpit: Any) -> None:
     cockpit.take_off(10.0)
     cockpit.offboard(rates(0.0, 0.0, 0.5))
-    cockpit.fly(8.0, rates(0.0, 0.0, 0.5))
-    turning = cockpit.vehicle.airframe.rates[2]
+    cockpit.fly(3.0, rates(0.0, 0.0, 0.5))
     for values in ([0.0] * 4, [math.nan] * 4):
         nothing = attitude()
         nothing.q = values
-        cockpit.fly(0.4, nothing)
-        assert 0.6 * turning < cockpit.vehicle.airframe.rates[2] < turning  # only the air slows it
-        turning = cockpit.vehicle.airframe.rates[2]
+        cockpit.fly(1.0, nothing)
+        assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.5, abs=0.05)
     assert cockpit.mode == "OFFBOARD"
 
 
@@ -165,11 +164,11 @@ def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(cockpi
     cockpit.take_off(10.0)
     spin = rates(0.0, 0.0, 0.8)
     cockpit.offboard(spin)
-    cockpit.fly(8.0, spin)
+    cockpit.fly(3.0, spin)
     assert cockpit.vehicle.airframe.rates == pytest.approx((0.0, 0.0, 0.8), abs=0.02)
     cockpit.fly(1.0, rates(0.0, 0.0, 0.0, mask=128 | 4))
     assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.8, abs=0.1)
-    cockpit.fly(8.0, rates(0.0, 0.0, 0.0))
+    cockpit.fly(2.0, rates(0.0, 0.0, 0.0))
     assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.0, abs=0.02)
 
 
@@ -285,6 +284,7 @@ angles = st.floats(-3.1, 3.1)
 attitudes = st.tuples(angles, st.floats(-1.5, 1.5), angles)
 
 
+@settings(max_examples=60, deadline=None)
 @given(attitudes, attitudes)
 def test_the_controller_turns_any_attitude_into_any_other(
     start: tuple[float, float, float], goal: tuple[float, float, float]
@@ -302,6 +302,7 @@ def test_the_controller_turns_any_attitude_into_any_other(
     assert abs(product(inverse(reached), wanted)[0]) > 0.9999
 
 
+@settings(max_examples=60, deadline=None)
 @given(attitudes)
 def test_euler_angles_survive_the_quaternion(attitude_rad: tuple[float, float, float]) -> None:
     assert euler(quaternion_from_euler(*attitude_rad)) == pytest.approx(attitude_rad, abs=1e-6)

@@ -41,7 +41,6 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--onboard-port", "0"], ["--onboard-port", "1 to 65535"]),
         (["--gcs-bind", "70000"], ["--gcs-bind", "0 to 65535"]),
         (["--system-id", "256"], ["--system-id", "1 to 255"]),
-        (["--set-mode-acks", "3"], ["--set-mode-acks", "1 to 2"]),
         (["--host", "not.a.host.invalid"], ["not.a.host.invalid"]),
         (["--truth", "/nonexistent/folder/truth.jsonl"], ["truth.jsonl"]),
     ],
