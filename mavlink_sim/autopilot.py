@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from mavlink_sim import flight, reposition
+from mavlink_sim import flight, position_failsafe, reposition
 from mavlink_sim.announcements import (
     ARMED_EVENT,
     ARMING_DENIED_EVENT,
@@ -78,6 +78,8 @@ class Autopilot:
         self.intended_mode = Mode.HOLD
         self.failsafe = False
         self.landed = True
+        self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
+        self.blind = False  # in the fallback for a lost position
         self.pilot_has_sticks = False  # a remote control is connected, so POSCTL and the like can be flown
         self.home: Vector = airframe.position
         self.texts: deque[Text] = deque()
@@ -88,6 +90,7 @@ class Autopilot:
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
         self._last_setpoint_s = -math.inf
+        self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
         self._armed_since_s = 0.0
         self._landed_since_s = 0.0
@@ -103,6 +106,8 @@ class Autopilot:
     @property
     def has_setpoints(self) -> bool:
         """The offboard stream is alive (COM_OF_LOSS_T)."""
+        if self._setpoint_needs_position and not self.position_valid:
+            return False
         limit = self._parameters.number("COM_OF_LOSS_T") + OFFBOARD_LOSS_MARGIN_S
         return self.now_s - self._last_setpoint_s <= limit
 
@@ -115,6 +120,7 @@ class Autopilot:
         """PX4's prearm check of the current mode (SYS_STATUS' bit MAV_SYS_STATUS_PREARM_CHECK)."""
         return (
             self.sensors_ready
+            and (self.position_valid or not position_failsafe.needs_position(self.mode))
             and self.mode not in MODES_PREVENTING_ARMING
             and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
             and not self.navigator.is_breached
@@ -188,6 +194,8 @@ class Autopilot:
 
     def can_run(self, mode: Mode) -> bool:
         """Whether an armed vehicle may fly in this mode now."""
+        if not self.position_valid and position_failsafe.needs_position(mode):
+            return False
         if mode is Mode.OFFBOARD:
             return self.has_setpoints
         if mode in MANUAL_MODES:
@@ -278,6 +286,7 @@ class Autopilot:
     def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
         """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
         self._last_setpoint_s = self.now_s
+        self._setpoint_needs_position = position_failsafe.asks_for_position(setpoint)
         self._rates_alone = isinstance(setpoint, RatesSetpoint)
         if self.mode is Mode.OFFBOARD and isinstance(self.task, flight.Offboard):
             self.task.setpoint = setpoint
@@ -288,6 +297,7 @@ class Autopilot:
         """Check failsafes and detectors, run the flight task, move the airframe."""
         self.now_s += dt_s
         self._check_offboard()
+        position_failsafe.check(self)
         self.navigator.update()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
@@ -423,7 +433,7 @@ class Autopilot:
             fallback = self._offboard_loss_mode()
             self._say(CRITICAL, "Failsafe activated\t")
             self._on_event(f"failsafe: offboard setpoints lost, {fallback.name}")
-            self._enter(fallback)
+            position_failsafe.enter_or_fall_back(self, fallback)
 
     def _offboard_loss_mode(self) -> Mode:
         """COM_OBL_RC_ACT; its manual modes need a remote control, else NAV_RCL_ACT decides."""
@@ -442,7 +452,7 @@ class Autopilot:
         self.intended_mode = mode
         if mode not in MODES_PREVENTING_ARMING:
             self._mode_after_disarming = mode
-        self.failsafe = self.failsafe_is_latched = False
+        self.failsafe = self.failsafe_is_latched = self.blind = False
         self._enter(mode)
 
     def _enter(self, mode: Mode) -> None:
@@ -487,7 +497,7 @@ class Autopilot:
 
     def _disarm(self, text: str, reason: str) -> None:
         self.armed = False
-        self.failsafe = self.failsafe_is_latched = self.terminated = False
+        self.failsafe = self.failsafe_is_latched = self.terminated = self.blind = False
         self.task = None
         self._takeoff_height_m = None
         self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))

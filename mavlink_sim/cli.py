@@ -97,6 +97,17 @@ def simulate(
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="Let something go wrong, e.g. 'link_delay 0.2 at=20 for=5'; may be repeated."),
+    ] = None,
+    console: Annotated[
+        bool | None,
+        typer.Option(help="Read faults from standard input; by default if that is a terminal."),
+    ] = None,
+    control: Annotated[
+        str | None, typer.Option(help="Take faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
+    ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
     ] = None,
@@ -139,6 +150,9 @@ def simulate(
         speed=speed,
         noise=noise == "on",
         parameters=_parameters(param or []),
+        faults=tuple(fault or ()),
+        console=console,
+        control=control,
     )
     try:
         fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)

@@ -77,6 +77,9 @@ def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
     if command.identifier == 0:
         return None
+    refused = vehicle.faults.refuses(command.identifier, command.parameters)
+    if refused is not None:
+        return refused
     handler = _HANDLERS.get(command.identifier)
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 

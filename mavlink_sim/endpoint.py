@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from mavlink_sim.faulty_socket import FaultySocket
 from mavlink_sim.messages import Outgoing, parser
 
 logger = logging.getLogger(__name__)
@@ -35,7 +36,7 @@ class UdpEndpoint:
     """
 
     def __init__(self, host: str, bind_port: int, peer_port: int, system_id: int = 1) -> None:
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket: socket.socket | FaultySocket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         try:
             self.socket.bind((host, bind_port))

@@ -79,7 +79,7 @@ def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
     try:
-        frame = vehicle.airframe
+        frame = vehicle.estimate
         setpoint = trajectory_setpoint(message, frame.yaw_rad, frame.roll_rad, frame.pitch_rad)
     except SetpointRejectedError as error:
         vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))

@@ -87,7 +87,7 @@ def obstacle_distance(vehicle: Vehicle, link: Link, message: Any) -> None:
             message.min_distance,
             message.max_distance,
             message.frame,
-            vehicle.airframe.yaw_rad,
+            vehicle.estimate.yaw_rad,
             vehicle.now_s,
         )
     except ValueError as error:

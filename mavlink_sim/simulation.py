@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.fault_room import fault_room
 from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.traffic_log import recording
@@ -52,6 +53,9 @@ class SimulationOptions:
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
         parameters: PX4 parameters that differ from the defaults.
+        faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
+        console: read faults from standard input; None: if that is a terminal.
+        control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
     """
 
     host: str = "127.0.0.1"
@@ -72,6 +76,9 @@ class SimulationOptions:
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
+    console: bool | None = None
+    control: str | None = None
 
 
 class Simulation:
@@ -79,6 +86,7 @@ class Simulation:
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
+        FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
         OSError: the truth file or the record cannot be written.
     """
 
@@ -121,6 +129,9 @@ class Simulation:
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
             if options.record is not None:
                 self._resources.enter_context(recording(self.endpoints, options.record))
+            self._faults = self._resources.enter_context(
+                fault_room(self.vehicle, self.endpoints, options, on_event)
+            )
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:
@@ -210,9 +221,12 @@ class Simulation:
         for _ in range(steps):
             self.vehicle.step(STEP_S)
             self._simulated_s += STEP_S
+            for name in self._faults.delivered():
+                self.receive(name)
         if steps:
             self.flush()
             self._show()
+        self._faults.poll()
 
     def _show(self) -> None:
         """The pose to the camera and the truth to its file, each at its rate."""

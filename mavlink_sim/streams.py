@@ -115,6 +115,15 @@ class Streams:
         heapq.heapify(self._due)
         self.next_us = self._due[0][0] if self._due else NEVER_US
 
+    def restart(self, now_us: int) -> None:
+        """The default rates again, as after a reboot."""
+        self._interval_us = dict(self._default_us)
+        self._due = [
+            (now_us + us, self._order[name], name) for name, us in self._interval_us.items() if us > 0
+        ]
+        heapq.heapify(self._due)
+        self.next_us = self._due[0][0] if self._due else NEVER_US
+
     def due(self, now_us: int) -> list[str]:
         """The messages to send now. A stream that fell behind by more than an interval skips."""
         names: list[str] = []

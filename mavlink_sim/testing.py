@@ -17,8 +17,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -177,6 +177,12 @@ class RunningSimulator:
     def resume(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
 
+    def fault(self, line: str) -> None:
+        """Type a line of the faults' grammar on the simulator's console: `link_loss for=3`, `end all`…"""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
     def stop(self, timeout_s: float = 10.0) -> int:
         """End it in good order (SIGTERM; SIGKILL if it does not). Returns the exit code."""
         if self.process.poll() is None:
@@ -199,6 +205,7 @@ def running_simulator(
     onboard_bind: int = 0,
     gcs_bind: int = 0,
     parameters: dict[str, float] | None = None,
+    faults: Sequence[str] = (),
     timeout_s: float = 60.0,
     **options: float | str | Path | None,
 ) -> Iterator[RunningSimulator]:
@@ -208,6 +215,7 @@ def running_simulator(
         onboard_port, gcs_port: where it sends to; None for ports that are free now.
         onboard_bind, gcs_bind: what it binds; give a former run's port to start it anew in the same place.
         parameters: PX4 parameters.
+        faults: each as `mavlink-sim --fault` takes it; `RunningSimulator.fault` brings more while it flies.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
             `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None
@@ -231,8 +239,11 @@ def running_simulator(
         command += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     for name, value in (parameters or {}).items():
         command += ["--param", f"{name}={value}"]
+    for fault in faults:
+        command += ["--fault", fault]
+    command += ["--console"]
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     simulator = RunningSimulator(process, count)
     try:
@@ -240,7 +251,10 @@ def running_simulator(
         yield simulator
     finally:
         simulator.stop()
+        assert process.stdin is not None
         assert process.stdout is not None
+        with suppress(BrokenPipeError):
+            process.stdin.close()
         process.stdout.close()
 
 

@@ -10,19 +10,20 @@ import heapq
 import itertools
 import math
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from mavlink_sim import mission_link, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
-from mavlink_sim.estimator import Estimate
+from mavlink_sim.estimate_errors import FallibleEstimate
+from mavlink_sim.faults import Faults
 from mavlink_sim.geography import geographic, start_of_vehicle
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor
+from mavlink_sim.physics import Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 
@@ -57,8 +58,8 @@ class Vehicle:
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
-        airframe: the motion (truth). estimate: what the vehicle knows of it. autopilot: the decisions.
-        parameters: the parameter set. links: by name.
+        airframe: the motion (truth). estimate: what the vehicle knows of it. faults: what goes wrong.
+        autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
         event_sequence: number of the newest EVENT.
@@ -89,13 +90,15 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
-        self.estimate = Estimate(self.airframe, seed, noise)
+        self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.event_sequence = 0
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
         self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self._boot_us * 1000
         self.start_ned_m = start_ned_m
         self._on_event = on_event or (lambda text: None)
+        self.ready_after_s = ready_after_s
+        self.faults = Faults(self, seed, self._on_event)
         self.autopilot = Autopilot(
             self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
@@ -138,6 +141,8 @@ class Vehicle:
     @property
     def battery_remaining(self) -> float:
         """0..1. Half of it goes in SIM_BAT_DRAIN seconds of armed time; never below SIM_BAT_MIN_PCT."""
+        if self.faults.battery is not None:
+            return self.faults.battery
         lowest = self.parameters.number("SIM_BAT_MIN_PCT") / 100.0
         return min(max(0.99 - self._used_charge, lowest, 0.0), 1.0)
 
@@ -156,6 +161,7 @@ class Vehicle:
         rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
         # links start out of step, so that they do not all send everything in the same millisecond
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link.gate = self.faults.gate
         link.tells_parameter_errors = self.release.has_parameter_errors
         return link
 
@@ -173,6 +179,8 @@ class Vehicle:
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self.system_id, AUTOPILOT_COMPONENT):
             return  # an echo of our own
+        if self.faults.intercepts(link_name, message):
+            return
         link.received += 1
         link.components.add(source)
         forward(message, link, self.links.values(), self.system_id)
@@ -217,17 +225,33 @@ class Vehicle:
             self.autopilot.texts.append(Text(INFO, "Onboard controller regained\t"))
             self._on_event("the companion's heartbeat is back")
 
+    def forget_boot(self) -> None:
+        """What does not survive a reboot, outside the autopilot."""
+        self._later.clear()
+        self._companion_seen_s, self._companion_lost, self._origin_told = None, False, False
+        self.event_sequence = 0
+        for link in self.links.values():
+            link.forget(self._boot_us)
+
+    def reload_wind(self, more: Iterable[Vector] = ()) -> None:
+        """The wind of SIH_WIND_N and SIH_WIND_E, and what else blows."""
+        self._wind_revision = self.parameters.revision
+        north, east = (
+            min(max(self.parameters.number(name), -MAX_WIND_MPS), MAX_WIND_MPS)
+            for name in ("SIH_WIND_N", "SIH_WIND_E")
+        )
+        for wind in more:
+            north, east = north + wind[0], east + wind[1]
+        self.airframe.wind = (north, east, 0.0)
+
     def _step(self) -> None:
+        if self.faults.step(STEP_S):
+            return
         self._boot_us += STEP_US
         while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
-            self._wind_revision = self.parameters.revision
-            north, east = (
-                min(max(self.parameters.number(name), -MAX_WIND_MPS), MAX_WIND_MPS)
-                for name in ("SIH_WIND_N", "SIH_WIND_E")
-            )
-            self.airframe.wind = (north, east, 0.0)
+            self.reload_wind(self.faults.winds.values())
         self._steps_to_control -= 1
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
