@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mavlink_sim.body_rates import IDENTITY, inverse, product, third_axis, unit
 from mavlink_sim.control import Demand, PositionController
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import MAX_THRUST_MPS2, Multirotor, Vector
+from mavlink_sim.quaternions import IDENTITY, inverse, product, third_axis, unit
 from vision.rotation import Quaternion, quaternion_from_euler
 
 NAN = math.nan
