@@ -473,6 +473,7 @@ class Autopilot:
 
     def _start_task(self) -> None:
         airframe, parameters = self._airframe, self._parameters
+        self.attitude.release()
         if self.mode is Mode.OFFBOARD:
             if not isinstance(self.task, flight.Offboard):
                 self.task = flight.Offboard()
