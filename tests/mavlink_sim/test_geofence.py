@@ -83,6 +83,7 @@ def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpi
     listen(cockpit)
     cockpit.take_off(4.0)
     cockpit.vehicle.airframe.position = (0.0, 40.0, -4.0)
+    cockpit.fly(0.01)  # until the estimate knows
     upload(cockpit, polygon(FENCE), 1)
     cockpit.fly(0.5)
     assert "Geofence invalid, doesn't contain current vehicle position\t" in cockpit.texts()
