@@ -32,8 +32,8 @@ def instance_options(
     """What each vehicle of a fleet is told; `options` are the first one's.
 
     A bind port of 0 stays 0 (a free one each). The camera goes to `camera_vehicle` (counted from 1) alone; a
-    truth file gets the system id into its name for all but the first. Every vehicle has the faults, each by its
-    own seed; the console is that of the first, the zenoh key each has its own.
+    truth file gets the system id into its name for all but the first. Every vehicle has the faults, each by
+    its own seed; the console is that of the first, the zenoh key each has its own.
 
     Raises:
         ValueError: a fleet of that size cannot be (ids, ports), or has no such vehicle for the camera.
