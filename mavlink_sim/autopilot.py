@@ -302,6 +302,7 @@ class Autopilot:
         self.now_s += dt_s
         self._check_offboard()
         position_failsafe.check(self)
+        position_failsafe.keep_landing(self)
         self.navigator.update()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
@@ -486,7 +487,7 @@ class Autopilot:
         elif self.mode is Mode.PRECLAND:
             self.task = self.navigator.precision_landing(Precision.REQUIRED)
         elif self.mode is Mode.LAND:
-            self.task = flight.Land(airframe, parameters)
+            self.task = position_failsafe.landing_task(self)
         elif self.mode is Mode.RTL:
             self.task = self.navigator.return_task()
         else:
