@@ -140,8 +140,8 @@ class Autopilot:
     @property
     def base_mode(self) -> int:
         # PX4 goes by the newest setpoint, however old
-        has_setpoint = math.isfinite(self._last_setpoint_s) and not self._rates_alone
-        return base_mode(self.mode, self.armed, has_setpoint)
+        ever_heard = math.isfinite(self._last_setpoint_s)
+        return base_mode(self.mode, self.armed, ever_heard and not self._rates_alone)
 
     @property
     def landed_state(self) -> LandedState:

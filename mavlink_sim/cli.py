@@ -98,6 +98,10 @@ def simulate(
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
+    signing_key: Annotated[
+        str | None,
+        typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
+    ] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option(help="Let something go wrong, e.g. 'link_delay 0.2 at=20 for=5'; may be repeated."),
@@ -108,10 +112,6 @@ def simulate(
     ] = None,
     control: Annotated[
         str | None, typer.Option(help="Take faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
-    ] = None,
-    signing_key: Annotated[
-        str | None,
-        typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
     ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
@@ -161,11 +161,11 @@ def simulate(
         px4=px4,
         speed=speed,
         noise=noise == "on",
+        parameters=parameters,
+        signing_key=key,
         faults=tuple(fault or ()),
         console=console,
         control=control,
-        parameters=parameters,
-        signing_key=key,
     )
     try:
         fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)

@@ -70,7 +70,7 @@ class FileSystem:
             return self._files[place]
         if place in self._provided:
             return self._provided[place]()
-        raise _error(errno.EISDIR if place in self._directories else errno.ENOENT, path)
+        raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
 
     # ---- writing
 
@@ -108,13 +108,13 @@ class FileSystem:
     def truncate(self, path: str, size: int) -> None:
         place = self._writable(path)
         if place not in self._files:
-            raise _error(errno.EISDIR if place in self._directories else errno.ENOENT, path)
+            raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
         self.resize(self._files[place], size)
 
     def remove(self, path: str) -> None:
         place = self._writable(path)
         if place not in self._files:
-            raise _error(errno.EISDIR if place in self._directories else errno.ENOENT, path)
+            raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
         del self._files[place]  # a session that has it open keeps it, as in POSIX
 
     def make_directory(self, path: str) -> None:
@@ -129,32 +129,34 @@ class FileSystem:
         if place in self._files:
             raise _error(errno.ENOTDIR, path)
         if place not in self._directories:
-            raise _error(errno.ENOENT, path)
-        if not place or any(other[:-1] == place for other in self._entries()):
-            raise _error(errno.ENOTEMPTY, path)
+            raise self._missing(place, path)
+        self._check_empty(place, path)
+        if not place:
+            raise _error(errno.EBUSY, path)  # the root
         self._directories.remove(place)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a file or a folder; a file takes the place of another file, as in POSIX."""
+        """Rename a file or a folder; it takes the place of another file or of an empty folder."""
         source, target = self._writable(old), self._writable(new)
-        if source in self._files:
-            if target in self._directories:
-                raise _error(errno.EISDIR, new)
-            if target not in self._files:
-                self._check_new(target, new)
-            self._files[target] = self._files.pop(source)
-            return
-        if source not in self._directories:
+        for place, path in ((source, old), (target, new)):
+            self._check_parent(place, path)
+        is_folder = source in self._directories
+        if not is_folder and source not in self._files:
             raise _error(errno.ENOENT, old)
         if target == source:
             return
         if target[: len(source)] == source:
             raise _error(errno.EINVAL, new)
-        if target in self._files:
+        if source[: len(target)] == target:
+            raise _error(errno.ENOTEMPTY, new)
+        if target in self._files and is_folder:
             raise _error(errno.ENOTDIR, new)
         if target in self._directories:
-            raise _error(errno.EEXIST, new)
-        self._check_new(target, new)
+            if not is_folder:
+                raise _error(errno.EISDIR, new)
+            self._check_empty(target, new)
+        elif target not in self._files:
+            self._check_new(target, new)
         depth = len(source)
         self._directories = {
             target + place[depth:] if place[:depth] == source else place for place in self._directories
@@ -162,6 +164,7 @@ class FileSystem:
         self._files = {
             target + place[depth:] if place[:depth] == source else place: content
             for place, content in self._files.items()
+            if place != target
         }
 
     # ---- within
@@ -175,7 +178,7 @@ class FileSystem:
         place = resolve(path)
         if place not in self._directories:
             known = place in self._files or place in self._provided
-            raise _error(errno.ENOTDIR if known else errno.ENOENT, path)
+            raise _error(errno.ENOTDIR, path) if known else self._missing(place, path)
         return place
 
     def _writable(self, path: str) -> Path:
@@ -183,10 +186,23 @@ class FileSystem:
             raise _error(errno.EROFS, path)
         return resolve(path)
 
+    def _missing(self, place: Path, path: str) -> OSError:
+        """What a path that leads nowhere is: ENOTDIR if it leads through a file, else ENOENT."""
+        through = any(
+            place[:depth] in self._files or place[:depth] in self._provided for depth in range(len(place))
+        )
+        return _error(errno.ENOTDIR if through else errno.ENOENT, path)
+
+    def _check_parent(self, place: Path, path: str) -> None:
+        if place[:-1] not in self._directories:
+            raise self._missing(place, path)
+
+    def _check_empty(self, place: Path, path: str) -> None:
+        if any(other[:-1] == place for other in self._entries()):
+            raise _error(errno.ENOTEMPTY, path)
+
     def _check_new(self, place: Path, path: str) -> None:
-        parent = place[:-1]
-        if parent not in self._directories:
-            raise _error(errno.ENOTDIR if parent in self._files else errno.ENOENT, path)
+        self._check_parent(place, path)
         if len(place[-1].encode(errors="surrogateescape")) > MAX_NAME_BYTES:
             raise _error(errno.ENAMETOOLONG, path)
         if len(self._files) + len(self._directories) >= MAX_ENTRIES:

@@ -30,9 +30,9 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
-        self.tells_parameter_errors = True
         self.file_transfer: Server | None = None  # made when somebody asks
         self.signing = Signing()
+        self.tells_parameter_errors = True
         self.sent = 0
         self.received = 0
         self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
@@ -70,6 +70,7 @@ class Link:
         self.components.clear()
         self.ground_station_seen_s = -math.inf
         self.parameters_left.clear()
+        self.file_transfer = None
 
     def knows(self, system: int, component: int) -> bool:
         """Whether a message to this target is worth sending here (PX4's `component_was_seen`)."""

@@ -142,10 +142,10 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_LIST": parameter_protocol.request_list,
     "PARAM_REQUEST_READ": parameter_protocol.request_read,
     "PARAM_SET": parameter_protocol.set_parameter,
-    **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
-    "LANDING_TARGET": mission_link.landing_target,
-    "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
     "FILE_TRANSFER_PROTOCOL": file_transfer.handle,
     "SETUP_SIGNING": signing.setup_signing,
     "UNKNOWN_412": event_protocol.request,
+    **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
+    "LANDING_TARGET": mission_link.landing_target,
+    "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
 }

@@ -53,10 +53,10 @@ class SimulationOptions:
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
         parameters: PX4 parameters that differ from the defaults.
+        signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG says what is refused.
         faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
         console: read faults from standard input; None: if that is a terminal.
         control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
-        signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG says what is refused.
     """
 
     host: str = "127.0.0.1"
@@ -77,10 +77,10 @@ class SimulationOptions:
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
+    signing_key: bytes | None = field(default=None, repr=False)
     faults: tuple[str, ...] = ()
     console: bool | None = None
     control: str | None = None
-    signing_key: bytes | None = field(default=None, repr=False)
 
 
 class Simulation:
@@ -129,16 +129,16 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            for name, endpoint in self.endpoints.items():
+                endpoint.signing = self.vehicle.links[name].signing
+            if options.signing_key is not None:
+                self.vehicle.sign_everything(options.signing_key)
             if options.record is not None:
                 files = {f"{name}-{options.system_id}": link for name, link in self.endpoints.items()}
                 self._resources.enter_context(recording(files, options.record))
             self._faults = self._resources.enter_context(
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )
-            for name, endpoint in self.endpoints.items():
-                endpoint.signing = self.vehicle.links[name].signing
-            if options.signing_key is not None:
-                self.vehicle.sign_everything(options.signing_key)
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.camera is not None or options.truth is not None:

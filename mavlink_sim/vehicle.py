@@ -167,16 +167,15 @@ class Vehicle:
         """Attach a link with the onboard link's rates, or others (`streams.GCS_RATES_HZ`)."""
         rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
         # links start out of step, so that they do not all send everything in the same millisecond
-        link = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link.gate = self.faults.gate
+        link.tells_parameter_errors = self.release.has_parameter_errors
         link.signing = Signing(
-            link_id=len(self.links),
+            link_id=len(self.links) - 1,
             streams=self._signing_streams,
             policy=lambda: int(self.parameters.number("MAV_SIGN_CFG")),
             is_usb=name == "gcs",  # the ground station's link stands for the USB port
         )
-        link.gate = self.faults.gate
-        link.tells_parameter_errors = self.release.has_parameter_errors
-        self.links[name] = link
         return link
 
     def sign_everything(self, key: bytes, timestamp: int | None = None) -> None:
@@ -260,6 +259,7 @@ class Vehicle:
         self._later.clear()
         self._companion_seen_s, self._companion_lost, self._origin_told = None, False, False
         self.events = EventBuffer()
+        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
         for link in self.links.values():
             link.forget(self._boot_us)
 
