@@ -53,7 +53,7 @@ def dataset(
         options = DatasetOptions(
             frames=frames,
             seed=seed,
-            layout=layout.value,  # type: ignore[arg-type]  # the enumeration's values are the literals
+            layout=layout.value,
             classes=tuple(name.strip() for name in classes.split(",") if name.strip()),
             depth=depth,
             validation=validation,

@@ -1,8 +1,8 @@
 """The default world and the training scenes look as they always did: models are trained on these pictures.
 
 The record holds mean brightnesses of squares of 32 pixels, so that another processor's rounding in the last
-bit passes, while one object moved or recoloured does not. `python tests/mavlink_sim/test_pictures_of_record.py`
-writes it anew, which makes every trained model's measured score a thing of the past.
+bit passes, while one object moved or recoloured does not. This file run as a program writes it anew, which
+makes every trained model's measured score a thing of the past.
 """
 
 from __future__ import annotations
