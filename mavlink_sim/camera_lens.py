@@ -3,8 +3,8 @@
 The pinhole picture is drawn a little larger than the camera's; every pixel of the camera then looks up where
 its ray, bent by the lens and turned by the camera's motion until that row was read out, meets it. For the
 rotation this is exact (Forssén and Ringaby 2010, "Rectifying rolling shutter video"); for the translation it
-is exact up to the depth, which is taken from the pixel's place in the middle of the readout. What stands
-behind an edge and would be seen earlier or later by the translation alone is not drawn anew.
+is exact within a surface, as the depth is taken from the pixel's place in the middle of the readout:
+outlines of near things before far ones lean with the rotation, but not with the translation.
 """
 
 from __future__ import annotations
@@ -84,19 +84,23 @@ class Lens:
         self._y = plane[:, 1].reshape(shape).astype(np.float32)
         moving = self.shutter.exposure_s > 0.0 or self.shutter.readout_s > 0.0
         margin = math.ceil(MARGIN_SHARE * camera.width) if moving else 1
-        left = math.ceil(-float(self._x.min()) * camera.fx) + margin
-        right = math.ceil(float(self._x.max()) * camera.fx) + margin
-        top = math.ceil(-float(self._y.min()) * camera.fy) + margin
-        bottom = math.ceil(float(self._y.max()) * camera.fy) + margin
-        width, height = left + right + 1, top + bottom + 1
+        # Whole pixels more on each side, so that where nothing bends or moves no pixel is interpolated.
+        left = math.ceil(-float(self._x.min()) * camera.fx - camera.cx) + margin
+        right = math.ceil(float(self._x.max()) * camera.fx + camera.cx) + 1 - camera.width + margin
+        top = math.ceil(-float(self._y.min()) * camera.fy - camera.cy) + margin
+        bottom = math.ceil(float(self._y.max()) * camera.fy + camera.cy) + 1 - camera.height + margin
+        width, height = left + camera.width + right, top + camera.height + bottom
         if width > MAX_GROWTH * camera.width or height > MAX_GROWTH * camera.height:
             raise ValueError(
                 f"the distortion {camera.distortion} bends the picture's edges out to a pinhole picture of "
                 f"{width}x{height}, more than {MAX_GROWTH} times {camera.width}x{camera.height}; "
                 "use weaker coefficients or a longer focal length"
             )
-        self.drawn = CameraModel(width, height, camera.fx, camera.fy, float(left), float(top))
-        self._still_map = (self._x * camera.fx + left, self._y * camera.fy + top)
+        self.drawn = CameraModel(width, height, camera.fx, camera.fy, camera.cx + left, camera.cy + top)
+        self._still_map = (
+            self._x * np.float32(camera.fx) + np.float32(self.drawn.cx),
+            self._y * np.float32(camera.fy) + np.float32(self.drawn.cy),
+        )
         self._still_index = self._nearest(*self._still_map)
 
     def expose(
