@@ -29,7 +29,7 @@ def bent(distortion: tuple[float, ...]) -> CameraModel:
 
 @settings(max_examples=20, deadline=None)
 @given(
-    k1=st.floats(-0.18, 0.15),
+    k1=st.floats(-0.1, 0.15),
     k2=st.floats(0.0, 0.05),
     tangential=st.floats(-0.003, 0.003),
     pitch=st.floats(-1.5, -0.3),

@@ -104,14 +104,14 @@ def test_coco_files_are_read_by_cocos_own_tools(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scene", [SCENE, None])
 def test_a_seed_gives_the_same_files_again_whatever_the_count(tmp_path: Path, scene: Scene | None) -> None:
-    options = DatasetOptions(4, seed=2, size=(96, 96), validation=0.0)
+    options = DatasetOptions(2, seed=2, size=(96, 96), validation=0.0)
     make_dataset(tmp_path / "one", scene, options)
     make_dataset(tmp_path / "two", scene, options)
     assert files(tmp_path / "one") == files(tmp_path / "two")
-    make_dataset(tmp_path / "short", scene, DatasetOptions(2, seed=2, size=(96, 96), validation=0.0))
+    make_dataset(tmp_path / "short", scene, DatasetOptions(1, seed=2, size=(96, 96), validation=0.0))
     pictures = {name: digest for name, digest in files(tmp_path / "short").items() if name.endswith(".jpg")}
     assert pictures.items() <= files(tmp_path / "one").items()
-    make_dataset(tmp_path / "other", scene, DatasetOptions(2, seed=3, size=(96, 96), validation=0.0))
+    make_dataset(tmp_path / "other", scene, DatasetOptions(1, seed=3, size=(96, 96), validation=0.0))
     assert not pictures.items() & files(tmp_path / "other").items()
 
 
@@ -145,17 +145,26 @@ def test_options_that_cannot_be_are_refused(changes: dict, says: str) -> None:
         DatasetOptions(**{"frames": 1, **changes})
 
 
+SCENE_FILE = """
+[ground]
+tile_texels = 256
+[[objects]]
+class = "car"
+place_m = [3, 4]
+[camera]
+width = 96
+height = 96
+"""
+
+
 def test_the_command_writes_a_data_set_and_says_what_it_wrote(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mavlink_sim", "dataset", str(tmp_path / "set")]
-    made = subprocess.run(
-        [*command, "--frames", "2", "--width", "96", "--height", "96"],
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
+    scene = tmp_path / "field.toml"
+    scene.write_text(SCENE_FILE, "utf-8")
+    command = [sys.executable, "-m", "mavlink_sim", "dataset", str(tmp_path / "set"), "--scene", str(scene)]
+    made = subprocess.run([*command, "--frames", "3"], capture_output=True, text=True, timeout=100)
     assert made.returncode == 0, made.stderr
-    assert "2 pictures" in made.stdout
-    assert len(truth_of(tmp_path / "set")) == 2
-    again = subprocess.run([*command, "--scene", "nowhere.toml"], capture_output=True, text=True, timeout=100)
+    assert "3 pictures" in made.stdout
+    assert len(truth_of(tmp_path / "set")) == 3
+    again = subprocess.run([*command, "--frames", "3"], capture_output=True, text=True, timeout=100)
     assert again.returncode == 2
-    assert "cannot read the scene file nowhere.toml" in again.stderr
+    assert "not an empty folder" in again.stderr
