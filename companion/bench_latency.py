@@ -28,7 +28,9 @@ from vision.pipeline import PerceptionResult
 def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
     """Fly `seek` and `approach` and time every setpoint that is the first after a new detection message.
 
-    `capture_to_setpoint` starts at the pose's stamp in the simulator; `network` is the detector's own share.
+    `capture_to_setpoint` starts at the pose's stamp in the simulator, before the picture is drawn.
+    `beyond_network` is what the companion adds to the network: from when the frame is there, less the
+    network's own time.
 
     Raises:
         RehearsalError: the vehicle did not get into the air.
@@ -94,7 +96,8 @@ def _measure_sent(service: Service, latency_ms: list[float], beyond_ms: list[flo
             newest, awaited = awaited[1], None
             elapsed_ms = (time.monotonic_ns() - newest.captured_ns) / 1e6
             latency_ms.append(elapsed_ms)
-            beyond_ms.append(elapsed_ms - newest.timing_ms["total"])
+            timing_ms = newest.timing_ms
+            beyond_ms.append(elapsed_ms - timing_ms.get("capture", 0.0) - timing_ms["inference"])
 
     service.pilot.update = noted  # type: ignore[method-assign]
     service.streamer.send = timed

@@ -47,14 +47,17 @@ def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
 def info(
     file: Annotated[str, typer.Argument(help="a checkpoint, `default`, or a name in the models folder")],
     image_size: Annotated[int, typer.Option(min=32, help="for the GFLOPs, pixels")] = 640,
+    runtime: Annotated[
+        str, typer.Option(help="torch, onnxruntime, openvino, tensorrt; auto measures")
+    ] = "torch",
     as_json: _JSON = False,
 ) -> None:
-    """What a model file is: generation, scale, classes, parameters, GFLOPs, licence, SHA-256."""
+    """What a model file is, and what it computes in here: generation, classes, GFLOPs, licence, precision."""
     from companion.models_info import info_lines, model_info
     from vision.yolo.checkpoint import CheckpointError
 
     with plain_errors(CheckpointError, ValueError):
-        found = model_info(_path(file), image_size)
+        found = model_info(_path(file), image_size, runtime)  # type: ignore[arg-type]  # checked there
     if as_json:
         typer.echo(json.dumps(found.plain()))
         return

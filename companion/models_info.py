@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from companion.models_catalog import KNOWN, known_by_digest
+from vision.detector import Detector
 from vision.model_files import kept_models
+from vision.runtimes.selection import RuntimeChoice
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.checkpoint_pair import is_pair, pair_paths, weights_sha256
@@ -27,6 +29,8 @@ class ModelInfo:
         classes: id → name.
         licence: as the file states it; None where it states none.
         official: the name under which the catalogue knows this very file; None for any other.
+        runtime, runtime_reason: what runs it on this computer, and why.
+        precision, precision_reason: what that computes in here, and why.
         stated: whatever else the file tells of itself.
     """
 
@@ -42,17 +46,22 @@ class ModelInfo:
     classes: tuple[str, ...]
     licence: str | None
     official: str | None
+    runtime: str
+    runtime_reason: str
+    precision: str
+    precision_reason: str
     stated: dict[str, Any]
 
     def plain(self) -> dict[str, Any]:
         return asdict(self)
 
 
-def model_info(path: Path, image_size: int = 640) -> ModelInfo:
-    """Read a checkpoint and describe it.
+def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torch") -> ModelInfo:
+    """Read a checkpoint, describe it, and make it ready to see what it would compute in on this computer.
 
     Raises:
         CheckpointError: it cannot be read. ValueError: the image size is no multiple of 32.
+        RuntimeUnusableError: the runtime is missing, or does not run it.
     """
     if image_size < 32 or image_size % 32:
         raise ValueError(f"the image size must be a multiple of 32, got {image_size}")
@@ -61,6 +70,7 @@ def model_info(path: Path, image_size: int = 640) -> ModelInfo:
     digest = weights_sha256(path)
     facts = describe(loaded.model, image_size)
     official = known_by_digest(digest)
+    detector = Detector(path, image_size=image_size, runtime=runtime)
     stated = dict(loaded.metadata)
     licence = stated.pop("licence", None)
     return ModelInfo(
@@ -76,6 +86,10 @@ def model_info(path: Path, image_size: int = 640) -> ModelInfo:
         classes=loaded.class_names,
         licence=None if licence is None else str(licence),
         official=None if official is None else official.name,
+        runtime=detector.runtime,
+        runtime_reason=detector.runtime_reason,
+        precision=detector.precision,
+        precision_reason=detector.precision_reason,
         stated=stated,
     )
 
@@ -94,6 +108,8 @@ def info_lines(info: ModelInfo) -> list[str]:
         "parameters": f"{info.parameters / 1e6:.2f} million",
         "work": f"{info.gflops:.1f} GFLOPs for {info.image_size}x{info.image_size}",
         "classes": f"{len(info.classes)}: {shown_classes}",
+        "runs here": f"on {info.runtime} ({info.runtime_reason})",
+        "precision": f"{info.precision} ({info.precision_reason})",
         "licence": info.licence or "not stated in the file",
         **{
             key: str(value)

@@ -43,7 +43,7 @@ from vision.frame import Frame
 from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
-from vision.sources.sharing import SharingSource
+from vision.sources.sharing import FrameSharing
 from vision.tracking import AttitudeHistory, CameraView, Tracker
 from vision.video_writer import VideoWriterError
 
@@ -210,10 +210,10 @@ def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Pe
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
         stack.callback(recording.close)
     detector = _load(settings) if settings.detector.enabled else None
-    source = open_source(settings.source.uri, settings.source.opening())
+    on_frame = None
     if settings.source.share is not None:
-        source = SharingSource(source, settings.source.share)
-    stack.enter_context(source)
+        on_frame = stack.enter_context(FrameSharing(settings.source.share)).write
+    source = stack.enter_context(open_source(settings.source.uri, settings.source.opening(on_frame)))
     if recording is not None:
         # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)

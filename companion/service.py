@@ -113,6 +113,7 @@ class Service:
         self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
         self._started_ns = time.monotonic_ns()
         self._linked = False
+        self._seen = asyncio.Event()
         self._stop = asyncio.Event()
         self._ending = False
 
@@ -246,13 +247,19 @@ class Service:
             self._event("warning", f"the console has ended: {type(error).__name__}: {error}")
 
     async def _guide(self) -> None:
-        """The loop that steers; the heartbeat, the watchdog and the video's text go with it."""
+        """The loop that steers; the heartbeat, the watchdog and the video's text go with it.
+
+        It turns at the guidance rate, and at once when the steering camera has seen something new.
+        """
         period_s = 1 / self.settings.guidance.rate_hz
-        due_s = next_heartbeat_s = next_hud_s = time.monotonic()
+        next_heartbeat_s = next_hud_s = time.monotonic()
+        seen = False
         while True:
             now_ns = time.monotonic_ns()
             self._watch_link(now_ns)
             self.pilot.update(self._situation(now_ns))
+            if seen:
+                self.streamer.hasten(now_ns)
             self._answer_under_way()
             now_s = now_ns / 1e9
             if now_s >= next_heartbeat_s:
@@ -265,8 +272,17 @@ class Service:
                 next_hud_s = now_s + _HUD_PERIOD_S
                 for view in self.views:
                     view.keeper.send_hud(self._hud())
-            due_s = max(due_s + period_s, time.monotonic())
-            await asyncio.sleep(due_s - time.monotonic())
+            seen = await self._something_new_until(now_s + period_s)
+
+    async def _something_new_until(self, due_s: float) -> bool:
+        """Whether the steering camera saw something before that time (CLOCK_MONOTONIC seconds)."""
+        try:
+            async with asyncio.timeout(due_s - time.monotonic()):
+                await self._seen.wait()
+        except TimeoutError:
+            return False
+        self._seen.clear()
+        return True
 
     async def _tell_vehicle(self) -> None:
         period_s = 1 / (topics.VEHICLE.rate_hz or 10.0)
@@ -370,6 +386,7 @@ class Service:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
         if view is self.steering:
             view.place(result, self._history)
+            self._seen.set()
 
     def _show(self, view: View, preview: Preview) -> None:
         """A picture for whoever watches; what it is of goes with it."""
@@ -433,4 +450,5 @@ def _limits(settings: Settings) -> Limits:
         min_altitude_m=guidance.min_altitude_m,
         max_altitude_m=guidance.max_altitude_m,
         max_distance_m=guidance.max_distance_m,
+        fence=guidance.fence(),
     )

@@ -7,11 +7,15 @@ the checks and their messages (`config.py`) all come from that declaration.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
+from companion.fence import Fence, Polygon
+from companion.points import points_from
 from vision.camera_model import CameraModel, CameraMount
+from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
@@ -103,9 +107,9 @@ class SourceSection(Section):
         self.opening()
         return self
 
-    def opening(self) -> SourceSettings:
+    def opening(self, on_frame: Callable[[Frame], None] | None = None) -> SourceSettings:
         """The same, as `vision.sources.open_source` takes it. Raises ValueError for a bad pixel format."""
-        return SourceSettings(**self.model_dump(exclude={"uri", "share"}))
+        return SourceSettings(**self.model_dump(exclude={"uri", "share"}), on_frame=on_frame)
 
 
 class CameraSection(Section):
@@ -260,6 +264,18 @@ class TrackerSection(Section):
         return TrackerSettings(keep_confidence=confidence, **values)
 
 
+def _corners(key: str, text: str) -> Polygon:
+    try:
+        points = points_from(text)
+        if any(len(point) != 2 for point in points):
+            raise ValueError("a corner is north,east")
+        corners = tuple((point[0], point[1]) for point in points)
+        Fence(corners)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from None
+    return corners
+
+
 class GuidanceSection(Section):
     """How the vehicle may be moved, and when what we know is too old to move by."""
 
@@ -281,6 +297,10 @@ class GuidanceSection(Section):
     """never asks to fly higher than this above home, metres"""
     max_distance_m: Annotated[float, Field(gt=0, le=100000)] = 200.0
     """never asks to fly farther than this from home, metres"""
+    fence_include: str = ""
+    """corners of the area never left, north,east of home in metres: "-50,-50 50,-50 50,50"; empty: none"""
+    fence_exclude: str = ""
+    """areas never entered, written the same way and parted by |"""
     setpoint_rate_hz: Annotated[float, Field(ge=5, le=250)] = 50.0
     """setpoints a second on the link; PX4 needs more than 2"""
     setpoint_lifetime_s: Annotated[float, Field(ge=0.02, le=2)] = 0.3
@@ -304,7 +324,14 @@ class GuidanceSection(Section):
                 f"setpoint_lifetime_s must be longer than one period of rate_hz ({1 / self.rate_hz:.3g} s), "
                 f"got {self.setpoint_lifetime_s:g}: each setpoint would expire before the next"
             )
+        self.fence()
         return self
+
+    def fence(self) -> Fence:
+        """The same as polygons. Raises ValueError for what is none."""
+        include = _corners("fence_include", self.fence_include) if self.fence_include else ()
+        areas = [text for text in self.fence_exclude.split("|") if text.strip()]
+        return Fence(include, tuple(_corners("fence_exclude", text) for text in areas))
 
 
 class ZenohSection(Section):

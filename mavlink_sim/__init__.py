@@ -1,1 +1,42 @@
-"""A MAVLink vehicle to fly against: PX4-like, in Python, with a camera. Imports nothing of `companion`."""
+"""A MAVLink vehicle to fly against: PX4-like, in Python, with a camera. Imports nothing of `companion`.
+
+`LockstepVehicle` is one in your own process, stepped by you; `running_simulator` one in a process of its own;
+`mavlink-sim` on the command line is one on UDP.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
+    from mavlink_sim.testing import RunningSimulator, running_simulator
+    from mavlink_sim.vehicle import Vehicle
+
+__all__ = [
+    "CommandRefusedError",
+    "LockstepVehicle",
+    "NotReachedError",
+    "RunningSimulator",
+    "Truth",
+    "Vehicle",
+    "running_simulator",
+]
+
+_HOMES = {
+    "CommandRefusedError": "lockstep",
+    "LockstepVehicle": "lockstep",
+    "NotReachedError": "lockstep",
+    "RunningSimulator": "testing",
+    "Truth": "lockstep",
+    "Vehicle": "vehicle",
+    "running_simulator": "testing",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for: who draws pictures alone shall not load MAVLink's dialect."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from mavlink_sim import flight
+from mavlink_sim import flight, position_failsafe, reposition
 from mavlink_sim.announcements import (
     ARMED_EVENT,
     ARMING_DENIED_EVENT,
@@ -26,17 +26,24 @@ from mavlink_sim.announcements import (
     GimbalCommand,
     Text,
 )
+from mavlink_sim.attitude_control import AttitudeController, RatesSetpoint
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
 from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
+from mavlink_sim.navigator import Navigator
+from mavlink_sim.orbit import Orbit, OrbitRequest
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.precision_landing import Precision
 
 ACCEPTED = 0  # MAV_RESULT
 TEMPORARILY_REJECTED = 1
 
 # Measured: a vehicle that does not take off is disarmed 11.2 s after arming with COM_DISARM_PRFLT = 10.
 PREFLIGHT_DISARM_MARGIN_S = 1.2
+# Measured with COM_OF_LOSS_T = 1: OFFBOARD is left 1.05-1.15 s after the last setpoint; a stream of 0.9 Hz is
+# lost for 50 ms at a time.
+OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
 TAKEOFF_DETECTION_HEIGHT_M = 0.12
@@ -63,12 +70,16 @@ class Autopilot:
         self._on_event = on_event
         self.controller = PositionController(parameters)
         self.controller.reset(airframe.yaw_rad)
+        self.attitude = AttitudeController(parameters)
+        self.cruise_mps = math.nan  # of DO_CHANGE_SPEED; it ends with the mode
         self.now_s = 0.0
         self.armed = False
         self.mode = Mode.HOLD
         self.intended_mode = Mode.HOLD
         self.failsafe = False
         self.landed = True
+        self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
+        self.blind = False  # in the fallback for a lost position
         self.pilot_has_sticks = False  # a remote control is connected, so POSCTL and the like can be flown
         self.home: Vector = airframe.position
         self.texts: deque[Text] = deque()
@@ -79,18 +90,26 @@ class Autopilot:
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
         self._last_setpoint_s = -math.inf
+        self._setpoint_needs_position = False
+        self._rates_alone = False  # the newest offboard setpoint was of body rates
         self._armed_since_s = 0.0
         self._landed_since_s = 0.0
         self._contact_since_s: float | None = None
         self._lifting_since_s: float | None = None
         self._has_flown = False
+        self.failsafe_is_latched = False  # it stays until the mode is changed by a user
+        self.terminated = False
+        self.navigator = Navigator(self, airframe, parameters, on_event)
 
     # ---- what others read -------------------------------------------------------------------------------
 
     @property
     def has_setpoints(self) -> bool:
         """The offboard stream is alive (COM_OF_LOSS_T)."""
-        return self.now_s - self._last_setpoint_s <= self._parameters.number("COM_OF_LOSS_T")
+        if self._setpoint_needs_position and not self.position_valid:
+            return False
+        limit = self._parameters.number("COM_OF_LOSS_T") + OFFBOARD_LOSS_MARGIN_S
+        return self.now_s - self._last_setpoint_s <= limit
 
     @property
     def sensors_ready(self) -> bool:
@@ -101,14 +120,18 @@ class Autopilot:
         """PX4's prearm check of the current mode (SYS_STATUS' bit MAV_SYS_STATUS_PREARM_CHECK)."""
         return (
             self.sensors_ready
+            and (self.position_valid or not position_failsafe.needs_position(self.mode))
             and self.mode not in MODES_PREVENTING_ARMING
-            and self.mode is not Mode.MISSION
+            and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
+            and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
             and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
         )
 
     @property
     def system_status(self) -> SystemState:
+        if self.terminated:
+            return SystemState.FLIGHT_TERMINATION
         if self.failsafe and self.armed:
             return SystemState.CRITICAL
         if self.armed:
@@ -117,13 +140,13 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        return base_mode(self.mode, self.armed, self.has_setpoints)
+        return base_mode(self.mode, self.armed, self.has_setpoints and not self._rates_alone)
 
     @property
     def landed_state(self) -> LandedState:
         if self.landed:
             return LandedState.ON_GROUND
-        if self.mode is Mode.TAKEOFF:
+        if self.mode is Mode.TAKEOFF or (self.task is not None and self.task.taking_off):
             return LandedState.TAKEOFF
         if self.task is not None and self.task.landing:
             return LandedState.LANDING
@@ -171,11 +194,13 @@ class Autopilot:
 
     def can_run(self, mode: Mode) -> bool:
         """Whether an armed vehicle may fly in this mode now."""
+        if not self.position_valid and position_failsafe.needs_position(mode):
+            return False
         if mode is Mode.OFFBOARD:
             return self.has_setpoints
         if mode in MANUAL_MODES:
             return self.pilot_has_sticks
-        return mode is not Mode.MISSION  # there is never a mission on board
+        return mode is not Mode.MISSION or self.navigator.mission.valid
 
     def takeoff(self, altitude_m: float | None) -> int:
         """Mode TAKEOFF to a height above home (None: MIS_TAKEOFF_ALT). It never arms."""
@@ -186,6 +211,9 @@ class Autopilot:
                 f"Using default takeoff altitude: {altitude_m:.1f} m\t",
                 (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
             )
+        elif altitude_m < self.home[2] - self._airframe.position[2]:
+            # what becomes of a height above ground in a field that is above the sea; it does not descend
+            self._say(CRITICAL, "Already higher than takeoff altitude\t")
         self._takeoff_height_m = altitude_m
         self._intend(Mode.TAKEOFF)
         return ACCEPTED
@@ -200,15 +228,32 @@ class Autopilot:
         self._intend(Mode.RTL)
         return ACCEPTED
 
-    def reposition(self, goal: Vector, yaw_rad: float) -> int:
-        """Fly to a local NED position and hold there; NaN components stay as they are."""
+    def reposition(self, goal: Vector, yaw_rad: float, speed_mps: float = math.nan) -> int:
+        """Fly to a local NED position and hold there; NaN components as in `reposition_goal`."""
+        airframe, parameters = self._airframe, self._parameters
+        former = None if self.task is None else self.task.goal
         self._intend(Mode.HOLD)
-        if self.armed and not self.landed:
-            here = flight.Trajectory(self._airframe, self._parameters).stopping_point()
-            x, y, z = (
-                wanted if math.isfinite(wanted) else own for wanted, own in zip(goal, here, strict=True)
-            )
-            self.task = flight.Hold(self._airframe, self._parameters, (x, y, z), yaw_rad)
+        if self.armed:
+            goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+            self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
+            self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
+        return ACCEPTED
+
+    def change_speed(self, speed_mps: float, at_once: bool) -> None:
+        """Another cruise speed for auto modes until the mode ends; zero or less: MPC_XY_CRUISE again.
+
+        `at_once`: for the goal that is being flown to as well, else from the next one on.
+        """
+        self.cruise_mps = speed_mps if speed_mps > 0.0 else math.nan
+        if at_once and speed_mps > 0.0 and self.task is not None:
+            self.task.cruise_at(speed_mps)
+
+    def orbit(self, request: OrbitRequest) -> int:
+        """Mode ORBIT; a radius that cannot be is accepted too, and then the vehicle hovers in that mode."""
+        if self.mode is not Mode.ORBIT or not isinstance(self.task, Orbit):
+            self._intend(Mode.ORBIT)
+        if isinstance(self.task, Orbit) and not self.task.apply(request):
+            self._say(CRITICAL, "Orbit radius limit exceeded\t")
         return ACCEPTED
 
     def pilot_takes_over(self, mode: Mode = Mode.POSCTL) -> int:
@@ -216,9 +261,33 @@ class Autopilot:
         self.pilot_has_sticks = True
         return self.set_mode(mode)
 
-    def offboard_setpoint(self, setpoint: TrajectorySetpoint) -> None:
+    def hold_at(self, place: Vector) -> None:
+        """Change to HOLD, and stay at a local NED position rather than where braking ends."""
+        self._intend(Mode.HOLD)
+        self.task = flight.Hold(self._airframe, self._parameters, place)
+
+    def restart_task(self) -> None:
+        """Begin the current mode's task anew."""
+        self._start_task()
+
+    def enter_failsafe(self, mode: Mode) -> None:
+        """A failsafe takes the vehicle until somebody changes the mode or it is disarmed."""
+        self.failsafe = self.failsafe_is_latched = True
+        self._say(CRITICAL, "Failsafe activated\t")
+        self._on_event(f"failsafe: {mode.name}")
+        self._enter(mode)
+
+    def terminate(self) -> None:
+        """Stop the motors in flight, for good: flight termination."""
+        self.terminated = self.failsafe = self.failsafe_is_latched = True
+        self._say(CRITICAL, "Failsafe activated\t")
+        self._on_event("flight terminated")
+
+    def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
         """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
         self._last_setpoint_s = self.now_s
+        self._setpoint_needs_position = position_failsafe.asks_for_position(setpoint)
+        self._rates_alone = isinstance(setpoint, RatesSetpoint)
         if self.mode is Mode.OFFBOARD and isinstance(self.task, flight.Offboard):
             self.task.setpoint = setpoint
 
@@ -228,10 +297,12 @@ class Autopilot:
         """Check failsafes and detectors, run the flight task, move the airframe."""
         self.now_s += dt_s
         self._check_offboard()
+        position_failsafe.check(self)
+        self.navigator.update()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
         airframe = self._airframe
-        if not self.armed:
+        if not self.armed or self.terminated:
             self._idle(dt_s, 0.0)
             if not self.landed and airframe.on_ground:
                 self._has_landed()
@@ -240,11 +311,14 @@ class Autopilot:
         assert task is not None
         was_landing = task.landing
         setpoint = task.update(dt_s)
-        if task.landing and not was_landing:
+        if task.landing and not was_landing and self.mode is Mode.RTL:
             self._say(INFO, "RTL: land at destination\t")
-        if self._on_ground_and_idle(setpoint):
+        if not isinstance(setpoint, TrajectorySetpoint):
+            self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
+        elif self._on_ground_and_idle(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
+            self.attitude.release()
             demand = self.demand = self.controller.update(
                 dt_s,
                 setpoint,
@@ -264,6 +338,7 @@ class Autopilot:
 
     def _idle(self, dt_s: float, thrust_mps2: float) -> None:
         airframe = self._airframe
+        self.attitude.release()
         self.controller.reset(airframe.yaw_rad)
         self.demand = Demand(thrust_mps2, 0.0, 0.0, 0.0)
         airframe.step(dt_s, thrust_mps2, 0.0, 0.0, 0.0)
@@ -306,7 +381,7 @@ class Autopilot:
         rise = (progress - RAMP_THRUST_SHARE) / (1.0 - RAMP_THRUST_SHARE)
         return min(max(speed * rise, RAMP_CREEP_MPS), speed)
 
-    def _detect_landing(self, setpoint: TrajectorySetpoint) -> None:
+    def _detect_landing(self, setpoint: flight.Setpoint) -> None:
         airframe = self._airframe
         if self.landed:
             if -airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
@@ -334,6 +409,8 @@ class Autopilot:
     def _disarm_automatically(self) -> None:
         if not self.landed:
             return
+        if self._has_flown and self.navigator.in_progress:
+            return
         if self._has_flown:
             delay = self._parameters.number("COM_DISARM_LAND")
             if delay >= 0.0 and self.now_s - self._landed_since_s >= delay:
@@ -345,7 +422,7 @@ class Autopilot:
 
     def _check_offboard(self) -> None:
         """Loss of the setpoint stream, and its return, while OFFBOARD is what the user wants."""
-        if self.intended_mode is not Mode.OFFBOARD or not self.armed:
+        if self.intended_mode is not Mode.OFFBOARD or not self.armed or self.failsafe_is_latched:
             return
         if self.failsafe and self.has_setpoints:
             self.failsafe = False
@@ -356,7 +433,7 @@ class Autopilot:
             fallback = self._offboard_loss_mode()
             self._say(CRITICAL, "Failsafe activated\t")
             self._on_event(f"failsafe: offboard setpoints lost, {fallback.name}")
-            self._enter(fallback)
+            position_failsafe.enter_or_fall_back(self, fallback)
 
     def _offboard_loss_mode(self) -> Mode:
         """COM_OBL_RC_ACT; its manual modes need a remote control, else NAV_RCL_ACT decides."""
@@ -375,12 +452,13 @@ class Autopilot:
         self.intended_mode = mode
         if mode not in MODES_PREVENTING_ARMING:
             self._mode_after_disarming = mode
-        self.failsafe = False
+        self.failsafe = self.failsafe_is_latched = self.blind = False
         self._enter(mode)
 
     def _enter(self, mode: Mode) -> None:
         if mode is not self.mode:
             self._on_event(f"mode {mode.name}")
+            self.cruise_mps = math.nan
         self.mode = mode
         if not self.armed:
             return
@@ -394,15 +472,21 @@ class Autopilot:
         if self.mode is Mode.OFFBOARD:
             if not isinstance(self.task, flight.Offboard):
                 self.task = flight.Offboard()
+        elif self.mode is Mode.ORBIT:
+            self.task = Orbit(airframe, parameters)
         elif self.mode is Mode.TAKEOFF:
             self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
-        elif self.mode in (Mode.LAND, Mode.PRECLAND):
+        elif self.mode is Mode.MISSION:
+            self.task = self.navigator.mission_task()
+        elif self.mode is Mode.PRECLAND:
+            self.task = self.navigator.precision_landing(Precision.REQUIRED)
+        elif self.mode is Mode.LAND:
             self.task = flight.Land(airframe, parameters)
         elif self.mode is Mode.RTL:
-            task = flight.Return(airframe, parameters, self.home)
+            task = self.navigator.return_task()
             self.task = task
             height = task.return_height_m
-            above_sea = HOME_ALTITUDE_M - self.home[2] + height
+            above_sea = HOME_ALTITUDE_M - task.destination[2] + height
             self._say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
         else:
             self.task = flight.Hold(airframe, parameters)
@@ -413,7 +497,7 @@ class Autopilot:
 
     def _disarm(self, text: str, reason: str) -> None:
         self.armed = False
-        self.failsafe = False
+        self.failsafe = self.failsafe_is_latched = self.terminated = self.blind = False
         self.task = None
         self._takeoff_height_m = None
         self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))

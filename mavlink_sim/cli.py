@@ -15,8 +15,10 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from mavlink_sim.endpoint import PortInUseError
+from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.parameters import UnknownParameterError
-from mavlink_sim.simulation import Simulation, SimulationOptions
+from mavlink_sim.releases import NEWEST
+from mavlink_sim.simulation import SimulationOptions
 from mavlink_sim.video_outputs import STANDARD_OUTPUT
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
@@ -89,9 +91,35 @@ def simulate(
     truth: Annotated[
         Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the traffic of each link into this folder, as LINK.tlog.")
+    ] = None,
+    ready_after: Annotated[
+        float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
+    ] = 3.0,
+    px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
+    noise: Annotated[
+        str, typer.Option(help="Sensors and estimates that err as a real vehicle's do: on or off.")
+    ] = "on",
+    vehicles: Annotated[
+        int, typer.Option(help="A fleet of so many: system ids and ports count up from those given.")
+    ] = 1,
+    spacing: Annotated[float, typer.Option(help="Metres between the vehicles of a fleet, on a grid.")] = 5.0,
+    camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="Let something go wrong, e.g. 'link_delay 0.2 at=20 for=5'; may be repeated."),
+    ] = None,
+    console: Annotated[
+        bool | None,
+        typer.Option(help="Read faults from standard input; by default if that is a terminal."),
+    ] = None,
+    control: Annotated[
+        str | None, typer.Option(help="Take faults over zenoh too, at this endpoint: tcp/127.0.0.1:7447.")
     ] = None,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
@@ -115,7 +143,11 @@ def simulate(
         _check("camera-rate", camera_rate, 1.0, 120.0)
     if STANDARD_OUTPUT in (camera_output or []):
         sys.stdout = sys.stderr  # the pictures have standard output to themselves
+    _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
+    _check("spacing", spacing, 0.5, 1000.0)
+    if noise not in ("on", "off"):
+        _fail(f"--noise {noise!r}: expected on or off")
     options = SimulationOptions(
         host=host,
         onboard_port=onboard_port,
@@ -131,43 +163,64 @@ def simulate(
         camera_truth=camera_truth,
         scene=scene,
         truth=truth,
+        record=record,
+        ready_after_s=ready_after,
+        px4=px4,
         speed=speed,
+        noise=noise == "on",
         parameters=_parameters(param or []),
+        faults=tuple(fault or ()),
+        console=console,
+        control=control,
     )
     try:
-        simulation = Simulation(options, on_event=_say)
+        fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)
     except PortInUseError as error:
         _fail(str(error))
     except UnknownParameterError as error:
         _fail(str(error.args[0]))
     except (OSError, ValueError) as error:
         _fail(str(error))
-    with simulation:
-        _run(simulation, ready_file)
+    with fleet:
+        _run(fleet, ready_file)
 
 
-def _run(simulation: Simulation, ready_file: Path | None) -> None:
+def _run(fleet: Fleet, ready_file: Path | None) -> None:
     def stop(number: int, frame: FrameType | None) -> None:
-        simulation.stop()
+        fleet.stop()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    ports = {name: endpoint.port for name, endpoint in simulation.endpoints.items()}
-    options = simulation.options
+    reports = [
+        {
+            "system_id": one.options.system_id,
+            **{f"{name}_bind": end.port for name, end in one.endpoints.items()},
+        }
+        for one in fleet
+    ]
     if ready_file is not None:
-        report = {"pid": os.getpid(), "onboard_bind": ports["onboard"], "gcs_bind": ports["gcs"]}
+        report: dict[str, Any] = {
+            "pid": os.getpid(),
+            **{name: reports[0][name] for name in ("onboard_bind", "gcs_bind")},
+        }
+        if len(reports) > 1:
+            report["vehicles"] = reports
         partial = ready_file.with_name(ready_file.name + ".partial")
         try:
             partial.write_text(json.dumps(report) + "\n", encoding="utf-8")
             partial.replace(ready_file)  # whoever waits for the file finds it whole
         except OSError as error:
             _fail(f"--ready-file: {error}")
-    _say(
-        f"ready: system {options.system_id}, "
-        f"onboard {options.host}:{ports['onboard']} -> {options.onboard_port}, "
-        f"ground station {options.host}:{ports['gcs']} -> {options.gcs_port}"
-    )
-    simulation.run()
+    for one, bound in zip(fleet, reports, strict=True):
+        options = one.options
+        _say(
+            f"ready: system {options.system_id}, "
+            f"onboard {options.host}:{bound['onboard_bind']} -> {options.onboard_port}, "
+            f"ground station {options.host}:{bound['gcs_bind']} -> {options.gcs_port}"
+        )
+    if len(reports) > 1:
+        _say(f"ready: {len(reports)} vehicles")
+    fleet.run()
     _say("stopped")
 
 
@@ -178,6 +231,10 @@ def main() -> None:
             from mavlink_sim.dataset_cli import app as dataset_app
 
             code = dataset_app(sys.argv[2:], prog_name="mavlink-sim dataset", standalone_mode=False)
+        elif sys.argv[1:2] == ["bench"]:
+            from mavlink_sim.bench import app as bench_app
+
+            code = bench_app(sys.argv[2:], prog_name="mavlink-sim bench", standalone_mode=False)
         else:
             code = app(standalone_mode=False)
     except _USAGE_ERROR as error:

@@ -11,7 +11,9 @@ from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.geography import geographic, local
 from mavlink_sim.messages import dialect, protocol_version
+from mavlink_sim.mission_start import mission_start
 from mavlink_sim.modes import CUSTOM_MODE_ENABLED, mode_of
+from mavlink_sim.orbit import OrbitRequest
 from mavlink_sim.telemetry import MESSAGE_IDS
 
 if TYPE_CHECKING:
@@ -23,14 +25,20 @@ UNSUPPORTED = 3
 FAILED = 4
 
 FORCE_DISARM = 21196.0
+SPEED_TYPE_GROUNDSPEED = 1
 MAX_ALTITUDE_M = 100_000.0
 MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL carries an int32
+NOT_GIVEN = 2**31 - 1  # x and y of COMMAND_INT
+NAN_AS_INTEGER = 0x7FF80000
 GROUND_STATION_COMPONENT = 190  # MAV_COMP_ID_MISSIONPLANNER
 
 NAV_RETURN_TO_LAUNCH = 20
 NAV_LAND = 21
 NAV_TAKEOFF = 22
+DO_ORBIT = 34
 DO_SET_MODE = 176
+DO_CHANGE_SPEED = 178
+DO_CHANGE_ALTITUDE = 186
 DO_REPOSITION = 192
 ARM_DISARM = 400
 GET_MESSAGE_INTERVAL = 510
@@ -50,19 +58,28 @@ class Command:
 def command_of(message: Any) -> Command:
     """The command of a COMMAND_LONG or COMMAND_INT message."""
     if message.get_type() == "COMMAND_INT":
-        # INT32_MAX means "not given", as NaN does in COMMAND_LONG
-        place = [value / 1e7 if abs(value) < 2**31 - 1 else math.nan for value in (message.x, message.y)]
-        tail = (place[0], place[1], message.z)
+        # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 looks at no frame, z is AMSL in all of them
+        given = (message.x, message.y) != (NOT_GIVEN, NOT_GIVEN)
+        place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
+        tail = (*place, message.z)
     else:
         tail = (message.param5, message.param6, message.param7)
     head = (message.param1, message.param2, message.param3, message.param4)
     return Command(int(message.command), head + tail, message.get_srcComponent())
 
 
+def is_misencoded(message: Any) -> bool:
+    """A COMMAND_INT whose place is a float's NaN put into integers by accident: PX4 denies it."""
+    return message.get_type() == "COMMAND_INT" and (message.x, message.y) == (NAN_AS_INTEGER, NAN_AS_INTEGER)
+
+
 def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
     if command.identifier == 0:
         return None
+    refused = vehicle.faults.refuses(command.identifier, command.parameters)
+    if refused is not None:
+        return refused
     handler = _HANDLERS.get(command.identifier)
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 
@@ -105,13 +122,36 @@ def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 
 def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
-    if not _identifier(command.parameters[1]) & 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
+    flags = command.parameters[1]
+    if not math.isfinite(flags) or int(flags) != 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other
         return UNSUPPORTED
-    yaw = command.parameters[3]
+    speed, yaw = command.parameters[0], command.parameters[3]
     latitude, longitude, altitude = command.parameters[4:7]
     if not _is_on_earth(latitude, longitude, altitude):
         return DENIED
-    return vehicle.autopilot.reposition(local(latitude, longitude, altitude), yaw)
+    return vehicle.autopilot.reposition(local(latitude, longitude, altitude), yaw, speed)
+
+
+def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
+    altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
+    if not _is_on_earth(0.0, 0.0, altitude):
+        return DENIED
+    return vehicle.autopilot.reposition(local(math.nan, math.nan, altitude), math.nan)
+
+
+def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
+    kind, speed = command.parameters[:2]
+    vehicle.autopilot.change_speed(speed, at_once=_identifier(kind) == SPEED_TYPE_GROUNDSPEED)
+    return ACCEPTED
+
+
+def _orbit(vehicle: Vehicle, link: Link, command: Command) -> int:
+    radius, speed, yaw_behaviour = command.parameters[:3]
+    latitude, longitude, altitude = command.parameters[4:7]
+    if not _is_on_earth(latitude, longitude, altitude):
+        return DENIED
+    centre = local(latitude, longitude, altitude)
+    return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
 
 
 def _is_on_earth(latitude: float, longitude: float, altitude: float) -> bool:
@@ -123,8 +163,8 @@ def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
-def _deny(vehicle: Vehicle, link: Link, command: Command) -> int:
-    return DENIED
+def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return mission_start(vehicle.autopilot, command.parameters[0])
 
 
 def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -188,13 +228,15 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     NAV_RETURN_TO_LAUNCH: _return_to_launch,
     NAV_LAND: _land,
     NAV_TAKEOFF: _takeoff,
+    DO_ORBIT: _orbit,
     DO_SET_MODE: _do_set_mode,
-    178: _accept,  # DO_CHANGE_SPEED
+    DO_CHANGE_SPEED: _change_speed,
     179: _set_home,  # DO_SET_HOME
     185: _flight_termination,  # DO_FLIGHTTERMINATION
+    DO_CHANGE_ALTITUDE: _change_altitude,
     DO_REPOSITION: _reposition,
     245: _accept,  # PREFLIGHT_STORAGE
-    300: _deny,  # MISSION_START: there is no mission
+    300: _mission_start,
     ARM_DISARM: _arm,
     401: _accept,  # RUN_PREARM_CHECKS
     GET_MESSAGE_INTERVAL: _get_message_interval,

@@ -20,7 +20,9 @@ MAX_DEMAND_MPS2 = 1000.0
 MAX_TILT_DEG = 80.0
 
 
-@dataclass(frozen=True, slots=True)
+# Not frozen, though nobody changes them: freezing makes a dataclass three times as dear to make, and each
+# control step makes both.
+@dataclass(slots=True)
 class TrajectorySetpoint:
     """What a flight task asks of the controller; NaN: not controlled. NED, metres, seconds, radians."""
 
@@ -31,7 +33,7 @@ class TrajectorySetpoint:
     yaw_rate_radps: float = NAN
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Demand:
     """What the airframe is asked for."""
 
@@ -47,7 +49,7 @@ class PositionController:
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._revision = -1
-        self._integral = [0.0, 0.0, 0.0]
+        self._integral: Vector = (0.0, 0.0, 0.0)
         self.position: Vector = NOTHING
         self.velocity: Vector = NOTHING
         self.acceleration: Vector = NOTHING
@@ -75,7 +77,7 @@ class PositionController:
 
     def reset(self, yaw_rad: float) -> None:
         """Forget the integrator and hold this yaw (on the ground)."""
-        self._integral = [0.0, 0.0, 0.0]
+        self._integral = (0.0, 0.0, 0.0)
         self.position = self.velocity = NOTHING
         self.acceleration = (0.0, 0.0, 100.0)  # PX4's "idle thrust" setpoint on the ground
         self.yaw_rad = yaw_rad
@@ -95,44 +97,57 @@ class PositionController:
         if self._revision != self._parameters.revision:
             self._load()
         velocity_setpoint = self._velocity_setpoint(setpoint, position, max_up_mps)
-        demanded = [0.0, 0.0, 0.0]
-        error = [0.0, 0.0, 0.0]
-        for axis in range(3):
-            wanted = velocity_setpoint[axis]
-            forward = setpoint.acceleration[axis]
-            if wanted == wanted:
-                error[axis] = wanted - velocity[axis]
-                demanded[axis] = (
-                    self._velocity_p[axis] * error[axis]
-                    + self._integral[axis]
-                    - self._velocity_d[axis] * acceleration[axis]
-                )
-            if forward == forward:
-                demanded[axis] += forward
-            demanded[axis] = min(max(demanded[axis], -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
-        thrust, achieved_x, achieved_y, achieved_z = self._allocate(demanded[0], demanded[1], demanded[2])
-        self._integrate(dt_s, error, demanded, (achieved_x, achieved_y, achieved_z))
+        # axis by axis rather than in a loop: this is the dearest part of a flight in lockstep
+        (px, _, pz), (dx, _, dz) = self._velocity_p, self._velocity_d
+        ix, iy, iz = self._integral
+        ux, uy, uz = velocity_setpoint
+        fx, fy, fz = setpoint.acceleration
+        ex = ey = ez = ax = ay = az = 0.0
+        if ux == ux:
+            ex = ux - velocity[0]
+            ax = px * ex + ix - dx * acceleration[0]
+        if uy == uy:
+            ey = uy - velocity[1]
+            ay = px * ey + iy - dx * acceleration[1]
+        if uz == uz:
+            ez = uz - velocity[2]
+            az = pz * ez + iz - dz * acceleration[2]
+        if fx == fx:
+            ax += fx
+        if fy == fy:
+            ay += fy
+        if fz == fz:
+            az += fz
+        if not (-MAX_DEMAND_MPS2 < ax < MAX_DEMAND_MPS2 and -MAX_DEMAND_MPS2 < ay < MAX_DEMAND_MPS2):
+            ax = min(max(ax, -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
+            ay = min(max(ay, -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
+        if not -MAX_DEMAND_MPS2 < az < MAX_DEMAND_MPS2:
+            az = min(max(az, -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
+        demanded = (ax, ay, az)
+        thrust, achieved_x, achieved_y, achieved_z = self._allocate(ax, ay, az)
+        self._integrate(dt_s, (ex, ey, ez), demanded, (achieved_x, achieved_y, achieved_z))
         self.position = setpoint.position
         self.velocity = velocity_setpoint
-        self.acceleration = (demanded[0], demanded[1], demanded[2])
+        self.acceleration = demanded
         roll, pitch = _tilt(achieved_x, achieved_y, yaw_rad)
         return Demand(thrust, roll, pitch, self._yaw_rate(setpoint, yaw_rad, dt_s))
 
     def _velocity_setpoint(self, setpoint: TrajectorySetpoint, position: Vector, max_up_mps: float) -> Vector:
-        values = [NAN, NAN, NAN]
-        for axis in range(3):
-            target, feed_forward = setpoint.position[axis], setpoint.velocity[axis]
-            if target == target:
-                values[axis] = self._position_p[axis] * (target - position[axis])
-                if feed_forward == feed_forward:
-                    values[axis] += feed_forward
-            else:
-                values[axis] = feed_forward
-        x, y, z = values
+        target_x, target_y, target_z = setpoint.position
+        x, y, z = setpoint.velocity
+        gain_x, gain_y, gain_z = self._position_p
+        if target_x == target_x:
+            forward = x if x == x else 0.0
+            x = gain_x * (target_x - position[0]) + forward
+        if target_y == target_y:
+            forward = y if y == y else 0.0
+            y = gain_y * (target_y - position[1]) + forward
+        if target_z == target_z:
+            forward = z if z == z else 0.0
+            z = gain_z * (target_z - position[2]) + forward
         if x == x and y == y:
-            speed = math.hypot(x, y)
-            if speed > self._max_xy:
-                x, y = x / speed * self._max_xy, y / speed * self._max_xy
+            if math.hypot(x, y) > self._max_xy:
+                x, y = _limited(setpoint.velocity[:2], x, y, self._max_xy)
         else:
             x, y = (
                 min(max(value, -self._max_xy), self._max_xy) if value == value else NAN for value in (x, y)
@@ -153,12 +168,20 @@ class PositionController:
         thrust = min(lift / cosine, MAX_THRUST_MPS2)
         return thrust, ax, ay, GRAVITY_MPS2 - thrust * cosine
 
-    def _integrate(self, dt_s: float, error: list[float], demanded: list[float], achieved: Vector) -> None:
-        for axis in range(3):
-            # back-calculation: a saturated demand must not wind the integrator up
-            excess = (demanded[axis] - achieved[axis]) * ANTI_WINDUP / self._velocity_p[axis]
-            change = self._velocity_i[axis] * (error[axis] - excess) * dt_s
-            self._integral[axis] = min(max(self._integral[axis] + change, -GRAVITY_MPS2), GRAVITY_MPS2)
+    def _integrate(self, dt_s: float, error: Vector, demanded: Vector, achieved: Vector) -> None:
+        (px, _, pz), (kx, _, kz) = self._velocity_p, self._velocity_i
+        x, y, z = self._integral
+        # back-calculation: a saturated demand must not wind the integrator up
+        share = ANTI_WINDUP / px
+        x += kx * (error[0] - (demanded[0] - achieved[0]) * share) * dt_s
+        y += kx * (error[1] - (demanded[1] - achieved[1]) * share) * dt_s
+        z += kz * (error[2] - (demanded[2] - achieved[2]) * ANTI_WINDUP / pz) * dt_s
+        limit = GRAVITY_MPS2
+        self._integral = (
+            limit if x > limit else -limit if x < -limit else x,
+            limit if y > limit else -limit if y < -limit else y,
+            limit if z > limit else -limit if z < -limit else z,
+        )
 
     def _yaw_rate(self, setpoint: TrajectorySetpoint, yaw_rad: float, dt_s: float) -> float:
         rate = setpoint.yaw_rate_radps if setpoint.yaw_rate_radps == setpoint.yaw_rate_radps else 0.0
@@ -169,6 +192,21 @@ class PositionController:
             self.yaw_rad = yaw_rad
             return rate
         return rate + self._yaw_p * math.remainder(self.yaw_rad - yaw_rad, math.tau)
+
+
+def _limited(feed_forward: tuple[float, float], x: float, y: float, limit: float) -> tuple[float, float]:
+    """A horizontal velocity cut to a limit, the part that leads to the position before the feed-forward."""
+    ahead_x, ahead_y = (value if value == value else 0.0 for value in feed_forward)
+    to_x, to_y = x - ahead_x, y - ahead_y
+    to, ahead = math.hypot(to_x, to_y), math.hypot(ahead_x, ahead_y)
+    if to >= limit:
+        return to_x / to * limit, to_y / to * limit
+    if ahead == 0.0:
+        return x, y
+    # the share of the feed-forward at which the sum has just the length of the limit
+    along = (to_x * ahead_x + to_y * ahead_y) / ahead
+    share = (math.sqrt(along * along + limit * limit - to * to) - along) / ahead
+    return to_x + share * ahead_x, to_y + share * ahead_y
 
 
 def _tilt(ax: float, ay: float, yaw_rad: float) -> tuple[float, float]:

@@ -6,9 +6,10 @@ import errno
 import logging
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
+from mavlink_sim.faulty_socket import FaultySocket
 from mavlink_sim.messages import Outgoing, parser
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ class UdpEndpoint:
     """One bound UDP socket, non-blocking.
 
     Sends to `peer_port` from the start, as PX4 does, then to its first correspondent until that falls silent.
-    Each outgoing message is one datagram.
+    Each outgoing message is one datagram. `on_packet` is shown every packet, sent or received, if it is set.
 
     Raises:
         PortInUseError: `bind_port` is taken; 0 chooses a free one.
@@ -35,7 +36,7 @@ class UdpEndpoint:
     """
 
     def __init__(self, host: str, bind_port: int, peer_port: int, system_id: int = 1) -> None:
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket: socket.socket | FaultySocket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         try:
             self.socket.bind((host, bind_port))
@@ -50,6 +51,7 @@ class UdpEndpoint:
         self._peer_heard_s: float | None = None
         self._codec = parser(system_id)
         self._refused = False
+        self.on_packet: Callable[[bytes], None] | None = None
 
     @property
     def port(self) -> int:
@@ -77,6 +79,9 @@ class UdpEndpoint:
             if found:
                 self._hear(sender)
                 messages.extend(found)
+                if self.on_packet is not None:
+                    for message in found:
+                        self.on_packet(bytes(message.get_msgbuf()))
         return messages
 
     def _hear(self, sender: tuple[str, int]) -> None:
@@ -91,6 +96,8 @@ class UdpEndpoint:
         """Send each message; what the network cannot take now is dropped, as a radio would."""
         for item in outgoing:
             packet = item.pack(self._codec)
+            if self.on_packet is not None:
+                self.on_packet(packet)
             try:
                 self.socket.sendto(packet, self.peer)
             except (BlockingIOError, ConnectionRefusedError):

@@ -8,9 +8,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 
+from mavlink_sim.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor, Vector
+
+Setpoint = TrajectorySetpoint | AttitudeSetpoint | RatesSetpoint
 
 # Share of the acceleration limit that the planned braking uses, so that the vehicle can follow it.
 BRAKING_SHARE = 0.6
@@ -31,6 +34,7 @@ class Trajectory:
         self.position = airframe.position
         self.velocity = airframe.velocity
         self.yaw_rad = airframe.yaw_rad
+        self.cruise_mps = NAN  # in place of MPC_XY_CRUISE, if above zero
 
     def keep_within(self, lead_m: float) -> None:
         """Let the planned height lead the vehicle's by at most this much."""
@@ -59,9 +63,12 @@ class Trajectory:
         lag = math.dist(self.position, self._airframe.position)
         pace = max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
         braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
-        dx, dy, dz = (goal[axis] - self.position[axis] for axis in range(3))
+        x, y, z = self.position
+        dx, dy, dz = goal[0] - x, goal[1] - y, goal[2] - z
         far = math.hypot(dx, dy)
-        speed = min(value("MPC_XY_CRUISE"), max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
+        cruise = self.cruise_mps if self.cruise_mps > 0.0 else value("MPC_XY_CRUISE")
+        cruise = min(cruise, value("MPC_XY_VEL_MAX"))
+        speed = min(cruise, max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
         wanted_x, wanted_y = (dx / far * speed, dy / far * speed) if far > 0.0 else (0.0, 0.0)
         limit = (
             min(value("MPC_Z_V_AUTO_UP"), max_up_mps)
@@ -94,7 +101,19 @@ class Task(ABC):
 
     landing = False  # on the final descent
     finished = False
+    taking_off = False  # climbing from the ground in a mode other than TAKEOFF
     goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
+
+    @abstractmethod
+    def update(self, dt_s: float) -> Setpoint:
+        """Where to be and how to move after another `dt_s` seconds."""
+
+    def cruise_at(self, speed_mps: float) -> None:  # noqa: B027 - a task without a route has no cruise speed
+        """Fly the rest of the route at this horizontal speed (DO_CHANGE_SPEED, DO_REPOSITION)."""
+
+
+class TrajectoryTask(Task):
+    """A task that asks for positions and velocities, never for attitudes."""
 
     @abstractmethod
     def update(self, dt_s: float) -> TrajectorySetpoint:
@@ -114,6 +133,9 @@ class Hold(Task):
         self._trajectory = Trajectory(airframe, parameters)
         self.goal = self._trajectory.stopping_point() if goal is None else goal
         self._yaw_rad = yaw_rad
+
+    def cruise_at(self, speed_mps: float) -> None:
+        self._trajectory.cruise_mps = speed_mps
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
         assert self.goal is not None
@@ -139,7 +161,7 @@ class Takeoff(Task):
         return self._trajectory.towards(self.goal, dt_s, max_up_mps=climb)
 
 
-class Land(Task):
+class Land(TrajectoryTask):
     """Descend at one place until the ground: MPC_LAND_SPEED low down, MPC_LAND_CRWL in the last metre."""
 
     landing = True
@@ -178,7 +200,7 @@ class Return(Task):
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
         self._home = home
-        self._land: Land | None = None
+        self._land: TrajectoryTask | None = None
         self._phase = "climb"
         x, y, z = self._trajectory.stopping_point()
         self.return_height_m = self._return_height(math.hypot(x - home[0], y - home[1]), home[2] - z)
@@ -192,6 +214,9 @@ class Return(Task):
         if distance_m < value("RTL_MIN_DIST") and 0.0 < cone < 90.0:
             height = min(height, distance_m / math.tan(math.radians(cone)))
         return max(height, height_m)
+
+    def cruise_at(self, speed_mps: float) -> None:
+        self._trajectory.cruise_mps = speed_mps
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
         if self._land is not None:
@@ -213,18 +238,22 @@ class Return(Task):
                 descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
                 self.goal = (home_x, home_y, home_z - descend)
         if self._phase == "descend" and self.goal[2] - z < value("NAV_MC_ALT_RAD"):
-            self._land = Land(self._airframe, self._parameters, (home_x, home_y, home_z))
+            self._land = self.landing_task((home_x, home_y, home_z))
             self.goal = self._land.goal
             self.landing = True
             return self._land.update(dt_s)
         return self._trajectory.towards(self.goal, dt_s, yaw)
+
+    def landing_task(self, place: Vector) -> TrajectoryTask:
+        """The descent at a place."""
+        return Land(self._airframe, self._parameters, place)
 
 
 class Offboard(Task):
     """Follow the newest setpoint; until the first one after the mode began, stay at rest."""
 
     def __init__(self) -> None:
-        self.setpoint = TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))
+        self.setpoint: Setpoint = TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))
 
-    def update(self, dt_s: float) -> TrajectorySetpoint:
+    def update(self, dt_s: float) -> Setpoint:
         return self.setpoint

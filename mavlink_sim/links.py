@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from mavlink_sim.announcements import Text
@@ -28,13 +28,19 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
+        self.tells_parameter_errors = True
         self.sent = 0
         self.received = 0
+        self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
         self._system_id = system_id
         self._text_identifier = 0
 
     def send(self, message: Any) -> None:
         """Queue a message of the vehicle's own."""
+        if self.gate is not None:
+            message = self.gate(self, message)
+            if message is None:
+                return
         self.sent += 1
         self.outbox.append(Outgoing(message, self._system_id, AUTOPILOT_COMPONENT))
 
@@ -52,6 +58,14 @@ class Link:
             self.send(
                 dialect.MAVLink_statustext_message(text.severity, chunk, self._text_identifier, sequence)
             )
+
+    def forget(self, now_us: int) -> None:
+        """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
+        self.streams.restart(now_us)
+        self.outbox.clear()
+        self.components.clear()
+        self.ground_station_seen_s = -math.inf
+        self.parameters_left.clear()
 
     def knows(self, system: int, component: int) -> bool:
         """Whether a message to this target is worth sending here (PX4's `component_was_seen`)."""

@@ -10,8 +10,7 @@ intended custom mode, standard mode); `development` and `all` decode it.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import development as dialect
 
@@ -33,8 +32,7 @@ _PROTOCOL_VERSION = struct.Struct("<HHH8s8s")
 _EVENT_SEQUENCE = struct.Struct("<HB")
 
 
-@dataclass(frozen=True, slots=True)
-class Outgoing:
+class Outgoing(NamedTuple):
     """A message on its way out of the vehicle, with the component it comes from.
 
     `forwarded`: it came in on another link and is passed on byte for byte.

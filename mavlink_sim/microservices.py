@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import commands, parameter_protocol
+from mavlink_sim import commands, mission_link, mission_transfer, parameter_protocol
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED
+from mavlink_sim.geography import geographic
 from mavlink_sim.messages import dialect
-from mavlink_sim.setpoints import SetpointRejectedError, trajectory_setpoint
+from mavlink_sim.setpoints import (
+    SetpointRejectedError,
+    attitude_setpoint,
+    flyable,
+    global_trajectory_setpoint,
+    trajectory_setpoint,
+)
 
 if TYPE_CHECKING:
     from mavlink_sim.links import Link
@@ -29,8 +36,11 @@ def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 
 def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if commands.is_misencoded(message):
+        _acknowledge(link, message, message.command, commands.DENIED)
+        return
     command = commands.command_of(message)
-    if command.identifier in commands.ANSWERED_TWICE:
+    if command.identifier in commands.ANSWERED_TWICE and vehicle.release.acknowledges_modes_twice:
         _acknowledge(link, message, command.identifier, ACCEPTED)
     if command.identifier in commands.ANSWERED_BY_RECEIVER:
         _execute(vehicle, link, message, command)
@@ -69,11 +79,30 @@ def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
     try:
-        setpoint = trajectory_setpoint(message, vehicle.airframe.yaw_rad)
+        frame = vehicle.estimate
+        setpoint = trajectory_setpoint(message, frame.yaw_rad, frame.roll_rad, frame.pitch_rad)
     except SetpointRejectedError as error:
         vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
         return
-    vehicle.autopilot.offboard_setpoint(setpoint)
+    vehicle.autopilot.offboard_setpoint(flyable(setpoint))
+
+
+def _global_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+    autopilot = vehicle.autopilot
+    home_altitude = geographic(autopilot.home)[2] if autopilot.sensors_ready else None
+    try:
+        setpoint = global_trajectory_setpoint(message, home_altitude)
+    except SetpointRejectedError as error:
+        autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
+        return
+    if setpoint is not None:
+        autopilot.offboard_setpoint(flyable(setpoint))
+
+
+def _attitude_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+    setpoint = attitude_setpoint(message)
+    if setpoint is not None:
+        vehicle.autopilot.offboard_setpoint(setpoint)
 
 
 def _timesync(vehicle: Vehicle, link: Link, message: Any) -> None:
@@ -90,13 +119,6 @@ def _ping(vehicle: Vehicle, link: Link, message: Any) -> None:
         )
 
 
-def _mission_request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
-    kind = getattr(message, "mission_type", 0)
-    link.send(
-        dialect.MAVLink_mission_count_message(message.get_srcSystem(), message.get_srcComponent(), 0, kind)
-    )
-
-
 Handler = Callable[["Vehicle", "Link", Any], None]
 
 HANDLERS: dict[str, Handler] = {
@@ -105,10 +127,14 @@ HANDLERS: dict[str, Handler] = {
     "COMMAND_INT": _command,
     "SET_MODE": _set_mode,
     "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
+    "SET_POSITION_TARGET_GLOBAL_INT": _global_setpoint,
+    "SET_ATTITUDE_TARGET": _attitude_setpoint,
     "TIMESYNC": _timesync,
     "PING": _ping,
     "PARAM_REQUEST_LIST": parameter_protocol.request_list,
     "PARAM_REQUEST_READ": parameter_protocol.request_read,
     "PARAM_SET": parameter_protocol.set_parameter,
-    "MISSION_REQUEST_LIST": _mission_request_list,
+    **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
+    "LANDING_TARGET": mission_link.landing_target,
+    "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
 }

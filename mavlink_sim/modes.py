@@ -31,6 +31,7 @@ class SystemState(IntEnum):
     STANDBY = 3
     ACTIVE = 4
     CRITICAL = 5
+    FLIGHT_TERMINATION = 8
 
 
 class Mode(Enum):
@@ -39,6 +40,7 @@ class Mode(Enum):
     MANUAL = (1, 0)
     ALTCTL = (2, 0)
     POSCTL = (3, 0)
+    ORBIT = (3, 1)
     POSITION_SLOW = (3, 2)
     TAKEOFF = (4, 2)
     HOLD = (4, 3)
@@ -71,6 +73,7 @@ _TITLES = {
     Mode.MANUAL: "Manual",
     Mode.ALTCTL: "Altitude",
     Mode.POSCTL: "Position",
+    Mode.ORBIT: "Orbit",
     Mode.POSITION_SLOW: "Position Slow",
     Mode.TAKEOFF: "Takeoff",
     Mode.HOLD: "Hold",
@@ -85,6 +88,7 @@ _TITLES = {
 }
 _STANDARD_MODES = {
     Mode.POSCTL: 1,
+    Mode.ORBIT: 2,
     Mode.ALTCTL: 4,
     Mode.RTL: 5,
     Mode.MISSION: 6,
@@ -96,10 +100,10 @@ MANUAL_MODES = frozenset(
     {Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.POSITION_SLOW, Mode.ACRO, Mode.STABILIZED}
 )
 # Modes a vehicle can never be armed in; after disarming, the mode chosen before one of these comes back.
-MODES_PREVENTING_ARMING = frozenset({Mode.RTL, Mode.LAND, Mode.PRECLAND})
+MODES_PREVENTING_ARMING = frozenset({Mode.RTL, Mode.LAND, Mode.PRECLAND, Mode.ORBIT})
 
 _BY_CUSTOM = {mode.value: mode for mode in Mode}
-# PX4 shows an orbit request as the position mode it falls back to.
+# Only DO_ORBIT leads to the orbit mode; DO_SET_MODE's (3, 1) is the position mode to PX4.
 _BY_CUSTOM[(3, 1)] = Mode.POSCTL
 
 
@@ -116,7 +120,7 @@ def base_mode(mode: Mode, armed: bool, has_setpoints: bool) -> int:
         flags = MANUAL_INPUT_ENABLED
     elif mode in MANUAL_MODES:
         flags = MANUAL_INPUT_ENABLED | STABILIZE_ENABLED
-    elif mode is Mode.FOLLOW:
+    elif mode in (Mode.FOLLOW, Mode.ORBIT):
         flags = STABILIZE_ENABLED
     else:
         flags = AUTO_ENABLED | GUIDED_ENABLED | STABILIZE_ENABLED

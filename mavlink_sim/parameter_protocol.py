@@ -104,6 +104,8 @@ def _send_hash(link: Link, parameters: Parameters) -> None:
 
 
 def _send_error(link: Link, message: Any, name: str, index: int, error: int) -> None:
+    if not link.tells_parameter_errors:
+        return
     link.send(
         dialect.MAVLink_param_error_message(
             message.get_srcSystem(), message.get_srcComponent(), name.encode(), index, error

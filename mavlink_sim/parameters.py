@@ -91,11 +91,14 @@ class Parameters:
         return self._parameters.get(name)
 
     def number(self, name: str) -> float:
-        return self[name].value
+        try:
+            return self._parameters[name].value
+        except KeyError:
+            return self[name].value  # which says what is wrong
 
     def positive(self, name: str) -> float:
         """A value to divide by or to take a root of: PX4 accepts any, this stays above zero."""
-        return max(self[name].value, 0.01)
+        return max(self.number(name), 0.01)
 
     def at(self, index: int) -> Parameter | None:
         """The parameter at an index of the list, None outside it."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import selectors
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,7 +16,10 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
+from mavlink_sim.fault_room import fault_room
+from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
+from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from vision.shared_frame import segment_path
 
@@ -48,8 +50,16 @@ class SimulationOptions:
         camera_truth: file for what is in each frame, one JSON object a line.
         scene: a scene file, or the name of an example (`scene_file.load_scene`); None for the demo world.
         truth: file for the truth, one JSON object a line; None for none.
+        record: folder for the traffic of each link, `<link>.tlog`; None for none.
+        ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
+        noise: whether sensors and estimates err as a real vehicle's do.
+        start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
         parameters: PX4 parameters that differ from the defaults.
+        faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
+        console: read faults from standard input; None: if that is a terminal.
+        control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
     """
 
     host: str = "127.0.0.1"
@@ -66,8 +76,16 @@ class SimulationOptions:
     camera_truth: Path | None = None
     scene: str | None = None
     truth: Path | None = None
+    record: Path | None = None
+    ready_after_s: float = 3.0
+    px4: str = NEWEST
     speed: float = 1.0
+    noise: bool = True
+    start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
+    console: bool | None = None
+    control: str | None = None
 
     @property
     def shows_world(self) -> bool:
@@ -80,7 +98,8 @@ class Simulation:
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
-        OSError: the truth file cannot be written.
+        FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
+        OSError: the truth file or the record cannot be written.
     """
 
     def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
@@ -90,9 +109,14 @@ class Simulation:
             seed=options.seed,
             wind_mps=options.wind_mps,
             parameters=options.parameters,
+            ready_after_s=options.ready_after_s,
+            px4=options.px4,
+            noise=options.noise,
+            start_ned_m=options.start_ned_m,
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns
+        self.vehicle.utc_ns = time.time_ns
         self._stopped = False
         self._started_ns = time.monotonic_ns()
         self._simulated_s = 0.0
@@ -116,6 +140,11 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            if options.record is not None:
+                self._resources.enter_context(recording(self.endpoints, options.record))
+            self._faults = self._resources.enter_context(
+                fault_room(self.vehicle, self.endpoints, options, on_event)
+            )
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
             if options.shows_world or options.truth is not None or options.scene is not None:
@@ -171,43 +200,53 @@ class Simulation:
 
     def run(self) -> None:
         """Run until `stop`."""
-        speed = self.options.speed
-        self._started_ns = time.monotonic_ns() - int(self._simulated_s / speed * 1e9)
-        with selectors.DefaultSelector() as selector:
-            for name, endpoint in self.endpoints.items():
-                selector.register(endpoint, selectors.EVENT_READ, name)
-            while not self._stopped:
-                behind = self._clock_ns() / 1e9 - self._simulated_s
-                if behind > MAX_BACKLOG_S * max(speed, 1.0):
-                    logger.warning("the simulation lost %.2f s: the machine is too busy", behind)
-                    self._started_ns += int((behind - STEP_S) / speed * 1e9)
-                    behind = STEP_S
-                ready = selector.select(max((STEP_S - behind) / speed, 0.0))
-                for key, _ in ready:
-                    self._receive(key.data)
-                self._advance()
+        from mavlink_sim.fleet import run_together  # which makes simulations itself
 
-    def _receive(self, name: str) -> None:
+        run_together([self], lambda: self._stopped, self._on_event)
+
+    def start_clock(self, now_ns: int) -> None:
+        """From this moment (monotonic) on, time passes."""
+        self._started_ns = now_ns - int(self._simulated_s / self.options.speed * 1e9)
+
+    def backlog(self) -> float:
+        """Simulated seconds that are hopelessly behind the clock, 0 in good order."""
+        behind = self._clock_ns() / 1e9 - self._simulated_s
+        return behind - STEP_S if behind > MAX_BACKLOG_S * max(self.options.speed, 1.0) else 0.0
+
+    def let_go(self, lost_s: float) -> None:
+        """Give up so many simulated seconds instead of racing after them."""
+        self._started_ns += int(lost_s / self.options.speed * 1e9)
+
+    def until_next_step(self) -> float:
+        """Real seconds until the next step is due."""
+        behind = self._clock_ns() / 1e9 - self._simulated_s
+        return max((STEP_S - behind) / self.options.speed, 0.0)
+
+    def receive(self, name: str) -> None:
+        """Take in what came on a link, and answer."""
         for message in self.endpoints[name].receive():
             self.vehicle.handle(name, message)
-        self._flush()
+        self.flush()
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
         for name, endpoint in self.endpoints.items():
             outgoing = self.vehicle.outgoing(name)
             if outgoing:
                 endpoint.send(outgoing)
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
         """The physics steps that are due; at most a few, so that the sockets are never left waiting long."""
         due = self._clock_ns() / 1e9 - self._simulated_s
         steps = min(int(due / STEP_S), max(4, int(4 * self.options.speed)))
         for _ in range(steps):
             self.vehicle.step(STEP_S)
             self._simulated_s += STEP_S
+            for name in self._faults.delivered():
+                self.receive(name)
         if steps:
-            self._flush()
+            self.flush()
             self._show()
+        self._faults.poll()
 
     def _show(self) -> None:
         """The pose to the camera and the truth to its file, each at its rate."""
@@ -216,7 +255,7 @@ class Simulation:
             period_s = self.options.speed / self._camera_rate_hz  # the rate is one of real time
             self._next_frame_s = max(self._next_frame_s + period_s, self._simulated_s)
             camera.send_pose(
-                self.vehicle.airframe.position,
+                self._place_in_world,
                 self.vehicle.quaternion,
                 time.monotonic_ns(),
                 self._simulated_s,
@@ -238,6 +277,13 @@ class Simulation:
             self._camera_seen = True
             self._on_event(f"camera {camera.name} is on")
 
+    @property
+    def _place_in_world(self) -> Vector:
+        """The true position from where the world begins, which is the first vehicle's start."""
+        north, east, down = self.vehicle.airframe.position
+        start_north, start_east = self.options.start_ned_m
+        return (start_north + north, start_east + east, down)
+
     def truth(self) -> dict[str, Any]:
         """What is really so now: pose, mode, and the range to every object of the world."""
         airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
@@ -251,7 +297,7 @@ class Simulation:
             "landed": autopilot.landed,
             "objects": []
             if self._scene is None
-            else _object_truth(self._scene.world_at(self._simulated_s), airframe.position),
+            else _object_truth(self._scene.world_at(self._simulated_s), self._place_in_world),
         }
 
 

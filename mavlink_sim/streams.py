@@ -5,6 +5,10 @@
 
 from __future__ import annotations
 
+import heapq
+
+NEVER_US = 2**63
+
 ONBOARD_RATES_HZ: dict[str, float] = {
     "HEARTBEAT": 1.0,
     "ATTITUDE": 98.5,
@@ -19,6 +23,7 @@ ONBOARD_RATES_HZ: dict[str, float] = {
     "ATTITUDE_TARGET": 9.85,
     "POSITION_TARGET_LOCAL_NED": 9.85,
     "POSITION_TARGET_GLOBAL_INT": 9.85,
+    "ORBIT_EXECUTION_STATUS": 4.95,  # as configured in PX4; sent while orbiting
     "SERVO_OUTPUT_RAW": 9.85,
     "VFR_HUD": 9.85,
     "GPS_RAW_INT": 7.9,
@@ -54,6 +59,7 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "EXTENDED_SYS_STATE": 1.0,
     "ESTIMATOR_STATUS": 0.5,
     "POSITION_TARGET_GLOBAL_INT": 1.0,
+    "ORBIT_EXECUTION_STATUS": 2.0,
     "SCALED_PRESSURE": 1.0,
     "SYSTEM_TIME": 1.0,
     "SYS_STATUS": 1.0,
@@ -74,17 +80,23 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
 
 
 class Streams:
-    """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1."""
+    """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1.
+
+    `next_us` is when something is due again: before that, `due` need not be asked.
+    """
 
     def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0) -> None:
         self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
         self._interval_us = dict(self._default_us)
-        self._due_us = {
-            name: int(phase_s * 1e6) + interval
+        self._order = {name: place for place, name in enumerate(rates_hz)}
+        # a heap of (due, place in the table, name): few of the streams are due at any one time
+        self._due = [
+            (int(phase_s * 1e6) + interval, self._order[name], name)
             for name, interval in self._interval_us.items()
             if interval > 0
-        }
-        self._next_us = min(self._due_us.values(), default=0)
+        ]
+        heapq.heapify(self._due)
+        self.next_us = self._due[0][0] if self._due else NEVER_US
 
     def __contains__(self, name: str) -> bool:
         """Whether there is such a stream, on or off."""
@@ -97,22 +109,34 @@ class Streams:
         """-1 switches off, 0 restores the default."""
         interval = self._default_us[name] if interval_us == 0 else max(interval_us, -1)
         self._interval_us[name] = interval
+        self._due = [entry for entry in self._due if entry[2] != name]
         if interval > 0:
-            self._due_us[name] = now_us + interval
-        else:
-            self._due_us.pop(name, None)
-        self._next_us = 0
+            self._due.append((now_us + interval, self._order[name], name))
+        heapq.heapify(self._due)
+        self.next_us = self._due[0][0] if self._due else NEVER_US
+
+    def restart(self, now_us: int) -> None:
+        """The default rates again, as after a reboot."""
+        self._interval_us = dict(self._default_us)
+        self._due = [
+            (now_us + us, self._order[name], name) for name, us in self._interval_us.items() if us > 0
+        ]
+        heapq.heapify(self._due)
+        self.next_us = self._due[0][0] if self._due else NEVER_US
 
     def due(self, now_us: int) -> list[str]:
         """The messages to send now. A stream that fell behind by more than an interval skips."""
-        if now_us < self._next_us:
-            return []
-        names = [name for name, due in self._due_us.items() if due <= now_us]
-        for name in names:
+        names: list[str] = []
+        if now_us < self.next_us:
+            return names
+        heap = self._due
+        while heap[0][0] <= now_us:
+            due, place, name = heap[0]
             interval = self._interval_us[name]
-            following = self._due_us[name] + interval
-            self._due_us[name] = following if following > now_us else now_us + interval
-        self._next_us = min(self._due_us.values(), default=now_us + 1_000_000)
+            following = due + interval
+            heapq.heapreplace(heap, (following if following > now_us else now_us + interval, place, name))
+            names.append(name)
+        self.next_us = heap[0][0]
         return names
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.geography import HOME_ALTITUDE_M, HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG, geographic
+from mavlink_sim import packing
+from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
+from mavlink_sim.mission_messages import mission_current
+from mavlink_sim.orbit import orbit_execution_status
 from mavlink_sim.physics import MAX_THRUST_MPS2
-from vision.rotation import quaternion_from_euler
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
@@ -32,23 +33,21 @@ def _heartbeat(vehicle: Vehicle) -> Any:
 
 
 def _attitude(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
-    return dialect.MAVLink_attitude_message(
-        vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates
-    )
+    frame = vehicle.estimate
+    return packing.attitude(vehicle.boot_ms, frame.roll_rad, frame.pitch_rad, frame.yaw_rad, *frame.rates)
 
 
 def _attitude_quaternion(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_attitude_quaternion_message(
-        vehicle.boot_ms, *vehicle.quaternion, *vehicle.airframe.rates, repr_offset_q=[0.0] * 4
+    return packing.attitude_quaternion(
+        vehicle.boot_ms, *vehicle.estimate.quaternion, *vehicle.estimate.rates, repr_offset_q=[0.0] * 4
     )
 
 
 def _global_position_int(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     latitude, longitude, altitude = geographic(frame.position)
     vx, vy, vz = frame.velocity
-    return dialect.MAVLink_global_position_int_message(
+    return packing.global_position_int(
         vehicle.boot_ms,
         round(latitude * 1e7),
         round(longitude * 1e7),
@@ -66,10 +65,10 @@ def _pressure_hpa(altitude_m: float) -> float:
 
 
 def _highres_imu(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
-    altitude = HOME_ALTITUDE_M - frame.position[2]
+    frame = vehicle.estimate
+    altitude = HOME_ALTITUDE_M + frame.pressure_height_m
     cosine, sine = math.cos(frame.yaw_rad), math.sin(frame.yaw_rad)
-    return dialect.MAVLink_highres_imu_message(
+    return packing.highres_imu(
         vehicle.boot_us,
         *frame.specific_force,
         *frame.rates,
@@ -85,8 +84,8 @@ def _highres_imu(vehicle: Vehicle) -> Any:
 
 
 def _local_position_ned(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
-    return dialect.MAVLink_local_position_ned_message(vehicle.boot_ms, *frame.position, *frame.velocity)
+    frame = vehicle.estimate
+    return packing.local_position_ned(vehicle.boot_ms, *frame.position, *frame.velocity)
 
 
 _POSE_COVARIANCE = [0.041, 0, 0, 0, 0, 0, 0.041, 0, 0, 0, 0, 0.044, 0, 0, 0, 2.3e-5, 0, 0, 2.6e-5, 0, 7.3e-4]
@@ -94,13 +93,13 @@ _VELOCITY_COVARIANCE = [0.011, 0, 0, 0, 0, 0, 0.012, 0, 0, 0, 0, 0.005, *([0] * 
 
 
 def _odometry(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
-    return dialect.MAVLink_odometry_message(
+    frame = vehicle.estimate
+    return packing.odometry(
         vehicle.boot_us,
         1,
         1,
         *frame.position,
-        list(vehicle.quaternion),
+        list(frame.quaternion),
         *frame.velocity,
         *frame.rates,
         _POSE_COVARIANCE,
@@ -116,29 +115,25 @@ def _timesync(vehicle: Vehicle) -> Any:
 
 
 def _altitude(vehicle: Vehicle) -> Any:
-    height = -vehicle.airframe.position[2]
+    height = -vehicle.estimate.position[2]
     relative = height + vehicle.autopilot.home[2]
-    return dialect.MAVLink_altitude_message(
+    return packing.altitude(
         vehicle.boot_us, HOME_ALTITUDE_M + height, HOME_ALTITUDE_M + height, height, relative, 0.0, height
     )
 
 
 def _distance_sensor(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
-    slant = -frame.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
-    return dialect.MAVLink_distance_sensor_message(
+    frame = vehicle.estimate
+    slant = -vehicle.airframe.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
+    return packing.distance_sensor(
         vehicle.boot_ms, 0, 10000, min(round(max(slant, 0.0) * 100), 65534), 0, 0, 25, 0
     )
 
 
 def _attitude_target(vehicle: Vehicle) -> Any:
-    demand = vehicle.autopilot.demand
-    yaw = vehicle.autopilot.controller.yaw_rad
-    q = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, yaw)
-    thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
-    return dialect.MAVLink_attitude_target_message(
-        vehicle.boot_ms, 0, list(q), 0.0, 0.0, demand.yaw_rate_radps, thrust
-    )
+    autopilot = vehicle.autopilot
+    target = autopilot.attitude.target(vehicle.estimate, autopilot.controller, autopilot.demand)
+    return packing.attitude_target(vehicle.boot_ms, 0, list(target.quaternion), *target.rates, target.thrust)
 
 
 def _type_mask(*groups: tuple[float, float, float]) -> int:
@@ -151,7 +146,9 @@ def _type_mask(*groups: tuple[float, float, float]) -> int:
 
 def _position_target_local_ned(vehicle: Vehicle) -> Any:
     inner = vehicle.autopilot.controller
-    return dialect.MAVLink_position_target_local_ned_message(
+    if vehicle.autopilot.attitude.active:
+        return None  # PX4's position controller rests meanwhile
+    return packing.position_target_local_ned(
         vehicle.boot_ms,
         1,
         _type_mask(inner.position, inner.velocity, inner.acceleration),
@@ -186,29 +183,29 @@ def _position_target_global_int(vehicle: Vehicle) -> Any:
 def _servo_output_raw(vehicle: Vehicle) -> Any:
     power = 900
     if vehicle.autopilot.armed:
-        power = 1000 + round(1000 * vehicle.airframe.thrust_mps2 / MAX_THRUST_MPS2)
+        power = 1000 + round(1000 * vehicle.estimate.thrust_mps2 / MAX_THRUST_MPS2)
     rest = {f"servo{number}_raw": 900 for number in range(9, 17)}
-    return dialect.MAVLink_servo_output_raw_message(
+    return packing.servo_output_raw(
         vehicle.boot_us & 0xFFFFFFFF, 0, power, power, power, power, 900, 900, 900, 900, **rest
     )
 
 
 def _vfr_hud(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     vx, vy, vz = frame.velocity
     throttle = round(100 * frame.thrust_mps2 / MAX_THRUST_MPS2) if vehicle.autopilot.armed else 0
     heading = round(math.degrees(frame.yaw_rad) % 360.0) % 360
-    return dialect.MAVLink_vfr_hud_message(
+    return packing.vfr_hud(
         _NAN, math.hypot(vx, vy), heading, throttle, HOME_ALTITUDE_M - frame.position[2], -vz
     )
 
 
 def _gps_raw_int(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.airframe.position)
-    vx, vy, _ = vehicle.airframe.velocity
+    latitude, longitude, altitude = geographic(vehicle.estimate.gps_position)
+    vx, vy, _ = vehicle.estimate.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
     height_mm = round(altitude * 1000)
-    return dialect.MAVLink_gps_raw_int_message(
+    return packing.gps_raw_int(
         0,
         3,
         round(latitude * 1e7),
@@ -260,7 +257,7 @@ def _estimator_status(vehicle: Vehicle) -> Any:
 
 
 def _open_drone_id_location(vehicle: Vehicle) -> Any:
-    frame = vehicle.airframe
+    frame = vehicle.estimate
     latitude, longitude, altitude = geographic(frame.position)
     vx, vy, vz = frame.velocity
     course = round(math.degrees(math.atan2(vy, vx)) % 360.0 * 100) % 36000
@@ -289,7 +286,7 @@ def _open_drone_id_location(vehicle: Vehicle) -> Any:
 
 def _open_drone_id_system(vehicle: Vehicle) -> Any:
     latitude, longitude, altitude = geographic(vehicle.autopilot.home)
-    since_2019 = max(int(time.time()) - 1546300800, 0)  # the standard counts from 2019-01-01
+    since_2019 = max(vehicle.utc_ns() // 10**9 - 1546300800, 0)  # the standard counts from 2019-01-01
     return dialect.MAVLink_open_drone_id_system_message(
         0,
         0,
@@ -314,16 +311,16 @@ def _ping(vehicle: Vehicle) -> Any:
 
 
 def _scaled_pressure(vehicle: Vehicle) -> Any:
-    altitude = HOME_ALTITUDE_M - vehicle.airframe.position[2]
+    altitude = HOME_ALTITUDE_M + vehicle.estimate.pressure_height_m
     return dialect.MAVLink_scaled_pressure_message(vehicle.boot_ms, _pressure_hpa(altitude), 0.0, 1182)
 
 
 def _system_time(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_system_time_message(time.time_ns() // 1000, vehicle.boot_ms)
+    return dialect.MAVLink_system_time_message(vehicle.utc_ns() // 1000, vehicle.boot_ms)
 
 
 def _mission_current(vehicle: Vehicle) -> Any:
-    return dialect.MAVLink_mission_current_message(0, 65535, 1, 2)
+    return mission_current(vehicle)
 
 
 def _battery_status(vehicle: Vehicle) -> Any:
@@ -365,7 +362,7 @@ def _time_estimate(vehicle: Vehicle) -> Any:
     if vehicle.autopilot.landed:
         return time_estimate_to_target(-1, -1)
     home = vehicle.autopilot.home
-    position = vehicle.airframe.position
+    position = vehicle.estimate.position
     away = math.hypot(position[0] - home[0], position[1] - home[1])
     positive = vehicle.parameters.positive
     seconds = away / positive("MPC_XY_CRUISE") + (home[2] - position[2]) / positive("MPC_LAND_SPEED")
@@ -378,10 +375,11 @@ def _current_event_sequence(vehicle: Vehicle) -> Any:
 
 
 def _gps_global_origin(vehicle: Vehicle) -> Any:
+    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
     return dialect.MAVLink_gps_global_origin_message(
-        round(HOME_LATITUDE_DEG * 1e7),
-        round(HOME_LONGITUDE_DEG * 1e7),
-        round(HOME_ALTITUDE_M * 1000),
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        round(altitude * 1000),
         vehicle.boot_us,
     )
 
@@ -389,8 +387,8 @@ def _gps_global_origin(vehicle: Vehicle) -> Any:
 def _autopilot_version(vehicle: Vehicle) -> Any:
     return dialect.MAVLink_autopilot_version_message(
         capabilities=59647,
-        flight_sw_version=0x01110040,
-        middleware_sw_version=0x01110040,
+        flight_sw_version=vehicle.release.software_version,
+        middleware_sw_version=vehicle.release.software_version,
         os_sw_version=0,
         board_version=1,
         flight_custom_version=[0, 0, 0, 253, 175, 214, 222, 89],
@@ -419,6 +417,7 @@ BUILDERS: dict[str, Builder] = {
     "ATTITUDE_TARGET": _attitude_target,
     "POSITION_TARGET_LOCAL_NED": _position_target_local_ned,
     "POSITION_TARGET_GLOBAL_INT": _position_target_global_int,
+    "ORBIT_EXECUTION_STATUS": orbit_execution_status,
     "SERVO_OUTPUT_RAW": _servo_output_raw,
     "VFR_HUD": _vfr_hud,
     "GPS_RAW_INT": _gps_raw_int,

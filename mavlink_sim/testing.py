@@ -1,11 +1,14 @@
 """A vehicle in a process of its own, for integration tests.
 
 >>> with running_simulator(seed=3, speed=4.0) as simulator:      # doctest: +SKIP
-...     connect(f"udpin://127.0.0.1:{simulator.onboard_port}")
+...     connect(simulator.mavsdk_url)
+
+In asyncio code `async with vehicle(seed=3) as simulator:` does the same without blocking the loop.
 """
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -13,11 +16,35 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
+
+FLEET_READY = re.compile(r"^ready: \d+ vehicles")
+
+
+def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
+    """The first of so many consecutive UDP ports that nobody is bound to at this moment.
+
+    Raises:
+        OSError: none were found in a hundred places.
+    """
+    for _ in range(100):
+        (start,) = free_udp_ports(1, host)
+        try:
+            with ExitStack() as stack:
+                for port in range(start, start + count):
+                    candidate = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                    candidate.bind((host, port))
+        except (OSError, OverflowError):
+            continue
+        return start
+    raise OSError(f"no {count} consecutive UDP ports are free on {host}")
 
 
 def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
@@ -31,6 +58,17 @@ def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
         return ports
 
 
+@dataclass(frozen=True, slots=True)
+class FleetMember:
+    """One vehicle of a running fleet: its system id, and the ports as `RunningSimulator` names them."""
+
+    system_id: int
+    onboard_bind: int
+    onboard_port: int
+    gcs_bind: int
+    gcs_port: int
+
+
 class RunningSimulator:
     """A `python -m mavlink_sim` that is up.
 
@@ -38,12 +76,18 @@ class RunningSimulator:
         onboard_port: the UDP port a companion listens on (`udpin:127.0.0.1:<port>`); the vehicle sends there.
         gcs_port: the same for a ground station.
         onboard_bind, gcs_bind: the ports the vehicle itself is bound to.
+        vehicles: every vehicle of a fleet in order (the ports above are the first one's).
         events: every line it printed so far, in order, without the ready line.
+        transcript: every line it printed, each after the seconds since it was started.
     """
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: subprocess.Popen[str], count: int = 1) -> None:
         self.process = process
+        self.vehicles: list[FleetMember] = []
+        self._count = count
         self.events: list[str] = []
+        self.transcript: list[str] = []
+        self._started_s = time.monotonic()
         self.onboard_port = self.onboard_bind = self.gcs_port = self.gcs_bind = 0
         self._ready = False
         self._ended = False
@@ -54,6 +98,21 @@ class RunningSimulator:
     @property
     def pid(self) -> int:
         return self.process.pid
+
+    @property
+    def mavsdk_url(self) -> str:
+        """What MAVSDK's `add_any_connection` takes, for a companion."""
+        return f"udpin://127.0.0.1:{self.onboard_port}"
+
+    @property
+    def pymavlink_device(self) -> str:
+        """What pymavlink's `mavlink_connection` takes, for a companion."""
+        return f"udpin:127.0.0.1:{self.onboard_port}"
+
+    @property
+    def gcs_pymavlink_device(self) -> str:
+        """What pymavlink and MAVProxy's `--master` take, for a ground station."""
+        return f"udpin:127.0.0.1:{self.gcs_port}"
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -66,11 +125,15 @@ class RunningSimulator:
     def _take(self, line: str) -> None:
         found = READY.match(line)
         with self._changed:
+            self.transcript.append(f"{time.monotonic() - self._started_s:9.3f} {line}")
             if found:
-                _, self.onboard_bind, self.onboard_port, self.gcs_bind, self.gcs_port = map(
-                    int, found.groups()
-                )
-                self._ready = True
+                self.vehicles.append(FleetMember(*map(int, found.groups())))
+                first = self.vehicles[0]
+                self.onboard_bind, self.onboard_port = first.onboard_bind, first.onboard_port
+                self.gcs_bind, self.gcs_port = first.gcs_bind, first.gcs_port
+                self._ready = len(self.vehicles) == self._count
+            elif FLEET_READY.match(line):
+                pass  # each of them has said so
             else:
                 self.events.append(line)
             self._changed.notify_all()
@@ -114,6 +177,12 @@ class RunningSimulator:
     def resume(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
 
+    def fault(self, line: str) -> None:
+        """Type a line of the faults' grammar on the simulator's console: `link_loss for=3`, `end all`…"""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
     def stop(self, timeout_s: float = 10.0) -> int:
         """End it in good order (SIGTERM; SIGKILL if it does not). Returns the exit code."""
         if self.process.poll() is None:
@@ -136,8 +205,9 @@ def running_simulator(
     onboard_bind: int = 0,
     gcs_bind: int = 0,
     parameters: dict[str, float] | None = None,
+    faults: Sequence[str] = (),
     timeout_s: float = 60.0,
-    **options: float | str | Path,
+    **options: float | str | Path | None,
 ) -> Iterator[RunningSimulator]:
     """Start a vehicle, wait until it is up, end it afterwards.
 
@@ -145,11 +215,16 @@ def running_simulator(
         onboard_port, gcs_port: where it sends to; None for ports that are free now.
         onboard_bind, gcs_bind: what it binds; give a former run's port to start it anew in the same place.
         parameters: PX4 parameters.
+        faults: each as `mavlink-sim --fault` takes it; `RunningSimulator.fault` brings more while it flies.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
-            `truth=path`, `wind=3.0`, `system_id=2`).
+            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None
+            for none.
     """
+    count = int(options.get("vehicles") or 1)  # type: ignore[arg-type]
     ports = free_udp_ports(2)
+    if count > 1 and onboard_port is None:
+        ports[0] = free_udp_port_range(count)
     arguments = {
         "onboard_port": ports[0] if onboard_port is None else onboard_port,
         "gcs_port": ports[1] if gcs_port is None else gcs_port,
@@ -159,17 +234,48 @@ def running_simulator(
     }
     command = [sys.executable, "-m", "mavlink_sim"]
     for name, value in arguments.items():
-        command += [f"--{name.replace('_', '-')}", str(value)]
+        if value is None or value is False:
+            continue
+        command += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     for name, value in (parameters or {}).items():
         command += ["--param", f"{name}={value}"]
+    for fault in faults:
+        command += ["--fault", fault]
+    command += ["--console"]
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
-    simulator = RunningSimulator(process)
+    simulator = RunningSimulator(process, count)
     try:
         simulator.wait_until_ready(timeout_s)
         yield simulator
     finally:
         simulator.stop()
+        assert process.stdin is not None
         assert process.stdout is not None
+        with suppress(BrokenPipeError):
+            process.stdin.close()
         process.stdout.close()
+
+
+class vehicle:  # noqa: N801 - it is used as a function, like the context managers of the standard library
+    """A vehicle that is up and can be armed at once: `with vehicle() as v:` or `async with vehicle() as v:`.
+
+    Args:
+        options: those of `running_simulator`. `ready_after` is 0 here: no wait for the estimator.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self._running = running_simulator(**{"ready_after": 0.0, **options})
+
+    def __enter__(self) -> RunningSimulator:
+        return self._running.__enter__()
+
+    def __exit__(self, *exception: Any) -> None:
+        self._running.__exit__(*exception)
+
+    async def __aenter__(self) -> RunningSimulator:
+        return await asyncio.to_thread(self.__enter__)
+
+    async def __aexit__(self, *exception: Any) -> None:
+        await asyncio.to_thread(self.__exit__, *exception)

@@ -10,22 +10,30 @@ import heapq
 import itertools
 import math
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from mavlink_sim import parameter_protocol, telemetry
+from mavlink_sim import mission_link, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
+from mavlink_sim.estimate_errors import FallibleEstimate
+from mavlink_sim.faults import Faults
+from mavlink_sim.geography import geographic, start_of_vehicle
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor
+from mavlink_sim.physics import Multirotor, Vector
+from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.streams import ONBOARD_RATES_HZ
-from vision.rotation import quaternion_from_euler
 
+# When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
+BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12
 STEP_S = 0.004
 STEP_US = 4000
+# PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
+STEPS_PER_CONTROL = 3
+CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
@@ -42,13 +50,18 @@ class Vehicle:
         seed: of wind direction and gusts.
         wind_mps: steady horizontal wind, from a direction that the seed chooses.
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
+        noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         ready_after_s: how long after boot the estimator allows arming.
+        px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
+        start_ned_m: where it starts, north and east of SIH's home; its local NED frame begins there.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
     Attributes:
-        airframe: the motion (truth). autopilot: the decisions. parameters: the parameter set. links: by name.
+        airframe: the motion (truth). estimate: what the vehicle knows of it. faults: what goes wrong.
+        autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
+        utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
         event_sequence: number of the newest EVENT.
     """
 
@@ -59,11 +72,15 @@ class Vehicle:
         seed: int = 0,
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
+        noise: bool = True,
         parameters: Mapping[str, float] | None = None,
         ready_after_s: float = 3.0,
+        px4: str = NEWEST,
+        start_ned_m: tuple[float, float] = (0.0, 0.0),
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
+        self.release = release_named(px4)
         self.parameters = Parameters(parameters)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
@@ -73,14 +90,20 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.event_sequence = 0
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
+        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self._boot_us * 1000
+        self.start_ned_m = start_ned_m
         self._on_event = on_event or (lambda text: None)
+        self.ready_after_s = ready_after_s
+        self.faults = Faults(self, seed, self._on_event)
         self.autopilot = Autopilot(
-            self.airframe, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
+            self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
         self._boot_us = 0
+        self._steps_to_control = 0
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
@@ -107,13 +130,19 @@ class Vehicle:
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """`ned_from_body`, (w, x, y, z)."""
-        frame = self.airframe
-        return quaternion_from_euler(frame.roll_rad, frame.pitch_rad, frame.yaw_rad)
+        """The true `ned_from_body`, (w, x, y, z)."""
+        return self.airframe.quaternion
+
+    @property
+    def home_altitude_m(self) -> float:
+        """Of home above mean sea level."""
+        return geographic(self.autopilot.home)[2]
 
     @property
     def battery_remaining(self) -> float:
         """0..1. Half of it goes in SIM_BAT_DRAIN seconds of armed time; never below SIM_BAT_MIN_PCT."""
+        if self.faults.battery is not None:
+            return self.faults.battery
         lowest = self.parameters.number("SIM_BAT_MIN_PCT") / 100.0
         return min(max(0.99 - self._used_charge, lowest, 0.0), 1.0)
 
@@ -132,6 +161,8 @@ class Vehicle:
         rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
         # links start out of step, so that they do not all send everything in the same millisecond
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link.gate = self.faults.gate
+        link.tells_parameter_errors = self.release.has_parameter_errors
         return link
 
     def outgoing(self, link: str) -> list[Outgoing]:
@@ -143,10 +174,13 @@ class Vehicle:
 
     def handle(self, link_name: str, message: Any) -> None:
         """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
+        start_of_vehicle.set(self.start_ned_m)
         link = self.links[link_name]
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self.system_id, AUTOPILOT_COMPONENT):
             return  # an echo of our own
+        if self.faults.intercepts(link_name, message):
+            return
         link.received += 1
         link.components.add(source)
         forward(message, link, self.links.values(), self.system_id)
@@ -158,10 +192,11 @@ class Vehicle:
 
     def send_built(self, link: Link, name: str) -> bool:
         """Send one telemetry message by name; False if it has nothing to say now."""
-        if name == "LINK_NODE_STATUS":
+        builder = telemetry.BUILDERS.get(name)
+        if builder is not None:
+            message = builder(self)
+        elif name == "LINK_NODE_STATUS":
             message = link_node_status(self.boot_ms, link.sent, link.received, 0)
-        elif name in telemetry.BUILDERS:
-            message = telemetry.BUILDERS[name](self)
         else:
             message = telemetry.REQUESTED[name](self)
         if message is not None:
@@ -172,6 +207,7 @@ class Vehicle:
 
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
+        start_of_vehicle.set(self.start_ned_m)
         self._leftover_s += dt_s
         while self._leftover_s >= STEP_S - 1e-9:
             self._leftover_s -= STEP_S
@@ -189,19 +225,41 @@ class Vehicle:
             self.autopilot.texts.append(Text(INFO, "Onboard controller regained\t"))
             self._on_event("the companion's heartbeat is back")
 
+    def forget_boot(self) -> None:
+        """What does not survive a reboot, outside the autopilot."""
+        self._later.clear()
+        self._companion_seen_s, self._companion_lost, self._origin_told = None, False, False
+        self.event_sequence = 0
+        for link in self.links.values():
+            link.forget(self._boot_us)
+
+    def reload_wind(self, more: Iterable[Vector] = ()) -> None:
+        """The wind of SIH_WIND_N and SIH_WIND_E, and what else blows."""
+        self._wind_revision = self.parameters.revision
+        north, east = (
+            min(max(self.parameters.number(name), -MAX_WIND_MPS), MAX_WIND_MPS)
+            for name in ("SIH_WIND_N", "SIH_WIND_E")
+        )
+        for wind in more:
+            north, east = north + wind[0], east + wind[1]
+        self.airframe.wind = (north, east, 0.0)
+
     def _step(self) -> None:
+        if self.faults.step(STEP_S):
+            return
         self._boot_us += STEP_US
-        while self._later and self._later[0][0] <= self.now_s + 1e-9:
+        while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
             heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
-            self._wind_revision = self.parameters.revision
-            north, east = (
-                min(max(self.parameters.number(name), -MAX_WIND_MPS), MAX_WIND_MPS)
-                for name in ("SIH_WIND_N", "SIH_WIND_E")
-            )
-            self.airframe.wind = (north, east, 0.0)
-        self.autopilot.update(STEP_S)
-        if self.autopilot.sensors_ready and not self._origin_told:
+            self.reload_wind(self.faults.winds.values())
+        self._steps_to_control -= 1
+        if self._steps_to_control <= 0:
+            self._steps_to_control = STEPS_PER_CONTROL
+            self.autopilot.update(CONTROL_STEP_S)
+        mission_link.update(self)
+        self.airframe.advance(STEP_S)
+        self.estimate.update(STEP_S)
+        if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
@@ -211,8 +269,9 @@ class Vehicle:
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
         for link in self.links.values():
-            for name in link.streams.due(self._boot_us):
-                self.send_built(link, name)
+            if link.streams.next_us <= self._boot_us:
+                for name in link.streams.due(self._boot_us):
+                    self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
 

@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from companion.cli import app as companion_app
+from companion.guidance import grammar
 from mavlink_sim.cli import app as simulator_app
 from mavlink_sim.dataset_cli import app as dataset_app
 
@@ -87,3 +88,9 @@ def test_every_file_in_the_architecture_exists() -> None:
         assert rooms
         for name in re.findall(r"`([^`]+)`", " ".join(rooms)):
             assert list((ROOT / package).glob(name)), f"docs/architecture.md: {package}/{name} does not exist"
+
+
+def test_every_flight_command_in_the_table_is_read_and_every_one_there_is_stands_in_it() -> None:
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "flight.md").read_text(), re.MULTILINE)
+    commands = [grammar.parse(text) for row in rows for text in re.findall(r"`([^`]+)`", row)]
+    assert {type(command) for command in commands} == set(grammar.COMMANDS.values())

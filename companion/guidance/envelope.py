@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
+from companion.fence import Fence
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from vision.rotation import wrap_angle
@@ -21,6 +22,7 @@ POSITION_GAIN_PER_S = 1.0
 LONGEST_STEP_S = 0.2
 # Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
 FENCE_BRAKING = 0.5
+NO_FENCE = Fence()
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,7 @@ class Limits:
         max_acceleration_mps2: at which a commanded velocity may grow or turn.
         min_altitude_m, max_altitude_m: band above home.
         max_distance_m: horizontally from home.
+        fence: polygons about home to stay inside and out of.
 
     Raises:
         ValueError: a limit is not finite and positive, or the band of altitudes is empty.
@@ -47,11 +50,12 @@ class Limits:
     min_altitude_m: float = 1.0
     max_altitude_m: float = 50.0
     max_distance_m: float = 200.0
+    fence: Fence = NO_FENCE
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0.0):
+            if field.name != "fence" and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{field.name} must be a finite number above 0, got {value}")
         if self.min_altitude_m >= self.max_altitude_m:
             raise ValueError(
@@ -148,6 +152,10 @@ class Envelope:
             if leaving > 0.0 and excess > 1e-9:
                 north, east = north - outward[0] * excess, east - outward[1] * excess
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
+        allowed = limits.fence.slowed((north, east), away, self._towards_fence)
+        if math.dist(allowed, (north, east)) > 1e-6:
+            reasons.append("slowed down at the fence")
+            north, east = allowed
         return (north, east, down)
 
     def _towards_fence(self, left_m: float) -> float:
@@ -184,6 +192,11 @@ class Envelope:
         else:
             place = (asked[0], asked[1], down)
 
+        goal = (place[0] - home[0], place[1] - home[1])
+        inside = limits.fence.clipped((here[0] - home[0], here[1] - home[1]), goal)
+        if inside != goal:
+            place = (home[0] + inside[0], home[1] + inside[1], down)
+            reasons.append("kept inside the fence")
         offset = (place[0] - here[0], place[1] - here[1], 0.0)
         carrot = _shorten(offset, limits.max_horizontal_speed_mps / POSITION_GAIN_PER_S)
         if carrot != offset:

@@ -19,8 +19,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
+from companion.points import points_from
+
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0
+
+
+MOST_POINTS = 500
 
 
 class GrammarError(ValueError):
@@ -55,7 +60,15 @@ class Choice:
     meaning: str
 
 
-Argument = Number | ClassName | Choice
+@dataclass(frozen=True, slots=True)
+class Points:
+    """A row of places, `north,east` or `north,east,height`, metres from home."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | Choice | Points
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +80,9 @@ class Command:
 
     def __post_init__(self) -> None:
         for field, argument in _arguments(type(self)):
-            _check(self.word, argument, getattr(self, field.name), _default(field))
+            value = getattr(self, field.name)
+            if value is not None or field.default is not None:
+                _check(self.word, argument, value, _default(field))
 
     @property
     def endless(self) -> bool:
@@ -154,6 +169,85 @@ class Orbit(Command):
 
 
 @dataclass(frozen=True, slots=True)
+class Goto(Command):
+    word: ClassVar[str] = "goto"
+    meaning: ClassVar[str] = "fly straight to a place, given by one pair of its arguments"
+
+    north_m: Annotated[float | None, Number("north", "m", -5000.0, 5000.0, "of home, with east")] = None
+    east_m: Annotated[float | None, Number("east", "m", -5000.0, 5000.0, "of home, with north")] = None
+    altitude_m: Annotated[float | None, Number("altitude", "m", 1.0, 500.0, "above home; else as it is")] = (
+        None
+    )
+    forward_m: Annotated[float | None, Number("forward", "m", -5000.0, 5000.0, "of here, with right")] = None
+    right_m: Annotated[float | None, Number("right", "m", -5000.0, 5000.0, "of here, with forward")] = None
+    latitude_deg: Annotated[
+        float | None, Number("latitude", "deg", -90.0, 90.0, "WGS 84, with longitude")
+    ] = None
+    longitude_deg: Annotated[
+        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84, with latitude")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    heading_deg: Annotated[
+        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; else along the way")
+    ] = None
+
+    def __post_init__(self) -> None:
+        super(Goto, self).__post_init__()
+        pairs = {
+            "north and east": (self.north_m, self.east_m),
+            "forward and right": (self.forward_m, self.right_m),
+            "latitude and longitude": (self.latitude_deg, self.longitude_deg),
+        }
+        begun = [name for name, pair in pairs.items() if pair != (None, None)]
+        if len(begun) != 1:
+            got = " and ".join(begun) if begun else "none of them"
+            raise GrammarError(f"goto: give exactly one pair of {', '.join(pairs)}; got {got}")
+        if None in pairs[begun[0]]:
+            raise GrammarError(f"goto: {begun[0]} belong together; one of them is missing")
+
+
+@dataclass(frozen=True, slots=True)
+class FollowPath(Command):
+    word: ClassVar[str] = "follow-path"
+    meaning: ClassVar[str] = "fly along a row of points, slowing down for corners"
+
+    points: Annotated[
+        str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
+    ]
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, Choice("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class FigureEight(Command):
+    word: ClassVar[str] = "figure-eight"
+    meaning: ClassVar[str] = "fly a level eight about this place, first towards the nose"
+
+    radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its middle to either end")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most; bends are slower")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, Choice("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Seek(Command):
     word: ClassVar[str] = "seek"
     meaning: ClassVar[str] = "turn on the spot until an object of the class is seen, then face it"
@@ -182,7 +276,8 @@ class Approach(Command):
 
 
 COMMANDS: dict[str, type[Command]] = {
-    kind.word: kind for kind in (Takeoff, Land, Rtl, Stop, Hold, Orbit, Seek, Approach)
+    kind.word: kind
+    for kind in (Takeoff, Land, Rtl, Stop, Hold, Goto, FollowPath, FigureEight, Orbit, Seek, Approach)
 }
 
 
@@ -223,6 +318,8 @@ def usage(kind: type[Command]) -> str:
             words.append(argument.key.upper())
         elif isinstance(argument, ClassName):
             words.append(f"[{argument.key.upper()}]")
+        elif default is None:
+            words.append(f"[{argument.key}=…]")
         else:
             words.append(
                 f"[{argument.key}={default:g}]"
@@ -243,7 +340,7 @@ def describe() -> str:
                     lines.append(f"    {key}: {meaning} ({low:g} to {high:g}{' ' + unit if unit else ''})")
                 case Choice(key, words, meaning):
                     lines.append(f"    {key}: {meaning} ({' or '.join(words)})")
-                case ClassName(key, meaning):
+                case ClassName(key, meaning) | Points(key, meaning):
                     lines.append(f"    {key}: {meaning}")
     return "\n".join(lines)
 
@@ -273,7 +370,7 @@ def _tokens(text: str) -> Iterator[_Token]:
 
 
 def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, Argument, str]]:
-    """(field name, argument, text) of each token; words of a class name left apart are joined."""
+    """(field name, argument, text) of each token; words of a class name, and points, are joined."""
     arguments = _arguments(kind)
     by_key = {argument.key: (field.name, argument) for field, argument in arguments}
     seen: set[str] = set()
@@ -286,7 +383,7 @@ def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, 
         return name, argument, text
 
     bare = [token for token in tokens if token.key is None]
-    if arguments and isinstance(arguments[0][1], ClassName):
+    if arguments and isinstance(arguments[0][1], ClassName | Points):
         if bare:
             yield claim(arguments[0][1].key, " ".join(token.text for token in bare))
     else:
@@ -313,6 +410,8 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
                 raise GrammarError(f"{word}: {key} must be {_range(argument)}, got {text!r}") from None
         case Choice():
             return text.lower()
+        case Points():
+            return text
         case ClassName():
             return text if class_names is None else known_class(text, class_names)
 
@@ -336,6 +435,13 @@ def _check(word: str, argument: Argument, value: Any, default: Any) -> None:
         case Choice(key, words):
             if value not in words:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
+        case Points(key):
+            try:
+                count = len(points_from(value))
+            except ValueError as error:
+                raise GrammarError(f"{word}: {key}: {error}") from None
+            if not 1 <= count <= MOST_POINTS:
+                raise GrammarError(f"{word}: {key} must be 1 to {MOST_POINTS} points, got {count}")
         case ClassName(key):
             if value == default:
                 return

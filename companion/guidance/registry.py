@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from companion.guidance import grammar
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour
+from companion.guidance.figure_eight import FigureEightBehaviour
+from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.orbit import OrbitBehaviour
@@ -26,6 +31,12 @@ def behaviour_for(command: grammar.Command) -> Behaviour:
             return StopBehaviour()
         case grammar.Hold(duration_s):
             return HoldBehaviour(duration_s)
+        case grammar.Goto():
+            return _goto(command)
+        case grammar.FollowPath(_, speed_mps, laps, nose):
+            return FollowPathBehaviour(command.places, speed_mps, laps=laps, nose_along=nose == "along")
+        case grammar.FigureEight(radius_m, speed_mps, laps, nose):
+            return FigureEightBehaviour(radius_m, speed_mps, laps, nose_along=nose == "along")
         case grammar.Orbit(class_name, radius_m, speed_mps, laps, direction):
             clockwise = direction == "clockwise"
             return OrbitBehaviour(radius_m, speed_mps, laps, clockwise=clockwise, class_name=class_name)
@@ -46,3 +57,19 @@ def behaviour_for(command: grammar.Command) -> Behaviour:
                 lost_timeout_s=lost_timeout_s,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
+
+
+def _goto(command: grammar.Goto) -> GotoBehaviour:
+    heading = command.heading_deg
+    return GotoBehaviour(
+        from_home_m=_pair(command.north_m, command.east_m),
+        from_here_m=_pair(command.forward_m, command.right_m),
+        global_deg=_pair(command.latitude_deg, command.longitude_deg),
+        altitude_m=command.altitude_m,
+        speed_mps=command.speed_mps,
+        heading_rad=None if heading is None else math.radians(heading),
+    )
+
+
+def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:
+    return None if first is None or second is None else (first, second)

@@ -13,8 +13,9 @@ import math
 import struct
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from typing import Any
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
@@ -71,6 +72,9 @@ WANTED_RATES_HZ = {
 _MEASURE_S = 1.5
 _RATE_TOLERANCE = 0.7
 _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
+# A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
+_SETBACKS_OF_TWO = 3
+_TWO_CLOCKS_S = 2.0
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 
 
@@ -99,6 +103,8 @@ class AutopilotDriver(ABC):
         self._source: Source = None
         self._newest_heartbeat: Frame | None = None
         self._boot_ms = 0
+        self._setbacks_ns: deque[int] = deque(maxlen=_SETBACKS_OF_TWO)
+        self._two_heard_ns = 0
         self._restarted = asyncio.Event()
         self._heard = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
@@ -257,9 +263,7 @@ class AutopilotDriver(ABC):
         """One message of the autopilot: into the state, and to whoever waits for it."""
         now_ns = time.monotonic_ns()
         if name == "LOCAL_POSITION_NED":
-            if fields["time_boot_ms"] < self._boot_ms - _BOOT_TOLERANCE_MS:
-                self._restarted.set()
-            self._boot_ms = fields["time_boot_ms"]
+            self._watch_clock(fields["time_boot_ms"], now_ns)
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             self._mode_ns = now_ns
         state = fold(self._state, name, fields, now_ns)
@@ -272,6 +276,32 @@ class AutopilotDriver(ABC):
                     callback(state)
                 except Exception:  # a subscriber's fault must not stop the vehicle's state
                     logger.exception("%s: a subscriber of the state failed", self.url)
+
+    def _watch_clock(self, boot_ms: int, now_ns: int) -> None:
+        """The autopilot's clock goes back: it has restarted, or another one speaks with its id by turns."""
+        if boot_ms < self._boot_ms - _BOOT_TOLERANCE_MS:
+            self._setbacks_ns.append(now_ns)
+            first_ns = self._setbacks_ns[0]
+            if len(self._setbacks_ns) == _SETBACKS_OF_TWO and now_ns - first_ns < _TWO_CLOCKS_S * 1e9:
+                if not self._two_autopilots(now_ns):
+                    logger.error(
+                        "%s: two autopilots send as system %s from one address: give each an id of its own",
+                        self.url,
+                        self._system_id,
+                    )
+                self._two_heard_ns = now_ns
+                self._restarted.clear()
+            else:
+                self._restarted.set()
+                # What held before the restart is not known to hold now, home least of all.
+                self._state = replace(
+                    self._state, ready_to_arm=False, home_altitude_amsl_m=None, home_position_ned_m=None
+                )
+        self._boot_ms = boot_ms
+
+    def _two_autopilots(self, now_ns: int) -> bool:
+        """Two of the same id were heard a moment ago: their states cannot be told apart."""
+        return self._two_heard_ns > 0 and now_ns - self._two_heard_ns < HEARTBEAT_MAX_AGE_S * 1e9
 
     @property
     def state(self) -> VehicleState:
@@ -374,6 +404,11 @@ class AutopilotDriver(ABC):
 
     async def _arm_or_disarm(self, armed: bool) -> None:
         word = "arm" if armed else "disarm"
+        if armed and self._two_autopilots(time.monotonic_ns()):
+            raise CommandRefusedError(
+                f"{self.url}: two autopilots answer as system {self._system_id}, so neither is armed; "
+                "give each an id of its own (MAV_SYS_ID)"
+            )
         result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
         if result != ACCEPTED:
             if not armed:

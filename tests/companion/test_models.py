@@ -61,9 +61,18 @@ def test_info_tells_what_a_model_is() -> None:
     assert not facts["end_to_end"]
     assert len(facts["sha256"]) == 64
     assert facts["official"] is None
+    assert facts["runtime"] == "torch"
+    assert facts["precision"] in ("float32", "bfloat16")
     told = run("info", "default")
+    assert f"{facts['precision']} (" in told
     assert "Apache-2.0" in told
     assert facts["sha256"] in told
+
+
+def test_info_of_a_runtime_that_there_is_not_is_one_line() -> None:
+    result = CliRunner().invoke(app, ["models", "info", "default", "--runtime", "abacus"])
+    assert result.exit_code == 2
+    assert "runtime must be auto, torch" in result.stderr
 
 
 def test_what_is_no_model_is_one_line(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ class Cockpit:
 
     def __init__(self, **options: Any) -> None:
         self.events: list[str] = []
-        self.vehicle = Vehicle(on_event=self.events.append, **{"gusts_mps": 0.0, **options})
+        self.vehicle = Vehicle(on_event=self.events.append, **{"gusts_mps": 0.0, "noise": False, **options})
         self.vehicle.add_link("onboard")
         self.vehicle.add_link("gcs", GCS_RATES_HZ)
         self.inbox: dict[str, list[tuple[float, Any]]] = defaultdict(list)

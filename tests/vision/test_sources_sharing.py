@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -11,8 +13,8 @@ import numpy as np
 import pytest
 
 from vision.shared_frame import SharedFrameReader, SharedFrameWriter
-from vision.sources import SourceError, open_source
-from vision.sources.sharing import SharingSource
+from vision.sources import Source, SourceError, SourceSettings, open_source
+from vision.sources.sharing import FrameSharing
 
 
 @pytest.fixture
@@ -30,9 +32,18 @@ def pictures(folder: Path, *sizes: tuple[int, int]) -> Path:
     return folder
 
 
+@contextmanager
+def shared(folder: Path, name: str, **settings: object) -> Iterator[Source]:
+    with (
+        FrameSharing(name) as sharing,
+        open_source(str(folder), SourceSettings(on_frame=sharing.write, **settings)) as source,
+    ):
+        yield source
+
+
 def test_what_is_read_is_there_for_others_with_its_stamp(name: str, tmp_path: Path) -> None:
     folder = pictures(tmp_path, (32, 24), (32, 24))
-    with SharingSource(open_source(str(folder)), name) as source:
+    with shared(folder, name) as source:
         for _ in range(2):
             frame = source.read()
             assert frame is not None
@@ -45,7 +56,7 @@ def test_what_is_read_is_there_for_others_with_its_stamp(name: str, tmp_path: Pa
 
 def test_a_stream_that_changes_its_size_goes_on(name: str, tmp_path: Path) -> None:
     folder = pictures(tmp_path, (32, 24), (48, 16))
-    with SharingSource(open_source(str(folder)), name) as source:
+    with shared(folder, name) as source:
         source.read()
         with SharedFrameReader(name) as reader:
             assert (reader.width, reader.height) == (32, 24)
@@ -59,7 +70,31 @@ def test_a_name_that_another_writes_is_one_clear_line(name: str, tmp_path: Path)
     folder = pictures(tmp_path, (32, 24))
     with (
         SharedFrameWriter(name, 8, 8, False),
-        SharingSource(open_source(str(folder)), name) as source,
+        shared(folder, name) as source,
         pytest.raises(SourceError, match=f"shm://{name}: .*another process"),
     ):
         source.read()
+
+
+def test_others_see_what_a_slow_reader_leaves_out(name: str, tmp_path: Path) -> None:
+    folder = pictures(tmp_path, (32, 24), (32, 24))
+    with shared(folder, name, realtime=True, loop=True, rate_hz=200.0), SharedFrameReader(name) as reader:
+        # Nobody reads the source itself.
+        seen: set[int] = set()
+        deadline_s = time.monotonic() + 30.0
+        while len(seen) < 5:
+            assert time.monotonic() < deadline_s, f"only the frames {seen} were shared"
+            frame = reader.latest()
+            if frame is not None:
+                seen.add(frame.sequence)
+            time.sleep(0.001)
+
+
+def test_a_live_source_whose_frames_cannot_be_shared_does_not_open(name: str, tmp_path: Path) -> None:
+    folder = pictures(tmp_path, (32, 24))
+    with (
+        SharedFrameWriter(name, 8, 8, False),
+        pytest.raises(SourceError, match=f"shm://{name}: .*another process"),
+        shared(folder, name, realtime=True),
+    ):
+        pass

@@ -155,15 +155,21 @@ def test_each_stage_has_its_own_fall_of_the_rate():
     stages = (
         Stage(64, 64, 1, 50, decay_steps=10),
         Stage(96, 96, 1, 30),
-        Stage(64, 64, 1, 20, decay_steps=20),
+        Stage(64, 64, 1, 20, decay_steps=20, rate=0.5),
     )
     settings = replace(SMALL, stages=stages, warmup_steps=5, final_rate=0.1)
     rates = [settings.rate_at(step) / settings.learning_rate for step in range(101)]
     assert rates[5:41] == pytest.approx([1.0] * 36)
     assert rates[49] == pytest.approx(0.19)
-    assert rates[50:81] == pytest.approx([1.0] * 31)
-    assert rates[90] == pytest.approx(0.55)
+    assert rates[50:80] == pytest.approx([1.0] * 30)
+    assert rates[80] == pytest.approx(0.5)
+    assert rates[90] == pytest.approx(0.3)
     assert rates[100] == pytest.approx(0.1)
+
+
+def test_a_stage_has_a_rate():
+    with pytest.raises(ValueError, match="rate of a stage must be above 0"):
+        Stage(64, 64, 1, 100, rate=0.0)
 
 
 @pytest.mark.parametrize("decay_steps", [-1, 101])

@@ -250,6 +250,8 @@ class LatestSource(Source):
             picture.image, captured_ns, self._sequence, picture.depth_m, ready_ns, picture.decode_ms
         )
         self._sequence += 1
+        if self._settings.on_frame is not None:
+            self._settings.on_frame(frame)
         came_back_after_s = None
         with self._changed:
             if not self._opened:

@@ -28,6 +28,7 @@ class SequentialSource(Source):
     ) -> None:
         self.uri = uri
         self._on_close = on_close
+        self._on_frame = settings.on_frame
         try:
             self._feed = open_feed()
         except FeedLost as lost:
@@ -86,6 +87,8 @@ class SequentialSource(Source):
         )
         self._sequence += 1
         self._delivered += 1
+        if self._on_frame is not None:
+            self._on_frame(frame)
         return frame
 
     def _say_what_is_missing(self, end: EndOfStream) -> None:

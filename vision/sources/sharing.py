@@ -1,41 +1,36 @@
-"""Offering a source's frames to other programs of this host while they are read: `shm://NAME`."""
+"""Offering a source's frames to other programs of this host while they arrive: `shm://NAME`."""
 
 from __future__ import annotations
 
-import contextlib
+from types import TracebackType
 
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameWriter
-from vision.sources.source import Source, SourceError, SourceStatistics
+from vision.sources.source import SourceError
 
 
-class SharingSource(Source):
-    """Another source, whose every frame also goes into shared memory before it is given.
+class FrameSharing:
+    """Frames of any size into shared memory, for as long as this is open.
 
-    A camera can be opened once; this lets several models look through it. The copy costs the reader of this
-    source one memory copy a frame, whoever reads the shared memory nothing.
+    A camera can be opened once; this lets several models look through it. Given to a source as
+    `SourceSettings.on_frame`, it writes every frame as it arrives, whoever takes it and how slowly. The copy
+    costs one memory copy a frame, whoever reads the shared memory nothing.
 
     Args:
-        source: open; closed with this one.
-        name: of the shared memory.
-
-    Raises:
-        SourceError: another program writes under that name, or the memory cannot be had.
+        name: of the shared memory. Nothing is there before the first frame, whose size it has.
     """
 
-    def __init__(self, source: Source, name: str) -> None:
-        self._source = source
+    def __init__(self, name: str) -> None:
         self._name = name
         self._writer: SharedFrameWriter | None = None
-        self.uri = source.uri
-        self.live = source.live
-        self.total_frames = source.total_frames
 
-    def read(self, timeout_s: float = 1.0) -> Frame | None:
-        frame = self._source.read(timeout_s)
-        if frame is not None:
-            self._writer_for(frame).write(frame)
-        return frame
+    def write(self, frame: Frame) -> None:
+        """Show a frame to the others.
+
+        Raises:
+            SourceError: another program writes under that name, or the memory cannot be had.
+        """
+        self._writer_for(frame).write(frame)
 
     def _writer_for(self, frame: Frame) -> SharedFrameWriter:
         """The writer of frames of this size: a stream may change its own in the middle."""
@@ -43,21 +38,23 @@ class SharingSource(Source):
         writer = self._writer
         if writer is not None and (writer.width, writer.height, writer.depth) == size:
             return writer
-        if writer is not None:
-            self._writer = None
-            writer.close()
+        self.close()
         try:
             self._writer = SharedFrameWriter(self._name, *size)
         except (OSError, ValueError) as error:
             raise SourceError(f"frames cannot be shared as shm://{self._name}: {error}") from error
         return self._writer
 
-    @property
-    def statistics(self) -> SourceStatistics:
-        return self._source.statistics
-
     def close(self) -> None:
-        with contextlib.ExitStack() as stack:
-            stack.callback(self._source.close)
-            if self._writer is not None:
-                stack.callback(self._writer.close)
+        """Take the shared memory away. The source must be closed before."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
+
+    def __enter__(self) -> FrameSharing:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -44,6 +44,9 @@ class SourceSettings:
         open_timeout_s: how long to wait for the very first frame.
         read_timeout_s: a live source silent for this long is lost, and is opened again.
         retry_min_s, retry_max_s: the pause between attempts starts at the first and doubles up to the second.
+        on_frame: called with every frame as it arrives, before it is given to the reader, and also with those
+            that the reader is too slow for. A live source calls it in its own thread. If it raises a
+            `SourceError`, that is as if the source had failed.
     """
 
     width: int | None = None
@@ -57,6 +60,7 @@ class SourceSettings:
     read_timeout_s: float = 5.0
     retry_min_s: float = 0.5
     retry_max_s: float = 10.0
+    on_frame: Callable[[Frame], None] | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

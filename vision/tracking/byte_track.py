@@ -12,6 +12,7 @@ and a track counts as true only past a second threshold, on the median of its co
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field, replace
 
@@ -32,6 +33,8 @@ from vision.tracking.tracks import (
     TrackEventKind,
     TrackState,
 )
+
+logger = logging.getLogger(__name__)
 
 Indices = NDArray[np.int64]
 
@@ -86,6 +89,7 @@ class Tracker:
         self._states = BoxStates.none()
         self._lives: list[_Life] = []
         self._newest_ns: int | None = None
+        self._warned_of_pace = False
         self._view: CameraView | None = None
         self._class_names: tuple[str, ...] = ()
 
@@ -154,11 +158,23 @@ class Tracker:
         self._states.mean[unseen, 6:] = 0.0
         states = kalman.predicted(self._states, (captured_ns - before_ns) / 1e9)
         ended = np.array([captured_ns - life.last_ns >= self.settings.end_s * 1e9 for life in self._lives])
+        self._warn_of_pace(bool((ended & ~unseen).any()), (captured_ns - before_ns) / 1e9)
         if view is not None and before is not None and view.camera == before.camera:
             states, visible = turned(states, view.camera, view.turn_from(before))
             ended |= ~visible
         self._states = states
         self._drop(ended, captured_ns, events)
+
+    def _warn_of_pace(self, ended_though_seen: bool, interval_s: float) -> None:
+        """Say once that frames are too far apart for anything to be followed from one to the next."""
+        if ended_though_seen and not self._warned_of_pace:
+            self._warned_of_pace = True
+            logger.warning(
+                "tracks end between two frames: %.1f s passed, and end_s is %g s; look at more frames "
+                "(every, rate_hz, a faster model), or raise end_s",
+                interval_s,
+                self.settings.end_s,
+            )
 
     def _associate(self, detections: Detections, captured_ns: int, track_of: Indices) -> None:
         """Fill in `track_of` (N,): the place of each detection's track."""

@@ -21,8 +21,9 @@ DEFAULT_RECIPE = TrainingSettings(
     stages=(
         Stage(320, 256, 16, 3970, scenes=12_000),
         Stage(640, 480, 8, 3900, scenes=6_000, decay_steps=3900),
-        Stage(320, 256, 16, 5500, scenes=12_000),
-        Stage(640, 480, 8, 3100, scenes=6_000, decay_steps=3100),
+        Stage(320, 256, 16, 5474, scenes=12_000),
+        Stage(320, 256, 16, 3800, scenes=8_000, decay_steps=3400),
+        Stage(640, 480, 8, 1300, scenes=4_000, decay_steps=1300, rate=0.25),
     ),
     learning_rate=3e-3,
     seed=1,

@@ -34,7 +34,8 @@ class Stage:
     None: every picture is a new scene.
 
     Over the last `decay_steps` the learning rate falls; before, it is constant, so that this stretch can be
-    prolonged without changing what went before. The next stage begins at the full rate again.
+    prolonged without changing what went before. `rate` is what it falls from, as a share of the settings'
+    `learning_rate`.
     """
 
     width: int
@@ -43,6 +44,7 @@ class Stage:
     steps: int
     scenes: int | None = None
     decay_steps: int = 0
+    rate: float = 1.0
 
     def __post_init__(self) -> None:
         if self.width % 32 or self.height % 32 or self.width <= 0 or self.height <= 0:
@@ -53,6 +55,8 @@ class Stage:
             raise ValueError(f"a stage needs a batch size, steps and scenes of 1 or more, got {self}")
         if not 0 <= self.decay_steps <= self.steps:
             raise ValueError(f"decay_steps of a stage must be from 0 to its steps, got {self}")
+        if not 0 < self.rate <= 1:
+            raise ValueError(f"rate of a stage must be above 0 and at most 1, got {self}")
 
     def with_steps(self, ratio: float) -> Stage:
         """The same stage with `ratio` times as many steps, at least one."""
@@ -74,7 +78,7 @@ class TrainingSettings:
         momentum: of SGD.
         warmup_steps: the rate rises linearly over these.
         decay: the shape of a stage's fall of the rate.
-        final_rate: where it ends, as a fraction of `learning_rate`.
+        final_rate: where it ends, as a share of `learning_rate`.
         normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03
             lags behind the weights in a short training.
         gradient_limit: largest norm of the gradient, longer ones are shortened to it.
@@ -148,7 +152,7 @@ class TrainingSettings:
         fallen = min(max((step - (stage.steps - stage.decay_steps)) / max(stage.decay_steps, 1), 0.0), 1.0)
         if self.decay == "cosine":
             fallen = (1 - math.cos(math.pi * fallen)) / 2
-        return self.learning_rate * (1 - fallen * (1 - self.final_rate))
+        return self.learning_rate * (stage.rate + fallen * (self.final_rate - stage.rate))
 
 
 @dataclass(frozen=True, slots=True)

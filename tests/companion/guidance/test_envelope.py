@@ -3,7 +3,9 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kinematic_vehicle import KinematicVehicle
 
+from companion.fence import Fence
 from companion.guidance.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
@@ -209,3 +211,27 @@ def test_without_a_position_a_position_setpoint_becomes_a_brake():
 def test_limits_that_make_no_sense_are_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         Limits(**arguments)
+
+
+def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why():
+    fence = Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0)))
+    limits = Limits(fence=fence)
+    vehicle, envelope, reasons = KinematicVehicle(), Envelope(limits), set()
+    for _ in range(1500):
+        setpoint = Setpoint.velocity((4.0, 2.0, 0.0), vehicle.now_ns)
+        sent, why = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
+        reasons.update(why)
+        vehicle.fly(sent, 0.02)
+        assert fence.holds((vehicle.position[0], vehicle.position[1]))
+    assert vehicle.position[0] > 14.0
+    assert vehicle.position[1] > 14.0
+    assert "slowed down at the fence" in reasons
+
+
+def test_a_position_beyond_a_polygon_is_kept_inside_of_it():
+    limits = Limits(fence=Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0))))
+    vehicle = KinematicVehicle(position=[12.0, 0.0, -5.0])
+    setpoint = Setpoint.position((30.0, 0.0, -5.0), vehicle.now_ns)
+    sent, why = Envelope(limits).apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
+    assert sent.position_ned_m == pytest.approx((14.5, 0.0, -5.0))
+    assert "kept inside the fence" in why

@@ -112,3 +112,29 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over(kind):
             assert landed.success, landed.reason
             assert not driver.state.armed
             assert service.streamer.sent_count == sent
+
+
+async def test_places_and_paths_are_flown_with_the_built_in_vehicle():
+    """By truth as telemetry tells it: where goto ends, and how far beside its path follow-path is."""
+    with running_simulator(speed=SPEED, seed=3) as simulator:
+        async with running_service("pymavlink", simulator.onboard_port) as service:
+            driver = service.driver
+            await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
+            assert (await service.fly("takeoff 4")).success
+            home = driver.state.home_position_ned_m
+            assert home is not None
+
+            outcome = await service.fly("goto 12 -6 altitude=6 speed=4")
+            assert outcome.success, outcome.reason
+            north, east, down = driver.state.position_ned_m
+            assert math.dist((north - home[0], east - home[1], home[2] - down), (12, -6, 6)) < 1.2
+
+            places = []
+            unsubscribe = driver.subscribe(lambda state: places.append(state.position_ned_m))
+            outcome = await service.fly("follow-path 12,6 0,6 0,0,4")
+            unsubscribe()
+            assert outcome.success, outcome.reason
+            for corner in ((12.0, 6.0), (0.0, 6.0), (0.0, 0.0)):
+                wanted = (home[0] + corner[0], home[1] + corner[1])
+                assert min(math.dist(wanted, place[:2]) for place in places) < 1.5, corner
+            assert (await service.fly("land")).success

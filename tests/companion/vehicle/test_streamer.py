@@ -55,6 +55,32 @@ def test_a_fresh_setpoint_is_sent_once_a_tick() -> None:
     assert bench.streamer.last_sent_ns == 1300 * MS
 
 
+def test_a_hastened_setpoint_leaves_at_once_and_only_once_between_two_ticks() -> None:
+    bench = Bench()
+    first = bench.submit(north_mps=1.0)
+    bench.run(40)
+    bench.now_ms += 5
+    second = bench.submit(north_mps=2.0)
+    bench.streamer.hasten(bench.now_ms * MS)
+    bench.streamer.hasten(bench.now_ms * MS)
+    bench.now_ms -= 5
+    bench.run(40)
+    assert bench.sent == [(1020, first), (1040, first), (1045, second), (1060, second), (1080, second)]
+
+
+def test_haste_begins_no_stream_and_takes_none_up_again() -> None:
+    bench = Bench(brake_ms=500)
+    bench.submit(300)
+    bench.streamer.hasten(bench.now_ms * MS)
+    assert bench.sent == []
+    bench.run(1000)
+    assert bench.streamer.state is StreamState.EXPIRED
+    count = bench.streamer.sent_count
+    bench.submit(300)
+    bench.streamer.hasten(bench.now_ms * MS)
+    assert bench.streamer.sent_count == count
+
+
 def test_an_expired_setpoint_brakes_and_then_falls_silent_for_good(caplog) -> None:
     bench = Bench(brake_ms=500)
     bench.submit(300)

@@ -200,6 +200,14 @@ def test_a_slow_detector_has_tracks_too() -> None:
     assert film.told == [("new", 1), ("update", 1)]
 
 
+def test_frames_too_far_apart_to_follow_anything_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    film = Film(end_s=2.0)
+    for _ in range(4):
+        film.show((100, 100, 0.8), after_s=3.0)
+    (line,) = caplog.messages
+    assert "tracks end between two frames: 3.0 s passed, and end_s is 2 s" in line
+
+
 def test_an_event_bears_the_box_that_was_seen_and_a_lost_one_where_it_should_be() -> None:
     film = Film(lost_s=0.3)
     for step in range(10):

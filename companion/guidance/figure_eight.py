@@ -1,0 +1,47 @@
+"""A figure of eight, level, about the place where it begins."""
+
+from __future__ import annotations
+
+import math
+
+from companion.guidance.behaviour import Situation
+from companion.guidance.motion import laps_text, position_and_yaw
+from companion.guidance.path import Path
+from companion.guidance.path_flight import PathFlight
+from companion.vehicle.state import Vector3
+
+_POINTS = 96
+
+
+class FigureEightBehaviour(PathFlight):
+    """Bernoulli's lemniscate, crossed in the middle towards the nose; each loop reaches `radius_m` out."""
+
+    name = "figure-eight"
+
+    def __init__(self, radius_m: float, speed_mps: float, laps: float, *, nose_along: bool = True) -> None:
+        super().__init__(speed_mps, laps=laps, nose_along=nose_along)
+        self._radius_m = radius_m
+
+    def _path(self, situation: Situation) -> Path:
+        centre, yaw_rad = position_and_yaw(situation.state)
+        return Path(lemniscate(centre, yaw_rad, self._radius_m), self._speed_mps, closed=True)
+
+    def _flown(self) -> str:
+        return f"{laps_text(self._laps)} of the eight flown"
+
+
+def lemniscate(centre: Vector3, bearing_rad: float, radius_m: float) -> list[Vector3]:
+    """One round of Bernoulli's lemniscate from its middle.
+
+    Args:
+        centre: local NED metres. bearing_rad: of the long axis. radius_m: from the middle to either end.
+    """
+    points = []
+    for step in range(_POINTS):
+        angle = math.tau * step / _POINTS + math.pi / 2
+        scale = radius_m / (1.0 + math.sin(angle) ** 2)
+        along, across = -scale * math.cos(angle), -scale * math.cos(angle) * math.sin(angle)
+        north = along * math.cos(bearing_rad) - across * math.sin(bearing_rad)
+        east = along * math.sin(bearing_rad) + across * math.cos(bearing_rad)
+        points.append((centre[0] + north, centre[1] + east, centre[2]))
+    return points

@@ -1,0 +1,49 @@
+"""Fly along a row of points, once or round and round, slowing down for the corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from companion.guidance.behaviour import Situation
+from companion.guidance.motion import laps_text, position_and_yaw
+from companion.guidance.path import Path
+from companion.guidance.path_flight import PathFlight
+from companion.vehicle.state import Vector3
+
+
+class FollowPathBehaviour(PathFlight):
+    """From where the vehicle is to the first point, and on along the others.
+
+    Args:
+        points: (north, east) or (north, east, height) metres from home; without a height, the one before's.
+        laps: 0: until another command; more than 1, or 0: from the last point on to the first again.
+    """
+
+    name = "follow-path"
+
+    def __init__(
+        self,
+        points: Sequence[tuple[float, ...]],
+        speed_mps: float,
+        *,
+        laps: float = 1.0,
+        nose_along: bool = True,
+    ) -> None:
+        super().__init__(speed_mps, laps=laps, nose_along=nose_along)
+        self._points = tuple(points)
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        home = situation.state.home_position_ned_m or (0.0, 0.0, 0.0)
+        down, places = position[2], list[Vector3]()
+        for north, east, *height in self._points:
+            down = home[2] - height[0] if height else down
+            places.append((home[0] + north, home[1] + east, down))
+        if self._laps != 1.0:
+            return Path(places, self._speed_mps, closed=True)
+        return Path([position, *places], self._speed_mps)
+
+    def _flown(self) -> str:
+        if self._laps == 1.0:
+            return f"all {len(self._points)} points flown"
+        return f"{laps_text(self._laps)} of {len(self._points)} points flown"

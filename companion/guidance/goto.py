@@ -1,0 +1,71 @@
+"""Fly straight to a place: metres from home, metres from here by the nose, or latitude and longitude."""
+
+from __future__ import annotations
+
+import math
+
+from companion.guidance.behaviour import Situation
+from companion.guidance.geodesy import north_east
+from companion.guidance.motion import position_and_yaw
+from companion.guidance.path import Path
+from companion.guidance.path_flight import PathFlight
+from companion.vehicle.state import Vector3
+
+NEAREST_M = 0.05
+
+
+class GotoBehaviour(PathFlight):
+    """Exactly one pair says where; what is not said about the height stays as it is.
+
+    Args:
+        from_home_m: (north, east) of home. from_here_m: (forward, right) of where it begins.
+        global_deg: (latitude, longitude), WGS 84. altitude_m: above home; None: as it is.
+    """
+
+    name = "goto"
+
+    def __init__(
+        self,
+        *,
+        from_home_m: tuple[float, float] | None = None,
+        from_here_m: tuple[float, float] | None = None,
+        global_deg: tuple[float, float] | None = None,
+        altitude_m: float | None = None,
+        speed_mps: float = 3.0,
+        heading_rad: float | None = None,
+    ) -> None:
+        super().__init__(speed_mps, heading_rad=heading_rad)
+        given = [place for place in (from_home_m, from_here_m, global_deg) if place is not None]
+        if len(given) != 1:
+            raise ValueError("goto needs exactly one of from_home_m, from_here_m and global_deg")
+        self._from_home_m, self._from_here_m, self._global_deg = from_home_m, from_here_m, global_deg
+        self._altitude_m = altitude_m
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        goal = self._goal(situation)
+        if math.dist(goal, position) < NEAREST_M:
+            # A path has a length: who is there already arrives from a hand's breadth above.
+            position = (goal[0], goal[1], goal[2] - NEAREST_M)
+        return Path([position, goal], self._speed_mps)
+
+    def _goal(self, situation: Situation) -> Vector3:
+        state = situation.state
+        position, yaw_rad = position_and_yaw(state)
+        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        down = position[2] if self._altitude_m is None else home[2] - self._altitude_m
+        if self._from_home_m is not None:
+            return (home[0] + self._from_home_m[0], home[1] + self._from_home_m[1], down)
+        if self._from_here_m is not None:
+            forward, right = self._from_here_m
+            north = forward * math.cos(yaw_rad) - right * math.sin(yaw_rad)
+            east = forward * math.sin(yaw_rad) + right * math.cos(yaw_rad)
+            return (position[0] + north, position[1] + east, down)
+        assert self._global_deg is not None
+        if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
+            raise ValueError("the vehicle does not know its latitude and longitude")
+        north, east = north_east((state.latitude_deg, state.longitude_deg), self._global_deg)
+        return (position[0] + north, position[1] + east, down)
+
+    def _flown(self) -> str:
+        return "there"

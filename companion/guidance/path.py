@@ -1,0 +1,198 @@
+"""Following a path: where along it the vehicle is, how fast it may be there, and which velocity leads on.
+
+The path is a row of points in local NED, joined by straight lines. Speeds come from its bends: what a bend of
+radius r allows is √(a·r), and before it the vehicle slows down by √(v² + 2·a·s).
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+
+from companion.guidance.motion import MAX_CORRECTION_MPS, POSITION_GAIN
+from companion.vehicle.state import Vector3
+
+# Under the envelope's 2 m/s², so that something is left against wind.
+ACCELERATION_MPS2 = 1.0
+# A corner is flown as a bend: what the path turns within so far of a point is its bend there.
+BEND_M = 1.0
+SPACING_M = 0.25
+SAME_M = 0.01
+SLOWEST_MPS = 0.4
+# How late a multirotor's velocity follows: it is led by the path as it will be then.
+DELAY_S = 0.4
+# The vehicle is looked for on the path no further on than it can have flown since, and a little behind.
+SEARCH_AHEAD_M = 3.0
+LONGEST_M = 20_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class PathPoint:
+    """A place on the path and what goes on there.
+
+    Attributes:
+        position_ned_m: the place. direction: (north, east, down) unit vector along the path.
+        speed_mps: the greatest speed there.
+    """
+
+    position_ned_m: Vector3
+    direction: Vector3
+    speed_mps: float
+
+
+class Path:
+    """A path with its speeds.
+
+    Args:
+        points: at least two, local NED metres; those that are where the one before is are left out.
+        speed_mps: along straight lines.
+        closed: from the last point back to the first, again and again: nothing is slowed down for an end.
+
+    Attributes:
+        length_m: of one round.
+
+    Raises:
+        ValueError: fewer than two different points, or a path too long to be meant.
+    """
+
+    def __init__(self, points: Sequence[Vector3], speed_mps: float, *, closed: bool = False) -> None:
+        corners = [points[0]] if points else []
+        for point in (*points, *points[:1]) if closed else points:
+            if math.dist(point, corners[-1]) >= SAME_M:
+                corners.append(point)
+        if len(corners) < 2:
+            raise ValueError("a path needs at least two different points")
+        self.closed = closed
+        self._points = _spaced(corners)
+        self._at = list(accumulate((math.dist(a, b) for a, b in pairwise(self._points)), initial=0.0))
+        self.length_m = self._at[-1]
+        if not self.length_m <= LONGEST_M:
+            raise ValueError(
+                f"a path may be {LONGEST_M:g} m long at most, this one has {self.length_m:.0f} m"
+            )
+        self._speeds = self._allowed(speed_mps)
+
+    def point(self, along_m: float) -> PathPoint:
+        """What is `along_m` from the beginning; beyond an open path's end, the end."""
+        along_m = self._on_path(along_m)
+        index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
+        start, end = self._points[index], self._points[index + 1]
+        length = self._at[index + 1] - self._at[index]
+        share = min(max((along_m - self._at[index]) / length, 0.0), 1.0)
+        north, east, down = ((b - a) / length for a, b in zip(start, end, strict=True))
+        x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+        before, after = self._speeds[index], self._speeds[index + 1]
+        # Speeds change by acceleration, so it is their squares that lie on a line.
+        speed = math.sqrt(before**2 + share * (after**2 - before**2))
+        return PathPoint((x, y, z), (north, east, down), speed)
+
+    def nearest(self, position: Vector3, from_m: float, to_m: float) -> float:
+        """How far along the nearest place to `position` is, looked for between two places."""
+        steps = max(2, math.ceil((to_m - from_m) / SPACING_M))
+        tried = [from_m + (to_m - from_m) * step / steps for step in range(steps + 1)]
+        if not self.closed:
+            tried = [min(max(along, 0.0), self.length_m) for along in tried]
+        best = min(tried, key=lambda along: math.dist(self.point(along).position_ned_m, position))
+        here = self.point(best)
+        offset = [p - h for p, h in zip(position, here.position_ned_m, strict=True)]
+        best += sum(o * d for o, d in zip(offset, here.direction, strict=True))
+        return min(max(best, from_m), to_m)
+
+    def _on_path(self, along_m: float) -> float:
+        return along_m % self.length_m if self.closed else min(max(along_m, 0.0), self.length_m)
+
+    def _allowed(self, speed_mps: float) -> list[float]:
+        """Greatest speed at each point: its bend's, and what can be slowed down from and sped up to."""
+        speeds = [min(speed_mps, self._bend_speed(along)) for along in self._at]
+        if not self.closed:
+            speeds[-1] = 0.0
+        rounds = 2 if self.closed else 1  # the second round knows the first one's beginning
+        for _ in range(rounds):
+            if self.closed:
+                speeds[-1] = speeds[0] = min(speeds[0], speeds[-1])
+            for index in range(len(speeds) - 2, -1, -1):
+                way = self._at[index + 1] - self._at[index]
+                speeds[index] = min(
+                    speeds[index], math.sqrt(speeds[index + 1] ** 2 + 2.0 * ACCELERATION_MPS2 * way)
+                )
+        return speeds
+
+    def _bend_speed(self, along_m: float) -> float:
+        if not self.closed and not BEND_M <= along_m <= self.length_m - BEND_M:
+            return math.inf
+        before, after = (self._direction(along_m + side * BEND_M) for side in (-1.0, 1.0))
+        turned = math.acos(min(max(sum(a * b for a, b in zip(before, after, strict=True)), -1.0), 1.0))
+        if turned < 1e-6:
+            return math.inf
+        return max(SLOWEST_MPS, math.sqrt(ACCELERATION_MPS2 * 2.0 * BEND_M / turned))
+
+    def _direction(self, along_m: float) -> Vector3:
+        along_m = self._on_path(along_m)
+        index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
+        start, end = self._points[index], self._points[index + 1]
+        length = self._at[index + 1] - self._at[index]
+        north, east, down = ((b - a) / length for a, b in zip(start, end, strict=True))
+        return (north, east, down)
+
+
+class PathFollower:
+    """A vehicle on its way along a path: call `velocity` at every turn.
+
+    Attributes:
+        along_m: how far it has come, over all rounds; it never goes back.
+        off_m: how far beside the path it was at the last turn.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.along_m = 0.0
+        self.off_m = 0.0
+
+    def velocity(self, position: Vector3, speed_mps: float) -> Vector3:
+        """The velocity over ground and down that brings it on along the path, and back onto it.
+
+        Args:
+            position: of the vehicle, local NED metres. speed_mps: its ground speed.
+        """
+        reach_m = self.along_m + SEARCH_AHEAD_M + 2.0 * speed_mps * DELAY_S
+        if not self.path.closed:
+            reach_m = min(reach_m, self.path.length_m)
+        self.along_m = self.path.nearest(position, self.along_m, reach_m)
+        here = self.path.point(self.along_m)
+        ahead = self.path.point(self.along_m + DELAY_S * here.speed_mps)
+        offset = [h - p for h, p in zip(here.position_ned_m, position, strict=True)]
+        self.off_m = math.hypot(*offset)
+        # Far beside the path it is flown to first, and along it only as far as that leaves speed.
+        back_mps = min(POSITION_GAIN * self.off_m, max(MAX_CORRECTION_MPS, here.speed_mps))
+        along_mps = math.sqrt(max(0.0, max(here.speed_mps, SLOWEST_MPS) ** 2 - back_mps**2))
+        if not self.path.closed:
+            along_mps = min(along_mps, POSITION_GAIN * (self.path.length_m - self.along_m))
+        scale = back_mps / self.off_m if self.off_m > 1e-6 else 0.0
+        north, east, down = (d * along_mps + o * scale for d, o in zip(ahead.direction, offset, strict=True))
+        return (north, east, down)
+
+    def bearing(self) -> float | None:
+        """Where the path leads from here, radians from north; None where it goes straight up or down."""
+        north, east, _ = self.path.point(self.along_m + BEND_M).direction
+        return math.atan2(east, north) if math.hypot(north, east) > 0.2 else None
+
+    @property
+    def left_m(self) -> float:
+        """Of an open path: how much is left of it."""
+        return max(0.0, self.path.length_m - self.along_m)
+
+
+def _spaced(corners: Sequence[Vector3]) -> list[Vector3]:
+    """The same path with a point at least every `SPACING_M`; on a long one in 8000 parts."""
+    length = sum(math.dist(a, b) for a, b in pairwise(corners))
+    spacing = max(SPACING_M, length / 8000)
+    points = [corners[0]]
+    for start, end in pairwise(corners):
+        count = max(1, math.ceil(math.dist(start, end) / spacing))
+        for step in range(1, count + 1):
+            x, y, z = (a + (b - a) * step / count for a, b in zip(start, end, strict=True))
+            points.append((x, y, z))
+    return points

@@ -1,0 +1,207 @@
+"""The one grammar of faults, for the command line, the console, zenoh and Python.
+
+    FAULT [VALUE…] [OPTION=VALUE…] [at=SECONDS] [for=SECONDS] [seed=NUMBER]
+
+Words in any order: `link_delay 0.2`, `at=20 motor_failure 2`, `packet_loss 0.3 link=onboard way=out for=10`.
+`at` counts simulated seconds since the simulator started; without it a fault begins at once. Without `for`
+it lasts until it is ended. Beside faults there are `list`, `help [FAULT]` and `end NUMBER|FAULT|all`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+class FaultError(ValueError):
+    """A fault, or what was said of it, that cannot be. The message is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One value of a fault.
+
+    Attributes:
+        read: makes the value of its text; raises ValueError with what was expected.
+        default: its value if not given; `REQUIRED` if it must be.
+    """
+
+    name: str
+    read: Callable[[str], Any]
+    default: Any
+    meaning: str
+
+
+REQUIRED: Any = object()
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of fault: its name, its values in the order they may be given, one line of what it does."""
+
+    name: str
+    summary: str
+    fields: tuple[Field, ...] = ()
+    momentary: bool = False  # over as soon as it began; cannot have a duration
+
+    @property
+    def usage(self) -> str:
+        words = [self.name]
+        for one in self.fields:
+            optional = f"[{one.name}]" if one.default is None else f"[{one.name}={_shown(one.default)}]"
+            words.append(one.name.upper() if one.default is REQUIRED else optional)
+        return " ".join(words)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What was asked for.
+
+    Attributes:
+        values: by field name, complete.
+        at_s: when it begins, simulated seconds since the start; None: now.
+        duration_s: None: until ended.
+        seed: of what is random about it; None: the vehicle's own and its number decide.
+    """
+
+    kind: Kind
+    values: Mapping[str, Any] = field(default_factory=dict)
+    at_s: float | None = None
+    duration_s: float | None = None
+    seed: int | None = None
+
+    def __str__(self) -> str:
+        words = [self.kind.name]
+        for one in self.kind.fields:
+            value = self.values[one.name]
+            if one.default is REQUIRED:
+                words.append(_shown(value))
+            elif value != one.default:
+                words.append(f"{one.name}={_shown(value)}")
+        if self.duration_s is not None:
+            words.append(f"for={self.duration_s:g}")
+        return " ".join(words)
+
+
+def parse_fault(text: str, kinds: Mapping[str, Kind]) -> Fault:
+    """Read a fault. Raises FaultError."""
+    words = text.split()
+    plain = [word for word in words if "=" not in word]
+    if not plain:
+        raise FaultError(f"{text!r} names no fault; there are: {', '.join(kinds)}")
+    name, *positional = plain
+    kind = kinds.get(name)
+    if kind is None:
+        near = difflib.get_close_matches(name, kinds, 1)
+        hint = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(kinds)}"
+        raise FaultError(f"there is no fault {name!r}{hint}")
+    given: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if equals:
+            if key in given:
+                raise FaultError(f"{name}: {key} is given twice")
+            given[key] = value
+    return make_fault(kind, positional, given)
+
+
+def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> Fault:
+    """A fault of values in order and values by name, all as text. Raises FaultError."""
+    named = dict(given)
+    at_s = _take(kind, named, "at", _seconds)
+    duration_s = _take(kind, named, "for", positive)
+    seed = _take(kind, named, "seed", whole(-(2**63), 2**63))
+    if duration_s is not None and kind.momentary:
+        raise FaultError(f"{kind.name} is over as soon as it began; for= means nothing with it")
+    values: dict[str, Any] = {}
+    left = list(positional)
+    for one in kind.fields:
+        if one.name in named:
+            text = named.pop(one.name)
+        elif left:
+            text = left.pop(0)
+        elif one.default is REQUIRED:
+            raise FaultError(f"{kind.name} needs {one.name}, {one.meaning}; usage: {kind.usage}")
+        else:
+            values[one.name] = one.default
+            continue
+        values[one.name] = _read(kind, one.name, one.read, text)
+    if left or named:
+        stray = left[0] if left else f"{next(iter(named))}="
+        raise FaultError(f"{kind.name}: {stray!r} is too much; usage: {kind.usage} [at=S] [for=S] [seed=N]")
+    return Fault(kind, values, at_s, duration_s, seed)
+
+
+def _take(kind: Kind, named: dict[str, str], name: str, read: Callable[[str], Any]) -> Any:
+    return _read(kind, name, read, named.pop(name)) if name in named else None
+
+
+def _read(kind: Kind, name: str, read: Callable[[str], Any], text: str) -> Any:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise FaultError(f"{kind.name}: {name}={text}: expected {error}") from None
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# ---- readers of values: each takes a text and raises ValueError with what it expected
+
+
+def number(low: float, high: float, unit: str = "") -> Callable[[str], float]:
+    """A finite number within limits."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high or math.isinf(value):
+            raise ValueError(f"a number, {low:g} to {high:g}{f' {unit}' if unit else ''}")
+        return value
+
+    return read
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """A whole number within limits."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise ValueError(f"a whole number, {low} to {high}")
+        return value
+
+    return read
+
+
+def choice(*words: str) -> Callable[[str], str]:
+    """One of some words, in any case."""
+
+    def read(text: str) -> str:
+        for word in words:
+            if word.lower() == text.lower():
+                return word
+        raise ValueError(f"one of {', '.join(words)}")
+
+    return read
+
+
+probability = number(0.0, 1.0)
+_seconds = number(0.0, 1e6, "s")
+
+
+def positive(text: str) -> float:
+    """A duration above zero."""
+    value = number(0.0, 1e6, "s")(text)
+    if value <= 0.0:
+        raise ValueError("a number above 0 s")
+    return value

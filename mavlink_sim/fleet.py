@@ -1,0 +1,169 @@
+"""Many vehicles in one process: each with its own system id, ports, seed and place, on one clock.
+
+Ports and ids go as in PX4's SITL: instance i has system id 1 + i, sends to 14540 + i from 14580 + i, and to
+the one ground station at 14550 from 18570 + i.
+"""
+
+from __future__ import annotations
+
+import math
+import selectors
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from mavlink_sim.simulation import Simulation, SimulationOptions
+
+PACE_PERIOD_S = 5.0
+MAX_VEHICLES = 250  # system ids are 1 to 255, and a ground station needs some
+
+
+def places(count: int, spacing_m: float) -> list[tuple[float, float]]:
+    """Where the vehicles start, (north, east) metres: a square grid, row by row, the first at (0, 0)."""
+    columns = math.ceil(math.sqrt(count))
+    return [(index // columns * spacing_m, index % columns * spacing_m) for index in range(count)]
+
+
+def instance_options(
+    options: SimulationOptions, count: int, spacing_m: float, camera_vehicle: int = 1
+) -> list[SimulationOptions]:
+    """What each vehicle of a fleet is told; `options` are the first one's.
+
+    A bind port of 0 stays 0 (a free one each). The camera goes to `camera_vehicle` (counted from 1) alone; a
+    truth file gets the system id into its name for all but the first. Faults are every vehicle's, each with its
+    own chance; the console is the first one's, the zenoh key each vehicle's own.
+
+    Raises:
+        ValueError: a fleet of that size cannot be (ids, ports), or has no such vehicle for the camera.
+    """
+    if not 1 <= count <= MAX_VEHICLES:
+        raise ValueError(f"{count} vehicles: expected 1 to {MAX_VEHICLES}")
+    if not 1 <= camera_vehicle <= count:
+        raise ValueError(f"camera on vehicle {camera_vehicle}: the fleet has vehicles 1 to {count}")
+    if options.system_id + count - 1 > 255:
+        raise ValueError(f"{count} vehicles from system id {options.system_id} on: ids end at 255")
+    for name in ("onboard_port", "onboard_bind", "gcs_bind"):
+        last = getattr(options, name) + count - 1
+        if last > 65535:
+            raise ValueError(f"{count} vehicles from --{name.replace('_', '-')} on: ports end at 65535")
+    fleet = []
+    for index, start in enumerate(places(count, spacing_m)):
+        system_id = options.system_id + index
+        fleet.append(
+            replace(
+                options,
+                system_id=system_id,
+                seed=options.seed + index,
+                start_ned_m=start,
+                onboard_port=options.onboard_port + index,
+                onboard_bind=options.onboard_bind + index if options.onboard_bind else 0,
+                gcs_bind=options.gcs_bind + index if options.gcs_bind else 0,
+                camera=options.camera if index + 1 == camera_vehicle else None,
+                camera_outputs=options.camera_outputs if index + 1 == camera_vehicle else (),
+                camera_truth=options.camera_truth if index + 1 == camera_vehicle else None,
+                console=options.console if index == 0 else False,
+                truth=options.truth if index == 0 else _numbered(options.truth, system_id),
+            )
+        )
+    return fleet
+
+
+def _numbered(path: Path | None, system_id: int) -> Path | None:
+    return None if path is None else path.with_stem(f"{path.stem}-{system_id}")
+
+
+class Fleet:
+    """Vehicles on one clock, in real time. Use as a context manager; `run` returns after `stop`.
+
+    Raises (when made): what `Simulation` raises.
+    """
+
+    def __init__(self, options: Sequence[SimulationOptions], on_event: Callable[[str], None]) -> None:
+        self._resources = ExitStack()
+        self._stopped = False
+        self._on_event = on_event
+        self.simulations: list[Simulation] = []
+        try:
+            for one in options:
+                told = on_event if len(options) == 1 else _named(on_event, one.system_id)
+                self.simulations.append(self._resources.enter_context(Simulation(one, told)))
+        except BaseException:
+            self._resources.close()
+            raise
+
+    def __enter__(self) -> Fleet:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._resources.close()
+
+    def __iter__(self) -> Iterator[Simulation]:
+        return iter(self.simulations)
+
+    def stop(self) -> None:
+        """Make `run` return soon; may be called from a signal handler."""
+        self._stopped = True
+
+    def run(self) -> None:
+        """Run until `stop`."""
+        run_together(self.simulations, lambda: self._stopped, self._on_event)
+
+
+def _named(on_event: Callable[[str], None], system_id: int) -> Callable[[str], None]:
+    return lambda text: on_event(f"vehicle {system_id}: {text}")
+
+
+class _Pace:
+    """Says, every few seconds, when the machine is too slow for the speed that was asked for."""
+
+    def __init__(self, speed: float, on_event: Callable[[str], None]) -> None:
+        self._speed = speed
+        self._on_event = on_event
+        self._lost_s = 0.0
+        self._since_s = time.monotonic()
+
+    def lose(self, simulated_s: float) -> None:
+        self._lost_s += simulated_s
+
+    def tell(self) -> None:
+        passed_s = time.monotonic() - self._since_s
+        if passed_s < PACE_PERIOD_S:
+            return
+        if self._lost_s > 0.01 * self._speed * passed_s:
+            reached = self._speed - self._lost_s / passed_s
+            self._on_event(
+                f"cannot keep up: {reached:.2f} times real time in the last {passed_s:.0f} s, "
+                f"not {self._speed:g}; the machine is too busy"
+            )
+        self._lost_s = 0.0
+        self._since_s += passed_s
+
+
+def run_together(
+    simulations: Sequence[Simulation], stopped: Callable[[], bool], on_event: Callable[[str], None]
+) -> None:
+    """The loop: wait for the sockets until the next step is due, take in what came, step, send."""
+    first = simulations[0]
+    speed = first.options.speed
+    pace = _Pace(speed, on_event)
+    started_ns = time.monotonic_ns()
+    for simulation in simulations:
+        simulation.start_clock(started_ns)
+    with selectors.DefaultSelector() as selector:
+        for simulation in simulations:
+            for name, endpoint in simulation.endpoints.items():
+                selector.register(endpoint, selectors.EVENT_READ, (simulation, name))
+        while not stopped():
+            lost_s = first.backlog()
+            if lost_s > 0.0:
+                pace.lose(lost_s)
+                for simulation in simulations:
+                    simulation.let_go(lost_s)
+            pace.tell()
+            for key, _ in selector.select(first.until_next_step()):
+                simulation, name = key.data
+                simulation.receive(name)
+            for simulation in simulations:
+                simulation.advance()

@@ -1,0 +1,331 @@
+"""A vehicle in your own process, stepped by you: no sockets, no threads, no sleeping, no clock.
+
+>>> from mavlink_sim import LockstepVehicle
+>>> vehicle = LockstepVehicle(seed=1)
+>>> vehicle.take_off(5.0)                           # arms, climbs, waits for HOLD: 13 s of flight in 0.1 s
+>>> vehicle.truth.position_ned_m[2] < -4.0
+True
+
+Anything else goes by MAVLink messages, as with a real vehicle: `send` one, `step`, look at what it sent. The
+same seed and the same calls give the same flight, and the same bytes, every time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mavlink_sim.messages import Outgoing, dialect, parser
+from mavlink_sim.modes import Mode
+from mavlink_sim.streams import ONBOARD_RATES_HZ
+from mavlink_sim.vehicle import STEP_S, Vehicle
+
+COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
+ANSWER_LIMIT_S = 1.0
+SECOND_ANSWER_S = 0.04  # Commander's own, after the receiver's
+# What nobody takes is kept up to this many messages a link: a minute of all streams.
+MAX_WAITING = 50_000
+_ARM_DISARM, _TAKEOFF, _LAND, _SET_MODE = 400, 22, 21, 176
+_RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
+
+
+class NotReachedError(TimeoutError):
+    """What was waited for did not come about within its limit of simulated time."""
+
+
+class CommandRefusedError(RuntimeError):
+    """The vehicle did not accept a command."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is really so at one moment.
+
+    Attributes:
+        time_s: since boot. position_ned_m, velocity_ned_mps: local NED, its origin at the start.
+        quaternion: `ned_from_body` (w, x, y, z). roll_rad, pitch_rad, yaw_rad: the same.
+        rates_radps: body FRD.
+        mode: PX4's name of the flight mode. on_ground: touching it. landed: as the land detector has it.
+    """
+
+    time_s: float
+    position_ned_m: tuple[float, float, float]
+    velocity_ned_mps: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    rates_radps: tuple[float, float, float]
+    mode: str
+    armed: bool
+    landed: bool
+    on_ground: bool
+    crashed: bool
+
+    @property
+    def height_m(self) -> float:
+        return -self.position_ned_m[2]
+
+
+class LockstepVehicle:
+    """A PX4-like quadrotor that moves only while `step` (or a method that says so) runs.
+
+    Args:
+        links: its connections by name, each with the rates of its streams in Hz; None is one link "onboard"
+            with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends answers
+            alone, which is the fastest.
+        options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`…
+
+    Attributes:
+        vehicle: the vehicle itself, with everything that is inside (`airframe`, `autopilot`, `parameters`).
+        events: what happened so far, one readable line each ("armed", "mode HOLD", "landed"…).
+        newest: of each link, the newest message of each type that it sent.
+        dropped: of each link, how many messages were let go because nobody took them.
+    """
+
+    def __init__(self, links: Mapping[str, Mapping[str, float]] | None = None, **options: Any) -> None:
+        self.events: list[str] = []
+        self.vehicle = Vehicle(on_event=self.events.append, **options)
+        self.newest: dict[str, dict[str, Any]] = {}
+        self.dropped: dict[str, int] = {}
+        self._waiting: dict[str, deque[Outgoing]] = {}
+        self._codecs: dict[str, Any] = {}
+        self._repeated: list[_Repeated] = []
+        self._answers: list[tuple[int, int]] = []
+        for name, rates in ({"onboard": ONBOARD_RATES_HZ} if links is None else links).items():
+            self.vehicle.add_link(name, dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | dict(rates))
+            self.newest[name] = {}
+            self.dropped[name] = 0
+            self._waiting[name] = deque(maxlen=MAX_WAITING)
+            self._codecs[name] = parser(self.vehicle.system_id)
+        self._main_link = next(iter(self._waiting), "")
+
+    # ---- time -------------------------------------------------------------------------------------------
+
+    @property
+    def now_s(self) -> float:
+        """Simulated seconds since boot."""
+        return self.vehicle.now_s
+
+    def step(self, dt_s: float) -> None:
+        """Let simulated time pass, in steps of 4 ms; a remainder waits for the next call.
+
+        Raises:
+            ValueError: `dt_s` is negative or no number.
+        """
+        if not dt_s >= 0.0:
+            raise ValueError(f"step: expected seconds, zero or more, got {dt_s}")
+        if not self._repeated:
+            self.vehicle.step(dt_s)
+        else:
+            ends_s = self.now_s + dt_s - STEP_S / 2
+            while self.now_s < ends_s:
+                for repeated in self._repeated:
+                    repeated.send_if_due(self)
+                self.vehicle.step(STEP_S)
+        self._take()
+
+    def _take(self) -> None:
+        for name, waiting in self._waiting.items():
+            outgoing = self.vehicle.outgoing(name)
+            if outgoing:
+                self.dropped[name] += max(0, len(waiting) + len(outgoing) - MAX_WAITING)
+                waiting.extend(outgoing)
+                newest = self.newest[name]
+                for item in outgoing:
+                    message = item.message
+                    kind = message.get_type()
+                    newest[kind] = message
+                    if kind == "COMMAND_ACK":
+                        self._answers.append((message.command, message.result))
+
+    def run_until(
+        self, condition: Callable[[Truth], bool], limit_s: float = 60.0, every_s: float = 0.02
+    ) -> float:
+        """Let time pass until the truth meets a condition. Returns how many simulated seconds that took.
+
+        Raises:
+            NotReachedError: not within `limit_s` simulated seconds.
+        """
+        started_s = self.now_s
+        while not condition(self.truth):
+            if self.now_s - started_s >= limit_s:
+                truth = self.truth
+                raise NotReachedError(
+                    f"not reached within {limit_s:g} s of simulated time: mode {truth.mode}, "
+                    f"{'armed' if truth.armed else 'disarmed'}, at {truth.position_ned_m}; "
+                    f"events so far: {', '.join(self.events[-6:]) or 'none'}"
+                )
+            self.step(every_s)
+        return self.now_s - started_s
+
+    # ---- messages ---------------------------------------------------------------------------------------
+
+    def send(self, message: Any, link: str = "", source: tuple[int, int] = COMPANION) -> None:
+        """Hand it a message (of any pymavlink dialect) as if it came in on a link, the first by default."""
+        header = message.get_header()
+        header.srcSystem, header.srcComponent = source
+        self.vehicle.handle(link or self._main_link, message)
+        self._take()
+
+    def send_bytes(self, data: bytes, link: str = "") -> int:
+        """Hand it bytes off a wire; returns how many whole messages were in them and what was left before."""
+        name = link or self._main_link
+        count = 0
+        for message in self._codecs[name].parse_buffer(data) or []:
+            if message.get_type() != "BAD_DATA":
+                self.vehicle.handle(name, message)
+                count += 1
+        self._take()
+        return count
+
+    def repeat(
+        self, message: Any, rate_hz: float, link: str = "", source: tuple[int, int] = COMPANION
+    ) -> Repeat:
+        """Send this message at a rate for as long as time passes (setpoints, heartbeats); `stop` ends it."""
+        repeated = _Repeated(message, 1.0 / rate_hz, self.now_s, link, source)
+        self._repeated.append(repeated)
+        return Repeat(self._repeated, repeated)
+
+    def receive(self, link: str = "") -> list[Any]:
+        """Every message it sent on a link since the last call, in order: pymavlink messages or like them."""
+        waiting = self._waiting[link or self._main_link]
+        messages = [item.message for item in waiting]
+        waiting.clear()
+        return messages
+
+    def receive_bytes(self, link: str = "") -> bytes:
+        """The same as the bytes on the wire."""
+        name = link or self._main_link
+        codec, waiting = self._codecs[name], self._waiting[name]
+        packed = b"".join(item.pack(codec) for item in waiting)
+        waiting.clear()
+        return packed
+
+    # ---- the usual commands -----------------------------------------------------------------------------
+
+    def command(self, identifier: int, *parameters: float) -> str:
+        """Send COMMAND_LONG and let time pass until it is answered. Returns the MAV_RESULT's name.
+
+        DO_SET_MODE is answered twice; the second one, the real one, counts.
+
+        Raises:
+            NotReachedError: no answer within a second of simulated time.
+        """
+        values = (*parameters, *([0.0] * (7 - len(parameters))))
+        system = self.vehicle.system_id
+        self._answers.clear()
+        self.send(dialect.MAVLink_command_long_message(system, 1, identifier, 0, *values))
+        started_s = self.now_s
+        while (waited_s := self.now_s - started_s) < ANSWER_LIMIT_S:
+            results = [result for command, result in self._answers if command == identifier]
+            if results and (identifier != _SET_MODE or waited_s > SECOND_ANSWER_S):
+                return _RESULTS[results[-1]] if results[-1] < len(_RESULTS) else str(results[-1])
+            self.step(STEP_S)
+        raise NotReachedError(f"command {identifier} was not answered within {ANSWER_LIMIT_S:g} s")
+
+    def arm(self) -> None:
+        """Wait until it can be armed, and arm it.
+
+        Raises:
+            NotReachedError: not ready within 30 s. CommandRefusedError: it refuses.
+        """
+        self.run_until(lambda truth: self.vehicle.autopilot.can_arm, 30.0)
+        self._demand("arming", _ARM_DISARM, 1.0)
+
+    def take_off(self, height_m: float = 2.5, limit_s: float = 60.0) -> None:
+        """Arm, take off to a height above home, and wait for HOLD.
+
+        Raises:
+            NotReachedError: not within `limit_s`. CommandRefusedError: it refuses.
+        """
+        self.arm()
+        altitude_m = self.vehicle.home_altitude_m + height_m
+        self._demand("taking off", _TAKEOFF, math.nan, 0.0, 0.0, math.nan, math.nan, math.nan, altitude_m)
+        self.run_until(lambda truth: truth.mode == "HOLD", limit_s)
+
+    def land(self, limit_s: float = 120.0) -> None:
+        """Land where it is and wait until it has disarmed itself. Raises as `take_off`."""
+        self._demand("landing", _LAND)
+        self.run_until(lambda truth: not truth.armed, limit_s)
+
+    def set_mode(self, name: str) -> None:
+        """Ask for a mode by PX4's name (`OFFBOARD`, `HOLD`, `RTL`…).
+
+        Raises:
+            ValueError: there is no such mode. CommandRefusedError: it cannot be flown now.
+        """
+        try:
+            mode = Mode[name]
+        except KeyError:
+            raise ValueError(
+                f"mode {name!r}: expected one of {', '.join(mode.name for mode in Mode)}"
+            ) from None
+        self._demand(
+            f"mode {name}", _SET_MODE, 1.0, mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24 & 0xFF
+        )
+
+    def _demand(self, what: str, identifier: int, *parameters: float) -> None:
+        result = self.command(identifier, *parameters)
+        if result != "ACCEPTED":
+            raise CommandRefusedError(f"{what} was answered with {result}; events: {self.events[-6:]}")
+
+    # ---- truth ------------------------------------------------------------------------------------------
+
+    @property
+    def truth(self) -> Truth:
+        """What is really so now."""
+        airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
+        return Truth(
+            self.now_s,
+            airframe.position,
+            airframe.velocity,
+            airframe.quaternion,
+            airframe.roll_rad,
+            airframe.pitch_rad,
+            airframe.yaw_rad,
+            airframe.rates,
+            autopilot.mode.name,
+            autopilot.armed,
+            autopilot.landed,
+            airframe.on_ground,
+            airframe.crashed,
+        )
+
+
+class _Repeated:
+    """A message that is sent again and again."""
+
+    def __init__(
+        self, message: Any, interval_s: float, next_s: float, link: str, source: tuple[int, int]
+    ) -> None:
+        self.message, self.link, self.source = message, link, source
+        self._interval_s, self._next_s = interval_s, next_s
+
+    def send_if_due(self, vehicle: LockstepVehicle) -> None:
+        if vehicle.now_s >= self._next_s - 1e-9:
+            self._next_s += self._interval_s
+            vehicle.send(self.message, self.link, self.source)
+
+
+class Repeat:
+    """A message that is being repeated; `message` may be replaced while it is."""
+
+    def __init__(self, among: list[_Repeated], repeated: _Repeated) -> None:
+        self._among, self._repeated = among, repeated
+
+    @property
+    def message(self) -> Any:
+        return self._repeated.message
+
+    @message.setter
+    def message(self, message: Any) -> None:
+        self._repeated.message = message
+
+    def stop(self) -> None:
+        """Send it no more; to stop twice is to stop."""
+        if self._repeated in self._among:
+            self._among.remove(self._repeated)

@@ -1,0 +1,343 @@
+"""PX4's Navigator in small: what is stored of plans, how the mission goes, the geofence, where RTL leads.
+
+Belongs to one Autopilot, which calls `update` at every step and asks for the tasks of MISSION, RTL, PRECLAND.
+What clients are to hear of it waits in `announcements`, what other components are to do in `commands`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim import flight, mission_items
+from mavlink_sim.announcements import CRITICAL, INFO, Text
+from mavlink_sim.collision_prevention import ObstacleMap
+from mavlink_sim.geofence import Action, Geofence
+from mavlink_sim.mission_feasibility import complaints
+from mavlink_sim.mission_flight import MissionFlight
+from mavlink_sim.mission_items import MissionItem, PlanType
+from mavlink_sim.mission_plan import Mission, MissionState, Plan
+from mavlink_sim.modes import Mode
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics import Multirotor, Vector
+from mavlink_sim.precision_landing import LandingTarget, Precision, PrecisionLanding
+from mavlink_sim.return_flight import ReturnFlight, destination, return_task
+
+if TYPE_CHECKING:
+    from mavlink_sim.autopilot import Autopilot
+
+FENCE_PERIOD_S = 0.2  # GEOFENCE_CHECK_INTERVAL_US
+REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is told again so often, once a second
+REACHED_PERIOD_S = 1.0
+ACTIVE, SUSPENDED = 1, 2  # MISSION_CURRENT.mission_mode
+_MISSION_MODES = frozenset({Mode.MISSION, Mode.TAKEOFF, Mode.LAND})
+
+
+@dataclass(frozen=True, slots=True)
+class Current:
+    """The current item changed: MISSION_CURRENT is due."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """MISSION_ITEM_REACHED is due."""
+
+    sequence: int
+
+
+class Navigator:
+    """Missions, fence and destinations of one vehicle.
+
+    Attributes:
+        plans: what is stored, by type. mission: the mission and the progress in it.
+        fence: what the vehicle is held to. obstacles: for collision prevention.
+        target: the newest landing target.
+        uploading: name of the link over which a client uploads. sessions: the mission protocol, by link.
+    """
+
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        airframe: Multirotor,
+        parameters: Parameters,
+        on_event: Callable[[str], None],
+    ) -> None:
+        self._autopilot = autopilot
+        self._airframe = airframe
+        self._parameters = parameters
+        self._on_event = on_event
+        self.plans: dict[PlanType, Plan] = dict.fromkeys(PlanType, Plan())
+        self.mission = Mission()
+        self.fence = Geofence(parameters)
+        self.obstacles = ObstacleMap()
+        self.target: LandingTarget | None = None
+        self.uploading: str | None = None
+        self.sessions: dict[str, Any] = {}
+        self.announcements: deque[Current | Reached] = deque()
+        self.commands: deque[MissionItem] = deque()
+        self._checked_with: object = None
+        self._state = MissionState.NO_MISSION
+        self._flown = False  # the mission on board was begun
+        self._disarmed_since_flown = False
+        self._breaches: list[str] = []
+        self._next_fence_check_s = 0.0
+        self._next_reached_s = 0.0
+        self._repetitions = 0
+
+    # ---- what others read -------------------------------------------------------------------------------
+
+    @property
+    def now_s(self) -> float:
+        return self._autopilot.now_s
+
+    @property
+    def landed(self) -> bool:
+        return self._autopilot.landed
+
+    @property
+    def cruise_mps(self) -> float:
+        """Of DO_CHANGE_SPEED; NaN: MPC_XY_CRUISE."""
+        return self._autopilot.cruise_mps
+
+    @property
+    def home(self) -> Vector:
+        return self._autopilot.home
+
+    @property
+    def is_breached(self) -> bool:
+        """The vehicle is where the fence does not allow it, and GF_ACTION is not to ignore that."""
+        return bool(self._breaches)
+
+    @property
+    def in_progress(self) -> bool:
+        """A mission is being flown; it is not disarmed by itself then."""
+        return self._autopilot.mode is Mode.MISSION and not self.mission.finished
+
+    @property
+    def mission_mode(self) -> int:
+        return ACTIVE if self._autopilot.mode in _MISSION_MODES else SUSPENDED
+
+    def mission_state(self) -> MissionState:
+        """MISSION_CURRENT.mission_state, with PX4's memory: a pause before any item keeps the last state."""
+        mission = self.mission
+        if not mission.items or not mission.valid:
+            self._state = MissionState.NO_MISSION
+        elif mission.finished:
+            self._state = MissionState.COMPLETE
+        elif self.mission_mode == ACTIVE:
+            self._state = MissionState.ACTIVE
+        elif mission.reached >= 0:
+            self._state = MissionState.PAUSED
+        elif mission.current < 1:
+            self._state = MissionState.NOT_STARTED
+        return self._state
+
+    def allows_goal(self, place: Vector) -> bool:
+        """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
+        return self.fence.allows_goal(place, self._known_home())
+
+    # ---- what clients do --------------------------------------------------------------------------------
+
+    def store(self, plan_type: PlanType, plan: Plan, current: int = -1) -> None:
+        """Take a whole new plan. An identical one changes nothing.
+
+        Args:
+            current: the mission item marked as current, -1 for none.
+        """
+        if plan.identifier and plan.identifier == self.plans[plan_type].identifier:
+            return
+        self.plans[plan_type] = plan
+        if plan_type is PlanType.FENCE:
+            flying = None if self.landed else self._airframe.position
+            for words in self.fence.load(plan.items, self._known_home(), flying):
+                self.say(CRITICAL, words)
+            self._checked_with = None
+        elif plan_type is PlanType.MISSION:
+            self._new_mission(plan, current)
+
+    def _new_mission(self, plan: Plan, current: int) -> None:
+        last = max(len(plan.items) - 1, 0)
+        kept = min(self.mission.current, last)
+        self.mission = Mission(plan.items, kept if current < 0 else current)
+        self._flown = False
+        self._check_mission()
+        self.announcements.append(Current())
+        if self._flies_mission():
+            self._autopilot.restart_task()
+
+    def set_current(self, index: int) -> None:
+        """Fly this item next, or when the mission begins."""
+        if index == self.mission.current or not self.mission.valid:
+            return
+        if not self.mission.go_to(index):
+            return
+        self.mission.finished = False
+        self.current_changed()
+        if self._flies_mission():
+            self._autopilot.restart_task()
+
+    def change_speed(self, speed_mps: float) -> None:
+        """DO_CHANGE_SPEED; not above zero: the usual speed again."""
+        self._autopilot.change_speed(speed_mps if speed_mps > 1e-6 else 0.0, at_once=False)
+
+    def forget_reached(self) -> None:
+        """A new mission begins to arrive: nothing of it is reached."""
+        self.mission.reached = -1
+
+    # ---- what the flight tasks report -------------------------------------------------------------------
+
+    def current_changed(self) -> None:
+        self.announcements.append(Current())
+
+    def reached(self, index: int) -> None:
+        """An item is reached. Told once, then again each second for a while."""
+        if index == self.mission.reached:
+            return
+        self.mission.reached = index
+        self._repetitions = 0
+        self._next_reached_s = self.now_s + REACHED_PERIOD_S
+        self.announcements.append(Reached(index))
+        self._on_event(f"mission item {index} reached")
+
+    def command(self, item: MissionItem) -> None:
+        """An item is a command, for this vehicle or another component."""
+        self.commands.append(item)
+
+    def say(self, severity: int, text: str) -> None:
+        self._autopilot.texts.append(Text(severity, text))
+
+    # ---- tasks ------------------------------------------------------------------------------------------
+
+    def mission_task(self) -> flight.Task:
+        """The task of Mode.MISSION, from the current item on."""
+        mission = self.mission
+        if self._flown and self._disarmed_since_flown and mission.current + 1 == len(mission.items):
+            mission.current = 0  # flown to its end before
+            mission.jumps.clear()
+        self._check_mission()
+        if not mission.valid:
+            then = "refusing takeoff" if self.landed else "loitering"
+            self.say(CRITICAL, f"No valid mission available, {then}\t")
+            return flight.Hold(self._airframe, self._parameters)
+        self.say(INFO, "Executing Mission\t")
+        self._flown, self._disarmed_since_flown = True, False
+        mission.finished, mission.reached = False, -1
+        self.current_changed()
+        return MissionFlight(self, self._airframe, self._parameters)
+
+    def precision_landing(self, precision: Precision, place: Vector | None = None) -> PrecisionLanding:
+        """The task of landing on a target, beginning above `place` (None: here)."""
+        return PrecisionLanding(
+            self._airframe,
+            self._parameters,
+            precision,
+            lambda: self.target,
+            lambda: self.now_s,
+            place,
+            self._on_event,
+        )
+
+    def return_task(self) -> ReturnFlight:
+        """The task of RTL, by RTL_TYPE and RTL_PLD_MD."""
+        found, words = destination(
+            self.plans[PlanType.RALLY].items,
+            self.mission,
+            self._parameters,
+            self.home,
+            self._airframe.position,
+        )
+        for text in words:
+            self.say(CRITICAL, text)
+        return return_task(self, self._airframe, self._parameters, found)
+
+    # ---- one step ---------------------------------------------------------------------------------------
+
+    def update(self) -> None:
+        """Look after the mission's end, its validity and the fence."""
+        autopilot = self._autopilot
+        if not autopilot.armed and self._flown:
+            self._disarmed_since_flown = True
+        task = autopilot.task
+        if isinstance(task, MissionFlight) and task.ended and not self.landed:
+            autopilot.hold_at(task.goal)
+        elif (
+            autopilot.armed and autopilot.mode is Mode.MISSION and not self.landed and not self.mission.valid
+        ):
+            autopilot.set_mode(Mode.HOLD)
+        self._repeat_reached()
+        if self.now_s >= self._next_fence_check_s:
+            self._next_fence_check_s = self.now_s + FENCE_PERIOD_S
+            if self._checked_with != self._check_key():
+                self._check_mission()
+            self._check_fence()
+
+    def _repeat_reached(self) -> None:
+        if self.mission.reached < 0 or self._repetitions >= REACHED_REPETITIONS:
+            return
+        if self.now_s >= self._next_reached_s:
+            self._next_reached_s += REACHED_PERIOD_S
+            self._repetitions += 1
+            self.announcements.append(Reached(self.mission.reached))
+
+    def _flies_mission(self) -> bool:
+        return self._autopilot.armed and self._autopilot.mode is Mode.MISSION
+
+    def _known_home(self) -> Vector | None:
+        return self.home if self._autopilot.sensors_ready else None
+
+    def _check_key(self) -> object:
+        """What the mission was last checked with; a change of it is reason to check again."""
+        return self._known_home(), self.plans[PlanType.FENCE].identifier
+
+    def _check_mission(self) -> None:
+        home = self._known_home()
+        if home is None:
+            return  # PX4 waits for a position
+        self._checked_with = self._check_key()
+        was_valid = self.mission.valid
+        self.mission.valid, words = complaints(
+            self.mission.items, self._parameters, self.fence, home, landed=self.landed
+        )
+        for text in words:
+            self.say(CRITICAL, text)
+        if was_valid != self.mission.valid:
+            self._on_event("mission is valid" if self.mission.valid else "mission is not valid")
+
+    def _check_fence(self) -> None:
+        autopilot, action = self._autopilot, self.fence.action
+        found: list[str] = []
+        if action is not Action.NONE and autopilot.sensors_ready:
+            found = self.fence.breaches(self._airframe.position, self._known_home())
+        fresh = [words for words in found if words not in self._breaches]
+        was_breached, self._breaches = self.is_breached, found
+        for words in fresh:
+            self.say(CRITICAL, words)
+        if not found or was_breached or not autopilot.armed:
+            return
+        self._on_event(f"geofence breached: {found[0]}")
+        if action is Action.WARN:
+            self.say(CRITICAL, "Failsafe warning\t")
+        elif action is Action.TERMINATE:
+            autopilot.terminate()
+        else:
+            modes = {Action.RETURN: Mode.RTL, Action.LAND: Mode.LAND}
+            autopilot.enter_failsafe(modes.get(action, Mode.HOLD))
+
+
+def goes_to_camera(command: int) -> bool:
+    """Whether PX4 passes a mission's command on to the camera component instead of obeying itself."""
+    return command in _CAMERA_COMMANDS
+
+
+_CAMERA_COMMANDS = frozenset(
+    {
+        mission_items.START_CAPTURE,
+        mission_items.STOP_CAPTURE,
+        mission_items.SET_CAMERA_MODE,
+        mission_items.SET_CAMERA_SOURCE,
+        mission_items.START_VIDEO,
+        mission_items.STOP_VIDEO,
+    }
+)

@@ -1,0 +1,85 @@
+"""What PX4 does when the horizontal position is no longer valid (its mode requirements and mode fallback).
+
+A mode that needs a position is refused, and left if it is flown: Position falls to Altitude where a pilot has
+sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
+(that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
+OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
+When the position comes back in the air, the mode that was wanted is flown again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mavlink_sim.announcements import CRITICAL, Text
+from mavlink_sim.control import NAN, TrajectorySetpoint
+from mavlink_sim.flight import Task
+from mavlink_sim.modes import Mode
+from mavlink_sim.parameters import Parameters
+
+if TYPE_CHECKING:
+    from mavlink_sim.autopilot import Autopilot
+
+# ALTCTL, STABILIZED, ACRO and MANUAL are flown without; OFFBOARD depends on its setpoints.
+WITHOUT_POSITION = frozenset({Mode.ALTCTL, Mode.STABILIZED, Mode.ACRO, Mode.MANUAL, Mode.OFFBOARD})
+
+
+class Descend(Task):
+    """Sink without knowing where: level, with MPC_LAND_SPEED, at the heading it had."""
+
+    landing = True
+
+    def __init__(self, parameters: Parameters, yaw_rad: float) -> None:
+        self._parameters = parameters
+        self._yaw_rad = yaw_rad
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        speed = self._parameters.number("MPC_LAND_SPEED")
+        return TrajectorySetpoint(
+            velocity=(NAN, NAN, speed), acceleration=(0.0, 0.0, NAN), yaw_rad=self._yaw_rad
+        )
+
+
+def needs_position(mode: Mode) -> bool:
+    """Whether PX4 refuses the mode without a valid horizontal position."""
+    return mode not in WITHOUT_POSITION
+
+
+def asks_for_position(setpoint: object) -> bool:
+    """Whether an offboard setpoint needs the horizontal position or velocity (attitude setpoints do not)."""
+    wanted = (*getattr(setpoint, "position", ()), *getattr(setpoint, "velocity", ()))
+    return any(value == value for value in wanted)
+
+
+def enter_or_fall_back(autopilot: Autopilot, mode: Mode) -> None:
+    """Enter a mode of the autopilot's own choice, or what PX4 flies in its place without a position."""
+    if autopilot.position_valid or not needs_position(mode):
+        autopilot._enter(mode)
+        return
+    autopilot.blind = True
+    if mode in (Mode.POSCTL, Mode.POSITION_SLOW) and autopilot.pilot_has_sticks:
+        autopilot._enter(Mode.ALTCTL)
+        return
+    autopilot._enter(Mode.LAND)
+    autopilot.task = Descend(autopilot._parameters, autopilot._airframe.yaw_rad)
+
+
+def check(autopilot: Autopilot) -> None:
+    """Leave a mode that lost its position; go back to the intended one when the position is back."""
+    if not autopilot.armed:
+        return
+    if not autopilot.position_valid:
+        if not autopilot.blind and needs_position(autopilot.mode):
+            autopilot.failsafe = True
+            autopilot.texts.append(Text(CRITICAL, "Failsafe activated\t"))
+            autopilot._on_event(f"failsafe: position lost in {autopilot.mode.name}")
+            enter_or_fall_back(autopilot, autopilot.mode)
+    elif autopilot.blind:
+        autopilot.blind = False
+        autopilot._on_event("the position is back")
+        if autopilot.intended_mode is Mode.OFFBOARD:
+            if not autopilot.has_setpoints:  # else the check of the setpoints goes back to OFFBOARD
+                autopilot._enter(autopilot._offboard_loss_mode())
+        else:
+            autopilot.failsafe = False
+            autopilot._enter(autopilot.intended_mode)

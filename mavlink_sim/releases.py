@@ -1,0 +1,45 @@
+"""What differs between PX4's releases, as far as this vehicle shows it. All else is v1.17's behaviour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """One release of PX4.
+
+    Attributes:
+        name: "1.17".
+        software_version: AUTOPILOT_VERSION's, `major << 24 | minor << 16 | patch << 8 | type`.
+        acknowledges_modes_twice: DO_SET_MODE is accepted at once by the MAVLink receiver, whatever Commander
+            answers a moment later (since v1.16; PX4's commit 01abe35563).
+        has_parameter_errors: what is wrong with a parameter request is told by PARAM_ERROR (since v1.17);
+            before that there is silence.
+    """
+
+    name: str
+    software_version: int
+    acknowledges_modes_twice: bool
+    has_parameter_errors: bool
+
+
+# FIRMWARE_VERSION_TYPE: 64 is an alpha, as was the v1.17 that was measured; 255 is a release.
+RELEASES = {
+    release.name: release
+    for release in (
+        Release("1.14", 0x010E00FF, False, False),
+        Release("1.15", 0x010F00FF, False, False),
+        Release("1.16", 0x011000FF, True, False),
+        Release("1.17", 0x01110040, True, True),
+    )
+}
+NEWEST = "1.17"
+
+
+def release_named(name: str) -> Release:
+    """The release of this name. Raises ValueError for one that is not known."""
+    try:
+        return RELEASES[name]
+    except KeyError:
+        raise ValueError(f"PX4 {name!r} is not known here; choose one of {', '.join(RELEASES)}") from None

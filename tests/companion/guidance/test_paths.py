@@ -1,0 +1,233 @@
+"""goto, follow-path and figure-eight, and the law under them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kinematic_vehicle import Flight, KinematicVehicle
+
+from companion.guidance import grammar
+from companion.guidance.behaviour import Outcome, Situation
+from companion.guidance.envelope import Limits
+from companion.guidance.figure_eight import FigureEightBehaviour, lemniscate
+from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.geodesy import north_east
+from companion.guidance.goto import GotoBehaviour
+from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
+from companion.guidance.registry import behaviour_for
+from companion.vehicle.setpoint import Setpoint
+from vision.rotation import wrap_angle
+
+WIDE = Limits(max_distance_m=1000.0, max_altitude_m=100.0)
+places = st.tuples(*[st.floats(-50, 50)] * 3)
+
+
+def flown(
+    behaviour, seconds: float = 120.0, vehicle: KinematicVehicle | None = None
+) -> tuple[Flight, Outcome]:
+    flight = Flight(behaviour, vehicle or KinematicVehicle(), limits=WIDE)
+    outcome = flight.run(seconds)
+    assert outcome is not None, behaviour.status
+    return flight, outcome
+
+
+def off_the_line(place, start, end) -> float:
+    way = [b - a for a, b in zip(start, end, strict=True)]
+    length = math.hypot(*way)
+    share = sum((p - a) * w for p, a, w in zip(place, start, way, strict=True)) / length**2
+    share = min(max(share, 0.0), 1.0)
+    return math.dist(place, [a + share * w for a, w in zip(start, way, strict=True)])
+
+
+def test_goto_flies_straight_there_and_stops_with_the_nose_along_the_way():
+    flight, outcome = flown(GotoBehaviour(from_home_m=(20.0, -10.0), altitude_m=8.0))
+    assert outcome.success
+    assert math.dist(flight.vehicle.position, (20.0, -10.0, -8.0)) < 0.5
+    assert max(off_the_line(place, (0, 0, -5), (20, -10, -8)) for place in flight.track) < 0.3
+    assert flight.vehicle.yaw_rad == pytest.approx(math.atan2(-10, 20), abs=0.1)
+    assert (
+        max(
+            math.hypot(*(b - a for a, b in zip(*pair, strict=True)))
+            for pair in zip(flight.track, flight.track[1:], strict=False)
+        )
+        < 3.2 / 50
+    )
+
+
+def test_goto_by_the_nose_and_with_a_heading():
+    vehicle = KinematicVehicle(position=[5.0, 5.0, -5.0], yaw_rad=math.pi / 2)
+    flight, outcome = flown(GotoBehaviour(from_here_m=(10.0, 2.0), heading_rad=math.pi), vehicle=vehicle)
+    assert outcome.success
+    assert math.dist(flight.vehicle.position, (3.0, 15.0, -5.0)) < 0.5
+    assert abs(wrap_angle(flight.vehicle.yaw_rad - math.pi)) < 0.05
+
+
+def test_goto_where_it_is_already_ends_at_once_and_in_success():
+    _, outcome = flown(GotoBehaviour(from_here_m=(0.0, 0.0)), 10.0)
+    assert outcome.success
+
+
+def test_goto_by_latitude_and_longitude_needs_to_know_its_own():
+    behaviour = GotoBehaviour(global_deg=(47.0, 8.0))
+    _, outcome = flown(behaviour)
+    assert not outcome.success
+    assert "does not know its latitude" in outcome.reason
+
+
+def test_goto_by_latitude_and_longitude():
+    vehicle = KinematicVehicle()
+    state = replace(vehicle.state, latitude_deg=47.397742, longitude_deg=8.545594)
+    behaviour = GotoBehaviour(global_deg=(47.397742 + 1e-4, 8.545594))
+    behaviour.on_activate(Situation(vehicle.now_ns, state))
+    step = behaviour.update(0.0, Situation(vehicle.now_ns, state))
+    assert isinstance(step, Setpoint)
+    assert behaviour._follower is not None
+    assert behaviour._follower.path.length_m == pytest.approx(11.12, abs=0.01)
+    assert step.velocity_ned_mps is not None
+    assert step.velocity_ned_mps[0] > 0.3
+    assert abs(step.velocity_ned_mps[1]) < 1e-6
+
+
+def test_a_goal_beyond_a_limit_is_given_up_with_the_reason():
+    flight = Flight(GotoBehaviour(from_home_m=(60.0, 0.0)), limits=Limits(max_distance_m=30.0))
+    outcome = flight.run(120.0)
+    assert outcome is not None
+    assert not outcome.success
+    assert "came no further" in outcome.reason
+    assert "guidance" in outcome.reason
+
+
+def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners():
+    points = [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0, 8.0), (0.0, 20.0)]
+    flight, outcome = flown(FollowPathBehaviour(points, 4.0))
+    assert outcome.success, outcome.reason
+    corners = [(0, 0, -5), (20, 0, -5), (20, 20, -8), (0, 20, -8)]
+    for corner in corners:
+        assert min(math.dist(corner, place) for place in flight.track) < 0.8
+    legs = list(itertools.pairwise(corners))
+    assert max(min(off_the_line(place, *leg) for leg in legs) for place in flight.track) < 0.8
+
+
+def test_a_path_is_flown_round_and_round_from_a_vehicle_far_from_it():
+    points = [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)]
+    vehicle = KinematicVehicle(position=[-60.0, 0.0, -5.0])
+    flight, outcome = flown(FollowPathBehaviour(points, 3.0, laps=2.0), 200.0, vehicle)
+    assert outcome.success, outcome.reason
+    assert "2 laps" in outcome.reason
+    times_by = sum(
+        math.dist(a, (12, 12, -5)) > 1.0 >= math.dist(b, (12, 12, -5))
+        for a, b in zip(flight.track, flight.track[1:], strict=False)
+    )
+    assert times_by == 2
+
+
+def test_an_eight_is_flown_on_its_line():
+    flight, outcome = flown(FigureEightBehaviour(10.0, 2.5, 1.0), vehicle=KinematicVehicle(yaw_rad=0.7))
+    assert outcome.success, outcome.reason
+    line = lemniscate((0.0, 0.0, -5.0), 0.7, 10.0)
+    legs = list(zip(line, line[1:] + line[:1], strict=True))
+    settled = flight.track[100:]
+    assert max(min(off_the_line(place, *leg) for leg in legs) for place in settled) < 0.8
+    ends = [(s * 10 * math.cos(0.7), s * 10 * math.sin(0.7), -5.0) for s in (1, -1)]
+    for end in ends:
+        assert min(math.dist(end, place) for place in flight.track) < 0.8
+
+
+@given(st.lists(places, min_size=2, max_size=8), st.booleans(), st.floats(0.5, 15))
+@settings(max_examples=60, deadline=None)
+def test_speeds_along_any_path_can_be_flown(points, closed, speed_mps):
+    points = [tuple(point) for point in points]
+    if all(math.dist(point, points[0]) < 0.01 for point in points):
+        with pytest.raises(ValueError, match="two different points"):
+            Path(points, speed_mps, closed=closed)
+        return
+    path = Path(points, speed_mps, closed=closed)
+    at = [path.length_m * step / 300 for step in range(301)]
+    speeds = [path.point(along).speed_mps for along in at]
+    assert all(speed <= speed_mps + 1e-9 for speed in speeds)
+    if not closed:
+        assert speeds[-1] == pytest.approx(0.0, abs=1e-3)
+        assert math.dist(path.point(path.length_m).position_ned_m, points[-1]) < 0.011
+    step_m = path.length_m / 300
+    for before, after in itertools.pairwise(speeds):
+        assert before**2 <= after**2 + 2 * ACCELERATION_MPS2 * step_m * (1 + 1e-6) + 1e-6
+    for along in at[:300]:
+        assert math.hypot(*path.point(along).direction) == pytest.approx(1.0)
+
+
+@given(st.lists(places, min_size=2, max_size=6), st.tuples(*[st.floats(-200, 200)] * 3))
+@settings(max_examples=60, deadline=None)
+def test_progress_never_goes_back_and_velocities_are_finite(points, position):
+    points = [tuple(point) for point in points]
+    if all(math.dist(point, points[0]) < 0.01 for point in points):
+        return
+    follower = PathFollower(Path(points, 3.0))
+    before = 0.0
+    for step in range(10):
+        velocity = follower.velocity(tuple(p + 0.3 * step for p in position), 3.0)
+        assert all(map(math.isfinite, velocity))
+        assert follower.along_m >= before
+        before = follower.along_m
+
+
+@given(st.floats(-60, 60), st.floats(-180, 180), st.floats(-2000, 2000), st.floats(-2000, 2000))
+def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_m, east_m):
+    """Against the chord between the two places in earth-centred coordinates."""
+
+    def earth_centred(place):
+        phi, lam = map(math.radians, place)
+        normal = 6378137.0 / math.sqrt(1 - 6.694379990141e-3 * math.sin(phi) ** 2)
+        return (
+            normal * math.cos(phi) * math.cos(lam),
+            normal * math.cos(phi) * math.sin(lam),
+            normal * (1 - 6.694379990141e-3) * math.sin(phi),
+        )
+
+    there = (latitude + north_m / 111_000, longitude + east_m / (111_000 * math.cos(math.radians(latitude))))
+    found = north_east((latitude, longitude), there)
+    chord = math.dist(earth_centred((latitude, longitude)), earth_centred(there))
+    assert math.hypot(*found) == pytest.approx(chord, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("goto", "exactly one pair"),
+        ("goto 3", "belong together"),
+        ("goto 3 4 forward=1 right=2", "north and east and forward and right"),
+        ("goto 3 99999", "-5000 to 5000"),
+        ("follow-path", "points is missing"),
+        ("follow-path 1,2 3", "'3'"),
+        ("follow-path 1,nan", "'1,nan'"),
+        ("figure-eight radius=1", "3 to 200"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line(text, words):
+    with pytest.raises(grammar.GrammarError, match=words):
+        grammar.parse(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "goto north=10 east=5",
+        "goto altitude=8 forward=5 right=0 heading=90",
+        "goto latitude=47.397742 longitude=8.545594",
+        'follow-path "0,0 10,0,6" laps=0',
+        "figure-eight radius=8 nose=still",
+    ],
+)
+def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text):
+    command = grammar.parse(text)
+    assert grammar.parse(str(command)) == command
+    assert behaviour_for(command).name == command.word
+    assert command.endless == ("laps=0" in text)
+
+
+def test_points_may_stand_without_quotes():
+    assert grammar.parse("follow-path 0,0 10,0 10,10,4").places == ((0, 0), (10, 0), (10, 10, 4))

@@ -1,0 +1,342 @@
+"""SET_ATTITUDE_TARGET: which of it counts, and how attitudes and rates are flown."""
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink_sim.attitude_control import AttitudeController, AttitudeSetpoint, RatesSetpoint
+from mavlink_sim.body_rates import euler, inverse, product, third_axis, turned, unit
+from mavlink_sim.messages import dialect
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2, Multirotor
+from mavlink_sim.setpoints import attitude_setpoint
+from vision.rotation import matrix_from_quaternion, quaternion_from_euler
+
+HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2
+RATES_IGNORED = 7
+
+
+def attitude(
+    roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0, thrust: float = HOVER, mask: int = RATES_IGNORED
+) -> Any:
+    q = quaternion_from_euler(math.radians(roll), math.radians(pitch), math.radians(yaw))
+    return dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, list(q), 0, 0, 0, thrust)
+
+
+def rates(p: float, q: float, r: float, thrust: float = HOVER, mask: int = 128) -> Any:
+    return dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, [1, 0, 0, 0], p, q, r, thrust)
+
+
+# ---- what counts
+
+
+@given(st.integers(0, 255))
+def test_the_type_mask_decides_between_attitude_rates_and_nothing(mask: int) -> None:
+    message = dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, [1, 0, 0, 0], 0.1, 0.2, 0.3, 0.6)
+    setpoint = attitude_setpoint(message)
+    if not mask & 128:
+        assert isinstance(setpoint, AttitudeSetpoint)
+        assert math.isnan(setpoint.yaw_rate_radps) == bool(mask & 4)
+        assert setpoint.thrust == pytest.approx(0.0 if mask & (64 | 32) else 0.6)
+    elif mask & 3:
+        assert setpoint is None
+    else:
+        assert isinstance(setpoint, RatesSetpoint)
+        assert setpoint.rates[:2] == pytest.approx((0.1, 0.2))
+        assert math.isnan(setpoint.rates[2]) == bool(mask & 4)
+        assert setpoint.thrust == pytest.approx(0.0 if mask & 64 else 0.6)
+
+
+def test_a_thrust_vector_counts_by_its_vertical_part() -> None:
+    message = attitude(mask=RATES_IGNORED | 32, thrust=0.9)
+    message.thrust_body = [0.1, 0.2, -0.55]
+    setpoint = attitude_setpoint(message)
+    assert setpoint is not None
+    assert setpoint.thrust == pytest.approx(0.55)
+
+
+@pytest.mark.parametrize(("mask", "counts"), [(7, True), (128, True), (0, True), (129, False), (135, False)])
+def test_what_controls_something_keeps_the_offboard_signal_alive(
+    cockpit: Any, mask: int, counts: bool
+) -> None:
+    cockpit.heartbeats.append(("gcs", (245, 190), 6))
+    cockpit.fly(0.1)
+    cockpit.send(attitude(mask=mask))
+    cockpit.fly(0.05)
+    assert cockpit.vehicle.autopilot.has_setpoints is counts
+    assert cockpit.texts() == []  # what counts for nothing is dropped without a word
+
+
+@pytest.mark.parametrize(("system", "component", "counts"), [(1, 0, True), (0, 0, True), (2, 1, False)])
+def test_it_counts_if_it_is_addressed_to_the_autopilot(
+    cockpit: Any, system: int, component: int, counts: bool
+) -> None:
+    cockpit.fly(0.1)
+    message = attitude()
+    message.target_system, message.target_component = system, component
+    cockpit.send(message)
+    assert cockpit.vehicle.autopilot.has_setpoints is counts
+
+
+# ---- flying by attitude
+
+
+def test_level_at_hover_thrust_it_stays_where_it_is(cockpit: Any) -> None:
+    cockpit.take_off(10.0)
+    cockpit.offboard(attitude())
+    before = cockpit.vehicle.airframe.position
+    cockpit.fly(5.0, attitude())
+    assert math.dist(cockpit.vehicle.airframe.position, before) < 0.3
+    assert cockpit.mode == "OFFBOARD"
+
+
+def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpit: Any) -> None:
+    cockpit.take_off(20.0)
+    tilted = attitude(roll=20.0, pitch=-10.0, yaw=60.0)
+    cockpit.offboard(tilted)
+    cockpit.fly(4.0, tilted)
+    airframe = cockpit.vehicle.airframe
+    seen = [math.degrees(angle) for angle in (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)]
+    assert seen == pytest.approx([20.0, -10.0, 60.0], abs=0.5)
+    down = third_axis(quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad))
+    drag = LINEAR_DRAG_PER_S
+    expected = [-GRAVITY_MPS2 * axis - drag * v for axis, v in zip(down, airframe.velocity, strict=True)]
+    expected[2] += GRAVITY_MPS2
+    assert airframe.acceleration == pytest.approx(expected, abs=0.02)
+    assert airframe.velocity[2] > 0.2  # hover thrust, tilted, does not carry the weight
+
+
+def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(cockpit: Any) -> None:
+    cockpit.take_off(10.0)
+    cockpit.offboard(attitude(yaw=170.0))
+    cockpit.fly(5.0, attitude(yaw=170.0))
+    turns = []
+    for _ in range(100):
+        cockpit.fly(0.02, attitude(yaw=-170.0))
+        turns.append(cockpit.vehicle.airframe.rates[2])
+        assert abs(cockpit.vehicle.airframe.roll_rad) < 0.02
+    assert min(turns) > -0.02
+    assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(-170.0, abs=3.0)
+
+
+def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(cockpit: Any) -> None:
+    cockpit.take_off(30.0)
+    cockpit.offboard(attitude())
+    cockpit.fly(1.0, attitude())
+    cockpit.fly(1.0, attitude(thrust=HOVER + 0.05))
+    gained = 0.05 * MAX_THRUST_MPS2 / LINEAR_DRAG_PER_S * (1 - math.exp(-LINEAR_DRAG_PER_S * 1.0))
+    assert cockpit.vehicle.airframe.velocity[2] == pytest.approx(-gained, abs=0.08)
+    cockpit.fly(0.6, attitude(mask=RATES_IGNORED | 64))
+    assert cockpit.vehicle.airframe.thrust_mps2 < 0.01
+
+
+def test_a_tumbling_vehicle_comes_upright(cockpit: Any) -> None:
+    cockpit.take_off(60.0)
+    flip = rates(8.0, 0.0, 0.0)
+    cockpit.offboard(flip)
+    cockpit.until(lambda: abs(cockpit.vehicle.airframe.roll_rad) > 3.0, 2.0, flip)
+    cockpit.fly(2.0, attitude(thrust=0.6))
+    assert abs(cockpit.vehicle.airframe.roll_rad) < 0.02
+    assert abs(cockpit.vehicle.airframe.pitch_rad) < 0.02
+
+
+def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(cockpit: Any) -> None:
+    cockpit.take_off(10.0)
+    cockpit.offboard(rates(0.0, 0.0, 0.5))
+    cockpit.fly(2.0, rates(0.0, 0.0, 0.5))
+    for values in ([0.0] * 4, [math.nan] * 4):
+        nothing = attitude()
+        nothing.q = values
+        cockpit.fly(1.0, nothing)
+        assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.5, abs=0.01)
+    assert cockpit.mode == "OFFBOARD"
+
+
+# ---- flying by rates
+
+
+def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(cockpit: Any) -> None:
+    cockpit.take_off(10.0)
+    spin = rates(0.0, 0.0, 0.8)
+    cockpit.offboard(spin)
+    cockpit.fly(2.0, spin)
+    assert cockpit.vehicle.airframe.rates == pytest.approx((0.0, 0.0, 0.8), abs=0.01)
+    cockpit.fly(1.0, rates(0.0, 0.0, 0.0, mask=128 | 4))
+    assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.8, abs=0.01)
+    cockpit.fly(1.0, rates(0.0, 0.0, 0.0))
+    assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_whole_flip_is_possible_by_rates(cockpit: Any) -> None:
+    cockpit.take_off(60.0)
+    cockpit.offboard(attitude())
+    flip = rates(0.0, 6.0, 0.0, thrust=0.3)
+    cockpit.until(lambda: cockpit.vehicle.airframe.roll_rad > 3.0, 2.0, flip)  # past the vertical
+    cockpit.until(lambda: abs(cockpit.vehicle.airframe.roll_rad) < 0.1, 2.0, flip)
+    cockpit.fly(2.0, attitude(thrust=0.7))
+    assert abs(cockpit.vehicle.airframe.pitch_rad) < 0.02
+    assert cockpit.armed
+
+
+@pytest.mark.parametrize("first", [attitude(roll=5.0), rates(0.1, 0.0, 0.0)], ids=["attitude", "rates"])
+def test_a_position_may_follow_an_attitude_and_is_flown(
+    cockpit: Any, position_setpoint: Any, first: Any
+) -> None:
+    cockpit.take_off(8.0)
+    cockpit.offboard(first)
+    cockpit.fly(1.0, first)
+    there = position_setpoint(0, 0, -8)
+    cockpit.fly(15.0, there)
+    assert math.dist(cockpit.vehicle.airframe.position, (0, 0, -8)) < 0.3
+
+
+# ---- taking off, landing, losing it
+
+
+def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_ground(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    climb = attitude(thrust=HOVER + 0.03)
+    cockpit.offboard(climb)
+    assert cockpit.command(400, 1) == [0]
+    cockpit.until(lambda: cockpit.height_m > 2.0, 15.0, climb)
+    assert "takeoff" in cockpit.events
+    sink = attitude(thrust=HOVER - 0.04)
+    cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 15.0, sink)
+    cockpit.until(lambda: not cockpit.armed, 6.0, attitude(thrust=0.0))
+    assert "landed" in cockpit.events
+
+
+def test_without_the_stream_the_failsafe_flies_home_by_position(cockpit: Any) -> None:
+    cockpit.take_off(8.0)
+    stream = attitude(roll=3.0)
+    cockpit.offboard(stream)
+    cockpit.fly(1.0, stream)
+    cockpit.send(stream)
+    assert 1.0 <= cockpit.until(lambda: cockpit.mode == "RTL", 3.0) <= 1.15
+    cockpit.until(lambda: not cockpit.armed, 60.0)
+
+
+# ---- what is echoed
+
+
+def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
+    cockpit: Any, position_setpoint: Any
+) -> None:
+    cockpit.take_off(10.0)
+    wanted = attitude(roll=6.0, yaw=30.0, thrust=0.52)
+    cockpit.offboard(wanted)
+    cockpit.fly(1.0, wanted)
+    cockpit.forget()
+    cockpit.fly(1.0, wanted)
+    assert cockpit.received("POSITION_TARGET_LOCAL_NED") == []
+    assert cockpit.received("POSITION_TARGET_GLOBAL_INT") == []
+    echo = cockpit.received("ATTITUDE_TARGET")[-1]
+    assert (echo.type_mask, echo.thrust) == (0, pytest.approx(0.52))
+    assert echo.q == pytest.approx(wanted.q, abs=1e-6)
+
+    turning = rates(0.0, 0.0, 0.4, thrust=0.5)
+    cockpit.forget()
+    cockpit.fly(0.5, turning)
+    echo = cockpit.received("ATTITUDE_TARGET")[-1]
+    assert (echo.body_roll_rate, echo.body_yaw_rate) == pytest.approx((0.0, 0.4))
+    assert echo.q == pytest.approx(wanted.q, abs=1e-6)  # as PX4: the last attitude setpoint stays in it
+    assert echo.thrust == pytest.approx(0.52)
+
+    cockpit.forget()
+    cockpit.fly(0.5, position_setpoint(0, 0, -10))
+    assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 0
+
+
+def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_attitude(
+    cockpit: Any, position_setpoint: Any
+) -> None:
+    cockpit.take_off(5.0)
+    facing_north = position_setpoint(0, 0, -5, 0.0)
+    cockpit.offboard(facing_north)
+    cockpit.fly(1.0, facing_north)
+    cockpit.forget()
+    cockpit.fly(0.11, position_setpoint(0, 0, -5, 1.4))
+    echo = cockpit.received("ATTITUDE_TARGET")[0]
+    assert echo.q[3] == pytest.approx(math.sin(0.7), abs=0.01)
+    assert echo.body_yaw_rate > 1.0  # a PX4 told 2.5 rad/s at the beginning of such a turn
+
+
+@pytest.mark.parametrize(("setpoint", "base"), [(attitude(), 145), (rates(0, 0, 0), 129)])
+def test_the_heartbeat_is_stabilized_unless_rates_alone_are_flown(
+    cockpit: Any, setpoint: Any, base: int
+) -> None:
+    cockpit.take_off(10.0)
+    cockpit.offboard(setpoint)
+    cockpit.forget()
+    cockpit.until(lambda: bool(cockpit.received("HEARTBEAT")), 1.5, setpoint)
+    beat = cockpit.received("HEARTBEAT")[-1]
+    assert (beat.custom_mode, beat.base_mode, beat.system_status) == (0x00060000, base, 4)
+
+
+# ---- the algebra
+
+angles = st.floats(-3.1, 3.1)
+attitudes = st.tuples(angles, st.floats(-1.5, 1.5), angles)
+
+
+@given(attitudes, attitudes)
+def test_the_controller_turns_any_attitude_into_any_other(
+    start: tuple[float, float, float], goal: tuple[float, float, float]
+) -> None:
+    controller = AttitudeController(Parameters())
+    airframe = Multirotor()
+    airframe.on_ground = False
+    airframe.set_attitude(*start)
+    wanted = quaternion_from_euler(*goal)
+    setpoint = AttitudeSetpoint(wanted, math.nan, 0.5)
+    for _ in range(600):
+        demanded = controller.rates(setpoint, airframe)
+        assert all(abs(rate) <= math.radians(220.0) + 1e-9 for rate in demanded)
+        now = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
+        airframe.set_attitude(*turned(now, demanded, 0.01))
+    reached = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
+    assert abs(product(inverse(reached), wanted)[0]) > 0.9999
+
+
+@given(attitudes)
+def test_euler_angles_survive_the_quaternion(attitude_rad: tuple[float, float, float]) -> None:
+    assert euler(quaternion_from_euler(*attitude_rad)) == pytest.approx(attitude_rad, abs=1e-6)
+    q = quaternion_from_euler(*attitude_rad)
+    assert third_axis(q) == pytest.approx(tuple(matrix_from_quaternion(q)[:, 2]), abs=1e-9)
+
+
+def test_body_rates_turn_about_the_body_axes() -> None:
+    tilted = (0.0, math.pi / 2 - 1e-3, 0.0)  # nose up: body yaw is the world's roll
+    roll, _, _ = turned((math.pi / 2, 0.0, 0.0), (0.0, 0.2, 0.0), 1.0)
+    assert roll == pytest.approx(math.pi / 2)  # on its side, pitching changes the heading
+    assert turned((math.pi / 2, 0.0, 0.0), (0.0, 0.2, 0.0), 1.0)[2] == pytest.approx(0.2)
+    assert turned(tilted, (0.0, 0.0, 0.0), 1.0) == pytest.approx(tilted, abs=1e-6)
+    assert unit((0.0, 0.0, 0.0, 0.0)) is None
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 255), st.lists(st.floats(width=32), min_size=8, max_size=8)),
+        min_size=1,
+        max_size=5,
+    )
+)
+def test_no_attitude_target_can_stop_the_vehicle(
+    make_cockpit: Any, requests: list[tuple[int, list[float]]]
+) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0)
+    cockpit.offboard(attitude())
+    cockpit.command(400, 1)
+    for mask, values in requests:
+        message = dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, values[:4], *values[4:])
+        cockpit.fly(0.3, message)
+    airframe = cockpit.vehicle.airframe
+    attitude_rad = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
+    assert all(map(math.isfinite, (*airframe.position, *airframe.velocity, *attitude_rad)))
+    codec = dialect.MAVLink(None, 1, 1)
+    for _, item in cockpit.inbox["onboard"]:
+        assert item.pack(codec)

@@ -1,0 +1,173 @@
+"""MAVProxy as a ground station, driven by what a person would type.
+
+MAVProxy is GPL, and asks for matplotlib, VTK and another OpenCV; it is a tool of this test alone, for which
+`pip install --no-deps MAVProxy pyserial` is enough. Without it the test is skipped.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.testing import RunningSimulator, vehicle
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("MAVProxy") is None or importlib.util.find_spec("serial") is None,
+    reason="MAVProxy is not installed: pip install --no-deps MAVProxy pyserial",
+)
+MODULES = "param,arm,wp,cmdlong,link,misc"
+TAKEOFF, MISSION, LAND = "4 2", "4 4", "4 6"  # PX4's main and sub modes
+
+
+class Console:
+    """A running MAVProxy: type a line, wait for words."""
+
+    def __init__(self, device: str, folder: Path) -> None:
+        self.said: list[str] = []
+        self._changed = threading.Condition()
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, "-u", "-m", "MAVProxy.mavproxy", f"--master={device}"),
+                *(f"--state-basedir={folder}", f"--default-modules={MODULES}", "--aircraft=test"),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            cwd=folder,
+            env={**os.environ, "HOME": str(folder)},  # nobody's .mavinit.scr
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._changed:
+                self.said.append(line.rstrip("\n"))
+                self._changed.notify_all()
+
+    def type(self, line: str) -> int:
+        """Returns how many lines had been said before."""
+        assert self.process.stdin is not None
+        before = len(self.said)
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+        return before
+
+    def wait_for(self, pattern: str, since: int = 0, limit_s: float = 40.0) -> re.Match[str]:
+        """The first line, from `since` on, in which the pattern is found."""
+
+        def found() -> re.Match[str] | None:
+            return next((hit for line in self.said[since:] if (hit := re.search(pattern, line))), None)
+
+        with self._changed:
+            self._changed.wait_for(lambda: found() is not None, limit_s)
+        hit = found()
+        assert hit is not None, f"no {pattern!r} in {self.said[since:]}"
+        return hit
+
+    def ask(self, line: str, pattern: str, limit_s: float = 10.0) -> re.Match[str]:
+        """Type a line, again and again if it takes a while to be true, until the answer comes."""
+        deadline = time.monotonic() + limit_s
+        while True:
+            since = self.type(line)
+            try:
+                return self.wait_for(pattern, since, 1.0)
+            except AssertionError:
+                if time.monotonic() > deadline:
+                    raise
+
+    def end(self) -> None:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.kill()  # asked kindly, it waits for one more line of input
+        self.process.wait()
+        self._reader.join(10.0)
+        self.process.stdin.close()
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def simulator() -> Iterator[RunningSimulator]:
+    with vehicle() as running:  # MAVProxy cannot keep up with a faster one
+        yield running
+
+
+@pytest.fixture
+def console(simulator: RunningSimulator, tmp_path: Path) -> Iterator[Console]:
+    mavproxy = Console(simulator.gcs_pymavlink_device, tmp_path)
+    try:
+        mavproxy.wait_for("online system 1")
+        yield mavproxy
+    finally:
+        mavproxy.end()
+
+
+def test_it_connects_sets_parameters_and_flies(simulator: RunningSimulator, console: Console) -> None:
+    count = int(console.wait_for(r"Received (\d+) parameters")[1])
+    since = console.type("param fetch")
+    assert int(console.wait_for(r"Received (\d+) parameters", since)[1]) == count > 250
+    assert float(console.ask("param show COM_OF_LOSS_T", r"COM_OF_LOSS_T\s+(\S+)")[1]) == 1.0
+    console.type("param set MIS_TAKEOFF_ALT 1.5")
+    console.ask("param show MIS_TAKEOFF_ALT", r"MIS_TAKEOFF_ALT\s+1\.5")
+    console.type("param set NAV_RCL_ACT 3")  # an integer, bytewise
+    console.ask("param show NAV_RCL_ACT", r"NAV_RCL_ACT\s+3")
+
+    console.ask("disarm", "COMPONENT_ARM_DISARM: ACCEPTED")  # it is disarmed: no error
+    console.type(f"long DO_SET_MODE 1 {TAKEOFF}")
+    simulator.wait_for_event("mode TAKEOFF")
+    console.type("arm throttle")
+    simulator.wait_for_event("takeoff")
+    console.wait_for("ARMED")
+    console.ask("disarm", "COMPONENT_ARM_DISARM: TEMPORARILY_REJECTED")  # in the air
+    simulator.wait_for_event("mode HOLD")
+    console.type("long NAV_RETURN_TO_LAUNCH")
+    simulator.wait_for_event("mode RTL")
+    console.type(f"long DO_SET_MODE 1 {LAND}")
+    simulator.wait_for_event("disarmed (after landing)")
+    console.wait_for("DISARMED")
+
+
+MISSION_FILE = """QGC WPL 110
+0\t1\t0\t16\t0\t0\t0\t0\t47.3977432\t8.5455942\t489.4\t1
+1\t0\t3\t22\t0\t0\t0\t0\t47.3977432\t8.5455942\t5.0\t1
+2\t0\t3\t16\t0\t0\t0\t0\t47.3979000\t8.5455942\t5.0\t1
+3\t0\t3\t21\t0\t0\t0\t0\t47.3979000\t8.5455942\t0.0\t1
+"""
+
+
+@pytest.mark.skipif("MISSION_COUNT" not in HANDLERS, reason="this vehicle takes no missions")
+def test_it_loads_a_mission_and_flies_it(
+    simulator: RunningSimulator, console: Console, tmp_path: Path
+) -> None:
+    console.wait_for(r"Received (\d+) parameters")
+    (tmp_path / "mission.txt").write_text(MISSION_FILE)
+    since = console.type("wp load mission.txt")
+    console.wait_for("Sent all 4 waypoints", since)
+    since = console.type("wp list")
+    console.wait_for("Requesting 4 waypoints", since)
+    console.type(f"long DO_SET_MODE 1 {MISSION}")
+    simulator.wait_for_event("mode MISSION")
+    console.type("arm throttle")
+    simulator.wait_for_event("takeoff")
+    simulator.wait_for_event("disarmed (after landing)", 60.0)
+
+
+@pytest.mark.skipif("FILE_TRANSFER_PROTOCOL" not in HANDLERS, reason="this vehicle has no MAVLink FTP")
+def test_it_lists_files(console: Console) -> None:
+    console.wait_for(r"Received (\d+) parameters")
+    since = console.type("module load ftp")
+    console.wait_for("Loaded module ftp", since)
+    since = console.type("ftp list /")
+    console.wait_for("Total size", since)

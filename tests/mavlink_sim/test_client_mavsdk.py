@@ -1,0 +1,139 @@
+"""MAVSDK 4 as a client: its action, telemetry, info, param and offboard plugins against the vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
+from mavsdk.asyncio.plugins.info import InfoAsync
+from mavsdk.asyncio.plugins.offboard import (
+    OffboardAsync,
+    OffboardError,
+    PositionNedYaw,
+    VelocityBodyYawspeed,
+    VelocityNedYaw,
+)
+from mavsdk.asyncio.plugins.param import ParamAsync, ParamError
+from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+
+from mavlink_sim.testing import RunningSimulator, vehicle
+
+SPEED = 4.0
+
+
+async def first(
+    updates: Any, condition: Callable[[Any], bool] = lambda _: True, limit_s: float = 40.0
+) -> Any:
+    """The first update that meets the condition."""
+    async with asyncio.timeout(limit_s):
+        async for update in updates:
+            if condition(update):
+                return update
+    raise AssertionError("the stream of updates ended")
+
+
+@pytest.fixture
+async def simulator() -> AsyncIterator[RunningSimulator]:
+    async with vehicle(speed=SPEED) as running:
+        yield running
+
+
+@pytest.fixture
+async def system(simulator: RunningSimulator) -> AsyncIterator[Any]:
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(simulator.mavsdk_url)
+        found = await mavsdk.first_autopilot(20.0)
+        assert found is not None
+        yield found
+
+
+async def test_it_knows_the_vehicle_its_parameters_and_its_state(system: Any) -> None:
+    information, telemetry, parameters = InfoAsync(system), TelemetryAsync(system), ParamAsync(system)
+    version = await information.get_version()
+    assert (version.flight_sw_major, version.flight_sw_minor) == (1, 17)
+    assert (await information.get_identification()).legacy_uid == 5283920058631409231
+
+    health = await first(telemetry.subscribe_health(), lambda health: health.is_armable)
+    assert health.is_global_position_ok
+    assert health.is_home_position_ok
+    assert await first(telemetry.subscribe_health_all_ok(), lambda ok: ok)
+    assert (await first(telemetry.subscribe_gps_info())).num_satellites == 10
+    assert (await first(telemetry.subscribe_home())).absolute_altitude_m == pytest.approx(489.4, abs=0.1)
+    assert (await first(telemetry.subscribe_battery())).remaining_percent == pytest.approx(99.0, abs=1.0)
+    assert not (await first(telemetry.subscribe_rc_status())).is_available
+    down = (await first(telemetry.subscribe_imu())).acceleration_frd.down_m_s2
+    assert down == pytest.approx(-9.81, abs=0.5)
+    await telemetry.set_rate_position(10.0)
+    assert (await telemetry.get_gps_global_origin()).altitude_m == pytest.approx(489.4, abs=0.1)
+
+    everything = await parameters.get_all_params()
+    assert len(everything.int_params) + len(everything.float_params) > 250
+    await parameters.set_param_int("NAV_RCL_ACT", 3)
+    await parameters.set_param_float("MIS_TAKEOFF_ALT", 3.0)
+    assert await parameters.get_param_int("NAV_RCL_ACT") == 3
+    assert await parameters.get_param_float("MIS_TAKEOFF_ALT") == 3.0
+    for request, result in (
+        (parameters.get_param_int("NO_SUCH"), "DOES_NOT_EXIST"),
+        (parameters.set_param_float("NAV_RCL_ACT", 3.0), "TYPE_MISMATCH"),
+    ):
+        with pytest.raises(ParamError, match=result):
+            await request
+
+
+async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, system: Any) -> None:
+    action, telemetry, offboard = ActionAsync(system), TelemetryAsync(system), OffboardAsync(system)
+    await first(telemetry.subscribe_health(), lambda health: health.is_armable)
+    await action.disarm()  # it is disarmed: no error
+    with pytest.raises(OffboardError, match="NO_SETPOINT_SET"):
+        await offboard.start()
+    await action.set_takeoff_altitude(4.0)
+    await action.set_return_to_launch_altitude(12.0)
+    assert await action.get_return_to_launch_altitude() == 12.0
+    await action.arm()
+    await action.takeoff()
+    await first(telemetry.subscribe_landed_state(), lambda state: int(state) == 2)  # in the air
+    with pytest.raises(ActionError, match="COMMAND_DENIED"):
+        await action.disarm()
+
+    await offboard.set_velocity_body(VelocityBodyYawspeed(2.0, 0.0, 0.0, 0.0))
+    await offboard.start()
+    await first(telemetry.subscribe_position_velocity_ned(), lambda p: p.velocity.north_m_s > 1.0)
+    await offboard.set_velocity_ned(VelocityNedYaw(0.0, 2.0, 0.0, 90.0))
+    await first(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90.0) < 8.0)
+    await offboard.set_position_ned(PositionNedYaw(0.0, 0.0, -5.0, 0.0))
+    await first(
+        telemetry.subscribe_position_velocity_ned(),
+        lambda p: math.dist((p.position.north_m, p.position.east_m, p.position.down_m), (0, 0, -5)) < 1.0,
+    )
+    await offboard.stop()
+    await asyncio.to_thread(
+        simulator.wait_for_event, "mode HOLD", since=simulator.events.index("mode OFFBOARD")
+    )
+
+    await action.goto_location(47.3978, 8.5455942, 494.4, 0.0)
+    await first(telemetry.subscribe_position(), lambda place: place.latitude_deg > 47.39777)
+    await action.return_to_launch()
+    await asyncio.to_thread(simulator.wait_for_event, "mode RTL")
+    await action.land()
+    await first(telemetry.subscribe_armed(), lambda armed: not armed)
+
+
+async def test_what_the_vehicle_refuses_is_an_error_of_its_own() -> None:
+    async with (
+        vehicle(speed=SPEED, ready_after=600.0) as simulator,
+        Mavsdk(Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)) as mavsdk,
+    ):
+        await mavsdk.add_any_connection(simulator.mavsdk_url)
+        action = ActionAsync(await mavsdk.first_autopilot(20.0))
+        with pytest.raises(ActionError, match="COMMAND_DENIED"):
+            await action.arm()  # not ready
+        with pytest.raises(ActionError, match="UNSUPPORTED"):
+            await action.set_actuator(1, 0.5)
+        with pytest.raises(ActionError, match="VTOL"):
+            await action.transition_to_fixedwing()

@@ -1,0 +1,201 @@
+"""Collision prevention as a function of the sticks and the map of obstacles."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plan_client import listen
+
+from mavlink_sim.collision_prevention import (
+    FRAME_BODY_FRD,
+    FRAME_LOCAL_NED,
+    SECTORS,
+    UNKNOWN_CM,
+    ObstacleMap,
+    limited_acceleration,
+)
+from mavlink_sim.messages import dialect
+from mavlink_sim.parameters import Parameters
+
+FAR_CM = 2100  # nothing within the 20 m of the sensor
+STILL = (0.0, 0.0)
+
+
+def parameters(**values: float) -> Parameters:
+    return Parameters({"CP_DIST": 2.0, "CP_GUIDE_ANG": 0.0, **values})
+
+
+def obstacle_map(
+    obstacles: dict[int, int] | None = None,
+    *,
+    others: int = FAR_CM,
+    frame: int = FRAME_BODY_FRD,
+    yaw: float = 0.0,
+) -> ObstacleMap:
+    """A fresh map: centimetres by 5° sector, the rest free."""
+    distances = [others] * SECTORS
+    for sector, distance in (obstacles or {}).items():
+        distances[sector % SECTORS] = distance
+    found = ObstacleMap()
+    found.add(distances, 5.0, 0.0, 20, 2000, frame, yaw, 100.0)
+    return found
+
+
+def limit(
+    acceleration: tuple[float, float],
+    found: ObstacleMap,
+    *,
+    velocity: tuple[float, float] = STILL,
+    yaw: float = 0.0,
+    now: float = 100.0,
+    **values: float,
+) -> Any:
+    return limited_acceleration(acceleration, velocity, yaw, found, parameters(**values), now)
+
+
+def test_switched_off_it_lets_everything_through() -> None:
+    assert limit((3.0, 1.0), ObstacleMap(), CP_DIST=-1.0).acceleration == (3.0, 1.0)
+
+
+def test_without_data_the_vehicle_does_not_move_and_holds_after_five_seconds() -> None:
+    found = ObstacleMap()
+    first = limit((3.0, 0.0), found, now=100.0)
+    assert (first.acceleration, first.hold) == (STILL, False)
+    assert not limit((3.0, 0.0), found, now=104.9).hold
+    assert limit((3.0, 0.0), found, now=105.1).hold
+
+
+def test_stale_data_count_for_nothing() -> None:
+    found = obstacle_map()
+    assert limit((3.0, 0.0), found, now=100.4).acceleration != STILL
+    assert limit((3.0, 0.0), found, now=100.6).acceleration == STILL
+
+
+def test_in_the_open_the_sticks_are_obeyed() -> None:
+    north, east = limit((2.0, 1.0), obstacle_map()).acceleration
+    assert (north, east) == pytest.approx((2.0, 1.0))
+
+
+def test_the_nearer_a_wall_the_less_is_left_and_at_the_distance_to_keep_nothing() -> None:
+    left = []
+    for distance_cm in (1500, 1000, 600, 300, 200):
+        wall = obstacle_map(dict.fromkeys(range(-6, 7), distance_cm))
+        left.append(limit((3.0, 0.0), wall).acceleration[0])
+    assert left == sorted(left, reverse=True)
+    assert left[0] == pytest.approx(3.0)
+    assert left[-1] == pytest.approx(0.0)
+
+
+def test_away_from_a_wall_the_sticks_are_obeyed() -> None:
+    wall = obstacle_map({0: 210})
+    assert limit((-3.0, 0.0), wall).acceleration == pytest.approx((-3.0, 0.0))
+
+
+def test_too_near_a_wall_the_stick_towards_it_pushes_away() -> None:
+    assert limit((3.0, 0.0), obstacle_map({0: 100})).acceleration[0] < -1.0
+
+
+def test_a_vehicle_too_fast_to_stop_is_braked() -> None:
+    wall = obstacle_map({0: 500})
+    slow = limit((1.0, 0.0), wall, velocity=(0.5, 0.0)).acceleration[0]
+    fast = limit((1.0, 0.0), wall, velocity=(6.0, 0.0)).acceleration[0]
+    assert fast < -3.0 < slow
+
+
+def test_older_data_brake_earlier() -> None:
+    wall = obstacle_map({0: 700})
+    now = limit((1.0, 0.0), wall, velocity=(4.0, 0.0)).acceleration[0]
+    later = limit((1.0, 0.0), wall, velocity=(4.0, 0.0), now=100.4).acceleration[0]
+    assert later < now
+
+
+def test_a_longer_delay_brakes_earlier() -> None:
+    wall = obstacle_map({0: 700})
+    swift = limit((1.0, 0.0), wall, velocity=(4.0, 0.0), CP_DELAY=0.0).acceleration[0]
+    slow = limit((1.0, 0.0), wall, velocity=(4.0, 0.0), CP_DELAY=1.0).acceleration[0]
+    assert slow < swift
+
+
+def test_into_the_unknown_only_a_parameter_allows() -> None:
+    blind = obstacle_map({0: UNKNOWN_CM, 1: UNKNOWN_CM, 71: UNKNOWN_CM})
+    assert limit((3.0, 0.0), blind).acceleration == STILL
+    assert limit((3.0, 0.0), blind, CP_GO_NO_DATA=1).acceleration[0] > 2.0
+
+
+def test_where_a_sensor_lost_its_sight_no_parameter_allows() -> None:
+    found = obstacle_map()
+    distances = [FAR_CM] * SECTORS
+    distances[0] = UNKNOWN_CM
+    found.add(distances, 5.0, 0.0, 20, 2000, FRAME_BODY_FRD, 0.0, 100.6)
+    assert limit((3.0, 0.0), found, now=100.7, CP_GO_NO_DATA=1).acceleration == STILL
+
+
+def test_the_setpoint_is_guided_into_a_gap_beside_it() -> None:
+    wall = dict.fromkeys(range(-12, 13), 400) | {4: 1900, 5: 1900, 3: 1900}
+    _, east = limit((3.0, 0.0), obstacle_map(wall), CP_GUIDE_ANG=30.0).acceleration
+    assert east > 0.1
+    assert abs(limit((3.0, 0.0), obstacle_map(wall)).acceleration[1]) < 1e-9
+
+
+def test_north_aligned_data_turn_with_the_vehicle() -> None:
+    east_wall = obstacle_map({18: 200}, frame=FRAME_LOCAL_NED, yaw=math.pi / 2)
+    assert east_wall.distances_cm[0] == 200  # it looks east
+    assert limit((0.0, 3.0), east_wall, yaw=math.pi / 2).acceleration[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_wide_sectors_fill_all_the_narrow_ones_they_cover() -> None:
+    found = ObstacleMap()
+    found.add([300, *([FAR_CM] * 11)], 30.0, 0.0, 20, 2000, FRAME_BODY_FRD, 0.0, 100.0)
+    near = {sector for sector in range(SECTORS) if found.distances_cm[sector] == 300}
+    assert near == {70, 71, 0, 1, 2}  # of a sector that two measurements share PX4 keeps the later
+
+
+def test_a_nearer_sensor_is_not_overruled_by_one_that_sees_nothing() -> None:
+    found = obstacle_map({0: 300})
+    found.add([4000] * SECTORS, 5.0, 0.0, 20, 3000, FRAME_BODY_FRD, 0.0, 100.1)
+    assert found.distances_cm[0] == 300
+    found.add([4000] * SECTORS, 5.0, 0.0, 20, 2000, FRAME_BODY_FRD, 0.0, 100.2)
+    assert found.distances_cm[0] == 4000
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(0, 65535), min_size=SECTORS, max_size=SECTORS),
+    st.floats(-math.pi, math.pi),
+    st.tuples(st.floats(-5, 5), st.floats(-5, 5)),
+    st.tuples(st.floats(-12, 12), st.floats(-12, 12)),
+    st.floats(0, 60),
+)
+def test_whatever_is_around_the_answer_is_finite(
+    distances: list[int],
+    yaw: float,
+    acceleration: tuple[float, float],
+    velocity: tuple[float, float],
+    guide: float,
+) -> None:
+    found = ObstacleMap()
+    found.add(distances, 5.0, 0.0, 20, 2000, FRAME_BODY_FRD, yaw, 100.0)
+    got = limit(acceleration, found, velocity=velocity, yaw=yaw, CP_GUIDE_ANG=guide)
+    assert all(map(math.isfinite, got.acceleration))
+
+
+def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
+    make_cockpit: Any, velocity_setpoint: Any
+) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
+    listen(cockpit)
+    near = [150] * SECTORS
+    cockpit.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 12))
+    assert cockpit.vehicle.autopilot.navigator.obstacles.distances_cm == near
+    cockpit.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 7))
+    cockpit.fly(0.1)
+    assert cockpit.texts()[-1] == "Obstacle message received in unsupported frame 7\t"
+    cockpit.take_off()
+    north = velocity_setpoint(2, 0, 0)
+    cockpit.offboard(north)
+    cockpit.fly(2.0, north)
+    assert cockpit.vehicle.airframe.velocity[0] > 1.5

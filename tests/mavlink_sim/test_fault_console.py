@@ -1,0 +1,92 @@
+"""Faults typed on a console: pipes, files and a real terminal."""
+
+from __future__ import annotations
+
+import os
+import pty
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mavlink_sim.fault_console import FaultConsole
+from mavlink_sim.vehicle import Vehicle
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def command() -> Callable:
+    vehicle = Vehicle()
+    vehicle.add_link("onboard")
+    return vehicle.faults.command
+
+
+def test_lines_are_carried_out_when_they_are_whole(command, said) -> None:
+    reading, writing = os.pipe()
+    console = FaultConsole(reading, command, said.append)
+    console.poll()  # nothing typed: nothing waits
+    os.write(writing, b"link_del")
+    console.poll()
+    assert said == []
+    os.write(writing, b"ay 0.2\n\n# a remark\nwind\nlist\n")
+    console.poll()
+    assert said[0] == "fault 1 link_delay 0.2"
+    assert said[1].startswith("not done: wind needs speed")
+    assert said[2].startswith("1 link_delay 0.2: since")
+    os.write(writing, b"end all")
+    os.close(writing)
+    console.poll()
+    console.poll()
+    assert said[3] == "ended 1"
+    console.poll()  # the end was reached: nothing more happens
+    assert len(said) == 4
+    console.close()
+    os.close(reading)
+
+
+def test_a_file_is_read_whole(command, said, tmp_path: Path) -> None:
+    path = tmp_path / "faults"
+    path.write_text("link_loss for=3\nstall at=9")
+    descriptor = os.open(path, os.O_RDONLY)
+    console = FaultConsole(descriptor, command, said.append)
+    for _ in range(3):
+        console.poll()
+    assert said == ["fault 1 link_loss for=3", "fault 2 stall at 9 s"]
+    console.close()
+    os.close(descriptor)
+
+
+def test_a_terminal_is_read_and_may_go_away(command, said) -> None:
+    controller, terminal = pty.openpty()
+    tty.setraw(terminal)
+    console = FaultConsole(terminal, command, said.append)
+    os.write(controller, b"gust 5\n")
+    console.poll()
+    assert said == ["fault 1 gust 5"]
+    os.close(controller)
+    console.poll()
+    console.poll()
+    console.close()
+    os.close(terminal)
+
+
+def test_bytes_that_are_no_text_and_lines_without_end_do_no_harm(command, said) -> None:
+    reading, writing = os.pipe()
+    console = FaultConsole(reading, command, said.append)
+    os.write(writing, b"\xff\xfe\x00\n")
+    console.poll()
+    assert said[0].startswith("not done: ")
+    for _ in range(8):
+        os.write(writing, b"x" * 4096)
+        console.poll()
+    os.write(writing, b"\nlist\n")
+    console.poll()
+    assert said[-1] == "no faults"
+    console.close()
+    os.close(reading)
+    os.close(writing)

@@ -1,0 +1,152 @@
+"""Faults begin, end and are told of when they should; the same seed has the same faults."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mavlink_sim.fault_grammar import FaultError
+from mavlink_sim.lockstep_link import LockstepLink
+from mavlink_sim.messages import dialect, parser
+from mavlink_sim.vehicle import STEP_S
+
+
+def fly(cockpit: Any, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
+    """What a client gets, and when."""
+    got = []
+    for _ in range(round(seconds / STEP_S)):
+        cockpit.vehicle.step(STEP_S)
+        got += [(cockpit.vehicle.faults.now_s, datagram) for datagram in link.receive()]
+    return got
+
+
+def decoded(datagrams: list[tuple[float, bytes]]) -> list[Any]:
+    codec = parser()
+    return [message for _, data in datagrams for message in codec.parse_buffer(data) or []]
+
+
+def test_a_fault_begins_and_ends_at_its_time(cockpit) -> None:
+    faults = cockpit.vehicle.faults
+    number = faults.begin("heartbeat_only", at_s=2.0, duration_s=3.0)
+    assert [one.number for one in faults.scheduled] == [number]
+    cockpit.until(lambda: bool(faults.active), 5.0)
+    assert faults.now_s == pytest.approx(2.0, abs=STEP_S)
+    assert cockpit.events[-1] == "fault 1 heartbeat_only for=3 begins"
+    cockpit.until(lambda: not faults.active, 5.0)
+    assert faults.now_s == pytest.approx(5.0, abs=STEP_S)
+    assert cockpit.events[-1] == "fault 1 heartbeat_only for=3 ends"
+
+
+def test_faults_are_ended_by_number_by_name_and_all_together(cockpit) -> None:
+    faults = cockpit.vehicle.faults
+    numbers = [faults.begin(line) for line in ("link_delay 0.1", "link_delay 0.2", "wind 3", "stall at=99")]
+    assert faults.end(numbers[0]) == 1
+    assert faults.end("link_delay") == 1
+    assert faults.end() == 2
+    assert faults.end("all") == 0
+    assert faults.listing() == ["no faults"]
+    with pytest.raises(FaultError, match="no fault 1 to end"):
+        faults.end(1)
+
+
+def test_values_may_be_given_in_python(cockpit) -> None:
+    faults = cockpit.vehicle.faults
+    faults.begin("packet_loss", 0.25, link="gcs", way="out", duration_s=2.0, seed=5)
+    assert str(faults.active[0]) == "1 packet_loss 0.25 link=gcs way=out for=2"
+    assert faults.active[0].seed == 5
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [("link_loss link=usb", "there are: all, onboard, gcs"), ("wind 3 at=0.5", "at=0.5 is over")],
+)
+def test_a_fault_that_cannot_begin_is_refused_at_once(cockpit, line, said) -> None:
+    cockpit.fly(1.0)
+    with pytest.raises(FaultError, match=said):
+        cockpit.vehicle.faults.begin(line)
+    assert cockpit.vehicle.faults.listing() == ["no faults"]
+
+
+def test_a_scheduled_fault_that_cannot_begin_then_is_told_of(cockpit) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(400, 1) == [0]
+    cockpit.vehicle.faults.begin("pilot_takeover MISSION at=5")
+    cockpit.until(lambda: any("did not begin" in event for event in cockpit.events), 5.0)
+    assert not cockpit.vehicle.faults.active
+
+
+def test_commands_of_the_grammar_are_answered_for_a_person(cockpit) -> None:
+    command = cockpit.vehicle.faults.command
+    assert command("list").text == "no faults"
+    assert command("link_delay 0.2 for=3").text == "fault 1 link_delay 0.2 for=3"
+    assert command("gust 5 at=9").text == "fault 2 gust 5 at 9 s"
+    assert command("list").text.splitlines() == [
+        "1 link_delay 0.2 for=3: since 0.0 s, 3.0 s left",
+        "2 gust 5: begins at 9 s",
+    ]
+    assert "link_delay SECONDS" in command("help link_delay").text
+    assert len(command("help").text.splitlines()) > 20
+    refused = command("link_delay")
+    assert not refused.ok
+    assert "needs seconds" in refused.text
+    assert command("end all").text == "ended 2"
+    assert not command("end 7").ok
+    assert not command("end").ok
+    assert not command("help nothing").ok
+
+
+def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit) -> None:
+    def flight(seed: int) -> list[tuple[float, bytes]]:
+        cockpit = make_cockpit(seed=seed)
+        link = LockstepLink(cockpit.vehicle, "onboard")
+        for line in (
+            "packet_loss 0.2",
+            "corrupt 0.1",
+            "link_delay 0.05 jitter=0.05",
+            "duplicate 0.1",
+            "gust 6",
+        ):
+            cockpit.vehicle.faults.begin(line)
+        return [(at, data) for at, data in fly(cockpit, link, 2.0) if data[7:10] != b"\x02\0\0"]
+
+    one, again, other = flight(3), flight(3), flight(4)
+    # SYSTEM_TIME and the remote identification carry the world's time
+    assert [at for at, _ in one] == [at for at, _ in again]
+    assert sum(a == b for a, b in zip(one, again, strict=True)) > 0.95 * len(one)
+    assert [at for at, _ in one] != [at for at, _ in other]
+
+
+def test_a_dead_link_carries_nothing_either_way(cockpit) -> None:
+    link = LockstepLink(cockpit.vehicle, "onboard")
+    assert fly(cockpit, link, 0.5)
+    cockpit.vehicle.faults.begin("link_loss link=onboard for=1")
+    link.send(dialect.MAVLink_command_long_message(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0))
+    assert not fly(cockpit, link, 0.99)
+    kinds = {message.get_type() for message in decoded(fly(cockpit, link, 0.5))}
+    assert "ATTITUDE" in kinds
+    assert "AUTOPILOT_VERSION" not in kinds
+
+
+def test_a_delay_holds_back_the_answer_both_ways(cockpit) -> None:
+    link = LockstepLink(cockpit.vehicle, "onboard")
+    cockpit.vehicle.faults.begin("link_delay 0.3")
+    link.send(dialect.MAVLink_timesync_message(0, 77))
+    for at_s, data in fly(cockpit, link, 1.0):
+        for message in parser().parse_buffer(data) or []:
+            if message.get_type() == "TIMESYNC" and message.tc1:
+                assert message.ts1 == 77
+                assert at_s == pytest.approx(0.6, abs=0.02)
+                return
+    raise AssertionError("no answer")
+
+
+def test_one_direction_of_one_link_can_be_meant(cockpit) -> None:
+    onboard, gcs = LockstepLink(cockpit.vehicle, "onboard"), LockstepLink(cockpit.vehicle, "gcs")
+    cockpit.vehicle.faults.begin("link_loss link=onboard way=in")
+    onboard.send(dialect.MAVLink_timesync_message(0, 77))
+    gcs.send(dialect.MAVLink_timesync_message(0, 78), (245, 190))
+    heard_onboard, heard_gcs = decoded(fly(cockpit, onboard, 0.5)), decoded([(0.0, d) for d in gcs.receive()])
+    assert heard_onboard
+    assert not [m for m in heard_onboard if m.get_type() == "TIMESYNC" and m.ts1 == 77]
+    assert [m for m in heard_gcs if m.get_type() == "TIMESYNC" and m.ts1 == 78]

@@ -1,0 +1,142 @@
+"""Many vehicles in one process: ids, ports, places, seeds, one clock."""
+
+import json
+import math
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+
+from mavlink_sim.cli import main
+from mavlink_sim.fleet import instance_options, places
+from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.simulation import SimulationOptions
+from mavlink_sim.testing import free_udp_port_range, running_simulator
+
+METRE_DEG = math.degrees(1.0 / 6371000.0)
+
+
+def test_ids_and_ports_count_up_as_in_px4s_sitl() -> None:
+    fleet = instance_options(SimulationOptions(seed=10), 20, 5.0)
+    assert [one.system_id for one in fleet] == list(range(1, 21))
+    assert [one.onboard_port for one in fleet] == list(range(14540, 14560))
+    assert [one.onboard_bind for one in fleet] == list(range(14580, 14600))
+    assert {one.gcs_port for one in fleet} == {14550}
+    assert [one.gcs_bind for one in fleet] == list(range(18570, 18590))
+    assert [one.seed for one in fleet] == list(range(10, 30))
+
+
+def test_places_are_a_grid_without_two_in_one() -> None:
+    grid = places(20, 5.0)
+    assert grid[0] == (0.0, 0.0)
+    assert len(set(grid)) == 20
+    assert max(max(place) for place in grid) == 20.0
+    assert min(math.dist(a, b) for a in grid for b in grid if a != b) == 5.0
+
+
+def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
+    options = SimulationOptions(camera="eye", truth=Path("truth.jsonl"))
+    fleet = instance_options(options, 3, 5.0)
+    assert [one.camera for one in fleet] == ["eye", None, None]
+    assert [one.camera for one in instance_options(options, 3, 5.0, camera_vehicle=2)] == [None, "eye", None]
+    assert [str(one.truth) for one in fleet] == ["truth.jsonl", "truth-2.jsonl", "truth-3.jsonl"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--vehicles", "0"], ["0 vehicles", "1 to 250"]),
+        (["--vehicles", "10", "--system-id", "250"], ["255"]),
+        (["--vehicles", "10", "--onboard-port", "65530"], ["--onboard-port", "65535"]),
+        (["--vehicles", "2", "--camera-vehicle", "3"], ["camera", "3"]),
+        (["--spacing", "0"], ["--spacing", "0.5 to 1000"]),
+        (["--noise", "some"], ["--noise", "on or off"]),
+    ],
+    ids=["none", "ids", "ports", "camera", "spacing", "noise"],
+)
+def test_a_fleet_that_cannot_be_is_refused_in_one_line(
+    arguments: list[str],
+    words: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", "--onboard-bind", "0", "--gcs-bind", "0", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert all(word in line for word in words)
+
+
+def test_each_has_its_own_home_and_a_local_frame_that_begins_there() -> None:
+    first = LockstepVehicle(noise=False)
+    second = LockstepVehicle(noise=False, start_ned_m=(10.0, 20.0))
+    for vehicle in (first, second):  # in turns, as a fleet's are
+        vehicle.step(2.0)
+    for _ in range(3):
+        for vehicle in (first, second):
+            vehicle.step(1.0)
+    here, there = (vehicle.newest["onboard"]["GLOBAL_POSITION_INT"] for vehicle in (first, second))
+    assert (there.lat - here.lat) * 1e-7 == pytest.approx(10.0 * METRE_DEG, rel=0.01)
+    east = 20.0 * METRE_DEG / math.cos(math.radians(47.4))
+    assert (there.lon - here.lon) * 1e-7 == pytest.approx(east, rel=0.01)
+    local = second.newest["onboard"]["LOCAL_POSITION_NED"]
+    assert (local.x, local.y) == (0.0, 0.0)
+    origin, home = (second.newest["onboard"][name] for name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"))
+    assert (origin.latitude, origin.longitude) == (there.lat, there.lon) == (home.latitude, home.longitude)
+
+
+def test_a_place_given_in_degrees_is_flown_to_from_another_start() -> None:
+    vehicle = LockstepVehicle({"onboard": {}}, noise=False, gusts_mps=0.0, start_ned_m=(10.0, 20.0))
+    vehicle.take_off(5.0)
+    # SIH's home, ten metres south and twenty west of where this one started
+    place = (47.397743225, 8.545594215, 494.4)
+    assert vehicle.command(192, -1.0, 1.0, 0.0, math.nan, *place) == "ACCEPTED"
+    vehicle.step(25.0)
+    north, east, _ = vehicle.truth.position_ned_m
+    assert (north, east) == pytest.approx((-10.0, -20.0), abs=0.7)
+
+
+def heard(port: int, wanted: set[int], limit_s: float = 40.0) -> dict[int, dict[str, Any]]:
+    """The newest messages by system and type, once each wanted system told its position."""
+    link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245)
+    newest: dict[int, dict[str, Any]] = defaultdict(dict)
+    deadline = time.monotonic() + limit_s
+    try:
+        while time.monotonic() < deadline:
+            message = link.recv_match(blocking=True, timeout=1)
+            if message is not None and not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):
+                newest[message.get_srcSystem()][message.get_type()] = message
+            if all({"HEARTBEAT", "GLOBAL_POSITION_INT"} <= set(newest[system]) for system in wanted):
+                return dict(newest)
+    finally:
+        link.close()
+    raise AssertionError(f"heard {sorted(newest)} of {sorted(wanted)}")
+
+
+def test_a_fleet_in_one_process_speaks_on_its_ports(tmp_path: Path) -> None:
+    ready = tmp_path / "ready.json"
+    with running_simulator(vehicles=3, spacing=50.0, ready_file=ready) as simulator:
+        assert [one.system_id for one in simulator.vehicles] == [1, 2, 3]
+        ports = [one.onboard_port for one in simulator.vehicles]
+        assert ports == list(range(ports[0], ports[0] + 3))
+        assert {one.gcs_port for one in simulator.vehicles} == {simulator.gcs_port}
+        everybody = heard(simulator.gcs_port, {1, 2, 3})  # all speak to the one ground station
+        assert len({place["GLOBAL_POSITION_INT"].lon for place in everybody.values()}) >= 2
+        assert set(heard(ports[1], {2})) == {2}  # and each to its own companion
+        report = json.loads(ready.read_text())
+        assert [one["system_id"] for one in report["vehicles"]] == [1, 2, 3]
+        third = simulator.vehicles[2]
+        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{third.onboard_port}", source_system=3)
+        link.wait_heartbeat(timeout=30)
+        link.mav.command_long_send(3, 1, 176, 0, 1, 4, 6, 0, 0, 0, 0)
+        simulator.wait_for_event("vehicle 3: mode LAND", 30.0)
+        link.close()
+
+
+def test_a_range_of_ports_is_free() -> None:
+    start = free_udp_port_range(5)
+    assert 1024 < start <= 65531

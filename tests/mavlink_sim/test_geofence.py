@@ -1,0 +1,197 @@
+"""The geofence: what is inside, what is refused, and what happens at a breach."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from plan_client import circle, listen, polygon, upload
+
+from mavlink_sim.geofence import Area, inside_polygon
+
+FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
+metres = st.floats(-100.0, 100.0)
+centimetres = st.integers(-10_000, 10_000)
+
+
+@pytest.fixture
+def cockpit(make_cockpit: Any) -> Any:
+    """A vehicle that is ready at once."""
+    return make_cockpit(ready_after_s=0.0)
+
+
+# ---- geometry
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 35), st.floats(1.0, 100.0)),
+        min_size=3,
+        max_size=12,
+        unique_by=lambda v: v[0],
+    ),
+    metres,
+    metres,
+)
+def test_a_star_shaped_polygon_is_told_as_opencv_tells_it(
+    spokes: list[tuple[int, float]], north: float, east: float
+) -> None:
+    corners = [
+        (length * math.cos(math.radians(10 * spoke)), length * math.sin(math.radians(10 * spoke)))
+        for spoke, length in sorted(spokes)
+    ]
+    contour = np.array(corners, dtype=np.float32)
+    distance = cv2.pointPolygonTest(contour, (north, east), True)
+    assume(abs(distance) > 0.01)  # on the edge either answer will do
+    assert inside_polygon(corners, (north, east)) == (distance > 0)
+
+
+@given(centimetres, centimetres, centimetres, centimetres, metres, metres, st.booleans())
+def test_inclusion_and_exclusion_are_opposites(
+    a: int, b: int, c: int, d: int, north: float, east: float, is_circle: bool
+) -> None:
+    corners = ((a / 100, b / 100), (c / 100, d / 100), (b / 100, d / 100))
+    radius = abs(a) / 100 if is_circle else None
+    inside, outside = Area(corners, True, radius), Area(corners, False, radius)
+    assert inside.allows((north, east)) != outside.allows((north, east))
+
+
+def test_a_polygon_of_nothing_holds_nothing() -> None:
+    assert not inside_polygon([], (0.0, 0.0))
+    assert not inside_polygon([(0.0, 0.0), (1.0, 1.0)], (0.5, 0.5))
+
+
+# ---- upload
+
+
+def test_a_fence_without_home_is_left_out_and_said(cockpit: Any) -> None:
+    listen(cockpit)
+    assert upload(cockpit, polygon(FENCE, inclusion=False), 1) == 0
+    cockpit.fly(0.1)
+    assert cockpit.texts()[-1] == "Geofence invalid, doesn't contain Home position\t"
+    cockpit.fly(0.5)
+    assert cockpit.vehicle.autopilot.can_arm
+
+
+def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpit: Any) -> None:
+    listen(cockpit)
+    cockpit.take_off(4.0)
+    cockpit.vehicle.airframe.position = (0.0, 40.0, -4.0)
+    cockpit.fly(0.01)  # until the estimate knows
+    upload(cockpit, polygon(FENCE), 1)
+    cockpit.fly(0.5)
+    assert "Geofence invalid, doesn't contain current vehicle position\t" in cockpit.texts()
+    assert cockpit.mode == "HOLD"
+    assert not cockpit.vehicle.autopilot.failsafe
+
+
+# ---- arming
+
+
+def test_outside_the_fence_nobody_arms(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0)
+    listen(cockpit)
+    upload(cockpit, [circle(0, 0, 10.0)], 1)
+    cockpit.fly(0.3)
+    assert cockpit.vehicle.autopilot.can_arm
+    cockpit.vehicle.airframe.position = (15.0, 0.0, 0.0)
+    cockpit.fly(0.3)
+    assert cockpit.texts()[-1] == "Geofence: approaching or outside geofence"
+    assert cockpit.command(400, 1) == [1]
+    assert cockpit.heartbeat().system_status == 0
+
+
+def test_without_an_action_the_fence_is_not_looked_at(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 0})
+    upload(cockpit, [circle(0, 0, 10.0)], 1)
+    cockpit.vehicle.airframe.position = (15.0, 0.0, 0.0)
+    cockpit.fly(0.3)
+    assert cockpit.vehicle.autopilot.can_arm
+
+
+# ---- breaches
+
+
+def fly_out(cockpit: Any, velocity_setpoint: Any, **parameters: float) -> None:
+    """Into the air, and north in OFFBOARD until the fence at 8 m is broken."""
+    listen(cockpit)
+    cockpit.take_off(4.0)
+    upload(cockpit, [circle(0, 0, 8.0)], 1)
+    north = velocity_setpoint(4, 0, 0)
+    cockpit.offboard(north)
+    cockpit.until(
+        lambda: cockpit.vehicle.autopilot.failsafe or cockpit.vehicle.airframe.position[0] > 14.0, 20.0, north
+    )
+    cockpit.fly(0.3, north)
+
+
+@pytest.mark.parametrize(
+    ("action", "mode", "words"),
+    [
+        (1, "OFFBOARD", "Failsafe warning\t"),
+        (2, "HOLD", "Failsafe activated\t"),
+        (3, "RTL", "Failsafe activated\t"),
+        (5, "LAND", "Failsafe activated\t"),
+    ],
+)
+def test_a_breach_does_what_gf_action_says(
+    make_cockpit: Any, velocity_setpoint: Any, action: int, mode: str, words: str
+) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": action})
+    fly_out(cockpit, velocity_setpoint)
+    assert cockpit.mode == mode
+    assert "Geofence: approaching or outside geofence" in cockpit.texts()
+    assert words in cockpit.texts()
+    assert cockpit.heartbeat().system_status == (4 if action == 1 else 5)
+    assert any("geofence breached" in event for event in cockpit.events)
+
+
+def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
+    cockpit: Any, velocity_setpoint: Any
+) -> None:
+    north = velocity_setpoint(4, 0, 0)
+    fly_out(cockpit, velocity_setpoint)
+    cockpit.fly(3.0, north)
+    assert cockpit.mode == "HOLD"
+    assert cockpit.vehicle.airframe.position[0] < 16.0
+    home = velocity_setpoint(-3, 0, 0)
+    cockpit.offboard(home)  # the user may, on purpose, still outside
+    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] < 6.0, 10.0, home)
+    assert cockpit.mode == "OFFBOARD"
+    cockpit.until(lambda: cockpit.mode == "HOLD", 10.0, north)  # and the next breach counts anew
+
+
+def test_termination_stops_the_motors(make_cockpit: Any, velocity_setpoint: Any) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 4})
+    fly_out(cockpit, velocity_setpoint)
+    assert cockpit.heartbeat().system_status == 8
+    cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 5.0)
+    assert cockpit.vehicle.airframe.thrust_mps2 < 0.1
+    assert cockpit.armed
+
+
+@pytest.mark.parametrize(
+    ("parameter", "setpoint", "words"),
+    [
+        ("GF_MAX_HOR_DIST", (4, 0, 0), "Geofence: exceeding maximum distance to Home"),
+        ("GF_MAX_VER_DIST", (0, 0, -2), "Geofence: exceeding maximum altitude above Home"),
+    ],
+)
+def test_the_greatest_distances_from_home_are_a_fence_too(
+    make_cockpit: Any, velocity_setpoint: Any, parameter: str, setpoint: tuple[float, ...], words: str
+) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={parameter: 8.0})
+    listen(cockpit)
+    cockpit.take_off(4.0)
+    away = velocity_setpoint(*setpoint)
+    cockpit.offboard(away)
+    cockpit.until(lambda: cockpit.mode == "HOLD", 20.0, away)
+    cockpit.fly(0.1)
+    assert words in cockpit.texts()
+    assert cockpit.vehicle.autopilot.failsafe

@@ -1,0 +1,152 @@
+"""The vehicle in one's own process: stepped, spoken to, looked at."""
+
+import hashlib
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import mavlink_sim
+from mavlink_sim import CommandRefusedError, LockstepVehicle, NotReachedError
+from mavlink_sim.messages import dialect
+from mavlink_sim.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
+
+
+def flight(seed: int, links: dict[str, dict[str, float]] | None = None) -> tuple[str, Any]:
+    """A take-off, a few seconds of OFFBOARD, a landing: the digest of every byte sent, and where it ended."""
+    vehicle = LockstepVehicle(
+        {"onboard": ONBOARD_RATES_HZ, "gcs": GCS_RATES_HZ} if links is None else links, seed=seed
+    )
+    vehicle.take_off(4.0)
+    ahead = dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 2552, 3, 2, -5, 0, 0, 0, 0, 0, 0, 0.5, 0
+    )
+    stream = vehicle.repeat(ahead, 20.0)
+    vehicle.step(0.2)
+    vehicle.set_mode("OFFBOARD")
+    vehicle.step(5.0)
+    vehicle.land()
+    stream.stop()
+    digest = hashlib.sha256()
+    for link in vehicle.newest:
+        digest.update(vehicle.receive_bytes(link))
+    return digest.hexdigest(), vehicle.truth
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[str, Any]:
+    return flight(5)
+
+
+def test_the_same_seed_is_the_same_flight_to_the_last_byte(flown: tuple[str, Any]) -> None:
+    assert flight(5) == flown
+
+
+def test_another_seed_is_another_flight(flown: tuple[str, Any]) -> None:
+    other = flight(6, {"onboard": ONBOARD_RATES_HZ})
+    assert flown[0] != other[0]
+    assert flown[1] != other[1]
+
+
+def test_the_number_of_links_does_not_change_the_flight(flown: tuple[str, Any]) -> None:
+    assert flown[1] == flight(5, {"onboard": {}})[1]
+
+
+def test_another_process_flies_the_same_flight() -> None:
+    program = (
+        "import hashlib\nfrom mavlink_sim import LockstepVehicle\n"
+        "vehicle = LockstepVehicle(seed=3)\nvehicle.take_off()\n"
+        "print(hashlib.sha256(vehicle.receive_bytes()).hexdigest())"
+    )
+    vehicle = LockstepVehicle(seed=3)
+    vehicle.take_off()
+    own = hashlib.sha256(vehicle.receive_bytes()).hexdigest()
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == own
+
+
+def test_three_lines_fly() -> None:
+    vehicle = LockstepVehicle(seed=1)
+    vehicle.take_off(5.0)
+    assert 3.5 < vehicle.truth.height_m < 6.0
+    assert vehicle.events == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD"]
+
+
+def test_time_passes_only_when_it_is_stepped_and_by_as_much() -> None:
+    vehicle = LockstepVehicle()
+    assert vehicle.now_s == 0.0
+    vehicle.step(0.01)
+    vehicle.step(0.01)
+    assert vehicle.now_s == pytest.approx(0.02)
+    with pytest.raises(ValueError, match="-1"):
+        vehicle.step(-1.0)
+    with pytest.raises(ValueError, match="nan"):
+        vehicle.step(math.nan)
+
+
+def test_messages_come_out_once_and_in_order() -> None:
+    vehicle = LockstepVehicle()
+    vehicle.step(1.0)
+    messages = vehicle.receive()
+    stamps = [message.time_boot_ms for message in messages if message.get_type() == "ATTITUDE"]
+    assert stamps == sorted(stamps)
+    assert 95 <= len(stamps) <= 99
+    assert vehicle.receive() == []
+    assert vehicle.newest["onboard"]["HEARTBEAT"].autopilot == 12
+
+
+def test_bytes_go_in_as_messages_do() -> None:
+    vehicle = LockstepVehicle({"onboard": {}})
+    codec = dialect.MAVLink(None, 1, 191)
+    packet = dialect.MAVLink_timesync_message(0, 77).pack(codec)
+    assert vehicle.send_bytes(b"noise" + packet[:9]) == 0
+    assert vehicle.send_bytes(packet[9:]) == 1
+    assert vehicle.newest["onboard"]["TIMESYNC"].ts1 == 77
+
+
+def test_a_quiet_link_sends_answers_alone() -> None:
+    vehicle = LockstepVehicle({"onboard": {}})
+    vehicle.step(4.0)
+    told = {message.get_type() for message in vehicle.receive()}
+    assert told <= {"GPS_GLOBAL_ORIGIN"}
+    assert vehicle.command(512, 30) == "ACCEPTED"
+    assert {message.get_type() for message in vehicle.receive()} == {"ATTITUDE", "COMMAND_ACK"}
+
+
+@pytest.mark.parametrize(
+    ("act", "error", "words"),
+    [
+        (lambda v: v.run_until(lambda t: t.height_m > 1, 2.0), NotReachedError, ["2 s", "HOLD", "disarmed"]),
+        (lambda v: (v.take_off(), v.set_mode("OFFBOARD")), CommandRefusedError, ["OFFBOARD", "TEMPORARILY"]),
+        (lambda v: v.set_mode("HOVER"), ValueError, ["HOVER", "OFFBOARD"]),
+    ],
+    ids=["limit", "refused", "no such mode"],
+)
+def test_what_does_not_happen_is_said(
+    act: Callable[[LockstepVehicle], object], error: type[Exception], words: list[str]
+) -> None:
+    vehicle = LockstepVehicle({"onboard": {}})
+    with pytest.raises(error) as raised:
+        act(vehicle)
+    for word in words:
+        assert word in str(raised.value)
+
+
+def test_the_time_of_day_is_stepped_too() -> None:
+    vehicle = LockstepVehicle()
+    vehicle.step(3.0)
+    first = vehicle.newest["onboard"]["SYSTEM_TIME"]
+    vehicle.step(10.0)
+    second = vehicle.newest["onboard"]["SYSTEM_TIME"]
+    passed_us = (second.time_boot_ms - first.time_boot_ms) * 1000
+    assert second.time_unix_usec - first.time_unix_usec == pytest.approx(passed_us, abs=1000)
+
+
+def test_the_package_names_what_it_offers() -> None:
+    for name in mavlink_sim.__all__:
+        assert getattr(mavlink_sim, name) is not None
+    with pytest.raises(AttributeError, match="nothing_here"):
+        _ = mavlink_sim.nothing_here

@@ -1,0 +1,137 @@
+"""Missions, fences and rally points by MAVSDK over UDP: a client that nobody here wrote."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio.plugins.action import ActionAsync
+from mavsdk.asyncio.plugins.geofence import GeofenceAsync
+from mavsdk.asyncio.plugins.mission import MissionAsync
+from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
+from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk.plugins.geofence.geofence import Circle, FenceType, GeofenceData, Point, Polygon
+from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
+from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
+from plan_client import item, land, polygon, rally, takeoff, waypoint
+
+from mavlink_sim.geography import geographic
+from mavlink_sim.testing import RunningSimulator, running_simulator
+
+SPEED = 6.0
+LIMIT_S = 80.0
+
+
+async def wait_for(updates: Any, condition: Callable[[Any], bool]) -> Any:
+    """The first update that meets the condition."""
+    async with asyncio.timeout(LIMIT_S):
+        async for update in updates:
+            if condition(update):
+                return update
+    raise AssertionError("the stream of updates ended")
+
+
+@asynccontextmanager
+async def flown_by_mavsdk() -> AsyncIterator[tuple[RunningSimulator, Any]]:
+    """A vehicle in its process and MAVSDK's view of it, ready to arm."""
+    with running_simulator(speed=SPEED, parameters={"RTL_RETURN_ALT": 5.0}) as simulator:
+        configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+        async with Mavsdk(configuration) as mavsdk:
+            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.onboard_port}")
+            system = await mavsdk.first_autopilot(20.0)
+            assert system is not None
+            await wait_for(TelemetryAsync(system).subscribe_health(), lambda health: health.is_armable)
+            yield simulator, system
+
+
+def place(north: float, east: float) -> tuple[float, float]:
+    latitude, longitude, _ = geographic((north, east, 0.0))
+    return latitude, longitude
+
+
+def mission_item(north: float, east: float, **options: Any) -> MissionItem:
+    latitude, longitude = place(north, east)
+    return MissionItem(latitude, longitude, 4.0, is_fly_through=True, acceptance_radius_m=1.0, **options)
+
+
+def raw(items: list[dict[str, Any]]) -> list[RawItem]:
+    """Items for the plugin mission_raw."""
+    return [RawItem(seq=index, current=int(index == 0), **fields) for index, fields in enumerate(items)]
+
+
+async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
+    async with flown_by_mavsdk() as (simulator, system):
+        mission, action, telemetry = MissionAsync(system), ActionAsync(system), TelemetryAsync(system)
+        plan = MissionPlan(
+            [
+                mission_item(0, 0, vehicle_action=MissionItem.VehicleAction.TAKEOFF),
+                mission_item(8, 0, speed_m_s=3.0),
+                mission_item(8, 12, camera_action=MissionItem.CameraAction.TAKE_PHOTO),
+            ]
+        )
+        await mission.set_return_to_launch_after_mission(True)
+        await mission.upload_mission(plan)
+        back = await mission.download_mission()
+        assert len(back.mission_items) == 3
+        assert back.mission_items[1].latitude_deg == pytest.approx(plan.mission_items[1].latitude_deg)
+        assert back.mission_items[1].speed_m_s == pytest.approx(3.0)
+
+        await action.arm()
+        await mission.start_mission()
+        await wait_for(mission.subscribe_mission_progress(), lambda progress: progress.current >= 2)
+        await mission.pause_mission()
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
+        assert not await mission.is_mission_finished()
+        await mission.start_mission()
+        done = await wait_for(
+            mission.subscribe_mission_progress(), lambda progress: progress.current == progress.total
+        )
+        assert done.total == 3
+        assert await mission.is_mission_finished()
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "RETURN_TO_LAUNCH")
+        await wait_for(telemetry.subscribe_armed(), lambda armed: not armed)
+        simulator.wait_for_event("disarmed (after landing)")
+
+        await mission.clear_mission()
+        assert (await mission.download_mission()).mission_items == []
+
+
+async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
+    async with flown_by_mavsdk() as (_, system):
+        missions = MissionRawAsync(system)
+        flight = raw([takeoff(4.0), waypoint(5, 5, 4.0), item(93, None, 2.0), land(5, 5)])
+        fence = raw(polygon([(-40, -40), (40, -40), (40, 40), (-40, 40)]))
+        points = raw([rally(20, 0), rally(0, 20)])
+        await missions.upload_mission(flight)
+        await missions.upload_geofence(fence)
+        await missions.upload_rally_points(points)
+        for sent, got in (
+            (flight, await missions.download_mission()),
+            (fence, await missions.download_geofence()),
+            (points, await missions.download_rallypoints()),
+        ):
+            assert [(i.command, i.x, i.y, i.z, i.mission_type) for i in got] == [
+                (i.command, i.x, i.y, i.z, i.mission_type) for i in sent
+            ]
+        await missions.set_current_mission_item(2)
+        seen = await wait_for(missions.subscribe_mission_progress(), lambda progress: progress.current == 2)
+        assert seen.total == 4
+
+
+async def test_mavsdk_sets_and_clears_a_geofence() -> None:
+    async with flown_by_mavsdk() as (_, system):
+        fence = GeofenceAsync(system)
+        corners = [Point(*place(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
+        inside = Polygon(corners, FenceType.INCLUSION)
+        around = Circle(Point(*place(0, 0)), 15.0, FenceType.INCLUSION)
+        await fence.upload_geofence(GeofenceData([inside], [around]))
+        back = await fence.download_geofence()
+        assert len(back.polygons[0].points) == 4
+        assert back.circles[0].radius == pytest.approx(15.0)
+
+        await fence.clear_geofence()
+        assert not (await fence.download_geofence()).circles

@@ -1,0 +1,137 @@
+"""What was measured of a real PX4's links: what they carry, how much of it, and who hears it."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common
+
+from mavlink_sim.messages import dialect, parser
+
+GCS = 6
+ONBOARD_CONTROLLER = 18
+# Messages of PX4 that pip's pymavlink 2.4.50 does not have in its `common` dialect.
+UNKNOWN_TO_COMMON = {8, 300, 380, 395, 397, 410, 411, 435, 436}
+SIGNATURE_BYTES = 13  # the vehicle that was measured signed what it sent
+
+
+def names(cockpit: Any, link: str = "onboard") -> Counter[str]:
+    return Counter(item.message.get_type() for _, item in cockpit.inbox[link])
+
+
+def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockpit: Any) -> None:
+    alone, heard = make_cockpit(), make_cockpit()
+    heard.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
+    for cockpit in (alone, heard):
+        cockpit.wait_ready()
+        cockpit.forget()
+        cockpit.fly(10.0)
+    assert names(alone) == names(heard)
+
+
+def test_the_onboard_link_carries_about_29_kilobytes_a_second_in_flight(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(gusts_mps=None)
+    cockpit.take_off()
+    cockpit.forget()
+    cockpit.fly(10.0)
+    codec = parser()
+    size = sum(len(item.pack(codec)) + SIGNATURE_BYTES for _, item in cockpit.inbox["onboard"]) / 10.0
+    assert size == pytest.approx(29_000, rel=0.15)
+
+
+def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(cockpit: Any) -> None:
+    cockpit.take_off()
+    cockpit.command(519, 1)
+    codec, reader = parser(), common.MAVLink(None)
+    unknown = set()
+    for _, item in cockpit.inbox["onboard"]:
+        (message,) = reader.parse_buffer(item.pack(codec))
+        if message.get_type().startswith("UNKNOWN_"):
+            unknown.add(int(message.get_type().removeprefix("UNKNOWN_")))
+    assert {8, 300, 380, 410, 411, 436} <= unknown <= UNKNOWN_TO_COMMON
+
+
+def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
+    cockpit: Any, velocity_setpoint: Any
+) -> None:
+    cockpit.wait_ready()
+    assert "POSITION_TARGET_GLOBAL_INT" not in names(cockpit)  # not on the ground
+    cockpit.take_off(4.0)
+    stream = velocity_setpoint(0, 0, 0)
+    cockpit.offboard(stream)
+    cockpit.forget()
+    cockpit.fly(2.0, stream)
+    assert "POSITION_TARGET_GLOBAL_INT" not in names(cockpit)
+    for command in (21, 20):
+        cockpit.command(command)
+        cockpit.forget()
+        cockpit.fly(1.0)
+        assert 9 <= names(cockpit)["POSITION_TARGET_GLOBAL_INT"] <= 10
+
+
+def test_a_heartbeat_comes_once_a_second_whatever_happens(cockpit: Any, velocity_setpoint: Any) -> None:
+    cockpit.wait_ready()
+    cockpit.forget()
+    started = cockpit.now_s
+    cockpit.command(400, 1)
+    cockpit.command(22, *[float("nan")] * 7)
+    cockpit.fly(9.0)
+    stream = velocity_setpoint(0, 0, 0)
+    cockpit.offboard(stream)
+    cockpit.until(lambda: cockpit.mode == "RTL", 10.0)
+    cockpit.command(21)
+    cockpit.until(lambda: not cockpit.armed)
+    stamps = [stamp for stamp, item in cockpit.inbox["onboard"] if item.message.get_type() == "HEARTBEAT"]
+    assert len(stamps) == pytest.approx(cockpit.now_s - started, abs=1.01)
+    gaps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
+    assert min(gaps) == pytest.approx(1.0, abs=0.01)
+    assert max(gaps) == pytest.approx(1.0, abs=0.01)
+
+
+def test_what_a_heartbeat_shows_lags_by_up_to_a_second(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    cockpit.heartbeat()
+    cockpit.fly(0.02)
+    cockpit.command(400, 1)
+    changed = cockpit.now_s
+    assert cockpit.heartbeat().base_mode == 157
+    assert 0.9 < cockpit.now_s - changed <= 1.0
+
+
+def test_the_old_request_for_a_data_stream_is_ignored(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    cockpit.forget()
+    for start in (0, 1):
+        cockpit.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 50, start))
+    cockpit.fly(2.0)
+    assert 196 <= names(cockpit)["ATTITUDE"] <= 198
+    assert 1 <= names(cockpit)["HEARTBEAT"] <= 2
+    assert "COMMAND_ACK" not in names(cockpit)
+
+
+def test_its_own_time_synchronisation_and_pings_are_requests_to_all(cockpit: Any) -> None:
+    cockpit.fly(5.0)
+    requests = cockpit.received("TIMESYNC")
+    assert len(requests) == pytest.approx(49, abs=1)
+    assert all(request.tc1 == 0 and request.ts1 > 0 for request in requests)
+    pings = cockpit.received("PING")
+    assert [(ping.target_system, ping.target_component) for ping in pings] == [(0, 0)] * len(pings)
+    assert [ping.seq for ping in pings] == list(range(pings[0].seq, pings[0].seq + len(pings)))
+
+
+def test_a_ground_stations_heartbeat_reaches_the_companion_under_the_ground_stations_name(
+    cockpit: Any,
+) -> None:
+    cockpit.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
+    cockpit.fly(5.0)
+    sources = Counter((item.system, item.component) for _, item in cockpit.inbox["onboard"] if item.forwarded)
+    assert sources[245, 190] == pytest.approx(5, abs=1)
+    own = [
+        item.message
+        for _, item in cockpit.inbox["onboard"]
+        if (item.system, item.component) == (1, 1) and item.message.get_type() == "HEARTBEAT"
+    ]
+    assert {message.autopilot for message in own} == {12}

@@ -1,0 +1,147 @@
+"""Every STATUSTEXT that was seen of a real PX4: its words, its severity, its closing tab, its chunks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mavlink_sim.messages import dialect
+
+INFO, CRITICAL = 6, 2
+GROUND_STATION = (245, 190)
+
+
+def said(cockpit: Any, link: str = "gcs") -> list[tuple[int, str]]:
+    """(severity, whole text) of every STATUSTEXT received."""
+    severities = [
+        message.severity for message in cockpit.received("STATUSTEXT", link) if not message.chunk_seq
+    ]
+    return list(zip(severities, cockpit.texts(link), strict=True))
+
+
+@pytest.fixture
+def heard(make_cockpit: Any) -> Any:
+    """A vehicle whose ground-station link has a ground station on it."""
+    cockpit = make_cockpit()
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    return cockpit
+
+
+def test_a_flight_by_command_is_told_in_px4s_words(heard: Any) -> None:
+    heard.wait_ready()
+    heard.command(400, 1)
+    heard.command(22, *[float("nan")] * 7)
+    heard.until(lambda: heard.mode == "HOLD")
+    heard.fly(4.0)
+    heard.command(21)
+    heard.until(lambda: not heard.armed)
+    heard.fly(0.1)
+    assert said(heard) == [
+        (INFO, "Armed by external command\t"),
+        (INFO, "Using default takeoff altitude: 2.5 m\t"),
+        (INFO, "Takeoff detected\t"),
+        (INFO, "Landing at current position\t"),
+        (INFO, "Landing detected\t"),
+        (INFO, "Disarmed by landing\t"),
+    ]
+
+
+def test_disarming_is_told_with_its_reason(heard: Any) -> None:
+    heard.wait_ready()
+    heard.command(400, 1)
+    heard.command(400, 0)
+    heard.command(400, 1)
+    heard.until(lambda: not heard.armed, 15.0)
+    heard.fly(0.1)
+    assert [text for text in said(heard) if "Disarmed" in text[1]] == [
+        (INFO, "Disarmed by external command\t"),
+        (INFO, "Disarmed by auto preflight disarming\t"),
+    ]
+
+
+def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(heard: Any) -> None:
+    heard.fly(0.1)
+    heard.command(400, 1)
+    heard.set_mode(77)
+    heard.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 9, 1479, *[0] * 11))
+    heard.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 4095 - 512, *[0] * 11))
+    heard.send(dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 512, *[0] * 11))
+    heard.fly(0.1)
+    heard.take_off()
+    heard.command(400, 0)
+    heard.set_mode(6, source=GROUND_STATION, link="gcs")
+    texts = said(heard)
+    critical = [text for severity, text in texts if severity == CRITICAL]
+    assert critical == [
+        "Preflight Fail: heading estimate not stable",
+        "Arming denied: Resolve system health failures first\t",
+        "Unsupported main mode\t",
+        "SET_POSITION_TARGET_LOCAL_NED coordinate frame 9 unsupported\t",
+        "SET_POSITION_TARGET_LOCAL_NED invalid\t",
+        "SET_POSITION_TARGET_LOCAL_NED force not supported\t",
+        "Disarming denied: not landed\t",
+        "Switching to Offboard is currently not available\t",
+    ]
+    assert {severity for severity, _ in texts} == {INFO, CRITICAL}
+
+
+def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Any, velocity_setpoint: Any) -> None:
+    heard.heartbeats.append(("onboard", (1, 191), 18))
+    heard.take_off(4.0)
+    stream = velocity_setpoint(0, 0, 0)
+    heard.offboard(stream)
+    del heard.heartbeats[1]
+    heard.forget()
+    last = heard.now_s
+    heard.until(lambda: "Connection to mission computer lost\t" in heard.texts(), 10.0)
+    assert heard.now_s - last == pytest.approx(7.0, abs=1.1)
+    heard.heartbeats.append(("onboard", (1, 191), 18))
+    heard.fly(1.5)
+    assert said(heard) == [
+        (CRITICAL, "Failsafe activated\t"),
+        (INFO, "RTL: start return at 493 m (4 m above destination)\t"),
+        (INFO, "RTL: land at destination\t"),
+        (CRITICAL, "Connection to mission computer lost\t"),
+        (INFO, "Onboard controller regained\t"),
+    ]
+
+
+def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(heard: Any) -> None:
+    heard.wait_ready()
+    heard.command(400, 1)
+    assert heard.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
+    heard.until(lambda: not heard.armed, 15.0)
+    heard.fly(0.1)
+    assert (CRITICAL, "Already higher than takeoff altitude\t") in said(heard)
+    assert heard.height_m < 0.1
+    assert said(heard)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
+
+
+def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: Any) -> None:
+    heard.fly(0.1)
+    heard.command(400, 1)
+    heard.fly(0.05)
+    short, *chunks = heard.received("STATUSTEXT", "gcs")
+    assert (short.id, short.chunk_seq) == (0, 0)
+    assert [chunk.chunk_seq for chunk in chunks] == [0, 1]
+    assert chunks[0].id == chunks[1].id != 0
+    assert len(chunks[0].text) == 50
+
+
+def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_on(make_cockpit: Any) -> None:
+    cockpit = make_cockpit()
+    cockpit.heartbeats.append(("onboard", GROUND_STATION, 6))
+    cockpit.wait_ready()
+    cockpit.command(400, 1)
+    cockpit.fly(0.1)
+    assert cockpit.texts("onboard") == ["Armed by external command\t"]
+    assert cockpit.texts("gcs") == []
+
+
+def test_events_go_to_every_link_with_one_numbering(cockpit: Any) -> None:
+    cockpit.take_off()
+    numbers = {link: [m.sequence for m in cockpit.received("EVENT", link)] for link in ("onboard", "gcs")}
+    assert numbers["onboard"] == numbers["gcs"] != []
+    newest = cockpit.received("CURRENT_EVENT_SEQUENCE")[-1]
+    assert newest.sequence <= numbers["onboard"][-1]

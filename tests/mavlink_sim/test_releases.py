@@ -1,0 +1,53 @@
+"""The behaviour of PX4's releases where they differ."""
+
+from typing import Any
+
+import pytest
+
+from mavlink_sim.messages import dialect
+from mavlink_sim.releases import RELEASES, release_named
+
+
+@pytest.mark.parametrize("release", ["1.14", "1.15"])
+def test_an_older_release_answers_a_mode_request_once_and_truly(make_cockpit: Any, release: str) -> None:
+    cockpit = make_cockpit(px4=release)
+    cockpit.take_off()
+    assert cockpit.set_mode(6) == [1]
+    assert cockpit.set_mode(4, 5) == [0]
+
+
+@pytest.mark.parametrize("release", ["1.16", "1.17"])
+def test_a_newer_release_answers_it_twice(make_cockpit: Any, release: str) -> None:
+    cockpit = make_cockpit(px4=release)
+    cockpit.take_off()
+    assert cockpit.set_mode(6) == [0, 1]
+
+
+@pytest.mark.parametrize(("release", "answers"), [("1.16", 0), ("1.17", 1)])
+def test_what_is_wrong_with_a_parameter_is_told_since_v1_17_alone(
+    make_cockpit: Any, release: str, answers: int
+) -> None:
+    cockpit = make_cockpit(px4=release)
+    for request in (
+        dialect.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1),
+        dialect.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 1.0, 6),
+    ):
+        cockpit.forget()
+        cockpit.send(request)
+        cockpit.fly(0.05)
+        assert cockpit.received("PARAM_VALUE") == []
+        assert len(cockpit.received("PARAM_ERROR")) == answers
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_the_version_that_is_reported_is_the_releases(make_cockpit: Any, release: str) -> None:
+    cockpit = make_cockpit(px4=release)
+    cockpit.fly(0.1)
+    cockpit.command(512, 148)
+    version = cockpit.received("AUTOPILOT_VERSION")[0].flight_sw_version
+    assert f"{version >> 24}.{version >> 16 & 0xFF}" == release
+
+
+def test_a_release_that_is_not_known_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"'2\.0'.*1\.14, 1\.15, 1\.16, 1\.17"):
+        release_named("2.0")
