@@ -28,7 +28,6 @@ from mavlink_sim.announcements import (
 )
 from mavlink_sim.attitude_control import AttitudeController, RatesSetpoint
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
-from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
 from mavlink_sim.navigator import Navigator
 from mavlink_sim.orbit import Orbit, OrbitRequest
@@ -237,6 +236,9 @@ class Autopilot:
         self._intend(Mode.HOLD)
         if self.armed:
             goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+            if not self.navigator.allows_goal(goal):
+                self._say(CRITICAL, "Reposition is outside geofence\t")
+                return ACCEPTED
             self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
             self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
         return ACCEPTED
@@ -300,6 +302,7 @@ class Autopilot:
         self.now_s += dt_s
         self._check_offboard()
         position_failsafe.check(self)
+        position_failsafe.keep_landing(self)
         self.navigator.update()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
@@ -471,6 +474,7 @@ class Autopilot:
 
     def _start_task(self) -> None:
         airframe, parameters = self._airframe, self._parameters
+        self.attitude.release()
         if self.mode is Mode.OFFBOARD:
             if not isinstance(self.task, flight.Offboard):
                 self.task = flight.Offboard()
@@ -483,13 +487,9 @@ class Autopilot:
         elif self.mode is Mode.PRECLAND:
             self.task = self.navigator.precision_landing(Precision.REQUIRED)
         elif self.mode is Mode.LAND:
-            self.task = flight.Land(airframe, parameters)
+            self.task = position_failsafe.landing_task(self)
         elif self.mode is Mode.RTL:
-            task = self.navigator.return_task()
-            self.task = task
-            height = task.return_height_m
-            above_sea = HOME_ALTITUDE_M - task.destination[2] + height
-            self._say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+            self.task = self.navigator.return_task()
         else:
             self.task = flight.Hold(airframe, parameters)
 

@@ -80,7 +80,7 @@ class FallibleEstimate(Estimate):
 
     def update(self, dt_s: float) -> None:
         """Look at the truth again, `dt_s` later."""
-        super().update(dt_s)
+        Estimate.update(self, dt_s)  # at every step: super() would be twice as dear
         if self.held_xy_m is not None:
             self.position = (*self.held_xy_m, self.position[2])
             self.velocity = (0.0, 0.0, self.velocity[2])

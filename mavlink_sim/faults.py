@@ -224,7 +224,7 @@ class Faults:
 
     def step(self, dt_s: float) -> bool:
         """Time passes: begin and end what is due. True: the vehicle itself stands still in this step."""
-        self._elapsed_us += round(dt_s * 1e6)
+        self._elapsed_us += int(dt_s * 1e6 + 0.5)
         if not self._all:
             return False
         now_s = self.now_s + 1e-9
@@ -271,8 +271,9 @@ class Faults:
             message = gate(link, message)
             if message is None:
                 return None
-        if self.vehicle.estimate.spoiled:
-            message = as_told(self.vehicle.estimate, message)
+        estimate = self.vehicle.estimate
+        if estimate.reset_counter or estimate.fix_lost:
+            message = as_told(estimate, message)
         if self.boot_offset_us or self.stalled_us:
             message = shifted(message, self.boot_offset_us, self.boot_offset_us - self.stalled_us)
         return message

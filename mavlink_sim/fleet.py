@@ -32,8 +32,8 @@ def instance_options(
     """What each vehicle of a fleet is told; `options` are the first one's.
 
     A bind port of 0 stays 0 (a free one each). The camera goes to `camera_vehicle` (counted from 1) alone; a
-    truth file gets the system id into its name for all but the first. Faults are every vehicle's, each with its
-    own chance; the console is the first one's, the zenoh key each vehicle's own.
+    truth file gets the system id into its name for all but the first. Faults are every vehicle's, each with
+    its own chance; the console is the first one's, the zenoh key each vehicle's own.
 
     Raises:
         ValueError: a fleet of that size cannot be (ids, ports), or has no such vehicle for the camera.
@@ -61,6 +61,8 @@ def instance_options(
                 onboard_bind=options.onboard_bind + index if options.onboard_bind else 0,
                 gcs_bind=options.gcs_bind + index if options.gcs_bind else 0,
                 camera=options.camera if index + 1 == camera_vehicle else None,
+                camera_outputs=options.camera_outputs if index + 1 == camera_vehicle else (),
+                camera_truth=options.camera_truth if index + 1 == camera_vehicle else None,
                 console=options.console if index == 0 else False,
                 truth=options.truth if index == 0 else _numbered(options.truth, system_id),
             )

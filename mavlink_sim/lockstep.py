@@ -95,6 +95,7 @@ class LockstepVehicle:
         self._codecs: dict[str, Any] = {}
         self._repeated: list[_Repeated] = []
         self._answers: list[tuple[int, int]] = []
+        self._owed_s = 0.0
         for name, rates in ({"onboard": ONBOARD_RATES_HZ} if links is None else links).items():
             self.vehicle.add_link(name, dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | dict(rates))
             self.newest[name] = {}
@@ -121,12 +122,23 @@ class LockstepVehicle:
         if not self._repeated:
             self.vehicle.step(dt_s)
         else:
-            ends_s = self.now_s + dt_s - STEP_S / 2
-            while self.now_s < ends_s:
-                for repeated in self._repeated:
-                    repeated.send_if_due(self)
-                self.vehicle.step(STEP_S)
+            self._step_and_repeat(dt_s)
         self._take()
+
+    def _step_and_repeat(self, dt_s: float) -> None:
+        """From one repeated message to the next; each goes out with the first step at or after its time."""
+        self._owed_s += dt_s
+        left = int(self._owed_s / STEP_S + 1e-6)
+        self._owed_s -= left * STEP_S
+        while left > 0:
+            now_s = self.now_s
+            for repeated in self._repeated:
+                if repeated.next_s <= now_s + 1e-9:
+                    repeated.send(self)
+            until_next_s = min(repeated.next_s for repeated in self._repeated) - now_s
+            steps = min(max(math.ceil(until_next_s / STEP_S - 1e-6), 1), left)
+            self.vehicle.step(steps * STEP_S)
+            left -= steps
 
     def _take(self) -> None:
         for name, waiting in self._waiting.items():
@@ -303,12 +315,12 @@ class _Repeated:
         self, message: Any, interval_s: float, next_s: float, link: str, source: tuple[int, int]
     ) -> None:
         self.message, self.link, self.source = message, link, source
-        self._interval_s, self._next_s = interval_s, next_s
+        self.next_s = next_s
+        self._interval_s = interval_s
 
-    def send_if_due(self, vehicle: LockstepVehicle) -> None:
-        if vehicle.now_s >= self._next_s - 1e-9:
-            self._next_s += self._interval_s
-            vehicle.send(self.message, self.link, self.source)
+    def send(self, vehicle: LockstepVehicle) -> None:
+        self.next_s += self._interval_s
+        vehicle.send(self.message, self.link, self.source)
 
 
 class Repeat:

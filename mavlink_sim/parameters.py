@@ -125,7 +125,8 @@ class Parameters:
 
     def positive(self, name: str) -> float:
         """A value to divide by or to take a root of: PX4 accepts any, this stays above zero."""
-        return max(self.number(name), 0.01)
+        value = self.number(name)
+        return value if value > 0.01 else 0.01
 
     def at(self, index: int) -> Parameter | None:
         """The parameter at an index of the list, None outside it."""

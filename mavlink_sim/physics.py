@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 
 from mavlink_sim.rate_loop import MAX_YAW_RATE_RADPS, demanded_rates, mixed_thrusts
 
@@ -31,7 +32,7 @@ ROTOR_TORQUE_NM = 0.1  # SIH_Q_MAX
 ANGULAR_DRAG_NMS = 0.025  # SIH_KDW
 
 GUST_TIME_CONSTANT_S = 1.5
-GUST_STEP_S = 0.016  # a hundredth of the time constant: between two values nothing would be seen
+GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
 
 # The ground. A multirotor's legs take a landing at a walking pace; at 5 m/s something breaks.
 GEAR_TIME_CONSTANT_S = 0.1
@@ -62,6 +63,7 @@ class Multirotor:
         on_ground: touching the ground.
         crashed: it hit the ground too hard or upside down: the rotors are broken.
         touchdown_mps: the downward speed of the last contact with the ground.
+        on_touch: called with that speed at every contact.
         wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
     """
 
@@ -77,6 +79,7 @@ class Multirotor:
         "crashed",
         "gusts_mps",
         "on_ground",
+        "on_touch",
         "position",
         "quaternion",
         "rates",
@@ -98,6 +101,7 @@ class Multirotor:
         self.on_ground = True
         self.crashed = False
         self.touchdown_mps = 0.0
+        self.on_touch: Callable[[float], None] | None = None
         self.wind = wind
         self.gusts_mps = gusts_mps
         self._matrix = _LEVEL
@@ -342,6 +346,8 @@ class Multirotor:
         self.touchdown_mps = down_mps
         if down_mps > CRASH_MPS or tilt_cosine < MAX_STANDING_TILT_COSINE:
             self.crashed = True
+        if self.on_touch is not None:
+            self.on_touch(down_mps)
         if down_mps > BOUNCE_MPS:
             return -RESTITUTION * down_mps
         self.on_ground = True

@@ -55,9 +55,13 @@ def demanded_rates(
     y = b * north + e * east + h * tilt_z
     z = c * north + f * east + i * tilt_z
     # 2 sin(angle / 2) about the axis e_z × wanted, as PX4 takes it from the error quaternion
-    gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + z)) if z > -0.98 else 10.0 * ATTITUDE_GAIN_PER_S
-    p = -gain * y
-    q = gain * x
+    if z > -0.98:
+        gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + z))
+        p = -gain * y
+        q = gain * x
+    else:  # upside down: any way round will do, and standing on the head it must choose one
+        p = MAX_TILT_RATE_RADPS if y <= 0.0 else -MAX_TILT_RATE_RADPS
+        q = 10.0 * ATTITUDE_GAIN_PER_S * x
     limit = MAX_TILT_RATE_RADPS
     p = (limit if p > limit else -limit if p < -limit else p) + yaw_rate_radps * g
     q = (limit if q > limit else -limit if q < -limit else q) + yaw_rate_radps * h

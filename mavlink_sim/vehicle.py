@@ -24,7 +24,7 @@ from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor, Vector
+from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.signing import Signing, Streams, timestamp_now
 from mavlink_sim.streams import ONBOARD_RATES_HZ
@@ -93,6 +93,7 @@ class Vehicle:
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        self.airframe.on_touch = self._touched
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.events = EventBuffer()
@@ -246,6 +247,13 @@ class Vehicle:
             self.autopilot.texts.append(Text(INFO, "Onboard controller regained\t"))
             self._on_event("the companion's heartbeat is back")
 
+    def _touched(self, down_mps: float) -> None:
+        """The airframe met the ground."""
+        if self.airframe.crashed:
+            self._on_event(f"crashed at {down_mps:.1f} m/s")
+        elif down_mps > HARD_LANDING_MPS:
+            self._on_event(f"hard landing at {down_mps:.1f} m/s")
+
     def forget_boot(self) -> None:
         """What does not survive a reboot, outside the autopilot."""
         self._later.clear()
@@ -278,16 +286,16 @@ class Vehicle:
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
-        mission_link.update(self)
+            mission_link.update(self)
+            if self.autopilot.armed:
+                self._used_charge += CONTROL_STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
+            self._watch_companion()
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
-        if self.autopilot.armed:
-            self._used_charge += STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
-        self._watch_companion()
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
         for link in self.links.values():

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
+from mavlink_sim import fleet
 from mavlink_sim.cli import main
 from mavlink_sim.fleet import instance_options, places
 from mavlink_sim.lockstep import LockstepVehicle
@@ -20,13 +21,13 @@ METRE_DEG = math.degrees(1.0 / 6371000.0)
 
 
 def test_ids_and_ports_count_up_as_in_px4s_sitl() -> None:
-    fleet = instance_options(SimulationOptions(seed=10), 20, 5.0)
-    assert [one.system_id for one in fleet] == list(range(1, 21))
-    assert [one.onboard_port for one in fleet] == list(range(14540, 14560))
-    assert [one.onboard_bind for one in fleet] == list(range(14580, 14600))
-    assert {one.gcs_port for one in fleet} == {14550}
-    assert [one.gcs_bind for one in fleet] == list(range(18570, 18590))
-    assert [one.seed for one in fleet] == list(range(10, 30))
+    members = instance_options(SimulationOptions(seed=10), 20, 5.0)
+    assert [one.system_id for one in members] == list(range(1, 21))
+    assert [one.onboard_port for one in members] == list(range(14540, 14560))
+    assert [one.onboard_bind for one in members] == list(range(14580, 14600))
+    assert {one.gcs_port for one in members} == {14550}
+    assert [one.gcs_bind for one in members] == list(range(18570, 18590))
+    assert [one.seed for one in members] == list(range(10, 30))
 
 
 def test_places_are_a_grid_without_two_in_one() -> None:
@@ -39,10 +40,10 @@ def test_places_are_a_grid_without_two_in_one() -> None:
 
 def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
     options = SimulationOptions(camera="eye", truth=Path("truth.jsonl"))
-    fleet = instance_options(options, 3, 5.0)
-    assert [one.camera for one in fleet] == ["eye", None, None]
+    members = instance_options(options, 3, 5.0)
+    assert [one.camera for one in members] == ["eye", None, None]
     assert [one.camera for one in instance_options(options, 3, 5.0, camera_vehicle=2)] == [None, "eye", None]
-    assert [str(one.truth) for one in fleet] == ["truth.jsonl", "truth-2.jsonl", "truth-3.jsonl"]
+    assert [str(one.truth) for one in members] == ["truth.jsonl", "truth-2.jsonl", "truth-3.jsonl"]
 
 
 @pytest.mark.parametrize(
@@ -140,3 +141,20 @@ def test_a_fleet_in_one_process_speaks_on_its_ports(tmp_path: Path) -> None:
 def test_a_range_of_ports_is_free() -> None:
     start = free_udp_port_range(5)
     assert 1024 < start <= 65531
+
+
+def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(fleet.time, "monotonic", lambda: now_s)
+    told: list[str] = []
+    pace = fleet._Pace(20.0, told.append)
+    pace.lose(25.0)
+    now_s += 2.0
+    pace.tell()
+    assert told == []  # not at every hiccup
+    now_s += 3.0
+    pace.tell()
+    assert told == ["cannot keep up: 15.00 times real time in the last 5 s, not 20; the machine is too busy"]
+    now_s += 6.0
+    pace.tell()
+    assert len(told) == 1  # nothing lost since

@@ -150,3 +150,26 @@ def test_the_package_names_what_it_offers() -> None:
         assert getattr(mavlink_sim, name) is not None
     with pytest.raises(AttributeError, match="nothing_here"):
         _ = mavlink_sim.nothing_here
+
+
+def test_a_vehicle_that_loses_a_motor_crashes_says_so_and_disarms() -> None:
+    vehicle = LockstepVehicle({"onboard": {}}, seed=1)
+    vehicle.take_off(10.0)
+    vehicle.vehicle.airframe.fail_motor(2)
+    vehicle.run_until(lambda truth: truth.crashed, 20.0)
+    assert any(event.startswith("crashed at ") for event in vehicle.events)
+    vehicle.run_until(lambda truth: truth.landed and not truth.armed, 20.0)
+    with pytest.raises(NotReachedError):
+        vehicle.run_until(lambda truth: truth.height_m > 0.5, 5.0)  # it stays where it fell
+
+
+def test_a_fall_is_a_hard_landing_and_a_landing_is_none() -> None:
+    vehicle = LockstepVehicle({"onboard": {}}, seed=1, noise=False, gusts_mps=0.0)
+    vehicle.take_off(2.5)
+    vehicle.land()
+    assert not any("hard landing" in event for event in vehicle.events)
+    vehicle.take_off(2.5)
+    vehicle.run_until(lambda truth: truth.height_m < 1.5 or truth.mode == "HOLD", 20.0)
+    vehicle.command(400, 0.0, 21196.0)  # motors off in the air
+    vehicle.run_until(lambda truth: truth.on_ground, 10.0)
+    assert any(event.startswith(("hard landing at", "crashed at")) for event in vehicle.events)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from mavlink_sim.control import PositionController, TrajectorySetpoint
 from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import GRAVITY_MPS2, Multirotor
+from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor, rotation_matrix
+from mavlink_sim.rate_loop import mixed_thrusts
 
 STEP_S = 0.004
 
@@ -59,6 +60,7 @@ def test_a_velocity_over_the_limit_is_cut_where_it_does_not_lead_to_the_position
     assert math.hypot(x, y) == pytest.approx(12.0)
 
 
+@settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-50.0, 50.0), min_size=4, max_size=4))
 def test_no_velocity_setpoint_is_over_the_limit(values: list[float]) -> None:
     _, controller = hovering()
@@ -146,3 +148,142 @@ def test_no_setpoint_however_absurd_makes_the_motion_a_nonsense(
     assert math.hypot(*airframe.velocity) < 30.0
     assert abs(math.degrees(airframe.roll_rad)) < 75.0
     assert abs(math.degrees(airframe.pitch_rad)) < 75.0
+
+
+def axis(airframe: Multirotor) -> tuple[float, float, float]:
+    """Where the body's down axis points, NED."""
+    matrix = airframe.matrix
+    return (matrix[2], matrix[5], matrix[8])
+
+
+def test_a_commanded_body_rate_is_reached_as_fast_as_px4s_rate_loop_does() -> None:
+    airframe, _ = hovering()
+    reached = []
+    for _ in range(100):
+        airframe.step_rates(STEP_S, GRAVITY_MPS2, (1.0, 0.0, 0.0))
+        reached.append(airframe.rates[0])
+    assert 0.04 < next(i for i, p in enumerate(reached) if p > 0.63) * STEP_S < 0.12
+    assert max(reached) < 1.2
+    assert abs(reached[-1] - 1.0) < 0.05
+
+
+def test_it_loops_the_loop_without_a_jump() -> None:
+    airframe, _ = hovering()
+    airframe.position = (0.0, 0.0, -200.0)
+    before = axis(airframe)
+    upside_down = False
+    for _ in range(round(2.0 / STEP_S)):
+        airframe.step_rates(STEP_S, GRAVITY_MPS2, (0.0, 4.0, 0.0))
+        after = axis(airframe)
+        assert math.dist(before, after) < 5.0 * STEP_S  # the pitch passes 90 degrees as any other angle
+        assert abs(math.hypot(*airframe.quaternion) - 1.0) < 1e-9
+        before = after
+        upside_down = upside_down or after[2] < -0.95
+    assert upside_down
+    assert abs(airframe.rates[0]) < 0.05
+
+
+def test_it_rights_itself_from_any_attitude() -> None:
+    for roll, pitch in ((math.pi, 0.0), (2.5, 0.4), (0.0, math.pi / 2), (-1.0, -1.4)):
+        airframe, _ = hovering()
+        airframe.position = (0.0, 0.0, -100.0)
+        airframe.set_attitude(roll, pitch, 0.3)
+        for _ in range(round(4.0 / STEP_S)):
+            airframe.step(STEP_S, GRAVITY_MPS2, 0.0, 0.0, 0.0)
+        assert axis(airframe)[2] > 0.99, (roll, pitch)
+
+
+def test_the_matrix_is_that_of_the_quaternion() -> None:
+    airframe, _ = hovering()
+    for _ in range(50):
+        airframe.step_rates(STEP_S, GRAVITY_MPS2, (1.0, -2.0, 0.5))
+    assert airframe.matrix == pytest.approx(rotation_matrix(airframe.quaternion), abs=1e-12)
+    other = Multirotor()
+    other.set_attitude(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
+    assert max(abs(a - b) for a, b in zip(other.matrix, airframe.matrix, strict=True)) < 1e-12
+
+
+def test_without_one_motor_it_spins_and_falls() -> None:
+    for motor in range(4):
+        airframe, controller = hovering()
+        airframe.position = (0.0, 0.0, -30.0)
+        setpoint = TrajectorySetpoint(position=(0.0, 0.0, -30.0), yaw_rad=0.0)
+        fly(airframe, controller, setpoint, 2.0)
+        airframe.fail_motor(motor)
+        fly(airframe, controller, setpoint, 3.0)
+        assert math.hypot(*airframe.rates) > 2.0
+        assert airframe.velocity[2] > 2.0
+        fly(airframe, controller, setpoint, 10.0)
+        assert airframe.on_ground
+        assert airframe.crashed
+        assert airframe.thrust_mps2 < 0.1
+
+
+def test_a_weak_motor_is_flown_with() -> None:
+    airframe, controller = hovering()
+    airframe.fail_motor(2, 0.8)
+    setpoint = TrajectorySetpoint(position=(0.0, 0.0, -5.0), yaw_rad=0.0)
+    fly(airframe, controller, setpoint, 20.0)
+    assert math.dist(airframe.position, (0.0, 0.0, -5.0)) < 1.0
+    airframe.fail_motor(2, 1.0)
+    fly(airframe, controller, setpoint, 20.0)
+    assert math.dist(airframe.position, (0.0, 0.0, -5.0)) < 0.1
+
+
+@pytest.mark.parametrize(("motor", "share"), [(4, 0.0), (-1, 0.0), (0, 1.5), (0, math.nan)])
+def test_a_motor_that_is_not_there_cannot_fail(motor: int, share: float) -> None:
+    with pytest.raises(ValueError, match="motor"):
+        Multirotor().fail_motor(motor, share)
+
+
+@pytest.mark.parametrize(
+    ("down_mps", "bounces", "crashes"), [(0.5, False, False), (2.5, True, False), (7.0, True, True)]
+)
+def test_the_ground_takes_a_landing_and_breaks_what_falls(
+    down_mps: float, bounces: bool, crashes: bool
+) -> None:
+    airframe = Multirotor()
+    airframe.position, airframe.velocity, airframe.on_ground = (0.0, 0.0, -0.001), (1.0, 0.0, down_mps), False
+    met: list[float] = []
+    airframe.on_touch = met.append
+    upwards = 0.0
+    for _ in range(500):
+        airframe.step(STEP_S, 0.0, 0.0, 0.0, 0.0)
+        upwards = min(upwards, airframe.velocity[2])
+    assert met[0] == pytest.approx(down_mps, abs=0.1)
+    assert (upwards < 0.0) is bounces
+    assert airframe.crashed is crashes
+    assert airframe.velocity == (0.0, 0.0, 0.0)  # friction stopped it
+    assert 0.0 < airframe.position[0] < 1.0
+    airframe.repair()
+    assert not airframe.crashed
+
+
+shares = st.floats(-3.0, 3.0)
+
+
+@given(shares, shares, shares, shares)
+def test_the_mixer_never_asks_a_rotor_for_what_it_cannot_give(
+    thrust: float, roll: float, pitch: float, yaw: float
+) -> None:
+    rotors = mixed_thrusts(thrust, (10 * roll, 10 * pitch, 10 * yaw), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert all(-1e-9 <= rotor <= 1.0 + 1e-9 for rotor in rotors)
+    assert sum(rotors) / 4 <= min(max(thrust, 0.0), 1.0) + 1e-9  # without air mode it adds no thrust
+
+
+def test_small_demands_are_mixed_as_they_are() -> None:
+    front_right, rear_left, front_left, rear_right = mixed_thrusts(
+        0.5, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    )
+    assert front_left == rear_left > front_right == rear_right  # a roll to the right
+    nose_up = mixed_thrusts(0.5, (0.0, 0.5, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert nose_up[0] == nose_up[2] > nose_up[1] == nose_up[3]
+    clockwise = mixed_thrusts(0.5, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert clockwise[0] == clockwise[1] > clockwise[2] == clockwise[3]
+
+
+def test_full_thrust_climbs_and_drag_bounds_the_speed() -> None:
+    airframe, _ = hovering()
+    for _ in range(round(8.0 / STEP_S)):
+        airframe.step(STEP_S, 10 * MAX_THRUST_MPS2, 0.0, 0.0, 0.0)
+    assert -airframe.velocity[2] == pytest.approx(MAX_THRUST_MPS2 - GRAVITY_MPS2, rel=0.01)

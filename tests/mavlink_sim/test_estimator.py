@@ -1,0 +1,140 @@
+"""What the vehicle believes of its motion, and what it tells."""
+
+import itertools
+import math
+import statistics
+from typing import Any
+
+import pytest
+
+from mavlink_sim import LockstepVehicle
+from mavlink_sim.estimator import Estimate
+from mavlink_sim.messages import dialect
+from mavlink_sim.physics import GRAVITY_MPS2, Multirotor
+
+TOLD = {"LOCAL_POSITION_NED": 20.0, "GPS_RAW_INT": 8.0, "ATTITUDE": 50.0, "HIGHRES_IMU": 50.0}
+HERE = dialect.MAVLink_set_position_target_local_ned_message(
+    0, 1, 1, 1, 2552, 0, 0, -5, 0, 0, 0, 0, 0, 0, 0, 0
+)
+
+
+def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[Any], LockstepVehicle]:
+    """A vehicle in OFFBOARD at one place: what it told by type, and the truth at the same time."""
+    vehicle = LockstepVehicle({"onboard": TOLD}, **options)
+    vehicle.take_off(5.0)
+    vehicle.repeat(HERE, 10.0)
+    vehicle.step(0.3)
+    vehicle.set_mode("OFFBOARD")
+    vehicle.step(12.0)
+    vehicle.receive()
+    told: dict[str, list[Any]] = {name: [] for name in TOLD}
+    truths = []
+    for _ in range(round(seconds / 0.05)):
+        vehicle.step(0.05)
+        truths.append(vehicle.truth)
+        for message in vehicle.receive():
+            if message.get_type() in told:
+                told[message.get_type()].append(message)
+    return told, truths, vehicle
+
+
+def test_a_held_position_is_told_as_the_real_vehicle_told_it() -> None:
+    spreads, farthest = [], []
+    for seed in range(3):
+        told, _, _ = holding(40.0, seed=seed)
+        places = [(one.x, one.y, one.z) for one in told["LOCAL_POSITION_NED"]]
+        spreads.append([statistics.pstdev(axis) for axis in zip(*places, strict=True)])
+        farthest.append(max(math.hypot(x, y) for x, y, _ in places))
+    north, east, down = (statistics.mean(axis) for axis in zip(*spreads, strict=True))
+    assert 0.15 < north < 0.37  # measured 0.26
+    assert 0.15 < east < 0.37  # 0.25
+    assert 0.05 < down < 0.14  # 0.09
+    assert max(farthest) < 1.2
+
+
+def test_the_truth_is_another_place_than_what_is_told_and_not_far_from_it() -> None:
+    told, truths, vehicle = holding(40.0, seed=4)
+    at = {round(one.time_s, 2): one.position_ned_m for one in truths}
+    errors = [
+        math.dist((one.x, one.y, one.z), at[round(one.time_boot_ms / 1000, 2)])
+        for one in told["LOCAL_POSITION_NED"]
+        if round(one.time_boot_ms / 1000, 2) in at
+    ]
+    assert len(errors) > 30
+    assert 0.05 < statistics.mean(errors) < 0.6
+    assert max(errors) < 1.2
+    assert math.dist(vehicle.vehicle.estimate.position, vehicle.truth.position_ned_m) > 0.0
+
+
+def test_the_estimate_has_no_steps_and_the_receiver_is_noisier_than_it() -> None:
+    told, _, _ = holding(20.0, seed=2, gusts_mps=0.0)
+    places = [one.x for one in told["LOCAL_POSITION_NED"]]
+    assert max(abs(b - a) for a, b in itertools.pairwise(places)) < 0.05
+    fixes = [one.lat * 1e-7 / math.degrees(1.0 / 6371000.0) for one in told["GPS_RAW_INT"]]
+    jumps = statistics.pstdev(b - a for a, b in itertools.pairwise(fixes))
+    assert 0.1 < jumps < 0.35  # metres; the recorded receiver's: 0.19
+
+
+def test_rates_and_accelerations_are_noisy_as_recorded() -> None:
+    told, _, _ = holding(10.0, seed=2, gusts_mps=0.0)
+    assert 0.02 < statistics.pstdev(one.rollspeed for one in told["ATTITUDE"]) < 0.06
+    assert 0.15 < statistics.pstdev(one.xacc for one in told["HIGHRES_IMU"]) < 0.6
+    assert statistics.mean(one.zacc for one in told["HIGHRES_IMU"]) == pytest.approx(-GRAVITY_MPS2, abs=0.2)
+
+
+def test_on_the_ground_it_hardly_drifts() -> None:
+    vehicle = LockstepVehicle({"onboard": TOLD}, seed=1)
+    vehicle.step(4.0)
+    vehicle.receive()
+    vehicle.step(20.0)
+    places = [one for one in vehicle.receive() if one.get_type() == "LOCAL_POSITION_NED"]
+    assert 0.0 < max(abs(one.x) for one in places) < 0.1
+
+
+def test_without_noise_the_vehicle_knows_the_truth() -> None:
+    told, truths, vehicle = holding(2.0, seed=4, noise=False)
+    truth, last = truths[-1], told["LOCAL_POSITION_NED"][-1]
+    assert (last.x, last.y, last.z) == pytest.approx(truth.position_ned_m, abs=0.05)
+    estimate = vehicle.vehicle.estimate
+    assert estimate.position == truth.position_ned_m
+    assert estimate.quaternion == truth.quaternion
+    assert estimate.rates == truth.rates_radps
+    assert (estimate.roll_rad, estimate.pitch_rad, estimate.yaw_rad) == pytest.approx(
+        (truth.roll_rad, truth.pitch_rad, truth.yaw_rad), abs=1e-12
+    )
+
+
+@pytest.mark.parametrize("noise", [True, False])
+def test_an_offset_moves_what_is_believed_and_so_the_vehicle(noise: bool) -> None:
+    _, _, vehicle = holding(0.5, seed=4, noise=noise, gusts_mps=0.0)
+    before = vehicle.truth.position_ned_m
+    vehicle.vehicle.estimate.offset = (2.0, 0.0, 0.0)
+    vehicle.step(12.0)
+    assert vehicle.truth.position_ned_m[0] == pytest.approx(before[0] - 2.0, abs=0.8)
+    assert vehicle.vehicle.estimate.position[0] == pytest.approx(0.0, abs=0.5)
+
+
+def test_the_attitude_it_tells_is_one_attitude() -> None:
+    airframe = Multirotor()
+    airframe.set_attitude(0.4, -0.3, 2.0)
+    estimate = Estimate(airframe, seed=3)
+    for _ in range(500):
+        estimate.update(0.004)
+    estimate.yaw_offset_rad = 0.5
+    other = Multirotor()
+    other.set_attitude(estimate.roll_rad, estimate.pitch_rad, estimate.yaw_rad)
+    alignment = abs(sum(a * b for a, b in zip(other.quaternion, estimate.quaternion, strict=True)))
+    assert alignment == pytest.approx(1.0, abs=1e-4)
+    assert estimate.yaw_rad == pytest.approx(2.5, abs=0.05)
+
+
+def test_what_is_asked_of_it_moves_the_true_airframe_when_time_passes() -> None:
+    airframe = Multirotor()
+    estimate = Estimate(airframe, noise=False)
+    estimate.step(0.004, 2.0 * GRAVITY_MPS2, 0.0, 0.0, 0.0)
+    assert airframe.thrust_mps2 == 0.0
+    for _ in range(100):
+        airframe.advance(0.004)
+    estimate.update(0.004)
+    assert estimate.position == airframe.position
+    assert estimate.position[2] < -0.1
