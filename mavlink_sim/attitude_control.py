@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mavlink_sim.body_rates import IDENTITY, inverse, product, third_axis, unit
 from mavlink_sim.control import Demand, PositionController
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import MAX_THRUST_MPS2, Multirotor, Vector
+from mavlink_sim.quaternions import IDENTITY, inverse, product, third_axis, unit
 from vision.rotation import Quaternion, quaternion_from_euler
 
 NAN = math.nan
@@ -27,7 +27,7 @@ class AttitudeSetpoint:
 
     Attributes:
         quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation leaves the vehicle
-            turning as it turns, as in PX4, where it makes the torques nothing.
+            turning as it turned; PX4 makes no torque then.
         yaw_rate_radps: feed-forward about the world's down axis; NaN for none.
         thrust: collective, 0..1.
     """
@@ -39,7 +39,10 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class RatesSetpoint:
-    """Body rates (FRD, rad/s) to turn at; NaN: go on as the vehicle turns now. `thrust`: collective, 0..1."""
+    """Body rates (FRD, rad/s) to turn at; NaN: as the vehicle turned when the setpoint came.
+
+    `thrust`: collective, 0..1.
+    """
 
     rates: Vector
     thrust: float
@@ -61,6 +64,8 @@ class AttitudeController:
         self._parameters = parameters
         self._revision = -1
         self._target: AttitudeTarget | None = None
+        self._setpoint: AttitudeSetpoint | RatesSetpoint | None = None
+        self._rates: Vector = (0.0, 0.0, 0.0)
         self._load()
 
     def _load(self) -> None:
@@ -78,7 +83,8 @@ class AttitudeController:
 
     def release(self) -> None:
         """Another controller has the vehicle."""
-        self._target = None
+        if self._target is not None:
+            self._target = self._setpoint = None
 
     @property
     def active(self) -> bool:
@@ -108,11 +114,15 @@ class AttitudeController:
         """One step of control and of the airframe. Returns the new demand; `demand` is the one before."""
         before = self.target(airframe, outer, demand)
         if isinstance(setpoint, AttitudeSetpoint):
-            rates = self.rates(setpoint, airframe)
-            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, rates, abs(setpoint.thrust))
+            told = self.rates(setpoint, airframe)
+            rates = _possible(told, airframe.rates)
+            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, told, abs(setpoint.thrust))
         else:
-            rates = _possible(setpoint.rates)
-            self._target = AttitudeTarget(before.quaternion, rates, before.thrust)
+            if setpoint is not self._setpoint:
+                self._rates = _possible(setpoint.rates, airframe.rates)
+            rates = self._rates
+            self._target = AttitudeTarget(before.quaternion, setpoint.rates, before.thrust)
+        self._setpoint = setpoint
         outer.reset(airframe.yaw_rad)  # so that it begins afresh, with the heading of that moment
         thrust_mps2 = min(max(setpoint.thrust, 0.0), 1.0) * MAX_THRUST_MPS2
         airframe.step_rates(dt_s, thrust_mps2, rates)
@@ -137,9 +147,10 @@ class AttitudeController:
         return (p, q, r)
 
 
-def _possible(rates: Vector) -> Vector:
+def _possible(rates: Vector, now: Vector) -> Vector:
     p, q, r = (
-        min(max(rate, -MAX_RATE_RADPS), MAX_RATE_RADPS) if math.isfinite(rate) else NAN for rate in rates
+        min(max(rate, -MAX_RATE_RADPS), MAX_RATE_RADPS) if math.isfinite(rate) else present
+        for rate, present in zip(rates, now, strict=True)
     )
     return (p, q, r)
 

@@ -28,7 +28,6 @@ from mavlink_sim.announcements import (
 )
 from mavlink_sim.attitude_control import AttitudeController, RatesSetpoint
 from mavlink_sim.control import Demand, PositionController, TrajectorySetpoint
-from mavlink_sim.geography import HOME_ALTITUDE_M
 from mavlink_sim.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, LandedState, Mode, SystemState, base_mode
 from mavlink_sim.navigator import Navigator
 from mavlink_sim.orbit import Orbit, OrbitRequest
@@ -121,7 +120,7 @@ class Autopilot:
         return (
             self.sensors_ready
             and (self.position_valid or not position_failsafe.needs_position(self.mode))
-            and self.mode not in MODES_PREVENTING_ARMING
+            and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # no matter once it is
             and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
             and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
@@ -140,7 +139,9 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        return base_mode(self.mode, self.armed, self.has_setpoints and not self._rates_alone)
+        # PX4 goes by the newest setpoint, however old
+        ever_heard = math.isfinite(self._last_setpoint_s)
+        return base_mode(self.mode, self.armed, ever_heard and not self._rates_alone)
 
     @property
     def landed_state(self) -> LandedState:
@@ -235,6 +236,9 @@ class Autopilot:
         self._intend(Mode.HOLD)
         if self.armed:
             goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+            if not self.navigator.allows_goal(goal):
+                self._say(CRITICAL, "Reposition is outside geofence\t")
+                return ACCEPTED
             self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
             self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
         return ACCEPTED
@@ -298,6 +302,7 @@ class Autopilot:
         self.now_s += dt_s
         self._check_offboard()
         position_failsafe.check(self)
+        position_failsafe.keep_landing(self)
         self.navigator.update()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
@@ -469,6 +474,7 @@ class Autopilot:
 
     def _start_task(self) -> None:
         airframe, parameters = self._airframe, self._parameters
+        self.attitude.release()
         if self.mode is Mode.OFFBOARD:
             if not isinstance(self.task, flight.Offboard):
                 self.task = flight.Offboard()
@@ -481,13 +487,9 @@ class Autopilot:
         elif self.mode is Mode.PRECLAND:
             self.task = self.navigator.precision_landing(Precision.REQUIRED)
         elif self.mode is Mode.LAND:
-            self.task = flight.Land(airframe, parameters)
+            self.task = position_failsafe.landing_task(self)
         elif self.mode is Mode.RTL:
-            task = self.navigator.return_task()
-            self.task = task
-            height = task.return_height_m
-            above_sea = HOME_ALTITUDE_M - task.destination[2] + height
-            self._say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+            self.task = self.navigator.return_task()
         else:
             self.task = flight.Hold(airframe, parameters)
 
@@ -500,6 +502,8 @@ class Autopilot:
         self.failsafe = self.failsafe_is_latched = self.terminated = self.blind = False
         self.task = None
         self._takeoff_height_m = None
+        if self.landed:
+            self.home = self._airframe.position
         self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))
         self._on_event(f"disarmed ({reason})")
         self.intended_mode = self._mode_after_disarming

@@ -18,7 +18,9 @@ from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.parameters import UnknownParameterError
 from mavlink_sim.releases import NEWEST
+from mavlink_sim.signing import ALWAYS, key_of
 from mavlink_sim.simulation import SimulationOptions
+from mavlink_sim.video_outputs import STANDARD_OUTPUT
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
 MAX_WIND_MPS = 8.0
@@ -74,12 +76,24 @@ def simulate(
     camera: Annotated[
         str | None, typer.Option(help="Render a camera into this shared memory; read it as shm://NAME.")
     ] = None,
-    camera_rate: Annotated[float, typer.Option(help="Frames per second of the camera.")] = 30.0,
+    camera_rate: Annotated[
+        float | None, typer.Option(help="Frames per second of the camera; default: the scene's, else 30.")
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="World and camera from this TOML file, or an example's name.")
+    ] = None,
+    camera_output: Annotated[
+        list[str] | None,
+        typer.Option(help="Frames here too: pipe:PATH, pipe:-, http://HOST:PORT, rtp://HOST:PORT; repeat."),
+    ] = None,
+    camera_truth: Annotated[
+        Path | None, typer.Option(help="Write what is in each frame to this file, one JSON object a line.")
+    ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="Write the true state to this file, one JSON object a line, 20 Hz.")
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(help="Record the traffic of each link into this folder, as LINK.tlog.")
+        Path | None, typer.Option(help="Record each link's traffic into this folder, as LINK-SYSTEM.tlog.")
     ] = None,
     ready_after: Annotated[
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
@@ -96,6 +110,10 @@ def simulate(
     camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
+    ] = None,
+    signing_key: Annotated[
+        str | None,
+        typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
     ] = None,
     fault: Annotated[
         list[str] | None,
@@ -126,12 +144,22 @@ def simulate(
         _check(name, port, 0 if name.endswith("bind") else 1, 65535)
     _check("system-id", system_id, 1, 255)
     _check("wind", wind, 0.0, MAX_WIND_MPS)
-    _check("camera-rate", camera_rate, 1.0, 120.0)
+    if camera_rate is not None:
+        _check("camera-rate", camera_rate, 1.0, 120.0)
+    if STANDARD_OUTPUT in (camera_output or []):
+        sys.stdout = sys.stderr  # the pictures have standard output to themselves
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     _check("spacing", spacing, 0.5, 1000.0)
     if noise not in ("on", "off"):
         _fail(f"--noise {noise!r}: expected on or off")
+    parameters = _parameters(param or [])
+    try:
+        key = None if signing_key is None else key_of(signing_key)
+    except ValueError as error:
+        _fail(f"--signing-key: {error}")
+    if key is not None:
+        parameters.setdefault("MAV_SIGN_CFG", ALWAYS)
     options = SimulationOptions(
         host=host,
         onboard_port=onboard_port,
@@ -143,13 +171,17 @@ def simulate(
         wind_mps=wind,
         camera=camera,
         camera_rate_hz=camera_rate,
+        camera_outputs=tuple(camera_output or ()),
+        camera_truth=camera_truth,
+        scene=scene,
         truth=truth,
         record=record,
         ready_after_s=ready_after,
         px4=px4,
         speed=speed,
         noise=noise == "on",
-        parameters=_parameters(param or []),
+        parameters=parameters,
+        signing_key=key,
         faults=tuple(fault or ()),
         console=console,
         control=control,
@@ -208,7 +240,11 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
 def main() -> None:
     """The console script's entry: what cannot be is said in one line, with exit code 2."""
     try:
-        if sys.argv[1:2] == ["bench"]:
+        if sys.argv[1:2] == ["dataset"]:
+            from mavlink_sim.dataset_cli import app as dataset_app
+
+            code = dataset_app(sys.argv[2:], prog_name="mavlink-sim dataset", standalone_mode=False)
+        elif sys.argv[1:2] == ["bench"]:
             from mavlink_sim.bench import app as bench_app
 
             code = bench_app(sys.argv[2:], prog_name="mavlink-sim bench", standalone_mode=False)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from mavlink_sim import parameter_protocol
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.geography import geographic, local
@@ -184,6 +185,10 @@ def _flight_termination(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED if command.parameters[0] > 0.5 else DENIED
 
 
+def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return parameter_protocol.reset(vehicle, command.parameters[0])
+
+
 def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     if name is None or not vehicle.send_built(link, name):
@@ -235,7 +240,7 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     185: _flight_termination,  # DO_FLIGHTTERMINATION
     DO_CHANGE_ALTITUDE: _change_altitude,
     DO_REPOSITION: _reposition,
-    245: _accept,  # PREFLIGHT_STORAGE
+    245: _preflight_storage,  # PREFLIGHT_STORAGE
     300: _mission_start,
     ARM_DISARM: _arm,
     401: _accept,  # RUN_PREARM_CHECKS

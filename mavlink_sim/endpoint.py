@@ -11,6 +11,7 @@ from typing import Any
 
 from mavlink_sim.faulty_socket import FaultySocket
 from mavlink_sim.messages import Outgoing, parser
+from mavlink_sim.signing import Signing
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ class UdpEndpoint:
         self.peer: tuple[str, int] = (host, peer_port)
         self._peer_heard_s: float | None = None
         self._codec = parser(system_id)
+        self.signing = Signing()
         self._refused = False
         self.on_packet: Callable[[bytes], None] | None = None
 
@@ -74,7 +76,7 @@ class UdpEndpoint:
             found = [
                 message
                 for message in self._codec.parse_buffer(datagram) or []
-                if message.get_type() != "BAD_DATA"
+                if message.get_type() != "BAD_DATA" and self.signing.accepts(message.get_msgbuf())
             ]
             if found:
                 self._hear(sender)
@@ -96,6 +98,8 @@ class UdpEndpoint:
         """Send each message; what the network cannot take now is dropped, as a radio would."""
         for item in outgoing:
             packet = item.pack(self._codec)
+            if self.signing.has_key and not item.forwarded:
+                packet = self.signing.signed(packet)
             if self.on_packet is not None:
                 self.on_packet(packet)
             try:

@@ -261,7 +261,8 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
 def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
     """Power was lost for a moment: disarmed, deaf and silent for a while, then a new boot.
 
-    Kept: parameters, mission, fence, rally points, position, battery. Forgotten: modes, home, stream intervals, who was heard.
+    Kept: parameters, mission, fence, rally points, position, battery. Forgotten: modes, home, the rates of
+    streams, who was heard.
     """
     faults = vehicle.faults
     one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])

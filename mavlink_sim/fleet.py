@@ -61,6 +61,8 @@ def instance_options(
                 onboard_bind=options.onboard_bind + index if options.onboard_bind else 0,
                 gcs_bind=options.gcs_bind + index if options.gcs_bind else 0,
                 camera=options.camera if index + 1 == camera_vehicle else None,
+                camera_outputs=options.camera_outputs if index + 1 == camera_vehicle else (),
+                camera_truth=options.camera_truth if index + 1 == camera_vehicle else None,
                 console=options.console if index == 0 else False,
                 truth=options.truth if index == 0 else _numbered(options.truth, system_id),
             )

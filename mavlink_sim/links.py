@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from mavlink_sim.announcements import Text
+from mavlink_sim.file_transfer import Server
 from mavlink_sim.messages import Outgoing, dialect
 from mavlink_sim.parameters import Parameter
+from mavlink_sim.signing import Signing
 from mavlink_sim.streams import Streams
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -28,6 +30,8 @@ class Link:
         self.ground_station_seen_s = -math.inf
         self.parameters_left: deque[Parameter] = deque()
         self.parameter_credit = 0.0
+        self.file_transfer: Server | None = None  # made when somebody asks
+        self.signing = Signing()
         self.tells_parameter_errors = True
         self.sent = 0
         self.received = 0
@@ -66,6 +70,7 @@ class Link:
         self.components.clear()
         self.ground_station_seen_s = -math.inf
         self.parameters_left.clear()
+        self.file_transfer = None
 
     def knows(self, system: int, component: int) -> bool:
         """Whether a message to this target is worth sending here (PX4's `component_was_seen`)."""
@@ -87,6 +92,8 @@ def forward(message: Any, source: Link, links: Iterable[Link], system_id: int) -
     system, component = target_of(message)
     if system not in (0, system_id) or component == AUTOPILOT_COMPONENT:
         return
+    if message.get_type() == "SETUP_SIGNING":
+        return  # a key is for the one it was told
     for link in links:
         if link is not source and link.knows(system, component):
             link.outbox.append(Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True))

@@ -16,9 +16,11 @@ from pymavlink.dialects.v20 import development as dialect
 
 __all__ = [
     "Outgoing",
+    "component_metadata",
     "current_event_sequence",
     "dialect",
     "event",
+    "event_error",
     "link_node_status",
     "parser",
     "protocol_version",
@@ -30,6 +32,8 @@ _TIME_ESTIMATE = struct.Struct("<5i")
 _EVENT = struct.Struct("<IIHBBB40s")
 _PROTOCOL_VERSION = struct.Struct("<HHH8s8s")
 _EVENT_SEQUENCE = struct.Struct("<HB")
+_EVENT_ERROR = struct.Struct("<HHBBB")
+_COMPONENT_METADATA = struct.Struct("<II100s")
 
 
 class Outgoing(NamedTuple):
@@ -110,6 +114,34 @@ def current_event_sequence(sequence: int) -> Any:
     """CURRENT_EVENT_SEQUENCE (411): the newest event's number."""
     return _PackedMessage(
         411, "CURRENT_EVENT_SEQUENCE", 106, _EVENT_SEQUENCE.pack(sequence, 0), sequence=sequence, flags=0
+    )
+
+
+def event_error(system: int, component: int, sequence: int, oldest: int) -> Any:
+    """RESPONSE_EVENT_ERROR (413): a requested event is not kept any more."""
+    return _PackedMessage(
+        413,
+        "RESPONSE_EVENT_ERROR",
+        77,
+        _EVENT_ERROR.pack(sequence, oldest, system, component, 0),
+        target_system=system,
+        target_component=component,
+        sequence=sequence,
+        sequence_oldest_available=oldest,
+        reason=0,
+    )
+
+
+def component_metadata(boot_ms: int, file_crc: int, uri: str) -> Any:
+    """COMPONENT_METADATA (397): where the component's general metadata file is, and its checksum."""
+    return _PackedMessage(
+        397,
+        "COMPONENT_METADATA",
+        182,
+        _COMPONENT_METADATA.pack(boot_ms, file_crc, uri.encode()),
+        time_boot_ms=boot_ms,
+        file_crc=file_crc,
+        uri=uri,
     )
 
 

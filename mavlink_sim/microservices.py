@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import commands, mission_link, mission_transfer, parameter_protocol
+from mavlink_sim import (
+    commands,
+    event_protocol,
+    file_transfer,
+    mission_link,
+    mission_transfer,
+    parameter_protocol,
+    signing,
+)
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED
 from mavlink_sim.geography import geographic
@@ -134,6 +142,9 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_LIST": parameter_protocol.request_list,
     "PARAM_REQUEST_READ": parameter_protocol.request_read,
     "PARAM_SET": parameter_protocol.set_parameter,
+    "FILE_TRANSFER_PROTOCOL": file_transfer.handle,
+    "SETUP_SIGNING": signing.setup_signing,
+    "UNKNOWN_412": event_protocol.request,
     **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
     "LANDING_TARGET": mission_link.landing_target,
     "OBSTACLE_DISTANCE": mission_link.obstacle_distance,

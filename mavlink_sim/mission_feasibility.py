@@ -77,7 +77,7 @@ def _far_first_waypoint(items: tuple[MissionItem, ...], parameters: Parameters, 
     if limit <= 0.0 or first is None:
         return []
     away = math.dist(first.place(home)[:2], home[:2])
-    if not away >= limit:
+    if not limit <= away < math.inf:
         return []
     return [f"First waypoint far away from home: {int(away)}m. Correct mission loaded?\t"]
 

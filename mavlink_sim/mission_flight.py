@@ -185,7 +185,7 @@ class MissionFlight(flight.Task):
         if command == mission_items.DO_LAND_START:
             return
         if command in (mission_items.SET_ROI_LOCATION, mission_items.SET_ROI):
-            mode = int(item.parameters[0]) if command == mission_items.SET_ROI else _ROI_LOCATION
+            mode = item.parameters[0] if command == mission_items.SET_ROI else _ROI_LOCATION
             self._roi = self._place(item) if mode == _ROI_LOCATION else None
             self._roi_is_next = mode == _ROI_NEXT
         elif command == mission_items.SET_ROI_NEXT_WAYPOINT:
@@ -271,7 +271,9 @@ class MissionFlight(flight.Task):
         if item.command == mission_items.WAYPOINT and item.parameters[1] > 0.0 and self._stage is Stage.FLY:
             radius = item.parameters[1]
         if item.command == mission_items.LOITER_TO_ALTITUDE:
-            radius += abs(item.parameters[1]) or self._parameters.number("NAV_LOITER_RAD")
+            given = abs(item.parameters[1])
+            usual = self._parameters.number("NAV_LOITER_RAD")
+            radius += given if math.isfinite(given) and given > 0.0 else usual
         return self._away(self.goal) <= radius and abs(left) <= altitude_radius
 
     def _acceptance(self) -> float:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim import flight, mission_items
 from mavlink_sim.announcements import CRITICAL, INFO, Text
-from mavlink_sim.collision_prevention import ObstacleMap
+from mavlink_sim.collision_prevention import ObstacleMap, Plane, limited_acceleration
 from mavlink_sim.geofence import Action, Geofence
+from mavlink_sim.geography import geographic
 from mavlink_sim.mission_feasibility import complaints
 from mavlink_sim.mission_flight import MissionFlight
 from mavlink_sim.mission_items import MissionItem, PlanType
@@ -23,7 +24,14 @@ from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor, Vector
 from mavlink_sim.precision_landing import LandingTarget, Precision, PrecisionLanding
-from mavlink_sim.return_flight import ReturnFlight, destination, return_task
+from mavlink_sim.return_flight import (
+    Goal,
+    ReturnFlight,
+    RouteReturn,
+    destination,
+    landing_route,
+    mission_route,
+)
 
 if TYPE_CHECKING:
     from mavlink_sim.autopilot import Autopilot
@@ -83,6 +91,7 @@ class Navigator:
         self._disarmed_since_flown = False
         self._breaches: list[str] = []
         self._next_fence_check_s = 0.0
+        self._held_for_obstacles = False
         self._next_reached_s = 0.0
         self._repetitions = 0
 
@@ -137,6 +146,20 @@ class Navigator:
     def allows_goal(self, place: Vector) -> bool:
         """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
         return self.fence.allows_goal(place, self._known_home())
+
+    def allowed_acceleration(self, acceleration: Plane, velocity: Plane) -> Plane:
+        """Collision prevention for Position mode: what is allowed of the acceleration the sticks ask for.
+
+        Both m/s² and m/s, (north, east). Without data for 5 s the vehicle is put into HOLD, as PX4 does.
+        """
+        limited = limited_acceleration(
+            acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
+        )
+        if limited.hold and not self._held_for_obstacles:
+            self._on_event("no obstacle data: HOLD")
+            self._autopilot.set_mode(Mode.HOLD)
+        self._held_for_obstacles = limited.hold
+        return limited.acceleration
 
     # ---- what clients do --------------------------------------------------------------------------------
 
@@ -239,18 +262,38 @@ class Navigator:
             self._on_event,
         )
 
-    def return_task(self) -> ReturnFlight:
-        """The task of RTL, by RTL_TYPE and RTL_PLD_MD."""
-        found, words = destination(
-            self.plans[PlanType.RALLY].items,
-            self.mission,
-            self._parameters,
-            self.home,
-            self._airframe.position,
-        )
+    def return_task(self) -> flight.Task:
+        """The task of RTL, by RTL_TYPE and RTL_PLD_MD; says where it leads."""
+        position = self._airframe.position
+        landing = self._return_landing()
+        route = mission_route(self.mission, self._parameters, self.home)
+        if route is not None:
+            return RouteReturn(self._airframe, self._parameters, *route, landing)
+        rally = self.plans[PlanType.RALLY].items
+        found, words = destination(rally, self.mission, self._parameters, self.home, position)
         for text in words:
             self.say(CRITICAL, text)
-        return return_task(self, self._airframe, self._parameters, found)
+        direct = ReturnFlight(self._airframe, self._parameters, found.position, landing)
+        height = direct.return_height_m
+        above_sea = geographic(found.position)[2] + height
+        self.say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+        if found.kind is not Goal.MISSION_LANDING:
+            return direct
+        last = landing_route(self.mission, self.home)
+        climb_to_z = found.position[2] - height
+        return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
+
+    def _return_landing(self) -> Callable[[Vector], flight.TrajectoryTask]:
+        """Makes the task of RTL's last descent."""
+        mode = int(self._parameters.number("RTL_PLD_MD"))
+
+        def landing(place: Vector) -> flight.TrajectoryTask:
+            if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
+                return flight.Land(self._airframe, self._parameters, place)
+            z = self._airframe.position[2]
+            return self.precision_landing(Precision(mode), (place[0], place[1], z))
+
+        return landing
 
     # ---- one step ---------------------------------------------------------------------------------------
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from mavlink_sim.ground_view import Matrix, View
 from mavlink_sim.painting_order import clip_polygon
 from mavlink_sim.palettes import palette_of
-from mavlink_sim.shapes import Shape, shape_of, variant_of
+from mavlink_sim.plates import printed_side, reflectance
+from mavlink_sim.shapes import Shape
 from mavlink_sim.textures import Plane, fractal_noise
 from mavlink_sim.world import Light, Sky, WorldObject
 
@@ -67,7 +68,7 @@ class PlacedObject:
     def __init__(self, item: WorldObject, light: Light, sky: Sky) -> None:
         self.item = item
         self.sky, self.light = sky, light
-        self.shape: Shape = shape_of(item.class_name, variant_of(item.class_name, item.appearance))
+        self.shape: Shape = item.shape
         if len(self.shape.normals) >= 1 << FACE_BITS:
             raise ValueError(f"a {item.class_name} has {len(self.shape.normals)} faces, too many to draw")
         c, s = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
@@ -99,6 +100,8 @@ class PlacedObject:
             outlines = self.shape.shadow(self.sun @ self.ned_from_object)
             flat = np.concatenate(outlines).astype(np.float64)
             turned = flat @ self.ned_from_object[:2, :2].T * self.item.scale + self.origin[:2]
+            if self.origin[2] < 0.0:  # in the air: its shadow falls farther from the sun
+                turned += self.sun[:2] * (self.origin[2] / max(-float(self.sun[2]), 0.05))
             first = np.cumsum([0] + [len(outline) for outline in outlines]).tolist()
             self._shadow = (np.column_stack([turned, np.zeros(len(turned))]), first)
         return self._shadow
@@ -156,6 +159,10 @@ class PlacedObject:
         np.clip(inverse, 1.0 / farthest, 1.0 / max(nearest, NEAR_M), out=inverse)
         colours = self._view_colours(view, facing).take(faces, axis=0)
         colours *= self._texture(view, x, y, inverse)[:, None]
+        if self.item.printed is not None:
+            front = np.flatnonzero((self.shape.normals @ printed_side(self.item.printed)).take(faces) > 0.9)
+            seen_on = reflectance(self.item.printed, eye, rays, x[front], y[front])
+            colours[front] *= seen_on[:, None]
         pixels = rows * view.width + columns
         at_rim = left == 0 or top == 0 or right == view.width or bottom == view.height
         share = _inside_share(points, view) if at_rim else 1.0

@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 
@@ -18,6 +19,12 @@ UINT32 = 5  # MAV_PARAM_TYPE_UINT32, of _HASH_CHECK alone
 HASH_CHECK = "_HASH_CHECK"
 HASH_CHECK_INDEX = 65535
 _TYPES = {"INT32": INT32, "REAL32": REAL32}
+# PX4's `volatile` parameters: the vehicle itself changes them, so they are no part of _HASH_CHECK.
+_VOLATILE = re.compile(
+    r"CAL_ACC\d_[XYZ](OFF|SCALE)|CAL_GYRO\d_[XYZ]OFF|CAL_BARO\d_OFF"
+    r"|CAL_MAG\d_[XYZ](OFF|SCALE|ODIAG|COMP)|EKF2_MAG_DECL|ASPD_SCALE_\d|SENS_DPRES_OFF"
+    r"|COM_FLIGHT_UUID|COM_MODE\d_HASH|LND_FLIGHT_T_(HI|LO)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +41,25 @@ class Parameter:
         if self.kind == INT32:
             return float(struct.unpack("<f", struct.pack("<i", int(self.value)))[0])
         return float(self.value)
+
+
+def is_volatile(name: str) -> bool:
+    """Whether PX4 excludes a parameter from _HASH_CHECK because the vehicle changes it by itself."""
+    return _VOLATILE.fullmatch(name) is not None
+
+
+def parameter_hash(parameters: Iterable[Parameter]) -> int:
+    """_HASH_CHECK by PX4's recipe: CRC-32 without inversions over names and values, in alphabetical order.
+
+    Args:
+        parameters: all that are listed, in order; volatile ones are left out here.
+    """
+    crc = 0xFFFFFFFF
+    for parameter in parameters:
+        if not is_volatile(parameter.name):
+            packed = struct.pack("<i" if parameter.kind == INT32 else "<f", parameter.value)
+            crc = zlib.crc32(parameter.name.encode() + packed, crc)
+    return crc ^ 0xFFFFFFFF
 
 
 class UnknownParameterError(KeyError):
@@ -64,7 +90,8 @@ class Parameters:
 
     def __init__(self, values: Mapping[str, float] | None = None) -> None:
         """Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be."""
-        self._parameters = {parameter.name: parameter for parameter in default_parameters()}
+        self._defaults = {parameter.name: parameter for parameter in default_parameters()}
+        self._parameters = dict(self._defaults)
         self._names = list(self._parameters)
         self.revision = 0
         for name, value in (values or {}).items():
@@ -124,13 +151,23 @@ class Parameters:
         self.revision += 1
         return changed
 
+    def reset(self, keep: Collection[str] = ()) -> list[Parameter]:
+        """Back to the values of `parameters.txt`, except those to keep. Returns what changed."""
+        changed = []
+        for name, default in self._defaults.items():
+            if name not in keep and self._parameters[name].value != default.value:
+                self._parameters[name] = default
+                changed.append(default)
+        self.revision += bool(changed)
+        return changed
+
+    def customised(self) -> list[Parameter]:
+        """The parameters whose value is not that of `parameters.txt`: what PX4 keeps in its file."""
+        return [item for item in self if item.value != self._defaults[item.name].value]
+
     def hash(self) -> int:
-        """_HASH_CHECK by PX4's recipe: CRC-32 without inversions over names and values, in order."""
-        crc = 0xFFFFFFFF
-        for parameter in self:
-            packed = struct.pack("<i" if parameter.kind == INT32 else "<f", parameter.value)
-            crc = zlib.crc32(parameter.name.encode() + packed, crc)
-        return crc ^ 0xFFFFFFFF
+        """The set's _HASH_CHECK."""
+        return parameter_hash(self)
 
     def hash_wire_value(self) -> float:
         """The hash as PARAM_VALUE carries it: its bytes read as a float."""

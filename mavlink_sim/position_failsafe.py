@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.control import NAN, TrajectorySetpoint
-from mavlink_sim.flight import Task
+from mavlink_sim.flight import Land, Task
 from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
 
@@ -61,7 +61,20 @@ def enter_or_fall_back(autopilot: Autopilot, mode: Mode) -> None:
         autopilot._enter(Mode.ALTCTL)
         return
     autopilot._enter(Mode.LAND)
-    autopilot.task = Descend(autopilot._parameters, autopilot._airframe.yaw_rad)
+
+
+def landing_task(autopilot: Autopilot) -> Task:
+    """How mode LAND is flown: at one place, or blindly down where there is no position."""
+    if autopilot.position_valid:
+        return Land(autopilot._airframe, autopilot._parameters)
+    return Descend(autopilot._parameters, autopilot._airframe.yaw_rad)
+
+
+def keep_landing(autopilot: Autopilot) -> None:
+    """A landing goes on blindly when the position is lost, and at one place when it is back."""
+    descending = isinstance(autopilot.task, Descend)
+    if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
+        autopilot.task = landing_task(autopilot)
 
 
 def check(autopilot: Autopilot) -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_sim.camera_lens import CameraMotion, Lens, Shutter
 from mavlink_sim.ground_view import Buffers, View, add_haze, draw_ground, draw_sky
 from mavlink_sim.image_effects import ImageEffects, apply_effects
 from mavlink_sim.object_view import FACE_BITS, FAR_PX, NEAR_M, SUBPIXEL_BITS, PlacedObject, Sighting
@@ -60,17 +61,25 @@ class Rendered:
         image: (H, W, 3) uint8 BGR.
         depth_m: (H, W) float32 along the optical axis, NaN in the sky and beyond 10 km.
         objects: those of which at least one pixel is seen, in the world's order.
+        eye_ned_m: (3,) the optical centre, NED.
     """
 
     image: Image
     depth_m: Plane
     objects: list[VisibleObject]
+    eye_ned_m: NDArray[np.float64]
+
+
+_STILL = CameraMotion()
 
 
 class Renderer:
     """Draws one world through one camera; `rng` draws the sensor's noise if there are effects.
 
-    Raises ValueError if the camera has lens distortion, which is not drawn yet.
+    A camera with lens distortion or a shutter is drawn through `camera_lens`, which costs more; others are
+    drawn straight away.
+
+    Raises ValueError for a distortion that cannot be drawn, and for buffers of another size.
     """
 
     def __init__(
@@ -81,14 +90,17 @@ class Renderer:
         effects: ImageEffects | None = None,
         buffers: Buffers | None = None,
         rng: np.random.Generator | None = None,
+        shutter: Shutter | None = None,
     ) -> None:
-        if any(camera.distortion):
-            raise ValueError(
-                f"the renderer draws no lens distortion, the camera has {camera.distortion}; "
-                "use a camera without distortion coefficients"
-            )
         self.world, self.camera, self.mount, self.effects = world, camera, mount, effects
-        self._buffers = buffers or Buffers(camera.width, camera.height)
+        self._lens = Lens(camera, shutter) if any(camera.distortion) or shutter is not None else None
+        self._drawn = camera if self._lens is None else self._lens.drawn
+        self._buffers = buffers or Buffers(self._drawn.width, self._drawn.height)
+        if self._buffers.work.shape != (self._drawn.height, self._drawn.width):
+            raise ValueError(
+                f"buffers must have the drawn picture's size {self._drawn.width}x{self._drawn.height}, "
+                f"got {self._buffers.work.shape[1]}x{self._buffers.work.shape[0]}"
+            )
         self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
         self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
         self._radii = np.array([placed.radius_m for placed in self._placed])
@@ -96,9 +108,34 @@ class Renderer:
         self._shadow_radii: NDArray[np.float64] | None = None
         self._rng = rng or np.random.default_rng(0)
 
-    def render(self, position_ned_m: Sequence[float], ned_from_body: NDArray[np.float64]) -> Rendered:
-        """The frame seen when the body is at `position_ned_m` (3,) with attitude `ned_from_body` (3, 3)."""
-        view = self.view(position_ned_m, ned_from_body)
+    def place(self, objects: Sequence[WorldObject]) -> None:
+        """Show these objects from now on; those that are the same values as before cost nothing."""
+        known = {placed.item: placed for placed in self._placed}
+        light, sky = self.world.light, self.world.sky
+        if all(placed.item is item for placed, item in zip(self._placed, objects, strict=False)) and len(
+            objects
+        ) == len(self._placed):
+            return
+        self.world = replace(self.world, objects=tuple(objects))
+        self._placed = [known.get(item) or PlacedObject(item, light, sky) for item in objects]
+        self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
+        self._radii = np.array([placed.radius_m for placed in self._placed])
+        self._shadow_middles = self._shadow_radii = None
+
+    def render(
+        self,
+        position_ned_m: Sequence[float],
+        ned_from_body: NDArray[np.float64],
+        mount: CameraMount | None = None,
+        motion: CameraMotion = _STILL,
+    ) -> Rendered:
+        """The frame seen when the body is at `position_ned_m` (3,) with attitude `ned_from_body` (3, 3).
+
+        Args:
+            mount: where the camera looks now if it is on a gimbal; by default the renderer's own mount.
+            motion: of the camera; only a camera with a shutter shows it.
+        """
+        view = self.view(position_ned_m, ned_from_body, mount)
         buffers, world = self._buffers, self.world
         inverse_depth = np.empty((view.height, view.width), np.float32)
         image = draw_ground(world, view, buffers, inverse_depth)
@@ -109,27 +146,43 @@ class Renderer:
         add_haze(world.sky, inverse_depth, buffers, image)
         draw_sky(world.sky, world.light, view, inverse_depth, image)
         _soften_edges(image, labels, sightings)
+        objects: list[VisibleObject | None]
+        if self._lens is None:
+            objects = [
+                _visible(placed, sighting, number, labels, view) for placed, sighting, number in sightings
+            ]
+        else:
+            image, inverse_depth, exposed, inside = self._lens.expose(image, inverse_depth, labels, motion)
+            objects = [
+                _visible_through_lens(placed, sighting, number, labels, exposed, inside, view)
+                for placed, sighting, number in sightings
+            ]
         if self.effects is not None:
             image = apply_effects(image, self.effects, self._rng)
-        objects = [_visible(placed, sighting, number, labels, view) for placed, sighting, number in sightings]
         with np.errstate(divide="ignore"):
             depth_m = np.divide(np.float32(1.0), inverse_depth, out=inverse_depth)
         np.copyto(depth_m, np.nan, where=np.isinf(depth_m))
-        return Rendered(image, depth_m, [item for item in objects if item is not None])
+        return Rendered(image, depth_m, [item for item in objects if item is not None], view.eye)
 
-    def view(self, position_ned_m: Sequence[float], ned_from_body: NDArray[np.float64]) -> View:
-        """The camera's pose for a body's pose, with matrices between pixels and NED."""
-        ned_from_optical = ned_from_body @ self.mount.body_from_optical
-        eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ self.mount.position_frd_m
+    def view(
+        self,
+        position_ned_m: Sequence[float],
+        ned_from_body: NDArray[np.float64],
+        mount: CameraMount | None = None,
+    ) -> View:
+        """The camera's pose for a body's pose, with matrices between the drawn picture's pixels and NED."""
+        mount = mount or self.mount
+        ned_from_optical = ned_from_body @ mount.body_from_optical
+        eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ mount.position_frd_m
         eye[2] = min(eye[2], -LOWEST_EYE_M)
-        matrix = self.camera.matrix
+        matrix = self._drawn.matrix
         return View(
             eye=eye,
             ned_from_pixel=ned_from_optical @ np.linalg.inv(matrix),
             pixel_from_ned=matrix @ ned_from_optical.T,
-            focal_px=(self.camera.fx + self.camera.fy) / 2,
-            width=self.camera.width,
-            height=self.camera.height,
+            focal_px=(self._drawn.fx + self._drawn.fy) / 2,
+            width=self._drawn.width,
+            height=self._drawn.height,
         )
 
     def _cast_shadows(self, view: View, image: Image) -> None:
@@ -275,3 +328,27 @@ def _visible(
     return VisibleObject(
         placed.item, xyxy, min(1.0, fraction), count, range_to(placed.item, (view.eye[0], view.eye[1]))
     )
+
+
+def _visible_through_lens(
+    placed: PlacedObject,
+    sighting: Sighting,
+    number: int,
+    labels: NDArray[np.int32],
+    exposed: NDArray[np.int32],
+    inside: NDArray[np.bool_],
+    view: View,
+) -> VisibleObject | None:
+    """The box in the exposed picture; the fraction in the drawn one, where a pixel is a pixel everywhere."""
+    own = (exposed >> FACE_BITS) == number
+    rows = np.flatnonzero(own.any(axis=1))
+    if not len(rows):
+        return None
+    columns = np.flatnonzero(own[rows[0] : rows[-1] + 1].any(axis=0))
+    edges = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+    xyxy = (float(edges[0]), float(edges[1]), float(edges[2]), float(edges[3]))
+    drawn = (slice(sighting.top, sighting.bottom), slice(sighting.left, sighting.right))
+    seen = ((labels[drawn] >> FACE_BITS) == number) & inside[drawn]
+    fraction = float(np.count_nonzero(seen)) / len(sighting.pixels) * sighting.inside_share
+    range_m = range_to(placed.item, (view.eye[0], view.eye[1]))
+    return VisibleObject(placed.item, xyxy, min(1.0, fraction), int(np.count_nonzero(own)), range_m)

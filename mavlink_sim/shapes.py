@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from mavlink_sim import clutter, creatures, vehicles
 from mavlink_sim.painting_order import PaintingTree, painting_tree
-from mavlink_sim.solids import Body, Points, ground_shadow
+from mavlink_sim.solids import Body, Points, Triple, ground_shadow
+from mavlink_sim.structures import DEFAULT_SIZES_M, SIZED_BUILDERS, check_size
 
 CLASS_NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair")
 """COCO's names of what the detector is to find."""
@@ -94,11 +95,26 @@ def variant_of(class_name: str, appearance: int) -> int:
 
 
 @lru_cache(maxsize=512)
-def shape_of(class_name: str, variant: int) -> Shape:
-    """The shape of a class's variant. Raises ValueError for a class that cannot be drawn."""
-    if class_name not in BUILDERS:
-        raise ValueError(f"cannot draw a {class_name!r}; known are {', '.join(sorted(BUILDERS))}")
-    body = BUILDERS[class_name](np.random.default_rng((variant, *class_name.encode())))
+def shape_of(class_name: str, variant: int, size_m: Triple | None = None) -> Shape:
+    """The shape of a class's variant; `size_m` (length, width, height) is for those of `structures` alone.
+
+    Raises ValueError for a class that cannot be drawn, and for a size that it cannot have.
+    """
+    rng = np.random.default_rng((variant, *class_name.encode()))
+    if class_name in SIZED_BUILDERS:
+        size = size_m or DEFAULT_SIZES_M[class_name]
+        check_size(class_name, size)
+        body = SIZED_BUILDERS[class_name](rng, size)
+    elif class_name not in BUILDERS:
+        raise ValueError(
+            f"cannot draw a {class_name!r}; known are {', '.join(sorted((*BUILDERS, *SIZED_BUILDERS)))}"
+        )
+    elif size_m is not None:
+        raise ValueError(
+            f"a {class_name} has its own size; size_m is for {', '.join(SIZED_BUILDERS)}: use scale"
+        )
+    else:
+        body = BUILDERS[class_name](rng)
     for solid in body.solids:
         for face in (*solid.faces, *solid.decals):
             # Mirroring z turns the winding round.

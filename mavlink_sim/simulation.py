@@ -26,6 +26,7 @@ from vision.shared_frame import segment_path
 if TYPE_CHECKING:
     from mavlink_sim.camera_process import CameraProcess
     from mavlink_sim.physics import Vector
+    from mavlink_sim.scene import Scene
     from mavlink_sim.world import World
 
 logger = logging.getLogger(__name__)
@@ -44,15 +45,19 @@ class SimulationOptions:
         onboard_port, gcs_port: UDP ports the vehicle sends to at first.
         onboard_bind, gcs_bind: UDP ports it binds; 0 chooses free ones.
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
-        camera: name of the shared-memory segment the camera's frames go to; None for no camera.
+        camera: name of the shared-memory segment the camera's frames go to; None for no shared memory.
+        camera_outputs: further addresses the frames go to (`video_outputs`).
+        camera_truth: file for what is in each frame, one JSON object a line.
+        scene: a scene file, or the name of an example (`scene_file.load_scene`); None for the demo world.
         truth: file for the truth, one JSON object a line; None for none.
-        record: folder for the traffic of each link, `<link>.tlog`; None for none.
+        record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
         px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
         parameters: PX4 parameters that differ from the defaults.
+        signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG says what is refused.
         faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
         console: read faults from standard input; None: if that is a terminal.
         control: a zenoh endpoint to take faults on (`tcp/127.0.0.1:7447`); None for none.
@@ -67,7 +72,10 @@ class SimulationOptions:
     seed: int = 0
     wind_mps: float = 0.0
     camera: str | None = None
-    camera_rate_hz: float = 30.0
+    camera_rate_hz: float | None = None
+    camera_outputs: tuple[str, ...] = ()
+    camera_truth: Path | None = None
+    scene: str | None = None
     truth: Path | None = None
     record: Path | None = None
     ready_after_s: float = 3.0
@@ -76,9 +84,15 @@ class SimulationOptions:
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
+    signing_key: bytes | None = field(default=None, repr=False)
     faults: tuple[str, ...] = ()
     console: bool | None = None
     control: str | None = None
+
+    @property
+    def shows_world(self) -> bool:
+        """Whether there is a camera."""
+        return self.camera is not None or bool(self.camera_outputs) or self.camera_truth is not None
 
 
 class Simulation:
@@ -113,8 +127,9 @@ class Simulation:
         self._on_event = on_event
         self._camera: CameraProcess | None = None
         self._camera_seen = False
+        self._camera_rate_hz = 30.0
         self._next_camera_check_s = 0.0
-        self._world: World | None = None
+        self._scene: Scene | None = None
         self._truth: IO[str] | None = None
         self._resources = ExitStack()
         try:
@@ -127,14 +142,19 @@ class Simulation:
             }
             self.vehicle.add_link("onboard")
             self.vehicle.add_link("gcs", GCS_RATES_HZ)
+            for name, endpoint in self.endpoints.items():
+                endpoint.signing = self.vehicle.links[name].signing
+            if options.signing_key is not None:
+                self.vehicle.sign_everything(options.signing_key)
             if options.record is not None:
-                self._resources.enter_context(recording(self.endpoints, options.record))
+                files = {f"{name}-{options.system_id}": link for name, link in self.endpoints.items()}
+                self._resources.enter_context(recording(files, options.record))
             self._faults = self._resources.enter_context(
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
-            if options.camera is not None or options.truth is not None:
+            if options.shows_world or options.truth is not None or options.scene is not None:
                 self._open_world()
         except BaseException:
             self._resources.close()
@@ -147,16 +167,23 @@ class Simulation:
 
     def _open_world(self) -> None:
         # imported here: a vehicle without camera or truth needs neither the renderer nor its start-up time
-        from mavlink_sim.world import demo_world
+        from mavlink_sim.scene_file import scene_or_demo
 
-        self._world = demo_world(self.options.seed)
-        if self.options.camera is None:
+        options = self.options
+        self._scene = scene_or_demo(options.scene, options.seed)
+        if not options.shows_world:
             return
         from mavlink_sim.camera_process import CameraProcess
 
-        segment_path(self.options.camera)  # raises for a name that cannot be
+        if options.camera is not None:
+            segment_path(options.camera)  # raises for a name that cannot be
+        self._camera_rate_hz = options.camera_rate_hz or self._scene.camera.rate_hz
         self._camera = CameraProcess(
-            self._world, rate_hz=self.options.camera_rate_hz, shared_name=self.options.camera
+            self._scene,
+            rate_hz=self._camera_rate_hz,
+            shared_name=options.camera,
+            outputs=options.camera_outputs,
+            truth=options.camera_truth,
         )
         self._resources.callback(self._camera.stop)
         self._camera.start()
@@ -232,9 +259,14 @@ class Simulation:
         """The pose to the camera and the truth to its file, each at its rate."""
         camera = self._camera
         if camera is not None and self._simulated_s >= self._next_frame_s:
-            period_s = self.options.speed / self.options.camera_rate_hz  # the rate is one of real time
+            period_s = self.options.speed / self._camera_rate_hz  # the rate is one of real time
             self._next_frame_s = max(self._next_frame_s + period_s, self._simulated_s)
-            camera.send_pose(self._place_in_world, self.vehicle.quaternion, time.monotonic_ns())
+            camera.send_pose(
+                self._place_in_world,
+                self.vehicle.quaternion,
+                time.monotonic_ns(),
+                self._simulated_s,
+            )
             if self._simulated_s >= self._next_camera_check_s:
                 self._next_camera_check_s = self._simulated_s + CAMERA_CHECK_S
                 self._check_camera(camera)
@@ -247,10 +279,10 @@ class Simulation:
         """Say when the camera begins and when it is lost; the vehicle flies on without it."""
         if not camera.alive:
             self._camera = None
-            self._on_event(f"camera {camera.shared_name} is lost: its process ended")
-        elif not self._camera_seen and segment_path(camera.shared_name).exists():
+            self._on_event(f"camera {camera.name} is lost: its process ended")
+        elif not self._camera_seen and camera.ready:
             self._camera_seen = True
-            self._on_event(f"camera {camera.shared_name} is on")
+            self._on_event(f"camera {camera.name} is on")
 
     @property
     def _place_in_world(self) -> Vector:
@@ -270,7 +302,9 @@ class Simulation:
             "mode": autopilot.mode.name,
             "armed": autopilot.armed,
             "landed": autopilot.landed,
-            "objects": [] if self._world is None else _object_truth(self._world, self._place_in_world),
+            "objects": []
+            if self._scene is None
+            else _object_truth(self._scene.world_at(self._simulated_s), self._place_in_world),
         }
 
 

@@ -12,6 +12,7 @@ from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_
 from mavlink_sim.mission_messages import mission_current
 from mavlink_sim.orbit import orbit_execution_status
 from mavlink_sim.physics import MAX_THRUST_MPS2
+from mavlink_sim.vehicle_files import metadata_message
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
@@ -371,7 +372,7 @@ def _time_estimate(vehicle: Vehicle) -> Any:
 
 
 def _current_event_sequence(vehicle: Vehicle) -> Any:
-    return current_event_sequence(vehicle.event_sequence)
+    return current_event_sequence(vehicle.events.sequence)
 
 
 def _gps_global_origin(vehicle: Vehicle) -> Any:
@@ -439,10 +440,18 @@ BUILDERS: dict[str, Builder] = {
     "GPS_GLOBAL_ORIGIN": _gps_global_origin,
 }
 # Built on request alone.
-REQUESTED: dict[str, Builder] = {"AUTOPILOT_VERSION": _autopilot_version}
+REQUESTED: dict[str, Builder] = {
+    "AUTOPILOT_VERSION": _autopilot_version,
+    "COMPONENT_METADATA": metadata_message,
+}
 
 MESSAGE_IDS: dict[int, str] = {
     identifier: message.msgname
     for identifier, message in dialect.mavlink_map.items()
     if message.msgname in BUILDERS or message.msgname in REQUESTED
-} | {8: "LINK_NODE_STATUS", 380: "TIME_ESTIMATE_TO_TARGET", 411: "CURRENT_EVENT_SEQUENCE"}
+} | {
+    8: "LINK_NODE_STATUS",
+    380: "TIME_ESTIMATE_TO_TARGET",
+    397: "COMPONENT_METADATA",
+    411: "CURRENT_EVENT_SEQUENCE",
+}

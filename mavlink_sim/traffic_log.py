@@ -41,7 +41,7 @@ class TrafficLog:
 
 @contextmanager
 def recording(endpoints: Mapping[str, UdpEndpoint], folder: Path) -> Iterator[None]:
-    """Record what every endpoint sends and receives into `folder/<name of the link>.tlog`.
+    """Record what every endpoint sends and receives into `folder/<its name>.tlog`.
 
     Raises OSError if the folder or a file in it cannot be made.
     """

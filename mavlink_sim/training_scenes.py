@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mavlink_sim.ground_view import Buffers, View
 from mavlink_sim.image_effects import ImageEffects
-from mavlink_sim.renderer import Renderer
+from mavlink_sim.renderer import Rendered, Renderer
 from mavlink_sim.shapes import CLASS_NAMES, CLUTTER_NAMES, shape_of, variant_of
 from mavlink_sim.textures import KINDS, Image
 from mavlink_sim.world import Ground, Light, Patch, Sky, World, WorldObject
@@ -64,6 +64,21 @@ def random_scene(
         class ids (N,) int64, indices into CLASS_NAMES. Only things of which at least a third is seen
         (MIN_VISIBLE_FRACTION) and whose box is not tiny are truth.
     """
+    rendered = random_frame(rng, width, height, focal_px)
+    boxes: list[tuple[float, float, float, float]] = []
+    ids: list[int] = []
+    for item in rendered.objects:
+        class_name = item.world_object.class_name
+        if class_name in CLASS_NAMES and _counts(item.xyxy, item.visible_fraction):
+            boxes.append(item.xyxy)
+            ids.append(CLASS_NAMES.index(class_name))
+    return rendered.image, np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+
+
+def random_frame(
+    rng: np.random.Generator, width: int, height: int, focal_px: tuple[float, float] | None = None
+) -> Rendered:
+    """The frame behind `random_scene`, with depth and all that is seen; the same draws, the same picture."""
     least, greatest = focal_px or (0.6 * width, 1.7 * width)
     altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(60.0))))
     # Looking down from higher up with a longer lens, so that people stay visible.
@@ -82,15 +97,7 @@ def random_scene(
     objects = _random_objects(rng, renderer, position, attitude, ground)
     effects = _random_effects(rng)
     renderer = Renderer(World(objects, ground, light, sky), camera, CameraMount(), effects, buffers, rng)
-    rendered = renderer.render(position, attitude)
-    boxes: list[tuple[float, float, float, float]] = []
-    ids: list[int] = []
-    for item in rendered.objects:
-        class_name = item.world_object.class_name
-        if class_name in CLASS_NAMES and _counts(item.xyxy, item.visible_fraction):
-            boxes.append(item.xyxy)
-            ids.append(CLASS_NAMES.index(class_name))
-    return rendered.image, np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+    return renderer.render(position, attitude)
 
 
 def render_dataset(

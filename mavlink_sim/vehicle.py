@@ -13,19 +13,22 @@ import random
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from mavlink_sim import mission_link, parameter_protocol, telemetry
+from mavlink_sim import file_transfer, mission_link, parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
 from mavlink_sim.estimate_errors import FallibleEstimate
+from mavlink_sim.event_protocol import EventBuffer
 from mavlink_sim.faults import Faults
 from mavlink_sim.geography import geographic, start_of_vehicle
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
-from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
+from mavlink_sim.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
+from mavlink_sim.signing import Signing, Streams, timestamp_now
 from mavlink_sim.streams import ONBOARD_RATES_HZ
+from mavlink_sim.vehicle_files import vehicle_files
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
 BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12
@@ -62,7 +65,7 @@ class Vehicle:
         autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
-        event_sequence: number of the newest EVENT.
+        events: the newest EVENTs. files: what MAVLink FTP reaches.
     """
 
     def __init__(
@@ -93,7 +96,9 @@ class Vehicle:
         self.airframe.on_touch = self._touched
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
-        self.event_sequence = 0
+        self.events = EventBuffer()
+        self.files = vehicle_files(self.parameters)
+        self._signing_streams: Streams = {}
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
         self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self._boot_us * 1000
         self.start_ned_m = start_ned_m
@@ -114,6 +119,7 @@ class Vehicle:
         self._origin_told = False
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._later_count = itertools.count()
+        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
 
     # ---- what is known of it ----------------------------------------------------------------------------
 
@@ -164,7 +170,18 @@ class Vehicle:
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
         link.gate = self.faults.gate
         link.tells_parameter_errors = self.release.has_parameter_errors
+        link.signing = Signing(
+            link_id=len(self.links) - 1,
+            streams=self._signing_streams,
+            policy=lambda: int(self.parameters.number("MAV_SIGN_CFG")),
+            is_usb=name == "gcs",  # the ground station's link stands for the USB port
+        )
         return link
+
+    def sign_everything(self, key: bytes, timestamp: int | None = None) -> None:
+        """Give every link a signing key; `timestamp` counts 10 us since 2015, None for now."""
+        for link in self.links.values():
+            link.signing.set_up(key, timestamp_now() if timestamp is None else timestamp)
 
     def outgoing(self, link: str) -> list[Outgoing]:
         """Take everything that waits to be sent on a link."""
@@ -218,6 +235,10 @@ class Vehicle:
         """Do something in a later step."""
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
 
+    def _tell_parameters(self) -> None:
+        """What differs from the defaults is told to everyone shortly after the start."""
+        parameter_protocol.tell_everyone(self, [item.name for item in self.parameters.customised()])
+
     def companion_heard(self) -> None:
         """An onboard controller's heartbeat arrived."""
         self._companion_seen_s = self.now_s
@@ -237,7 +258,8 @@ class Vehicle:
         """What does not survive a reboot, outside the autopilot."""
         self._later.clear()
         self._companion_seen_s, self._companion_lost, self._origin_told = None, False, False
-        self.event_sequence = 0
+        self.events = EventBuffer()
+        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
         for link in self.links.values():
             link.forget(self._boot_us)
 
@@ -282,6 +304,7 @@ class Vehicle:
                     self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
+            file_transfer.continue_transfer(link, self.now_s)
 
     def _watch_companion(self) -> None:
         seen = self._companion_seen_s
@@ -300,10 +323,8 @@ class Vehicle:
             for link in self.links.values():
                 link.send_text(text, self.now_s)
             if text.event is not None:
-                self.event_sequence = (self.event_sequence + 1) & 0xFFFF
                 identifier, levels, arguments = text.event
-                for link in self.links.values():
-                    link.send(event(identifier, self.boot_ms, self.event_sequence, levels, arguments))
+                self.events.emit(self.links.values(), identifier, self.boot_ms, levels, arguments)
         while autopilot.gimbal_commands:
             command, confirmation, values = autopilot.gimbal_commands.popleft()
             for link in self.links.values():

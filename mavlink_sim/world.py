@@ -12,22 +12,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mavlink_sim.shapes import CLASS_NAMES, CLUTTER_NAMES, shape_of, variant_of
+from mavlink_sim.plates import Print
+from mavlink_sim.shapes import CLASS_NAMES, CLUTTER_NAMES, Shape, shape_of, variant_of
+from mavlink_sim.structures import STRUCTURE_NAMES, check_size
 
 Vector = tuple[float, float, float]
 
 
+OBJECT_NAMES = CLASS_NAMES + CLUTTER_NAMES + STRUCTURE_NAMES
+
+
 @dataclass(frozen=True, slots=True)
 class WorldObject:
-    """One thing standing on the ground.
+    """One thing standing on the ground, or above it.
 
     Attributes:
         identifier: unique in its world, from 0.
-        class_name: a COCO name (`shapes.CLASS_NAMES`) or a kind of clutter (`shapes.CLUTTER_NAMES`).
-        position_ned_m: the middle of its footprint; z = 0 is the ground.
+        class_name: a COCO name (`shapes.CLASS_NAMES`), a kind of clutter (`shapes.CLUTTER_NAMES`), or one of
+            `structures.STRUCTURE_NAMES`.
+        position_ned_m: the middle of its footprint; z = 0 is the ground, negative is above it.
         yaw_rad: where its front points, from north over east.
         scale: multiplies its natural size.
         appearance: seed of its variant (size, pose) and colours.
+        size_m: length, width and height of one of `structures.STRUCTURE_NAMES`; None for its usual size.
+        printed: what a plate shows.
     """
 
     identifier: int
@@ -36,27 +44,43 @@ class WorldObject:
     yaw_rad: float = 0.0
     scale: float = 1.0
     appearance: int = 0
+    size_m: Vector | None = None
+    printed: Print | None = None
 
     def __post_init__(self) -> None:
-        if self.class_name not in CLASS_NAMES + CLUTTER_NAMES:
+        if self.class_name not in OBJECT_NAMES:
             raise ValueError(
                 f"object {self.identifier}: unknown class {self.class_name!r}; "
-                f"known are {', '.join(CLASS_NAMES + CLUTTER_NAMES)}"
+                f"known are {', '.join(OBJECT_NAMES)}"
             )
         if not self.scale > 0.0:
             raise ValueError(f"object {self.identifier}: scale must be positive, got {self.scale}")
+        if (self.class_name == "plate") != (self.printed is not None):
+            raise ValueError(f"object {self.identifier}: a plate, and nothing else, has a print")
+        if self.size_m is not None:
+            if self.class_name not in STRUCTURE_NAMES or self.printed is not None:
+                raise ValueError(
+                    f"object {self.identifier}: a {self.class_name} has its own size, size_m cannot be given"
+                )
+            check_size(self.class_name, self.size_m)
+
+    @property
+    def shape(self) -> Shape:
+        """What it looks like, in its own frame and before `scale`."""
+        size_m = self.size_m if self.printed is None else self.printed.board_size_m
+        return shape_of(self.class_name, variant_of(self.class_name, self.appearance), size_m)
 
     @property
     def footprint_m(self) -> tuple[float, float, float, float]:
         """(rear, front, left, right) edges of its footprint in its own frame, x forward, y right."""
-        shape = shape_of(self.class_name, variant_of(self.class_name, self.appearance))
+        shape = self.shape
         low, high = shape.low * self.scale, shape.high * self.scale
         return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
     @property
     def height_m(self) -> float:
         """How far it reaches above the ground."""
-        shape = shape_of(self.class_name, variant_of(self.class_name, self.appearance))
+        shape = self.shape
         return float(-shape.low[2]) * self.scale
 
 

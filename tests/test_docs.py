@@ -13,6 +13,7 @@ import typer
 from companion.cli import app as companion_app
 from companion.guidance import grammar
 from mavlink_sim.cli import app as simulator_app
+from mavlink_sim.dataset_cli import app as dataset_app
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [
@@ -51,6 +52,8 @@ OURS = [
 def test_every_command_in_the_documents_is_one_that_exists(words: list[str]) -> None:
     command = typer.main.get_command(APPS[words[0]])
     arguments = words[1:]
+    if words[:2] == ["mavlink-sim", "dataset"]:
+        command, arguments = typer.main.get_command(dataset_app), words[2:]
     context = command.make_context(words[0], list(arguments), resilient_parsing=False)
     # A group hands what is left to its command; that one must take it all.
     while hasattr(command, "resolve_command"):

@@ -139,11 +139,11 @@ def test_it_connects_sets_parameters_and_flies(simulator: RunningSimulator, cons
     console.wait_for("DISARMED")
 
 
+# A file for an ArduPilot begins with the home position; to a PX4 every line is an item to fly.
 MISSION_FILE = """QGC WPL 110
-0\t1\t0\t16\t0\t0\t0\t0\t47.3977432\t8.5455942\t489.4\t1
-1\t0\t3\t22\t0\t0\t0\t0\t47.3977432\t8.5455942\t5.0\t1
-2\t0\t3\t16\t0\t0\t0\t0\t47.3979000\t8.5455942\t5.0\t1
-3\t0\t3\t21\t0\t0\t0\t0\t47.3979000\t8.5455942\t0.0\t1
+0\t1\t3\t22\t0\t0\t0\t0\t47.3977432\t8.5455942\t4.0\t1
+1\t0\t3\t16\t0\t0\t0\t0\t47.3978000\t8.5455942\t4.0\t1
+2\t0\t3\t21\t0\t0\t0\t0\t47.3978000\t8.5455942\t0.0\t1
 """
 
 
@@ -154,12 +154,12 @@ def test_it_loads_a_mission_and_flies_it(
     console.wait_for(r"Received (\d+) parameters")
     (tmp_path / "mission.txt").write_text(MISSION_FILE)
     since = console.type("wp load mission.txt")
-    console.wait_for("Sent all 4 waypoints", since)
+    console.wait_for("Sent all 3 waypoints", since)
     since = console.type("wp list")
-    console.wait_for("Requesting 4 waypoints", since)
+    console.wait_for("Requesting 3 waypoints", since)
     console.type(f"long DO_SET_MODE 1 {MISSION}")
     simulator.wait_for_event("mode MISSION")
-    console.type("arm throttle")
+    console.ask("arm throttle", "COMPONENT_ARM_DISARM: ACCEPTED")
     simulator.wait_for_event("takeoff")
     simulator.wait_for_event("disarmed (after landing)", 60.0)
 

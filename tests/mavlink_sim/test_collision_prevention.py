@@ -183,6 +183,23 @@ def test_whatever_is_around_the_answer_is_finite(
     assert all(map(math.isfinite, got.acceleration))
 
 
+def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
+    cockpit.take_off()
+    cockpit.vehicle.autopilot.pilot_takes_over()
+    allowed = cockpit.vehicle.autopilot.navigator.allowed_acceleration
+    assert allowed((3.0, 0.0), STILL) == STILL
+    free = dialect.MAVLink_obstacle_distance_message(0, 0, [FAR_CM] * SECTORS, 5, 20, 2000, 0.0, 0.0, 12)
+    cockpit.send(free)
+    assert allowed((3.0, 0.0), STILL)[0] > 2.9
+    cockpit.fly(4.0)
+    assert allowed((3.0, 0.0), STILL) == STILL
+    assert cockpit.mode == "POSCTL"
+    cockpit.fly(1.5)
+    allowed((3.0, 0.0), STILL)
+    assert cockpit.mode == "HOLD"
+
+
 def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
     make_cockpit: Any, velocity_setpoint: Any
 ) -> None:

@@ -322,3 +322,15 @@ def test_a_reboot_on_the_ground_is_ready_again(cockpit) -> None:
     assert not cockpit.vehicle.autopilot.can_arm
     cockpit.fly(3.0)
     assert cockpit.command(ARM, 1) == [0]
+
+
+def test_a_landing_goes_on_blindly_when_gps_is_lost(cockpit) -> None:
+    cockpit.take_off(8.0)
+    begin(cockpit, "gps_loss")
+    cockpit.fly(2.0)
+    assert cockpit.command(LAND) == [0]
+    cockpit.until(lambda: not cockpit.vehicle.autopilot.position_valid, 5.0)
+    cockpit.fly(0.1)
+    assert type(cockpit.vehicle.autopilot.task).__name__ == "Descend"
+    assert cockpit.mode == "LAND"
+    cockpit.until(lambda: not cockpit.armed, 25.0)

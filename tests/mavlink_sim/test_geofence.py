@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from plan_client import circle, listen, polygon, upload
 
 from mavlink_sim.geofence import Area, inside_polygon
+from mavlink_sim.geography import geographic
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
 metres = st.floats(-100.0, 100.0)
@@ -165,6 +166,18 @@ def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
     cockpit.until(lambda: cockpit.vehicle.airframe.position[0] < 6.0, 10.0, home)
     assert cockpit.mode == "OFFBOARD"
     cockpit.until(lambda: cockpit.mode == "HOLD", 10.0, north)  # and the next breach counts anew
+
+
+def test_a_place_outside_the_fence_is_not_flown_to(cockpit: Any) -> None:
+    listen(cockpit)
+    cockpit.take_off(4.0)
+    upload(cockpit, [circle(0, 0, 8.0)], 1)
+    latitude, longitude, altitude = geographic((20.0, 0.0, -4.0))
+    place = (round(latitude * 1e7), round(longitude * 1e7), altitude)
+    assert cockpit.command_int(192, (-1, 1, 0, math.nan), *place) == [0]
+    cockpit.fly(2.0)
+    assert cockpit.texts()[-1] == "Reposition is outside geofence\t"
+    assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 1.0
 
 
 def test_termination_stops_the_motors(make_cockpit: Any, velocity_setpoint: Any) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
@@ -115,6 +115,7 @@ def test_the_force_bit_matters_only_with_an_acceleration(mask: int, refused: boo
         assert trajectory_setpoint(locally(mask), 0.0).velocity == (0.0, 0.0, 0.0)
 
 
+@settings(max_examples=60, deadline=None)
 @given(
     st.sampled_from([0, 3, 5, 6, 10, 11, 99]),
     st.integers(0, 65535),

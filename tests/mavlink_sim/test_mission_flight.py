@@ -219,6 +219,25 @@ def test_a_finished_mission_begins_again_after_disarming(cockpit: Any) -> None:
     assert reached(cockpit)[-2:] == [0, 1]
 
 
+def test_numbers_that_are_none_do_not_stop_the_vehicle(cockpit: Any) -> None:
+    nothing = [NAN] * 7
+    strange = [
+        takeoff(3.0),
+        item(201, None, NAN),
+        item(178, None, NAN, NAN),
+        item(177, None, NAN, NAN),
+        item(1000, None, *nothing[:4]),
+        {**waypoint(2, 0, 3, NAN, NAN, NAN, NAN), "z": NAN},
+        item(31, (2, 0, 3), NAN, NAN, NAN, NAN),
+        item(19, (0, 0, 3), math.inf, NAN, NAN, NAN),
+        waypoint(0, 2, 3),
+    ]
+    assert upload(cockpit, strange) == 0
+    cockpit.command(300)
+    cockpit.until(lambda: cockpit.mode == "HOLD", 60.0)
+    assert all(map(math.isfinite, cockpit.vehicle.airframe.position))
+
+
 def test_an_empty_mission_cannot_be_flown_or_armed_in(cockpit: Any) -> None:
     assert cockpit.set_mode(4, 4) == [0, 0]  # on the ground any mode may be chosen
     assert not cockpit.vehicle.autopilot.can_arm

@@ -289,7 +289,7 @@ def test_the_failsafe_lands_disarms_and_the_vehicle_shows_offboard_again(
     cockpit, _ = streaming
     cockpit.until(lambda: not cockpit.armed, 40.0)
     beat = cockpit.heartbeat()
-    assert (beat.custom_mode, beat.base_mode, beat.system_status) == (0x00060000, 1, 0)
+    assert (beat.custom_mode, beat.base_mode, beat.system_status) == (0x00060000, 17, 0)
 
 
 @pytest.mark.parametrize(

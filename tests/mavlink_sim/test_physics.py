@@ -60,6 +60,7 @@ def test_a_velocity_over_the_limit_is_cut_where_it_does_not_lead_to_the_position
     assert math.hypot(x, y) == pytest.approx(12.0)
 
 
+@settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-50.0, 50.0), min_size=4, max_size=4))
 def test_no_velocity_setpoint_is_over_the_limit(values: list[float]) -> None:
     _, controller = hovering()

@@ -74,14 +74,14 @@ def test_a_failing_test_keeps_the_log_and_the_traffic_and_names_them(
         "--basetemp=temporary",
     )
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log", "traffic:*gcs.tlog", "* armed"])
+    result.stdout.fnmatch_lines(["*- vehicle 1 -*", "log:*vehicle.log", "traffic:*gcs-1.tlog", "* armed"])
     (log,) = pytester.path.glob("temporary/vehicles/*test_it-1/vehicle.log")
     assert f"log:     {log}" in result.stdout.str()
     lines = log.read_text().splitlines()
     assert "ready: system 1" in lines[0]
     assert lines[1].endswith(" armed")
     assert lines[-2].endswith(" stopped")  # the log goes on to the end, beyond what the report shows
-    record = mavutil.mavlink_connection(str(log.with_name("onboard.tlog")))
+    record = mavutil.mavlink_connection(str(log.with_name("onboard-1.tlog")))
     kinds = set()
     while (message := record.recv_match()) is not None:
         kinds.add((message.get_srcSystem(), message.get_type()))

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mavlink_sim.ground_view import Buffers
 from mavlink_sim.image_effects import ImageEffects
 from mavlink_sim.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered, Renderer, VisibleObject
 from mavlink_sim.shapes import CLASS_NAMES
@@ -247,10 +248,9 @@ def test_a_landed_camera_still_sees() -> None:
     assert 0.0 < np.nanmin(rendered.depth_m) < 0.5
 
 
-def test_a_distorting_lens_is_refused() -> None:
-    lens = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5, (0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="draws no lens distortion"):
-        Renderer(world_of(), lens)
+def test_buffers_of_another_size_are_refused() -> None:
+    with pytest.raises(ValueError, match="buffers must have the drawn picture's size 160x120, got 64x48"):
+        Renderer(world_of(), CAMERA, buffers=Buffers(64, 48))
 
 
 def test_effects_change_the_picture_as_named() -> None:

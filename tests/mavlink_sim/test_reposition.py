@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
@@ -179,6 +179,7 @@ def test_the_altitude_can_be_changed_by_a_command_of_its_own(cockpit: Any) -> No
 coordinate = st.one_of(st.just(NAN), st.floats(-500.0, 500.0))
 
 
+@settings(max_examples=60, deadline=None)
 @given(coordinate, coordinate, coordinate, st.one_of(st.just(NAN), st.floats(-3.0, 3.0)), st.booleans())
 def test_the_goal_is_always_a_whole_place(x: float, y: float, z: float, yaw: float, going: bool) -> None:
     airframe = Multirotor()

@@ -1,0 +1,226 @@
+"""A file system in memory, for MAVLink FTP: nothing of the host's disk can be reached through it.
+
+Paths are absolute or not, as in PX4: both begin at the root. `..` never leads above it. Errors are OSErrors
+with the errno that POSIX has for the case.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+
+CAPACITY_BYTES = 16 * 1024 * 1024
+MAX_ENTRIES = 2000
+MAX_NAME_BYTES = 220  # with its size it must fit one answer to a list request
+# A flight controller's card is mounted here; PX4's simulation has the same files at its root.
+STORAGE = ("fs", "microsd")
+
+Path = tuple[str, ...]
+
+
+class FileSystem:
+    """Files that clients write, and files that the vehicle provides, which are read-only and made when read.
+
+    Args:
+        capacity_bytes: what all written files together may take; more is ENOSPC.
+    """
+
+    def __init__(self, capacity_bytes: int = CAPACITY_BYTES) -> None:
+        self._capacity_bytes = capacity_bytes
+        self._files: dict[Path, bytearray] = {}
+        self._provided: dict[Path, Callable[[], bytes]] = {}
+        self._directories: set[Path] = {()}
+
+    # ---- what the vehicle offers
+
+    def provide(self, path: str, content: Callable[[], bytes]) -> None:
+        """Offer a read-only file, whose content is asked for whenever it is opened; its folders are made."""
+        place = resolve(path)
+        for depth in range(1, len(place)):
+            self._directories.add(place[:depth])
+        self._provided[place] = content
+
+    def is_protected(self, path: str) -> bool:
+        """Whether this is the vehicle's own: a provided file, or a folder with one in it."""
+        place = resolve(path)
+        return any(provided[: len(place)] == place for provided in self._provided)
+
+    # ---- reading
+
+    def list(self, path: str) -> Iterator[tuple[str, int | None]]:
+        """(name, size) of a folder's entries by name; a folder's size is None. ENOENT, ENOTDIR."""
+        place = self._directory(path)
+        entries = {
+            directory[-1]: None for directory in self._directories if directory[:-1] == place != directory
+        }
+        sizes: dict[str, int | None] = dict(entries)
+        for found, content in self._files.items():
+            if found[:-1] == place:
+                sizes[found[-1]] = len(content)
+        for found, provider in self._provided.items():
+            if found[:-1] == place:
+                sizes[found[-1]] = len(provider())
+        return iter(sorted(sizes.items()))
+
+    def read(self, path: str) -> bytes | bytearray:
+        """A file's content: the live buffer of a written one. ENOENT, EISDIR."""
+        place = resolve(path)
+        if place in self._files:
+            return self._files[place]
+        if place in self._provided:
+            return self._provided[place]()
+        raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
+
+    # ---- writing
+
+    def create(self, path: str, truncate: bool) -> bytearray:
+        """Open for writing, making the file if there is none. ENOENT (folder), EISDIR, ENOSPC, EROFS."""
+        place = self._writable(path)
+        if place in self._directories:
+            raise _error(errno.EISDIR, path)
+        if place not in self._files:
+            self._check_new(place, path)
+            self._files[place] = bytearray()
+        elif truncate:
+            self.resize(self._files[place], 0)
+        return self._files[place]
+
+    def resize(self, content: bytearray, size: int) -> None:
+        """Cut a written file off or fill it up with zeros. ENOSPC."""
+        growth = size - len(content)
+        # the sum leaves out what was removed while open, so that buffer is also limited by itself
+        if growth > 0 and max(size, growth + sum(map(len, self._files.values()))) > self._capacity_bytes:
+            raise _error(errno.ENOSPC, f"{growth} more bytes")
+        if growth > 0:
+            content.extend(bytes(growth))
+        else:
+            del content[size:]
+
+    def write(self, content: bytearray, offset: int, data: bytes) -> int:
+        """Write into an open file, after zeros where that begins behind its end. ENOSPC."""
+        end = offset + len(data)
+        if end > len(content):
+            self.resize(content, end)
+        content[offset:end] = data
+        return len(data)
+
+    def truncate(self, path: str, size: int) -> None:
+        place = self._writable(path)
+        if place not in self._files:
+            raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
+        self.resize(self._files[place], size)
+
+    def remove(self, path: str) -> None:
+        place = self._writable(path)
+        if place not in self._files:
+            raise _error(errno.EISDIR, path) if place in self._directories else self._missing(place, path)
+        del self._files[place]  # a session that has it open keeps it, as in POSIX
+
+    def make_directory(self, path: str) -> None:
+        place = resolve(path)
+        if place in self._directories or place in self._files or place in self._provided:
+            raise _error(errno.EEXIST, path)
+        self._check_new(place, path)
+        self._directories.add(place)
+
+    def remove_directory(self, path: str) -> None:
+        place = self._writable(path)
+        if place in self._files:
+            raise _error(errno.ENOTDIR, path)
+        if place not in self._directories:
+            raise self._missing(place, path)
+        self._check_empty(place, path)
+        if not place:
+            raise _error(errno.EBUSY, path)  # the root
+        self._directories.remove(place)
+
+    def rename(self, old: str, new: str) -> None:
+        """Rename a file or a folder; it takes the place of another file or of an empty folder."""
+        source, target = self._writable(old), self._writable(new)
+        for place, path in ((source, old), (target, new)):
+            self._check_parent(place, path)
+        is_folder = source in self._directories
+        if not is_folder and source not in self._files:
+            raise _error(errno.ENOENT, old)
+        if target == source:
+            return
+        if target[: len(source)] == source:
+            raise _error(errno.EINVAL, new)
+        if source[: len(target)] == target:
+            raise _error(errno.ENOTEMPTY, new)
+        if target in self._files and is_folder:
+            raise _error(errno.ENOTDIR, new)
+        if target in self._directories:
+            if not is_folder:
+                raise _error(errno.EISDIR, new)
+            self._check_empty(target, new)
+        elif target not in self._files:
+            self._check_new(target, new)
+        depth = len(source)
+        self._directories = {
+            target + place[depth:] if place[:depth] == source else place for place in self._directories
+        }
+        self._files = {
+            target + place[depth:] if place[:depth] == source else place: content
+            for place, content in self._files.items()
+            if place != target
+        }
+
+    # ---- within
+
+    def _entries(self) -> Iterator[Path]:
+        yield from (place for place in self._directories if place)
+        yield from self._files
+        yield from self._provided
+
+    def _directory(self, path: str) -> Path:
+        place = resolve(path)
+        if place not in self._directories:
+            known = place in self._files or place in self._provided
+            raise _error(errno.ENOTDIR, path) if known else self._missing(place, path)
+        return place
+
+    def _writable(self, path: str) -> Path:
+        if self.is_protected(path):
+            raise _error(errno.EROFS, path)
+        return resolve(path)
+
+    def _missing(self, place: Path, path: str) -> OSError:
+        """What a path that leads nowhere is: ENOTDIR if it leads through a file, else ENOENT."""
+        through = any(
+            place[:depth] in self._files or place[:depth] in self._provided for depth in range(len(place))
+        )
+        return _error(errno.ENOTDIR if through else errno.ENOENT, path)
+
+    def _check_parent(self, place: Path, path: str) -> None:
+        if place[:-1] not in self._directories:
+            raise self._missing(place, path)
+
+    def _check_empty(self, place: Path, path: str) -> None:
+        if any(other[:-1] == place for other in self._entries()):
+            raise _error(errno.ENOTEMPTY, path)
+
+    def _check_new(self, place: Path, path: str) -> None:
+        self._check_parent(place, path)
+        if len(place[-1].encode(errors="surrogateescape")) > MAX_NAME_BYTES:
+            raise _error(errno.ENAMETOOLONG, path)
+        if len(self._files) + len(self._directories) >= MAX_ENTRIES:
+            raise _error(errno.ENOSPC, path)
+
+
+def resolve(path: str) -> Path:
+    """The names on the way from the root; the storage card's two places are one."""
+    names: list[str] = []
+    for name in path.split("/"):
+        if name == "..":
+            del names[-1:]
+        elif name not in ("", "."):
+            names.append(name)
+    if tuple(names[:2]) == STORAGE:
+        del names[:2]
+    return tuple(names)
+
+
+def _error(number: int, path: str) -> OSError:
+    return OSError(number, os.strerror(number), path)

@@ -1,0 +1,149 @@
+"""Distortion and shutter: every pixel sees what geometry says it sees, and the boxes follow."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink_sim.camera_lens import CameraMotion, Lens, Shutter
+from mavlink_sim.plates import Print
+from mavlink_sim.renderer import Renderer
+from mavlink_sim.world import Ground, World, WorldObject
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import matrix_from_euler
+
+GROUND = Ground(("concrete",), 0, 256, 0.05)
+PLAIN = CameraModel.from_horizontal_fov(160, 120, math.radians(80.0))
+BARREL = (-0.2, 0.05, 0.001, -0.002)
+LEVEL = np.eye(3)
+
+
+def bent(distortion: tuple[float, ...]) -> CameraModel:
+    return CameraModel(160, 120, PLAIN.fx, PLAIN.fy, 81.0, 58.5, distortion)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    k1=st.floats(-0.1, 0.15),
+    k2=st.floats(0.0, 0.05),
+    tangential=st.floats(-0.003, 0.003),
+    pitch=st.floats(-1.5, -0.3),
+    yaw=st.floats(-3.0, 3.0),
+)
+def test_a_point_on_the_ground_is_seen_where_the_camera_model_projects_it(
+    k1: float, k2: float, tangential: float, pitch: float, yaw: float
+) -> None:
+    camera, mount = bent((k1, k2, tangential, -tangential)), CameraMount()
+    attitude = matrix_from_euler(0.1, pitch, yaw)
+    rendered = Renderer(World((), GROUND), camera, mount).render((1.0, 2.0, -6.0), attitude)
+    assert rendered.image.shape == (120, 160, 3)
+    ahead = attitude @ mount.body_from_optical @ np.array([0.0, 0.0, 1.0])
+    middle = ahead[:2] / ahead[2] * 6.0
+    north, east = (axis.ravel() for axis in np.meshgrid(np.linspace(-4, 4, 13), np.linspace(-4, 4, 13)))
+    offsets = np.column_stack([middle[0] + north, middle[1] + east, np.full(len(north), 6.0)])
+    optical = offsets @ (attitude @ mount.body_from_optical)
+    pixels = camera.project(optical)
+    # Far outside the picture the polynomial may bend points back into it.
+    plane = np.hypot(*(optical[:, :2] / optical[:, 2:]).T)
+    inside = (pixels > 1).all(axis=1) & (pixels < (158, 118)).all(axis=1) & (optical[:, 2] > 0) & (plane < 1)
+    assert inside.any()
+    columns, rows = np.rint(pixels[inside]).astype(int).T
+    around = np.array([rendered.depth_m[rows + i, columns + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    depth = optical[inside, 2]
+    assert np.all(around.min(axis=0) - 1e-3 <= depth)
+    assert np.all(depth <= around.max(axis=0) + 1e-3)
+
+
+def test_the_box_of_a_bent_picture_holds_the_projected_corners() -> None:
+    camera, mount = bent(BARREL), CameraMount()
+    car = WorldObject(0, "car", (9.0, 4.0, 0.0), 0.7)
+    attitude = matrix_from_euler(0.0, -0.15, 0.0)
+    renderer = Renderer(World((car,), GROUND), camera, mount)
+    rendered = renderer.render((0.0, 0.0, -2.0), attitude)
+    (seen,) = rendered.objects
+    shape = car.shape
+    c, s = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
+    turned = shape.corners @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + car.position_ned_m
+    optical = (turned - (0.0, 0.0, -2.0)) @ (attitude @ mount.body_from_optical)
+    points = camera.project(optical)
+    low, high = points.min(axis=0), points.max(axis=0)
+    assert np.abs(np.array(seen.xyxy) - (low[0], low[1], high[0] + 1, high[1] + 1)).max() < 1.6
+    assert seen.visible_fraction > 0.97
+    assert seen.pixel_count < (high - low).prod()
+
+
+def test_a_straight_lens_with_a_shutter_that_stands_still_draws_the_plain_picture() -> None:
+    world = World((WorldObject(0, "car", (9.0, 1.0, 0.0), 0.7),), GROUND)
+    plain = Renderer(world, PLAIN).render((0.0, 0.0, -3.0), LEVEL)
+    still = Renderer(world, PLAIN, shutter=Shutter(0.01, 0.02)).render((0.0, 0.0, -3.0), LEVEL)
+    assert np.abs(plain.image.astype(int) - still.image).mean() < 2.0  # the ground's dither differs
+    assert np.allclose(plain.depth_m, still.depth_m, rtol=1e-4, equal_nan=True)
+    assert plain.objects[0].xyxy == still.objects[0].xyxy
+    assert plain.objects[0].visible_fraction == pytest.approx(still.objects[0].visible_fraction, abs=0.01)
+
+
+def pole_columns(rendered_labels: np.ndarray) -> np.ndarray:
+    """Mean column of the pole in each row in which it is seen."""
+    rows = np.flatnonzero(rendered_labels.any(axis=1))
+    return np.array([np.flatnonzero(rendered_labels[row]).mean() for row in rows])
+
+
+@pytest.mark.parametrize("rate_radps", [2.0, -2.0])
+def test_under_a_turning_rolling_shutter_uprights_lean(rate_radps: float) -> None:
+    world = World((WorldObject(0, "wall", (6.0, 0.0, 0.0), math.pi, size_m=(0.3, 0.3, 8.0)),), GROUND)
+    renderer = Renderer(world, PLAIN, CameraMount(), shutter=Shutter(0.0, 0.03))
+    motion = CameraMotion(angular_velocity_radps=(0.0, rate_radps, 0.0))
+    rendered = renderer.render((0.0, 0.0, -3.0), LEVEL, motion=motion)
+    near = np.nan_to_num(rendered.depth_m, nan=99.0) < 6.2
+    near[70:] = False  # below, the ground is near too
+    columns = pole_columns(near)
+    # From the first row to the 70th the camera turns on: to the right, so that things move to the left.
+    expected = -rate_radps * 0.03 * 70 / 120 * PLAIN.fx
+    assert columns[-1] - columns[0] == pytest.approx(expected, abs=1.2)
+
+
+def test_under_a_rolling_shutter_moving_sideways_the_ground_shears_by_its_depth() -> None:
+    camera = CameraModel.from_horizontal_fov(320, 240, math.radians(80.0))
+    down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
+    for height in (2.0, 4.0):
+        plate = WorldObject(0, "plate", (0.0, 0.0, 0.0), 0.0, printed=Print("4X4_50", 9, 0.4 * height))
+        renderer = Renderer(World((plate,), GROUND), camera, CameraMount(), shutter=Shutter(0.0, 0.03))
+        motion = CameraMotion(velocity_mps=(8.0, 0.0, 0.0))
+        image = renderer.render((0.0, 0.0, -height), down, motion=motion).image
+        book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        corners, identifiers, _ = cv2.aruco.ArucoDetector(book).detectMarkers(image)
+        assert np.ravel(identifiers).tolist() == [9]
+        upper_left, _, _, lower_left = corners[0].reshape(4, 2)
+        rows = lower_left[1] - upper_left[1]
+        # Lower rows are read later, when the camera is farther to the right.
+        expected = -8.0 * 0.03 * rows / 240 * camera.fx / height
+        assert lower_left[0] - upper_left[0] == pytest.approx(expected, abs=1.5)
+
+
+def test_an_exposure_smears_along_the_motion_alone() -> None:
+    world = World((), Ground(("paving",), 0, 256, 0.05))
+    looking_down = matrix_from_euler(0.0, -math.pi / 2, 0.0)
+    renderer = Renderer(world, PLAIN, CameraMount(), shutter=Shutter(0.02))
+
+    def detail(motion: CameraMotion) -> tuple[float, float]:
+        image = renderer.render((0.0, 0.0, -3.0), looking_down, motion=motion).image.astype(int)
+        return float(np.abs(np.diff(image, axis=1)).mean()), float(np.abs(np.diff(image, axis=0)).mean())
+
+    sharp, smeared = detail(CameraMotion()), detail(CameraMotion(velocity_mps=(15.0, 0.0, 0.0)))
+    assert smeared[0] / sharp[0] < 0.6 * smeared[1] / sharp[1]
+
+
+def test_a_distortion_that_cannot_be_drawn_is_refused() -> None:
+    with pytest.raises(ValueError, match="weaker coefficients"):
+        Lens(bent((-2.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(("exposure", "readout"), [(-0.1, 0.0), (0.0, 0.6), (math.nan, 0.0)])
+def test_a_shutter_that_cannot_be_is_refused(exposure: float, readout: float) -> None:
+    with pytest.raises(ValueError, match=r"must be 0 to 0\.5 s"):
+        Shutter(exposure, readout)

@@ -1,0 +1,170 @@
+"""Data sets: labels that lie on what they name, in the layouts that trainers read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from mavlink_sim.dataset import DatasetError, DatasetOptions, make_dataset
+from mavlink_sim.depth_camera import DepthSensor
+from mavlink_sim.scene import CameraSettings, Scene
+from mavlink_sim.shapes import CLASS_NAMES
+from mavlink_sim.world import Ground, World, WorldObject
+from vision.camera_model import CameraModel
+
+SCENE = Scene(
+    World(
+        (WorldObject(0, "car", (5.0, 0.0, 0.0)), WorldObject(1, "person", (0.0, 6.0, 0.0))),
+        Ground(("concrete",), 0, 256, 0.05),
+    ),
+    camera=CameraSettings(CameraModel.from_horizontal_fov(160, 120, math.radians(75.0)), depth=DepthSensor()),
+)
+
+
+def files(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def truth_of(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "truth.jsonl").read_text("utf-8").splitlines()]
+
+
+def test_yolo_labels_say_what_the_truth_says(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    done: list[int] = []
+    options = DatasetOptions(8, seed=3, validation=0.25, depth=True, altitude_m=(2.0, 8.0))
+    labels = make_dataset(folder, SCENE, options, done.append)
+    assert done == list(range(1, 9))
+    described = yaml.safe_load((folder / "data.yaml").read_text("utf-8"))
+    assert described["names"] == dict(enumerate(CLASS_NAMES))
+    assert len(list((folder / described["train"]).glob("*.jpg"))) == 6
+    assert len(list((folder / described["val"]).glob("*.jpg"))) == 2
+    counted = 0
+    for entry in truth_of(folder):
+        picture = cv2.imread(str(folder / entry["image"]))
+        assert picture.shape == (120, 160, 3)
+        depth = cv2.imread(
+            str(folder / entry["image"].replace("images", "depth").replace("jpg", "png")),
+            cv2.IMREAD_UNCHANGED,
+        )
+        assert depth.dtype == np.uint16
+        label = folder / entry["image"].replace("images", "labels").replace("jpg", "txt")
+        lines = label.read_text("utf-8").splitlines()
+        counted += len(lines)
+        for line in lines:
+            number, x, y, width, height = (float(word) for word in line.split())
+            shares = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+            box = shares * (160, 120, 160, 120)
+            match = [
+                item
+                for item in entry["objects"]
+                if item["class_name"] == CLASS_NAMES[int(number)]
+                and np.allclose(item["xyxy"], box, atol=0.01)
+            ]
+            assert len(match) == 1
+            assert match[0]["visible_fraction"] >= options.min_visible
+    assert counted == labels
+    assert labels >= 6
+
+
+def test_coco_files_are_read_by_cocos_own_tools(tmp_path: Path) -> None:
+    coco = pytest.importorskip("pycocotools.coco", reason="COCO's own reader is not installed")
+    folder = tmp_path / "set"
+    labels = make_dataset(folder, None, DatasetOptions(6, layout="coco", size=(160, 128), validation=0.5))
+    found = 0
+    for split in ("train", "val"):
+        book = coco.COCO(str(folder / "annotations" / f"instances_{split}.json"))
+        assert len(book.getImgIds()) == 3
+        for image in book.loadImgs(book.getImgIds()):
+            picture = cv2.imread(str(folder / "images" / split / image["file_name"]))
+            assert picture.shape[:2] == (image["height"], image["width"]) == (128, 160)
+        for item in book.loadAnns(book.getAnnIds()):
+            left, top, width, height = item["bbox"]
+            assert left >= 0 <= top
+            assert left + width <= 160
+            assert top + height <= 128
+            assert 0 < item["area"] <= width * height
+            found += 1
+        assert [item["name"] for item in book.loadCats(book.getCatIds())] == list(CLASS_NAMES)
+    assert found == labels > 0
+
+
+@pytest.mark.parametrize("scene", [SCENE, None])
+def test_a_seed_gives_the_same_files_again_whatever_the_count(tmp_path: Path, scene: Scene | None) -> None:
+    options = DatasetOptions(2, seed=2, size=(96, 96), validation=0.0)
+    make_dataset(tmp_path / "one", scene, options)
+    make_dataset(tmp_path / "two", scene, options)
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+    make_dataset(tmp_path / "short", scene, DatasetOptions(1, seed=2, size=(96, 96), validation=0.0))
+    pictures = {name: digest for name, digest in files(tmp_path / "short").items() if name.endswith(".jpg")}
+    assert pictures.items() <= files(tmp_path / "one").items()
+    make_dataset(tmp_path / "other", scene, DatasetOptions(1, seed=3, size=(96, 96), validation=0.0))
+    assert not pictures.items() & files(tmp_path / "other").items()
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="not an empty folder"):
+        make_dataset(tmp_path, SCENE, DatasetOptions(1))
+    assert files(tmp_path).keys() == {"mine.txt"}
+
+
+def test_a_scene_with_no_place_to_look_from_is_refused(tmp_path: Path) -> None:
+    full = World((WorldObject(0, "box", (0.0, 0.0, 0.0), size_m=(400.0, 400.0, 50.0)),))
+    with pytest.raises(DatasetError, match="found no place between"):
+        make_dataset(tmp_path / "set", Scene(full), DatasetOptions(1, classes=("box",)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"frames": 0}, "needs 1 frame or more"),
+        ({"classes": ("car", "cat")}, "classes must be different names"),
+        ({"classes": ()}, "got none"),
+        ({"validation": 1.0}, "shares of validation"),
+        ({"altitude_m": (5.0, 2.0)}, "altitudes must rise"),
+        ({"size": (8, 8)}, "sides must be 32 to 4096"),
+        ({"seed": -1}, "seed must be 0 or more"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(changes: dict, says: str) -> None:
+    with pytest.raises(DatasetError, match=says):
+        DatasetOptions(**{"frames": 1, **changes})
+
+
+SCENE_FILE = """
+[ground]
+tile_texels = 256
+[[objects]]
+class = "car"
+place_m = [3, 4]
+[camera]
+width = 96
+height = 96
+"""
+
+
+def test_the_command_writes_a_data_set_and_says_what_it_wrote(tmp_path: Path) -> None:
+    scene = tmp_path / "field.toml"
+    scene.write_text(SCENE_FILE, "utf-8")
+    command = [sys.executable, "-m", "mavlink_sim", "dataset", str(tmp_path / "set"), "--scene", str(scene)]
+    made = subprocess.run([*command, "--frames", "3"], capture_output=True, text=True, timeout=100)
+    assert made.returncode == 0, made.stderr
+    assert "3 pictures" in made.stdout
+    assert len(truth_of(tmp_path / "set")) == 3
+    again = subprocess.run([*command, "--frames", "3"], capture_output=True, text=True, timeout=100)
+    assert again.returncode == 2
+    assert "not an empty folder" in again.stderr

@@ -1,0 +1,408 @@
+"""MAVLink FTP: the protocol in lockstep, and foreign clients over UDP."""
+
+import asyncio
+import errno
+import json
+import lzma
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio.plugins.component_metadata import ComponentMetadataAsync
+from mavsdk.asyncio.plugins.ftp import FtpAsync, FtpError
+from mavsdk.plugins.component_metadata import MetadataType
+from pymavlink import mavftp, mavutil
+
+from mavlink_sim.file_system import FileSystem, resolve
+from mavlink_sim.file_transfer import DATA_BYTES, Failure, Opcode, Packet, Server
+from mavlink_sim.messages import dialect
+from mavlink_sim.parameters import INT32, Parameters
+from mavlink_sim.testing import RunningSimulator, running_simulator
+from mavlink_sim.vehicle_files import bson, offer_packed_parameters, packed_parameters
+
+
+class Client:
+    """A client in lockstep: one request, and the packets that came back within 20 ms."""
+
+    def __init__(self, cockpit: Any) -> None:
+        self.cockpit = cockpit
+        self.sequence = 0
+
+    def ask(
+        self, opcode: int, data: bytes = b"", offset: int = 0, session: int = 0, size: int = -1
+    ) -> list[Packet]:
+        self.sequence += 2
+        return self.repeat(opcode, data, offset, session, size)
+
+    def repeat(
+        self, opcode: int, data: bytes = b"", offset: int = 0, session: int = 0, size: int = -1
+    ) -> list[Packet]:
+        """The same again under the same number, as after a lost answer."""
+        payload = struct.pack(
+            "<HBBBBBBI", self.sequence, session, opcode, len(data) if size < 0 else size, 0, 0, 0, offset
+        )
+        self.cockpit.forget()
+        self.cockpit.send(
+            dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, (payload + data).ljust(251, b"\0"))
+        )
+        self.cockpit.fly(0.02)
+        messages = self.cockpit.received("FILE_TRANSFER_PROTOCOL")
+        assert all((message.target_system, message.target_component) == (1, 191) for message in messages)
+        return [Packet.unpack(bytes(message.payload)) for message in messages]
+
+    def ack(self, opcode: int, *arguments: Any, **options: Any) -> Packet:
+        (answer,) = self.ask(opcode, *arguments, **options)
+        assert answer.opcode == Opcode.ACK, answer
+        assert (answer.requested, answer.sequence) == (opcode, self.sequence + 1)
+        return answer
+
+    def nak(self, opcode: int, *arguments: Any, **options: Any) -> tuple[int, ...]:
+        (answer,) = self.ask(opcode, *arguments, **options)
+        assert (answer.opcode, answer.requested) == (Opcode.NAK, opcode)
+        return tuple(answer.data)
+
+    def upload(self, path: bytes, content: bytes) -> None:
+        self.ack(Opcode.CREATE_FILE, path)
+        for start in range(0, len(content), DATA_BYTES):
+            part = content[start : start + DATA_BYTES]
+            assert self.ack(Opcode.WRITE_FILE, part, start).data == struct.pack("<I", len(part))
+        self.ack(Opcode.TERMINATE_SESSION)
+
+    def list(self, path: bytes) -> list[bytes]:
+        return self.ack(Opcode.LIST_DIRECTORY, path).data.rstrip(b"\0").split(b"\0")
+
+
+@pytest.fixture
+def client(cockpit: Any) -> Client:
+    cockpit.fly(0.1)
+    return Client(cockpit)
+
+
+def test_the_root_lists_what_px4_has_there(client: Client) -> None:
+    entries = client.list(b"/")
+    assert entries[:2] == [b"S", b"S"]  # "." and ".."
+    size = len(bson(client.cockpit.vehicle.parameters.customised()))
+    assert entries[2:] == [
+        b"Detc",
+        b"Dlog",
+        b"Fparameters.bson\t%d" % size,
+        b"Fparameters_backup.bson\t%d" % size,
+    ]
+
+
+def test_the_storage_card_of_a_flight_controller_is_the_same_place(client: Client) -> None:
+    client.upload(b"/fs/microsd/note.txt", b"hello")
+    assert b"Fnote.txt\t5" in client.list(b"")
+    client.ack(Opcode.REMOVE_FILE, b"note.txt")
+    assert b"Fnote.txt\t5" not in client.list(b"/fs/microsd")
+
+
+def test_a_long_list_comes_in_parts_by_offset(client: Client) -> None:
+    client.ack(Opcode.CREATE_DIRECTORY, b"many")
+    names = [f"file-number-{number:03d}" for number in range(30)]
+    for name in names:
+        client.upload(f"many/{name}".encode(), b"")
+    found: list[bytes] = []
+    while True:
+        (answer,) = client.ask(Opcode.LIST_DIRECTORY, b"many", len(found))
+        if answer.opcode == Opcode.NAK:
+            assert answer.data == bytes([Failure.END_OF_FILE])
+            break
+        found += answer.data.rstrip(b"\0").split(b"\0")
+    assert found == [b"S", b"S"] + [f"F{name}\t0".encode() for name in names]
+
+
+def test_what_is_written_is_read_and_bursts(client: Client) -> None:
+    content = os.urandom(5000)
+    client.upload(b"log/flight.ulg", content)
+    assert client.ack(Opcode.OPEN_FILE_RO, b"log/flight.ulg").data == struct.pack("<I", 5000)
+    assert client.ack(Opcode.READ_FILE, b"", 4900, size=239).data == content[4900:]
+    assert client.nak(Opcode.READ_FILE, b"", 5000, size=239) == (Failure.END_OF_FILE,)
+    packets = client.ask(Opcode.BURST_READ_FILE, b"", 239, size=239)
+    assert [packet.sequence for packet in packets] == list(
+        range(client.sequence + 1, client.sequence + 1 + len(packets))
+    )
+    assert b"".join(packet.data for packet in packets[:-1]) == content[239:]
+    assert (packets[-1].opcode, packets[-1].data) == (Opcode.NAK, bytes([Failure.END_OF_FILE]))
+    client.ack(Opcode.TERMINATE_SESSION)
+
+
+def test_a_burst_pauses_after_35_kilobytes_and_goes_on_where_it_is_asked_to(client: Client) -> None:
+    content = os.urandom(100_000)
+    files = client.cockpit.vehicle.files
+    files.write(files.create("big", True), 0, content)
+    client.ack(Opcode.OPEN_FILE_RO, b"big")
+    got = b""
+    rounds = 0
+    while len(got) < len(content):
+        packets = client.ask(Opcode.BURST_READ_FILE, b"", len(got), size=239)
+        client.cockpit.fly(0.4)
+        packets = [
+            Packet.unpack(bytes(message.payload))
+            for message in client.cockpit.received("FILE_TRANSFER_PROTOCOL")
+        ]
+        assert [packet.burst_complete for packet in packets[:-1]] == [False] * (len(packets) - 1)
+        assert packets[-1].burst_complete or packets[-1].opcode == Opcode.NAK
+        got += b"".join(packet.data for packet in packets if packet.opcode == Opcode.ACK)
+        rounds += 1
+    assert got == content
+    assert rounds == 3
+
+
+def test_a_session_is_one_a_link_and_closes_after_ten_seconds_of_silence(client: Client) -> None:
+    client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
+    assert client.nak(Opcode.OPEN_FILE_RO, b"parameters.bson") == (Failure.NO_SESSIONS_AVAILABLE,)
+    client.cockpit.fly(9.0)
+    assert client.nak(Opcode.CREATE_FILE, b"x") == (Failure.NO_SESSIONS_AVAILABLE,)
+    client.cockpit.fly(10.1)
+    assert client.nak(Opcode.READ_FILE, size=4) == (Failure.INVALID_SESSION,)
+    client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
+    client.ack(Opcode.RESET_SESSIONS)
+    client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
+
+
+def test_a_repeated_request_is_not_carried_out_twice(client: Client) -> None:
+    client.ack(Opcode.CREATE_DIRECTORY, b"once")
+    (again,) = client.repeat(Opcode.CREATE_DIRECTORY, b"once")
+    assert again.opcode == Opcode.ACK
+    assert client.nak(Opcode.CREATE_DIRECTORY, b"once") == (Failure.FILE_EXISTS,)
+
+
+@pytest.mark.parametrize(
+    ("opcode", "data", "failure"),
+    [
+        (Opcode.LIST_DIRECTORY, b"nowhere", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.OPEN_FILE_RO, b"nowhere", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.OPEN_FILE_RO, b"@PARAM/param.pck", (Failure.FILE_NOT_FOUND,)),  # ArduPilot's; PX4 has none
+        (Opcode.OPEN_FILE_RO, b"etc", (Failure.FAIL_ERRNO, errno.EISDIR)),
+        (Opcode.CREATE_FILE, b"nowhere/x", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.CREATE_FILE, b"log", (Failure.FAIL_ERRNO, errno.EISDIR)),
+        (Opcode.CREATE_FILE, b"parameters.bson", (Failure.FILE_PROTECTED,)),
+        (Opcode.REMOVE_FILE, b"parameters.bson", (Failure.FILE_PROTECTED,)),
+        (Opcode.REMOVE_FILE, b"nowhere", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.REMOVE_DIRECTORY, b"etc", (Failure.FILE_PROTECTED,)),
+        (Opcode.REMOVE_DIRECTORY, b"/", (Failure.FILE_PROTECTED,)),
+        (Opcode.CREATE_DIRECTORY, b"log", (Failure.FILE_EXISTS,)),
+        (Opcode.CREATE_DIRECTORY, b"a/b", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.RENAME, b"nowhere\0there\0", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.RENAME, b"log", (Failure.FAIL_ERRNO, errno.EINVAL)),
+        (Opcode.TRUNCATE_FILE, b"nowhere", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.CALC_FILE_CRC32, b"nowhere", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.READ_FILE, b"", (Failure.INVALID_SESSION,)),
+        (Opcode.BURST_READ_FILE, b"", (Failure.INVALID_SESSION,)),
+        (Opcode.WRITE_FILE, b"x", (Failure.INVALID_SESSION,)),
+        (Opcode.TERMINATE_SESSION, b"", (Failure.INVALID_SESSION,)),
+        (77, b"", (Failure.UNKNOWN_COMMAND,)),
+        (Opcode.ACK, b"", (Failure.UNKNOWN_COMMAND,)),
+    ],
+)
+def test_failures_have_px4s_codes(client: Client, opcode: int, data: bytes, failure: tuple[int, ...]) -> None:
+    assert client.nak(opcode, data) == failure
+
+
+def test_a_size_beyond_the_payload_is_refused(client: Client) -> None:
+    assert client.nak(Opcode.OPEN_FILE_RO, b"x", size=240) == (Failure.INVALID_DATA_SIZE,)
+
+
+def test_files_are_renamed_truncated_summed_and_removed(client: Client) -> None:
+    client.upload(b"one", b"123456789")
+    # the check value of this CRC-32 variant (no inversions), as PX4 computes it
+    assert client.ack(Opcode.CALC_FILE_CRC32, b"one").data == struct.pack("<I", 0x2DFD2D88)
+    client.ack(Opcode.RENAME, b"one\0log/two\0")
+    client.ack(Opcode.TRUNCATE_FILE, b"log/two", 4)
+    assert client.list(b"log") == [b"S", b"S", b"Ftwo\t4"]
+    assert client.nak(Opcode.REMOVE_DIRECTORY, b"log") == (Failure.FAIL_ERRNO, errno.ENOTEMPTY)
+    assert client.nak(Opcode.TRUNCATE_FILE, b"log/two", 2**32 - 1) == (Failure.FAIL_ERRNO, errno.ENOSPC)
+    client.ack(Opcode.REMOVE_FILE, b"log/two")
+    client.ack(Opcode.REMOVE_DIRECTORY, b"log")
+
+
+def test_the_host_cannot_be_reached(client: Client) -> None:
+    here = Path(__file__).resolve()
+    for path in (str(here), "../../../../../../etc/passwd", "/etc/passwd", "..\\..", f"etc/../..{here}"):
+        assert client.nak(Opcode.OPEN_FILE_RO, path.encode()) == (Failure.FILE_NOT_FOUND,)
+
+
+def test_the_card_is_full_at_its_capacity() -> None:
+    files = FileSystem(capacity_bytes=1000)
+    files.write(files.create("a", True), 0, bytes(600))
+    b = files.create("b", True)
+    with pytest.raises(OSError, match="No space") as full:
+        files.write(b, 0, bytes(401))
+    assert full.value.errno == errno.ENOSPC
+    files.remove("a")
+    assert files.write(b, 0, bytes(1000)) == 1000
+
+
+@given(st.lists(st.sampled_from(["a", "..", ".", "", "fs", "microsd", "etc"]), max_size=12))
+def test_no_path_leads_above_the_root(names: list[str]) -> None:
+    assert ".." not in resolve("/".join(names))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.sampled_from(list(Opcode)), st.integers(0, 255)),
+            st.binary(max_size=DATA_BYTES),
+            st.one_of(st.integers(0, 300), st.integers(0, 2**32 - 1)),
+            st.integers(0, 255),
+        ),
+        max_size=20,
+    )
+)
+def test_any_payload_is_answered(requests: list[tuple[int, bytes, int, int]]) -> None:
+    files = FileSystem(capacity_bytes=5000)
+    files.provide("etc/file", lambda: b"content")
+    server = Server(files)
+    for number, (opcode, data, offset, size) in enumerate(requests):
+        header = struct.pack("<HBBBBBBI", number * 2, 0, opcode, size, 0, 0, 0, offset)
+        reply = server.answer((header + data).ljust(251, b"\0"), (1, 191), number * 0.1)
+        assert reply is None or len(reply) == 251
+        assert all(len(payload) == 251 for _, payload in server.burst(number * 0.1))
+
+
+# ---- what is in the files
+
+
+def test_the_parameter_file_holds_what_differs_from_the_defaults_as_bson() -> None:
+    parameters = Parameters({"COM_OF_LOSS_T": 0.5, "NAV_RCL_ACT": 3})
+    content = bson(parameters.customised())
+    assert content == (
+        struct.pack("<i", len(content))
+        + b"\x01COM_OF_LOSS_T\0" + struct.pack("<d", 0.5)
+        + b"\x10NAV_RCL_ACT\0" + struct.pack("<i", 3)
+        + b"\0"
+    )  # fmt: skip
+
+
+def test_packed_parameters_are_read_by_pymavlinks_own_decoder(cockpit: Any) -> None:
+    parameters = cockpit.vehicle.parameters
+    decoded = mavftp.MAVFTP.ftp_param_decode(packed_parameters(parameters))
+    assert decoded is not None
+    found = {name.decode(): (value, kind) for name, value, kind in decoded.params}
+    assert found == {
+        parameter.name: (parameter.value, mavftp_kind)
+        for parameter in parameters
+        for mavftp_kind in [3 if parameter.kind == INT32 else 4]
+    }
+
+
+def test_packed_parameters_are_offered_on_wish(client: Client) -> None:
+    vehicle = client.cockpit.vehicle
+    offer_packed_parameters(vehicle.files, vehicle.parameters)
+    size = len(packed_parameters(vehicle.parameters))
+    assert client.ack(Opcode.OPEN_FILE_RO, b"@PARAM/param.pck").data == struct.pack("<I", size)
+
+
+def test_the_metadata_is_found_through_component_metadata(cockpit: Any) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(512, 397) == [0]
+    (message,) = cockpit.received("COMPONENT_METADATA")
+    assert message.uri.startswith("mftp://")
+
+    def content(uri: str) -> bytes:
+        return lzma.decompress(bytes(cockpit.vehicle.files.read(uri.removeprefix("mftp://"))))
+
+    def crc(data: bytes) -> int:
+        return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+    general = content(message.uri)
+    assert message.file_crc == crc(general)
+    types = json.loads(general)["metadataTypes"]
+    assert [entry["type"] for entry in types] == [1, 4]
+    for entry in types:
+        assert entry["fileCrc"] == crc(content(entry["uri"]))
+    listed = json.loads(content(types[0]["uri"]))["parameters"]
+    assert [entry["name"] for entry in listed] == [parameter.name for parameter in cockpit.vehicle.parameters]
+
+
+# ---- clients nobody here wrote
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Iterator[RunningSimulator]:
+    with running_simulator() as running:
+        yield running
+
+
+async def collect(transfer: Any) -> list[Any]:
+    return [progress async for progress in transfer]
+
+
+async def test_mavsdk_lists_loads_stores_compares_renames_and_removes(
+    simulator: RunningSimulator, tmp_path: Path
+) -> None:
+    content = os.urandom(20_000)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "file.bin").write_bytes(content)
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.gcs_port}")
+        system = await mavsdk.first_autopilot(20.0)
+        ftp = FtpAsync(system)
+        root = await ftp.list_directory("/")
+        names = {entry.name for entry in root.entries}
+        assert names == {"etc", "log", "parameters.bson", "parameters_backup.bson"}
+        await ftp.create_directory("/log/mine")
+        with pytest.raises(FtpError, match="FILE_EXISTS"):
+            await ftp.create_directory("/log/mine")
+        await collect(ftp.upload(str(tmp_path / "file.bin"), "/log/mine"))
+        (entry,) = (await ftp.list_directory("/log/mine")).entries
+        assert (entry.name, entry.size_bytes) == ("file.bin", len(content))
+        assert await ftp.are_files_identical(str(tmp_path / "file.bin"), "/log/mine/file.bin")
+        await ftp.rename("/log/mine/file.bin", "/log/mine/other.bin")
+        for burst in (False, True):
+            await collect(ftp.download("/log/mine/other.bin", str(tmp_path / "there"), burst))
+            loaded = tmp_path / "there" / "other.bin"
+            assert loaded.read_bytes() == content
+            loaded.unlink()
+        with pytest.raises(FtpError):
+            await collect(ftp.download("/nowhere", str(tmp_path / "there"), False))
+        await ftp.remove_file("/log/mine/other.bin")
+        await ftp.remove_directory("/log/mine")
+        assert (await ftp.list_directory("/log")).entries == []
+
+
+async def test_mavsdk_finds_the_metadata(simulator: RunningSimulator) -> None:
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.gcs_port}")
+        metadata = ComponentMetadataAsync(await mavsdk.first_autopilot(20.0))
+        updates = metadata.subscribe_metadata_available()
+        update = asyncio.ensure_future(anext(updates))
+        await asyncio.sleep(0)  # lets it subscribe
+        await metadata.request_autopilot_component()
+        while (await update).type != MetadataType.ALL_COMPLETED:
+            update = asyncio.ensure_future(anext(updates))
+        await updates.aclose()
+        found = await metadata.get_metadata(1, MetadataType.PARAMETER)
+        names = [entry["name"] for entry in json.loads(found.json_metadata)["parameters"]]
+        assert names == [parameter.name for parameter in Parameters()]
+        events = await metadata.get_metadata(1, MetadataType.EVENTS)
+        assert "components" in json.loads(events.json_metadata)
+
+
+def test_pymavlinks_own_client_stores_and_loads(simulator: RunningSimulator, tmp_path: Path) -> None:
+    content = os.urandom(30_000)
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.write_bytes(content)
+    link = mavutil.mavlink_connection(
+        f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=1, source_component=191
+    )
+    try:
+        link.wait_heartbeat(timeout=20)
+        ftp = mavftp.MAVFTP(link, 1, 1)
+        assert ftp.cmd_put([str(source), "log/flight"]).error_code == 0
+        assert ftp.process_ftp_reply("CreateFile", timeout=30).error_code == 0
+        assert ftp.cmd_get(["log/flight", str(target)]).error_code == 0
+        assert ftp.process_ftp_reply("OpenFileRO", timeout=30).error_code == 0
+        assert target.read_bytes() == content
+    finally:
+        link.close()

@@ -1,0 +1,146 @@
+"""Where RTL leads: home, a rally point, the mission's landing, or back along the mission."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
+
+from mavlink_sim.geography import geographic
+from mavlink_sim.mission_items import item_of
+from mavlink_sim.mission_plan import Mission
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.return_flight import Goal, destination, mission_route
+
+HOME = (0.0, 0.0, 0.0)
+
+
+def stored(*items: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(item_of(message(index, fields)) for index, fields in enumerate(items))
+
+
+def chosen(
+    kind: int, north: float, east: float, points: tuple[Any, ...] = (), mission: Mission | None = None
+) -> Any:
+    found, _ = destination(
+        points, mission or Mission(), Parameters({"RTL_TYPE": kind}), HOME, (north, east, -5.0)
+    )
+    return found
+
+
+POINTS = stored(rally(60, 0), rally(0, 60), rally(5, 0))
+LANDING = Mission(stored(takeoff(5.0), waypoint(100, 0, 10), land(100, 30)), valid=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "goal", "north"),
+    [
+        (0, (50, 0), Goal.RALLY, 60.0),
+        (0, (10, 0), Goal.HOME, 0.0),
+        (0, (5, 0), Goal.HOME, 0.0),  # a rally point next to home is none
+        (5, (5, 0), Goal.RALLY, 5.0),  # unless home is not allowed
+        (1, (10, 0), Goal.RALLY, 60.0),
+        (3, (99, 29), Goal.MISSION_LANDING, 100.0),
+        (3, (1, 1), Goal.HOME, 0.0),
+    ],
+)
+def test_the_nearest_place_that_rtl_type_allows_is_chosen(
+    kind: int, place: tuple[float, float], goal: Goal, north: float
+) -> None:
+    found = chosen(kind, *place, POINTS, LANDING)
+    assert found.kind is goal
+    assert found.position[0] == pytest.approx(north, abs=0.02)
+
+
+def test_without_any_place_type_five_lands_here_and_type_one_at_home() -> None:
+    assert chosen(5, 20, 0).kind is Goal.HERE
+    assert chosen(1, 20, 0).kind is Goal.HOME
+
+
+@given(st.floats(-200, 200), st.floats(-200, 200))
+def test_no_other_allowed_place_is_much_nearer(north: float, east: float) -> None:
+    found = chosen(3, north, east, POINTS[:2], LANDING)
+    nearest = min(math.dist((north, east), place) for place in ((0, 0), (60, 0), (0, 60), (100, 30)))
+    assert math.dist((north, east), found.position[:2]) <= nearest + 4.1
+
+
+def test_a_rally_point_in_an_integer_frame_is_refused_as_px4_does() -> None:
+    points = stored(rally(60, 0, frame=6))
+    found, words = destination(points, Mission(), Parameters(), HOME, (59.0, 0.0, -5.0))
+    assert found.kind is Goal.HOME
+    assert words == ["RTL: unsupported MAV_FRAME\t"]
+
+
+def test_along_a_mission_it_goes_on_to_the_landing_or_back_home() -> None:
+    there = Mission(LANDING.items, current=1, valid=True)
+    places, end = mission_route(there, Parameters({"RTL_TYPE": 2}), HOME) or ([], HOME)
+    assert [place[0] for place in places] == [pytest.approx(100.0, abs=0.02)]
+    assert end[1] == pytest.approx(30.0, abs=0.02)
+    back = Mission(stored(takeoff(5.0), waypoint(30, 0, 5), waypoint(60, 0, 5)), current=2, valid=True)
+    places, end = mission_route(back, Parameters({"RTL_TYPE": 2}), HOME) or ([], (9.0, 9.0, 9.0))
+    assert [place[0] for place in places] == pytest.approx([30.0, 0.0], abs=0.02)
+    assert end == HOME
+    assert mission_route(back, Parameters(), HOME) is None
+
+
+@pytest.fixture
+def make(make_cockpit: Any) -> Any:
+    """Makes vehicles that are ready at once and return low."""
+    return lambda **values: make_cockpit(
+        ready_after_s=0.0, parameters={"RTL_RETURN_ALT": 5.0, "RTL_DESCEND_ALT": 5.0, **values}
+    )
+
+
+def lands_at(cockpit: Any, north: float, east: float) -> None:
+    cockpit.until(lambda: not cockpit.armed, 90.0)
+    assert math.dist(cockpit.vehicle.airframe.position[:2], (north, east)) < 1.0
+
+
+def test_rtl_lands_at_the_nearer_rally_point(make: Any) -> None:
+    cockpit = make()
+    listen(cockpit)
+    upload(cockpit, [rally(14, 0)], 2)
+    cockpit.take_off(4.0)
+    cockpit.vehicle.airframe.position = (12.0, 3.0, -4.0)
+    cockpit.fly(0.01)  # until the estimate knows
+    assert cockpit.command(20) == [0]
+    lands_at(cockpit, 14, 0)
+    assert any("m above destination)" in text for text in cockpit.texts())
+
+
+def test_rtl_goes_on_along_the_mission_to_its_landing(make: Any) -> None:
+    cockpit = make(RTL_TYPE=2)
+    plan = [takeoff(4.0), waypoint(6, 0, 4, 60.0), waypoint(6, 8, 4), item(189), land(0, 12)]
+    upload(cockpit, plan)
+    cockpit.command(300)
+    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 4.5, 30.0)
+    cockpit.command(20)
+    passed = cockpit.until(lambda: math.dist(cockpit.vehicle.airframe.position[:2], (6, 8)) < 2.5, 30.0)
+    assert passed < 20.0  # it does not wait the minute at the first
+    lands_at(cockpit, 0, 12)
+
+
+def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: Any) -> None:
+    cockpit = make(RTL_TYPE=3)
+    upload(cockpit, [takeoff(4.0), waypoint(30, 0, 4), item(189), waypoint(20, 5, 4), land(20, 12)])
+    cockpit.take_off(4.0)
+    cockpit.vehicle.airframe.position = (16.0, 8.0, -4.0)
+    cockpit.fly(0.01)  # until the estimate knows
+    cockpit.command(20)
+    lands_at(cockpit, 20, 12)
+
+
+def test_rtl_leads_to_where_home_was_set(make: Any) -> None:
+    cockpit = make()
+    cockpit.take_off(4.0)
+    latitude, longitude, altitude = geographic((0.0, 8.0, 0.0))
+    assert cockpit.command(179, 0, 0, 0, 0, latitude, longitude, altitude) == [0]
+    cockpit.fly(2.1)
+    home = cockpit.received("HOME_POSITION")[-1]
+    assert home.longitude == pytest.approx(longitude * 1e7, abs=200)  # COMMAND_LONG carries floats
+    cockpit.command(20)
+    lands_at(cockpit, 0, 8)

@@ -1,0 +1,114 @@
+"""`mavlink-sim` with a scene: its things in the truth, its camera at several outputs at once."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
+
+pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
+DEADLINE_S = 90.0
+SCENE = """
+[ground]
+kinds = ["concrete"]
+tile_texels = 256
+[[objects]]
+class = "car"
+place_m = [9, 0]
+[[objects]]
+class = "person"
+path = { waypoints_m = [[8, -2], [8, 2]], speed_mps = 1, repeat = "back_and_forth" }
+[camera]
+width = 160
+height = 120
+rate_hz = 20
+latency_ms = 50
+[camera.mount]
+pitch_deg = 5
+[camera.depth]
+maximum_m = 15
+"""
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -> None:
+    scene, truth, seen = tmp_path / "field.toml", tmp_path / "truth.jsonl", tmp_path / "seen.jsonl"
+    scene.write_text(SCENE, "utf-8")
+    name = f"test-scene-{os.getpid()}-{secrets.token_hex(4)}"
+    port = free_port(socket.SOCK_STREAM)
+    command = [sys.executable, "-m", "mavlink_sim", "--scene", str(scene), "--camera", name]
+    command += ["--camera-output", f"http://127.0.0.1:{port}", "--camera-output", "pipe:-"]
+    command += ["--truth", str(truth), "--camera-truth", str(seen)]
+    for option in ("onboard", "gcs"):
+        command += [f"--{option}-bind", "0", f"--{option}-port", str(free_port(socket.SOCK_DGRAM))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as vehicle:
+        try:
+            assert vehicle.stdout is not None
+            raw = vehicle.stdout.read(160 * 120 * 3)  # standard output has pictures and nothing else
+            piped = np.frombuffer(raw, np.uint8).reshape(120, 160, 3)
+            with urllib.request.urlopen(
+                f"http://127.0.0.1:{port}/snapshot.jpg", timeout=DEADLINE_S
+            ) as answer:
+                served = cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR)
+            with SharedFrameReader(name) as reader:
+                frame = reader.latest()
+            assert frame is not None
+            assert frame.depth_m is not None
+            assert np.nanmax(frame.depth_m) <= 15.0
+            for picture in (piped, served):
+                assert np.abs(picture.astype(int) - frame.image).mean() < 12.0
+            deadline = time.monotonic() + DEADLINE_S
+            lines: list[dict] = []
+            while len(lines) < 20:
+                assert time.monotonic() < deadline, "no truth of frames"
+                time.sleep(0.05)
+                lines = [
+                    json.loads(line) for line in seen.read_text("utf-8").splitlines(True) if line[-1] == "\n"
+                ]
+        finally:
+            vehicle.send_signal(signal.SIGTERM)
+            vehicle.stdout.close()
+            assert vehicle.wait(DEADLINE_S) == 0
+    segment_path(name).unlink(missing_ok=True)
+    easts = [
+        item["position_ned_m"][1] for line in lines for item in line["objects"] if item["identifier"] == 1
+    ]
+    assert max(easts) - min(easts) > 0.5
+    stamps = [line["stamp_ns"] for line in lines]
+    assert stamps == sorted(stamps)
+    assert {"car", "person"} == {item["class_name"] for line in lines for item in line["objects"]}
+    flown = [json.loads(line) for line in truth.read_text("utf-8").splitlines()]
+    assert {item["class_name"] for item in flown[-1]["objects"]} == {"car", "person"}
+    assert flown[0]["objects"][1]["position_ned_m"] != flown[-1]["objects"][1]["position_ned_m"]
+
+
+def test_a_scene_that_cannot_be_is_explained_in_one_line_and_nothing_starts(tmp_path: Path) -> None:
+    scene = tmp_path / "field.toml"
+    scene.write_text("[camera]\nwidth = 'wide'\n", "utf-8")
+    command = [sys.executable, "-m", "mavlink_sim", "--onboard-bind", "0", "--gcs-bind", "0"]
+    for arguments, says in (
+        (["--scene", str(scene)], "camera.width: must be a valid integer, got 'wide'"),
+        (["--camera-output", "gopher://x"], "expected one of shm://NAME"),
+    ):
+        made = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=DEADLINE_S)
+        assert made.returncode == 2
+        assert says in made.stderr
+        assert "Traceback" not in made.stderr

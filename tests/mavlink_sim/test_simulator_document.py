@@ -1,0 +1,120 @@
+"""What docs/simulator.md says can be typed is typed here, and what it says of installing is tried."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mavlink_sim.testing import RunningSimulator, free_udp_ports, running_simulator
+
+pytest_plugins = ["pytester"]
+
+ROOT = Path(__file__).parents[2]
+DOCUMENT = (ROOT / "docs" / "simulator.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", DOCUMENT, re.MULTILINE | re.DOTALL)
+
+
+COMMANDS = [line for block in blocks("sh") for line in block.splitlines()]
+OF_THE_VEHICLE = [line for line in COMMANDS if line.startswith("mavlink-sim")]
+
+
+@pytest.mark.parametrize("line", OF_THE_VEHICLE)
+def test_every_command_of_the_vehicle_starts_it(line: str, tmp_path: Path) -> None:
+    words = shlex.split(line)[1:]
+    if "--camera" in words:  # a name of this test alone
+        words[words.index("--camera") + 1] = f"document-{tmp_path.parent.name}-{tmp_path.name}"
+    ports = [str(port) for port in free_udp_ports(2)]
+    elsewhere = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", ports[0], "--gcs-port", ports[1]]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mavlink_sim", *words, *elsewhere],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=tmp_path,
+        env=environment(),
+    )
+    count = int(words[words.index("--vehicles") + 1]) if "--vehicles" in words else 1
+    simulator = RunningSimulator(process, count)
+    try:
+        simulator.wait_until_ready(60.0)
+    finally:
+        code = simulator.stop()
+        assert process.stdout is not None
+        process.stdout.close()
+    assert code == 0, simulator.events
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+def test_the_other_commands_only_install() -> None:
+    others = [line for line in COMMANDS if line not in OF_THE_VEHICLE]
+    assert others
+    assert all(line.startswith("pip install ") for line in others)
+
+
+def scripts() -> list[str]:
+    return [block for block in blocks("python") if "def test_" not in block]
+
+
+@pytest.mark.parametrize("script", scripts(), ids=lambda script: script.split()[1])
+def test_every_example_runs(script: str, tmp_path: Path) -> None:
+    (port,) = free_udp_ports(1)
+    (tmp_path / "example.py").write_text(script.replace("14540", str(port)))
+    with running_simulator(onboard_port=port):
+        finished = subprocess.run(
+            [sys.executable, "example.py"],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    assert finished.returncode == 0, finished.stderr
+
+
+def test_the_example_for_pytest_passes(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    (test,) = [block for block in blocks("python") if "def test_" in block]
+    pytester.makepyfile(test)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    result = pytester.runpytest_subprocess(
+        "-p", "mavlink_sim.pytest_plugin", "-p", "no:cacheprovider", timeout=100
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_the_example_for_continuous_integration_is_a_list_of_steps() -> None:
+    (block,) = blocks("yaml")
+    steps = yaml.safe_load(block)
+    assert all("run" in step or "uses" in step for step in steps)
+    assert "--vehicle-logs=" in steps[1]["run"]
+
+
+def test_the_vehicle_needs_nothing_but_what_the_document_names() -> None:
+    code = """
+import sys
+for name in ("torch", "cv2", "zenoh", "mavsdk", "pydantic", "aioconsole", "yaml"):
+    sys.modules[name] = None  # an import of it fails
+sys.argv = ["mavlink-sim", "--help"]
+import mavlink_sim.testing
+from mavlink_sim.cli import main
+main()
+"""
+    finished = subprocess.run(
+        [sys.executable, "-c", code], env=environment(), capture_output=True, text=True, timeout=60
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "--onboard-port" in finished.stdout
