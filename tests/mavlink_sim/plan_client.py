@@ -79,9 +79,8 @@ def message(sequence: int, fields: dict[str, Any], current: int = 0) -> Any:
 
 def newest(cockpit: Any, kind: str, before: int) -> Any:
     """The one message of a kind that came after the `before`th, waited for."""
-    cockpit.until(lambda: len(cockpit.received(kind)) > before, 1.0) if len(
-        cockpit.received(kind)
-    ) <= before else None
+    if len(cockpit.received(kind)) <= before:
+        cockpit.until(lambda: len(cockpit.received(kind)) > before, 1.0)
     return cockpit.received(kind)[before]
 
 
