@@ -80,6 +80,7 @@ def simulate(
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
+    gimbal: Annotated[bool, typer.Option("--gimbal", help="With a two-axis gimbal.")] = False,
     ready_file: Annotated[
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
     ] = None,
@@ -114,6 +115,7 @@ def simulate(
         truth=truth,
         speed=speed,
         parameters=_parameters(param or []),
+        gimbal=gimbal,
     )
     try:
         simulation = Simulation(options, on_event=_say)

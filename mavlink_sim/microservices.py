@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import commands, parameter_protocol
+from mavlink_sim import commands, gimbal_protocol, parameter_protocol, pilot_link
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED
 from mavlink_sim.messages import dialect
@@ -23,7 +23,7 @@ COMMANDER_DELAY_S = 0.004
 
 def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
     if message.type == MAV_TYPE_GCS:
-        link.ground_station_seen_s = vehicle.now_s
+        link.ground_station_seen_s = vehicle.autopilot.supervision.ground_station_seen_s = vehicle.now_s
     elif message.type == MAV_TYPE_ONBOARD_CONTROLLER and message.get_srcSystem() == vehicle.system_id:
         vehicle.companion_heard()
 
@@ -105,6 +105,11 @@ HANDLERS: dict[str, Handler] = {
     "COMMAND_INT": _command,
     "SET_MODE": _set_mode,
     "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
+    "MANUAL_CONTROL": pilot_link.manual_control,
+    "RC_CHANNELS_OVERRIDE": pilot_link.rc_channels_override,
+    "GIMBAL_MANAGER_SET_ATTITUDE": gimbal_protocol.set_attitude,
+    "GIMBAL_MANAGER_SET_PITCHYAW": gimbal_protocol.set_pitchyaw,
+    "GIMBAL_MANAGER_SET_MANUAL_CONTROL": gimbal_protocol.set_manual_control,
     "TIMESYNC": _timesync,
     "PING": _ping,
     "PARAM_REQUEST_LIST": parameter_protocol.request_list,

@@ -46,6 +46,7 @@ class SimulationOptions:
         truth: file for the truth, one JSON object a line; None for none.
         speed: simulated seconds per real second.
         parameters: PX4 parameters that differ from the defaults.
+        gimbal: with a two-axis gimbal (gimbal protocol version 2).
     """
 
     host: str = "127.0.0.1"
@@ -61,6 +62,7 @@ class SimulationOptions:
     truth: Path | None = None
     speed: float = 1.0
     parameters: dict[str, float] = field(default_factory=dict)
+    gimbal: bool = False
 
 
 class Simulation:
@@ -78,6 +80,7 @@ class Simulation:
             seed=options.seed,
             wind_mps=options.wind_mps,
             parameters=options.parameters,
+            gimbal=options.gimbal,
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns

@@ -157,9 +157,12 @@ def running_simulator(
         "gcs_bind": gcs_bind,
         **options,
     }
+    flags = [name for name, value in arguments.items() if value is True]
+    arguments = {name: value for name, value in arguments.items() if not isinstance(value, bool)}
     command = [sys.executable, "-m", "mavlink_sim"]
     for name, value in arguments.items():
         command += [f"--{name.replace('_', '-')}", str(value)]
+    command += [f"--{name.replace('_', '-')}" for name in flags]
     for name, value in (parameters or {}).items():
         command += ["--param", f"{name}={value}"]
     process = subprocess.Popen(

@@ -16,12 +16,15 @@ from typing import Any
 from mavlink_sim import parameter_protocol, telemetry
 from mavlink_sim.announcements import CRITICAL, INFO, Text
 from mavlink_sim.autopilot import Autopilot
+from mavlink_sim.gimbal import Gimbal
+from mavlink_sim.gimbal_protocol import GimbalManager
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor
 from mavlink_sim.streams import ONBOARD_RATES_HZ
+from mavlink_sim.transmitter import Transmitter
 from vision.rotation import quaternion_from_euler
 
 STEP_S = 0.004
@@ -43,6 +46,7 @@ class Vehicle:
         wind_mps: steady horizontal wind, from a direction that the seed chooses.
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
         parameters: PX4 parameters that differ from `parameters.txt`.
+        gimbal: with a two-axis gimbal and its parameters.
         ready_after_s: how long after boot the estimator allows arming.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
@@ -60,11 +64,12 @@ class Vehicle:
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
         parameters: Mapping[str, float] | None = None,
+        gimbal: bool = False,
         ready_after_s: float = 3.0,
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
-        self.parameters = Parameters(parameters)
+        self.parameters = Parameters(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
             direction = random.Random(seed).uniform(0.0, math.tau)
@@ -80,11 +85,11 @@ class Vehicle:
         self.autopilot = Autopilot(
             self.airframe, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
+        self.gimbal_manager = GimbalManager(self) if gimbal else None
         self._boot_us = 0
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
-        self._used_charge = 0.0
         self._companion_seen_s: float | None = None
         self._companion_lost = False
         self._origin_told = False
@@ -112,14 +117,23 @@ class Vehicle:
         return quaternion_from_euler(frame.roll_rad, frame.pitch_rad, frame.yaw_rad)
 
     @property
+    def gimbal(self) -> Gimbal | None:
+        """The gimbal, for its pose: angles, `quaternion` and `body_quaternion`; None without one."""
+        return None if self.gimbal_manager is None else self.gimbal_manager.gimbal
+
+    @property
     def battery_remaining(self) -> float:
-        """0..1. Half of it goes in SIM_BAT_DRAIN seconds of armed time; never below SIM_BAT_MIN_PCT."""
-        lowest = self.parameters.number("SIM_BAT_MIN_PCT") / 100.0
-        return min(max(0.99 - self._used_charge, lowest, 0.0), 1.0)
+        """0..1, as the autopilot believes it to be."""
+        return self.autopilot.supervision.battery.remaining
 
     @property
     def battery_volts(self) -> float:
-        return 14.4 + 1.8 * self.battery_remaining
+        return self.autopilot.supervision.battery.volts
+
+    @property
+    def transmitter(self) -> Transmitter:
+        """The pilot's remote control, switched off at first (COM_RC_IN_MODE decides whether it counts)."""
+        return self.autopilot.supervision.transmitter
 
     def next_ping(self) -> int:
         """The sequence number of the next PING of its own."""
@@ -201,12 +215,12 @@ class Vehicle:
             )
             self.airframe.wind = (north, east, 0.0)
         self.autopilot.update(STEP_S)
+        if self.gimbal_manager is not None:
+            self.gimbal_manager.step(STEP_S)
         if self.autopilot.sensors_ready and not self._origin_told:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
                 self.send_built(link, "GPS_GLOBAL_ORIGIN")
-        if self.autopilot.armed:
-            self._used_charge += STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
         self._watch_companion()
         if self.autopilot.texts or self.autopilot.gimbal_commands:
             self._tell()
@@ -239,6 +253,10 @@ class Vehicle:
                     link.send(event(identifier, self.boot_ms, self.event_sequence, levels, arguments))
         while autopilot.gimbal_commands:
             command, confirmation, values = autopilot.gimbal_commands.popleft()
+            if self.gimbal_manager is not None:
+                if confirmation:
+                    continue  # the first one was answered
+                self.gimbal_manager.own_command((command, confirmation, values))
             for link in self.links.values():
                 link.send(
                     dialect.MAVLink_command_long_message(self.system_id, 0, command, confirmation, *values)
