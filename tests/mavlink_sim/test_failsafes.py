@@ -119,7 +119,8 @@ def test_sticks_take_over_from_a_return_but_not_during_the_hold_before_it() -> N
     assert machine.run(5.0) is Mode.RTL
     assert machine.run(0.1, sticks=True) is Mode.POSCTL
     assert machine.intended is Mode.POSCTL
-    assert machine.machine.user_took_over and not machine.machine.in_failsafe
+    assert machine.machine.user_took_over
+    assert not machine.machine.in_failsafe
     assert [text.event[0] for text in machine.said if text.event][-1] == event_identifier(
         "failsafe_rc_override"
     )
@@ -157,7 +158,8 @@ def test_a_vehicle_armed_without_a_remote_control_never_misses_it() -> None:
     machine.machine.update(STEP_S, machine.conditions, armed=False, intended=Mode.HOLD)
     machine.intended = Mode.HOLD
     machine.conditions.manual_control_lost = True
-    assert machine.run(1.0) is Mode.HOLD and not machine.machine.in_failsafe
+    assert machine.run(1.0) is Mode.HOLD
+    assert not machine.machine.in_failsafe
     machine.conditions.manual_control_lost = False
     machine.run(0.1)
     machine.conditions.manual_control_lost = True

@@ -73,9 +73,11 @@ def test_sticks_expire_after_com_rc_loss_t() -> None:
     control = selector(1, COM_RC_LOSS_T=0.5)
     control.offer(Sticks(roll=0.5), MAVLINK_0, 1.0)
     control.update(1.49)
-    assert control.valid and control.sticks.roll == 0.5
+    assert control.valid
+    assert control.sticks.roll == 0.5
     control.update(1.51)
-    assert not control.valid and control.sticks == Sticks()
+    assert not control.valid
+    assert control.sticks == Sticks()
 
 
 def test_sticks_that_creep_are_not_moved_and_sticks_that_are_pushed_are() -> None:
@@ -297,7 +299,7 @@ def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_cockpit: An
 
 
 def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_cockpit: Any) -> None:
-    cockpit = remote_cockpit(make_cockpit)
+    cockpit = remote_cockpit(make_cockpit, COM_DISARM_LAND=-1)
     cockpit.take_off(6.0)
     cockpit.vehicle.transmitter.kill = True
     cockpit.until(lambda: "Kill engaged\t" in cockpit.texts(), 1.0)
