@@ -105,6 +105,21 @@ class Conditions:
     flight_time_exceeded: bool = False
     motor_failed: bool = False
 
+    def snapshot(self) -> tuple[object, ...]:
+        """All of it, to compare with what was before."""
+        return (
+            self.manual_control_lost,
+            self.ground_station_lost,
+            self.battery_warning,
+            self.offboard_signal_lost,
+            self.geofence_breached,
+            self.mission_failed,
+            self.mission_finished,
+            self.wind_exceeded,
+            self.flight_time_exceeded,
+            self.motor_failed,
+        )
+
 
 @dataclass(slots=True)
 class _Held:
@@ -241,6 +256,7 @@ class FailsafeMachine:
         self._must_notify = False
         self._manual_control_optional = True
         self._warning_at_arming = BatteryWarning.NONE
+        self._quiet_situation: tuple[object, ...] | None = None
         self._load()
 
     @property
@@ -267,6 +283,16 @@ class FailsafeMachine:
             mode_requested: somebody asked for `intended` since the last step, even if it was set before.
             sticks_request: a pilot moved the sticks enough to want to fly.
         """
+        situation = (
+            armed,
+            intended,
+            self._parameters.revision,
+            self._can_fly(intended),
+            self._can_fly(Mode.HOLD),
+            conditions.snapshot(),
+        )
+        if situation == self._quiet_situation and not (mode_requested or sticks_request):
+            return intended  # all was well, and nothing has changed: the usual case, and a frequent one
         if armed != self._was_armed:
             self._remove_settled()
             self.user_took_over = False
@@ -284,6 +310,8 @@ class FailsafeMachine:
         intended = self._select(dt_s, conditions, armed, intended, mode_requested, sticks_request)
         self._was_armed = armed
         self._last_intended = intended
+        quiet = not (self._held or self.user_took_over) and self._start_delay_s >= self._act_delay_s
+        self._quiet_situation = situation if quiet and self.action is Action.NONE else None
         return intended
 
     # ---- the checks -------------------------------------------------------------------------------------

@@ -101,12 +101,17 @@ def flying(make_cockpit: Any, **values: float) -> Any:
 
 
 def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_cockpit: Any) -> None:
-    cockpit = flying(make_cockpit, SIM_BAT_DRAIN=30, RTL_RETURN_ALT=12)
-    cockpit.until(lambda: "Low battery\t" in cockpit.texts(), 30.0)
+    cockpit = flying(make_cockpit, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.12
+    cockpit.until(lambda: any(line.startswith("battery low") for line in cockpit.events), 8.0)
+    cockpit.fly(0.1)
+    assert "Low battery\t" in cockpit.texts()
     assert cockpit.mode == "HOLD"
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.06
     cockpit.until(lambda: "failsafe: battery critical, HOLD" in cockpit.events, 10.0)
     cockpit.until(lambda: "failsafe: battery critical, RTL" in cockpit.events, 2.0)
-    cockpit.until(lambda: cockpit.mode == "LAND", 5.0)
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.04
+    cockpit.until(lambda: cockpit.mode == "LAND", 8.0)
     assert cockpit.heartbeat().system_status == 5
     cockpit.fly(2.1)
     assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4

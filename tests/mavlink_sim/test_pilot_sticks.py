@@ -302,7 +302,9 @@ def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_co
     cockpit = remote_cockpit(make_cockpit, COM_DISARM_LAND=-1)
     cockpit.take_off(6.0)
     cockpit.vehicle.transmitter.kill = True
-    cockpit.until(lambda: "Kill engaged\t" in cockpit.texts(), 1.0)
+    cockpit.until(lambda: "kill switch engaged" in cockpit.events, 1.0)
+    cockpit.fly(0.02)
+    assert "Kill engaged\t" in cockpit.texts()
     fell_s = cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 4.0)
     assert fell_s < 2.5
     assert cockpit.armed
