@@ -1,4 +1,4 @@
-"""MAVSDK, a client nobody here wrote: flies by joystick, turns the gimbal, reads battery and remote control."""
+"""MAVSDK, a client nobody here wrote: flies by joystick, turns the gimbal, reads battery and remote."""
 
 from __future__ import annotations
 
