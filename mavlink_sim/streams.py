@@ -22,10 +22,6 @@ ONBOARD_RATES_HZ: dict[str, float] = {
     "SERVO_OUTPUT_RAW": 9.85,
     "VFR_HUD": 9.85,
     "GPS_RAW_INT": 7.9,
-    "RC_CHANNELS": 20.0,  # with a remote control alone
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": 5.0,  # with a gimbal alone, like the two below
-    "GIMBAL_MANAGER_STATUS": 0.5,
-    "MOUNT_ORIENTATION": 10.0,
     "EXTENDED_SYS_STATE": 4.95,
     "SYS_STATUS": 4.95,
     "ESTIMATOR_STATUS": 1.0,
@@ -54,10 +50,6 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "POSITION_TARGET_LOCAL_NED": 49.0,
     "SERVO_OUTPUT_RAW": 49.0,
     "GPS_RAW_INT": 5.0,
-    "RC_CHANNELS": 5.0,
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": 5.0,
-    "GIMBAL_MANAGER_STATUS": 0.5,
-    "MOUNT_ORIENTATION": 10.0,
     "ALTITUDE": 1.0,
     "EXTENDED_SYS_STATE": 1.0,
     "ESTIMATOR_STATUS": 0.5,
@@ -78,6 +70,14 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "CURRENT_EVENT_SEQUENCE": 0.3,
     "PING": 0.1,
     "VIBRATION": 0.1,
+}
+
+# What comes on top with a remote control or a gimbal, by PX4's source: (onboard link, any other link).
+EQUIPMENT_RATES_HZ: dict[str, tuple[float, float]] = {
+    "RC_CHANNELS": (20.0, 5.0),
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": (5.0, 5.0),
+    "GIMBAL_MANAGER_STATUS": (0.5, 0.5),
+    "MOUNT_ORIENTATION": (10.0, 10.0),
 }
 
 

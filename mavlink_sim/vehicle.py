@@ -23,7 +23,7 @@ from mavlink_sim.messages import Outgoing, dialect, event, link_node_status
 from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import Multirotor
-from mavlink_sim.streams import ONBOARD_RATES_HZ
+from mavlink_sim.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
 from mavlink_sim.transmitter import Transmitter
 from vision.rotation import quaternion_from_euler
 
@@ -143,7 +143,8 @@ class Vehicle:
 
     def add_link(self, name: str, rates_hz: dict[str, float] | None = None) -> Link:
         """Attach a link with the onboard link's rates, or others (`streams.GCS_RATES_HZ`)."""
-        rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
+        equipment = {name: rates[rates_hz is not None] for name, rates in EQUIPMENT_RATES_HZ.items()}
+        rates = equipment | (ONBOARD_RATES_HZ if rates_hz is None else rates_hz)
         # links start out of step, so that they do not all send everything in the same millisecond
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
         return link
