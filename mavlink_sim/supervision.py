@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 from mavlink_sim.announcements import CRITICAL, INFO, Text, event_identifier
 from mavlink_sim.battery import Battery, BatteryWarning
-from mavlink_sim.failsafes import INFO_LEVELS, Action, Conditions, FailsafeMachine
+from mavlink_sim.failsafe_actions import Action
+from mavlink_sim.failsafes import INFO_LEVELS, Conditions, FailsafeMachine
 from mavlink_sim.manual_control import GESTURE, ManualControl, Request, RequestKind, Source
 from mavlink_sim.modes import MANUAL_MODES, Mode
 from mavlink_sim.parameters import Parameters

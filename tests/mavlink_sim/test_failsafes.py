@@ -8,7 +8,8 @@ import pytest
 
 from mavlink_sim.announcements import Text, event_identifier
 from mavlink_sim.battery import BatteryWarning
-from mavlink_sim.failsafes import Action, Conditions, FailsafeMachine
+from mavlink_sim.failsafe_actions import Action
+from mavlink_sim.failsafes import Conditions, FailsafeMachine
 from mavlink_sim.messages import dialect
 from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
