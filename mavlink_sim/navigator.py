@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim import flight, mission_items
 from mavlink_sim.announcements import CRITICAL, INFO, Text
-from mavlink_sim.collision_prevention import ObstacleMap
+from mavlink_sim.collision_prevention import ObstacleMap, Plane, limited_acceleration
 from mavlink_sim.geofence import Action, Geofence
 from mavlink_sim.geography import geographic
 from mavlink_sim.mission_feasibility import complaints
@@ -280,6 +280,16 @@ class Navigator:
 
         return landing
 
+    def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
+        """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""
+        limited = limited_acceleration(
+            acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
+        )
+        if limited.hold:
+            self._on_event("no distances to obstacles: collision prevention changes to HOLD")
+            self._autopilot.set_mode(Mode.HOLD)
+        return limited.acceleration
+
     # ---- one step ---------------------------------------------------------------------------------------
 
     def update(self) -> None:
@@ -344,14 +354,7 @@ class Navigator:
             self.say(CRITICAL, words)
         if not found or was_breached or not autopilot.armed:
             return
-        self._on_event(f"geofence breached: {found[0]}")
-        if action is Action.WARN:
-            self.say(CRITICAL, "Failsafe warning\t")
-        elif action is Action.TERMINATE:
-            autopilot.terminate()
-        else:
-            modes = {Action.RETURN: Mode.RTL, Action.LAND: Mode.LAND}
-            autopilot.enter_failsafe(modes.get(action, Mode.HOLD))
+        self._on_event(f"geofence breached: {found[0]}")  # what is done about it is up to the failsafes
 
 
 def goes_to_camera(command: int) -> bool:
