@@ -203,7 +203,7 @@ def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
 
 
 class Wall:
-    """A wall to the north of a hovering vehicle whose pilot flies by remote control, and a sensor that sees it.
+    """A wall north of a hovering vehicle whose pilot flies by remote control, and a sensor that sees it.
 
     `at_m`: north of where the vehicle was when the wall was put up.
     """
@@ -226,7 +226,7 @@ class Wall:
         return self.start_m + self.at_m - self.north_m
 
     def fly(self, seconds: float, setpoint: Any = None, *, seen: bool = True, **sticks: float) -> None:
-        """Let time pass with these sticks; the sensor reports at 10 Hz, straight ahead and 20° to the sides."""
+        """Let time pass with these sticks; the sensor tells at 10 Hz, ahead and 20° to the sides."""
         self.vehicle.transmitter.sticks = Sticks(**sticks)
         for _ in range(round(seconds * 10)):
             distances = [FAR_CM] * SECTORS
@@ -243,7 +243,7 @@ class Wall:
 
 
 def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: Any) -> None:
-    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0)
+    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     assert wall.cockpit.set_mode(3, 0) == [0, 0]
     wall.fly(8.0, pitch=1.0)
     assert wall.cockpit.mode == "POSCTL"
@@ -261,7 +261,7 @@ def test_without_collision_prevention_the_same_stick_leads_through_the_wall(make
 
 
 def test_in_offboard_nothing_is_held_back(make_cockpit: Any, velocity_setpoint: Any) -> None:
-    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0)
+    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     north = velocity_setpoint(2, 0, 0)
     wall.cockpit.offboard(north)
     wall.fly(4.0, north)
@@ -270,7 +270,7 @@ def test_in_offboard_nothing_is_held_back(make_cockpit: Any, velocity_setpoint: 
 
 
 def test_a_sensor_that_falls_silent_ends_position_mode(make_cockpit: Any) -> None:
-    wall = Wall(make_cockpit, 10.0, CP_DIST=1.0)
+    wall = Wall(make_cockpit, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     wall.cockpit.set_mode(3, 0)
     wall.fly(1.0)
     wall.fly(4.5, seen=False)
