@@ -206,9 +206,9 @@ def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
 
 
 def pilot_takeover(vehicle: Vehicle, one: ActiveFault) -> None:
-    """A pilot's sticks are there and the mode is switched; at the end the sticks go.
+    """A pilot's sticks are there and the mode is switched; at the end the sticks go, the mode stays.
 
-    PX4 then sees a remote control that is lost: NAV_RCL_ACT, after COM_FAIL_ACT_T.
+    Where a remote control counts (COM_RC_IN_MODE other than 4), it is lost then, and NAV_RCL_ACT follows.
     """
     mode = Mode[one.fault.values["mode"]]
     had_sticks = vehicle.autopilot.supervision.pilot_attached

@@ -270,7 +270,7 @@ class Simulation:
                 self.vehicle.quaternion,
                 time.monotonic_ns(),
                 self._simulated_s,
-                self._camera_turn,
+                self.camera_turn_rad,
             )
             if self._simulated_s >= self._next_camera_check_s:
                 self._next_camera_check_s = self._simulated_s + CAMERA_CHECK_S
@@ -297,7 +297,7 @@ class Simulation:
         return (start_north + north, start_east + east, down)
 
     @property
-    def _camera_turn(self) -> Vector | None:
+    def camera_turn_rad(self) -> Vector | None:
         """Roll, pitch, yaw from the body to a camera on the gimbal; None for one that sits on the body."""
         gimbal = self.vehicle.gimbal
         return None if gimbal is None else euler_from_quaternion(gimbal.body_quaternion)

@@ -14,6 +14,7 @@ from mavlink_sim.geography import geographic
 from mavlink_sim.gimbal import Aim, Gimbal, Target
 from mavlink_sim.messages import dialect
 from mavlink_sim.parameters import Parameters
+from mavlink_sim.simulation import Simulation, SimulationOptions
 from vision.rotation import matrix_from_quaternion, quaternion_from_euler
 
 NAN = math.nan
@@ -245,3 +246,20 @@ def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: Any
     assert [m.command for m in sent] == [1001, 1000, 1001]
     assert steered.vehicle.gimbal.tilt_rad == pytest.approx(0.0, abs=0.01)
     assert steered.vehicle.gimbal_manager.primary == (0, 0)
+
+
+@pytest.mark.parametrize("equipped", [True, False])
+def test_the_camera_of_a_simulation_turns_with_the_gimbal(equipped: bool) -> None:
+    options = SimulationOptions(
+        onboard_bind=0, gcs_bind=0, ready_after_s=0.0, gimbal=equipped, noise=False, console=False
+    )
+    with Simulation(options, lambda line: None) as simulation:
+        if not equipped:
+            assert simulation.camera_turn_rad is None
+            return
+        vehicle = simulation.vehicle
+        assert vehicle.gimbal is not None
+        vehicle.gimbal.point(Target(Aim.ANGLES, math.radians(-20.0), math.radians(30.0)))
+        vehicle.step(3.0)
+        wanted = (0.0, math.radians(-20.0), math.radians(30.0))
+        assert simulation.camera_turn_rad == pytest.approx(wanted, abs=0.01)
