@@ -382,7 +382,9 @@ class Service:
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Publish what a view saw; work out where it is, if that view steers."""
         name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
-        self.bus.publish(topics.DETECTIONS, detections_message(result, name, now_ns, view.name), view.name)
+        clock = self.driver.state.clock
+        message = detections_message(result, name, now_ns, view.name, clock)
+        self.bus.publish(topics.DETECTIONS, message, view.name)
         self.bus.publish(topics.LABELS, labels_message(result), view.name)
         if result.track_events:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
