@@ -12,7 +12,7 @@ from dataclasses import dataclass
 KEPT_S = 10.0
 # Two quartz clocks: 50 ppm each is more than any flight controller's data sheet allows.
 DRIFT = 100e-6
-# A slower answer says no more than the messages' arrival does; a radio at 57600 baud needs a fifth of a second.
+# A slower answer says no more than the arrival of messages does; a radio of 57600 baud needs 0.2 s.
 LONGEST_TRIP_NS = 500_000_000
 # A stamp so far from its arrival is of another clock, not of a slow link.
 WRONG_CLOCK_NS = 2_000_000_000
@@ -27,7 +27,11 @@ class ClockOffset:
 
 
 class ClockSync:
-    """Learns the offset from questions and answers; forgets it when the autopilot's clock jumps."""
+    """Learns the offset from questions and answers; forgets it when the autopilot's clock jumps.
+
+    A simulated autopilot that runs faster or slower than time does jumps all the while: its messages then bear
+    their arrival.
+    """
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, ClockOffset]] = deque()  # (when, what), CLOCK_MONOTONIC ns
