@@ -75,6 +75,7 @@ _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
 # A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
 _SETBACKS_OF_TWO = 3
 _TWO_CLOCKS_S = 2.0
+_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE")
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 
 
@@ -266,6 +267,8 @@ class AutopilotDriver(ABC):
             self._watch_clock(fields["time_boot_ms"], now_ns)
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             self._mode_ns = now_ns
+        if name in _OF_ITS_PLACE and self._two_autopilots(now_ns):
+            return  # Nobody can tell whose it is: what is known grows stale, and what needs it ends.
         state = fold(self._state, name, fields, now_ns)
         changed, self._state = state is not self._state, state
         for watcher in list(self._watchers.values()):

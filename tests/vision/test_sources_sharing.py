@@ -54,6 +54,17 @@ def test_what_is_read_is_there_for_others_with_its_stamp(name: str, tmp_path: Pa
             assert np.array_equal(other.image, frame.image)
 
 
+def test_a_frame_that_comes_after_the_end_is_shown_to_nobody(name: str, tmp_path: Path) -> None:
+    folder = pictures(tmp_path, (32, 24), (32, 24))
+    with FrameSharing(name) as sharing, open_source(str(folder)) as source:
+        frame = source.read()
+        assert frame is not None
+        sharing.write(frame)
+    sharing.write(frame)
+    with pytest.raises(FileNotFoundError):
+        SharedFrameReader(name)
+
+
 def test_a_stream_that_changes_its_size_goes_on(name: str, tmp_path: Path) -> None:
     folder = pictures(tmp_path, (32, 24), (48, 16))
     with shared(folder, name) as source:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Lock
 from types import TracebackType
 
 from vision.frame import Frame
@@ -23,14 +24,19 @@ class FrameSharing:
     def __init__(self, name: str) -> None:
         self._name = name
         self._writer: SharedFrameWriter | None = None
+        # A camera's driver that hangs may still be giving a frame when all is being closed.
+        self._lock = Lock()
+        self._closed = False
 
     def write(self, frame: Frame) -> None:
-        """Show a frame to the others.
+        """Show a frame to the others. After `close` it does nothing.
 
         Raises:
             SourceError: another program writes under that name, or the memory cannot be had.
         """
-        self._writer_for(frame).write(frame)
+        with self._lock:
+            if not self._closed:
+                self._writer_for(frame).write(frame)
 
     def _writer_for(self, frame: Frame) -> SharedFrameWriter:
         """The writer of frames of this size: a stream may change its own in the middle."""
@@ -38,7 +44,7 @@ class FrameSharing:
         writer = self._writer
         if writer is not None and (writer.width, writer.height, writer.depth) == size:
             return writer
-        self.close()
+        self._take_away()
         try:
             self._writer = SharedFrameWriter(self._name, *size)
         except (OSError, ValueError) as error:
@@ -46,7 +52,12 @@ class FrameSharing:
         return self._writer
 
     def close(self) -> None:
-        """Take the shared memory away. The source must be closed before."""
+        """Take the shared memory away."""
+        with self._lock:
+            self._closed = True
+            self._take_away()
+
+    def _take_away(self) -> None:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()

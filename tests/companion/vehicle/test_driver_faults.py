@@ -204,6 +204,7 @@ async def test_a_second_autopilot_of_the_same_id_is_named(kind: str, caplog) -> 
             assert caplog.text.count("has restarted") <= 1
             with pytest.raises(CommandRefusedError, match="two autopilots answer as system 1"):
                 await driver.arm()
+            await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
             simulator.fault("end all")
             await asyncio.to_thread(simulator.wait_for_event, "second_autopilot ends")
             await wait_until(lambda: not driver._two_autopilots(time.monotonic_ns()), 10.0)
