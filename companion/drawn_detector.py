@@ -46,11 +46,13 @@ class Thing:
         class_name: as the detector calls it; empty: it only hides others.
         size_m: length, width, height.
         pose: at seconds of the flight.
+        hidden: at seconds of the flight it is behind something that is not drawn.
     """
 
     class_name: str
     size_m: Vector3
     pose: Callable[[float], Pose]
+    hidden: Callable[[float], bool] = lambda _: False
 
     def range_m(self, place: Sequence[float], seconds: float) -> float:
         """Horizontal metres from (north, east) to the nearest point of its footprint, 0 inside."""
@@ -121,7 +123,13 @@ class DrawnDetector:
             unsure, far = rng.normal(0.0, 0.06), rng.normal(0.0, faults.range_sigma)
             sides = np.tile(outline.xyxy[2:] - outline.xyxy[:2], 2)
             visible = outline.inside * (1.0 - _hidden(outline, outlines))
-            if not thing.class_name or missed or visible < LEAST_VISIBLE or sides.min() < LEAST_PIXELS:
+            if (
+                not thing.class_name
+                or thing.hidden(seconds)
+                or missed
+                or visible < LEAST_VISIBLE
+                or sides.min() < LEAST_PIXELS
+            ):
                 continue
             box = outline.xyxy + shake * sides
             boxes.append(box)
