@@ -1,7 +1,7 @@
 """Flights of `approach` without depth: the range comes from the ground plane.
 
 A car, a truck or a person stands 12 to 30 m away, anywhere in the picture's width, with another of its class
-and something else about; the wind is up to 6 m/s. A flight succeeds when the behaviour says that it arrived
+and something else about; the wind is up to 3 m/s. A flight succeeds when the behaviour says that it arrived
 and the true distance to the object's nearest surface is off by 1.5 m at most, with no limit left on the way.
 """
 
@@ -17,7 +17,7 @@ from companion.guidance.approach import ApproachBehaviour
 from companion.lockstep_flight import LockstepFlight, Sight
 from vision.camera_model import CameraModel, CameraMount
 
-CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
 SIZES_M = {
     "car": (4.2, 1.8, 1.5),
@@ -52,7 +52,7 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
     flight = LockstepFlight(
         seed=seed,
         height_m=HEIGHT_M,
-        wind_mps=float(rng.uniform(0.0, 6.0)),
+        wind_mps=float(rng.uniform(0.0, 3.0)),
         sight=Sight(CAMERA, MOUNT, detector),
     )
     flight.turn_to(

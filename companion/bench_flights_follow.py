@@ -2,7 +2,7 @@
 
 A person or a car goes its winding way for a minute, with up to 1 m/s² sideways. Twice it is hidden, for 1 to
 2 s. Another of its class stands 3.5 m beside its way, a second one comes towards it and passes as near. The
-wind is up to 6 m/s with its gusts; the detector's faults are those of `drawn_detector`, its results 80 ms
+wind is up to 3 m/s with its gusts; the detector's faults are those of `drawn_detector`, its results 80 ms
 late. Range comes from the ground plane.
 
 Time on target is the share of guidance's turns, from 8 s after the beginning until the minute is over (a
@@ -26,11 +26,11 @@ from companion.lockstep_flight import LockstepFlight, Moment, Sight
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 
-CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
 SIZES_M = {"car": (4.2, 1.8, 1.5), "person": (0.5, 0.6, 1.7)}
 SPEED_MPS = 3.0
-DISTANCE_M, HEIGHT_M = 8.0, 3.0
+DISTANCE_M, HEIGHT_M = 8.0, 2.5
 SETTLING_S, FLIGHT_S = 8.0, 60.0
 RANGE_TOLERANCE_M, PICTURE_TOLERANCE_RAD = 1.5, math.radians(10.0)
 LEAST_TIME_ON_TARGET = 0.95
@@ -47,7 +47,7 @@ def run(seed: int) -> FlightResult:
     flight = LockstepFlight(
         seed=seed,
         height_m=HEIGHT_M,
-        wind_mps=float(rng.uniform(0.0, 6.0)),
+        wind_mps=float(rng.uniform(0.0, 3.0)),
         sight=Sight(CAMERA, MOUNT, detector),
     )
     flight.turn_to(yaw)
