@@ -246,7 +246,40 @@ class Approach(Command):
     ] = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class Follow(Command):
+    word: ClassVar[str] = "follow"
+    meaning: ClassVar[str] = "keep a distance and a bearing to a moving object of the class"
+
+    class_name: Annotated[str, ClassName("class", "what to follow")]
+    distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
+    bearing: Annotated[
+        str,
+        Choice(
+            "bearing",
+            ("here", "compass", "course"),
+            "where to stay: as it is, or `angle` from north or course",
+        ),
+    ] = "here"
+    angle_deg: Annotated[
+        float,
+        Number("angle", "deg", -360.0, 360.0, "seen from the object, clockwise; of course, 180 is behind"),
+    ] = 180.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 5.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    occlusion_s: Annotated[
+        float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's expected way this long")
+    ] = 3.0
+    duration_s: Annotated[
+        float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
+    ] = 0.0
+
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
+
 COMMANDS: dict[str, type[Command]] = {
     kind.word: kind
-    for kind in (Takeoff, Land, Rtl, Stop, Hold, Goto, FollowPath, FigureEight, Orbit, Seek, Approach)
+    for kind in (Takeoff, Land, Rtl, Stop, Hold, Goto, FollowPath, FigureEight, Orbit, Seek, Approach, Follow)
 }

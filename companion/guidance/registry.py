@@ -8,6 +8,7 @@ from companion.guidance import commands
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.figure_eight import FigureEightBehaviour
+from companion.guidance.follow import FollowBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
@@ -56,6 +57,8 @@ def behaviour_for(command: commands.Command) -> Behaviour:
                 confidence=confidence,
                 lost_timeout_s=lost_timeout_s,
             )
+        case commands.Follow():
+            return _follow(command)
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 
 
@@ -68,6 +71,19 @@ def _goto(command: commands.Goto) -> GotoBehaviour:
         altitude_m=command.altitude_m,
         speed_mps=command.speed_mps,
         heading_rad=None if heading is None else math.radians(heading),
+    )
+
+
+def _follow(command: commands.Follow) -> FollowBehaviour:
+    return FollowBehaviour(
+        command.class_name,
+        distance_m=command.distance_m,
+        bearing=command.bearing,
+        angle_rad=math.radians(command.angle_deg),
+        speed_mps=command.speed_mps,
+        confidence=command.confidence,
+        occlusion_s=command.occlusion_s,
+        duration_s=command.duration_s,
     )
 
 
