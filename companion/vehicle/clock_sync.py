@@ -29,7 +29,7 @@ class ClockOffset:
 class ClockSync:
     """Learns the offset from questions and answers; forgets it when the autopilot's clock jumps.
 
-    A simulated autopilot that runs faster or slower than time does jumps all the while: its messages then bear
+    A simulated autopilot that runs faster or slower than time jumps all the while: its messages then bear
     their arrival.
     """
 
