@@ -1,6 +1,6 @@
 """PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, auto-disarming.
 
-`update` runs once a physics step. Whatever PX4 would tell a ground station is queued in `texts`.
+`update` runs once a control step. Whatever PX4 would tell a ground station is queued in `texts`.
 Times are seconds since boot. Names in capitals are PX4's parameters.
 """
 
@@ -97,6 +97,7 @@ class Autopilot:
         self._lifting_since_s: float | None = None
         self._has_flown = False
         self.failsafe_is_latched = False  # it stays until the mode is changed by a user
+        self.latched_mode = Mode.HOLD  # of that failsafe
         self.terminated = False
         self.navigator = Navigator(self, airframe, parameters, on_event)
 
@@ -277,12 +278,13 @@ class Autopilot:
     def enter_failsafe(self, mode: Mode) -> None:
         """A failsafe takes the vehicle until somebody changes the mode or it is disarmed."""
         self.failsafe = self.failsafe_is_latched = True
+        self.latched_mode = mode
         self._say(CRITICAL, "Failsafe activated\t")
         self._on_event(f"failsafe: {mode.name}")
-        self._enter(mode)
+        position_failsafe.enter_or_fall_back(self, mode)
 
     def terminate(self) -> None:
-        """Stop the motors in flight, for good: flight termination."""
+        """Stop the motors in flight until it is disarmed, by itself once it is down: flight termination."""
         self.terminated = self.failsafe = self.failsafe_is_latched = True
         self._say(CRITICAL, "Failsafe activated\t")
         self._on_event("flight terminated")
@@ -311,6 +313,8 @@ class Autopilot:
             self._idle(dt_s, 0.0)
             if not self.landed and airframe.on_ground:
                 self._has_landed()
+            if self.armed:
+                self._disarm_automatically()
             return
         task = self.task
         assert task is not None
@@ -407,6 +411,8 @@ class Autopilot:
     def _has_landed(self) -> None:
         self._contact_since_s = None
         self.landed = True
+        if not self.armed:  # it fell
+            self.home = self._airframe.position
         self._landed_since_s = self.now_s
         self._say(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
@@ -414,7 +420,7 @@ class Autopilot:
     def _disarm_automatically(self) -> None:
         if not self.landed:
             return
-        if self._has_flown and self.navigator.in_progress:
+        if self._has_flown and self.navigator.in_progress and not self.terminated:
             return
         if self._has_flown:
             delay = self._parameters.number("COM_DISARM_LAND")

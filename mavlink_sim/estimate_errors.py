@@ -65,14 +65,13 @@ class FallibleEstimate(Estimate):
     def set_error(
         self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
     ) -> None:
-        """What a fault adds to the estimate (NED); None: nothing any more."""
+        """What a fault adds to the estimate (NED) from its next update on; None: nothing any more."""
         if position_m is None:
             self._errors.pop(number, None)
         else:
             self._errors[number] = (position_m, velocity_mps, yaw_rad)
         self.offset = _sum(error[0] for error in self._errors.values())
         self._yaw_error_rad = sum(error[2] for error in self._errors.values())
-        self.update(0.0)
 
     def count_reset(self, resets: int = 1) -> None:
         """The estimate jumped."""

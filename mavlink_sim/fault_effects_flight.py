@@ -26,7 +26,15 @@ GUST_S = 4.0
 WARNING, INFO = 4, 6  # MAV_SEVERITY
 
 # Commands that are a request for a mode; DO_SET_MODE (176) names it in its parameters.
-_MODE_OF_COMMAND = {20: Mode.RTL, 21: Mode.LAND, 22: Mode.TAKEOFF, 192: Mode.HOLD, 300: Mode.MISSION}
+_MODE_OF_COMMAND = {
+    20: Mode.RTL,
+    21: Mode.LAND,
+    22: Mode.TAKEOFF,
+    34: Mode.ORBIT,
+    186: Mode.HOLD,
+    192: Mode.HOLD,
+    300: Mode.MISSION,
+}
 _DO_SET_MODE = 176
 
 
@@ -55,13 +63,12 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
             estimate.position_valid = vehicle.autopilot.position_valid = False
 
     def fuse_again() -> None:
+        estimate.set_error(one.number, None)
         if estimate.fix_lost:
             return
-        vehicle.estimate.set_error(one.number, None)
         if estimate.held_xy_m is not None:
             estimate.held_xy_m = None
             estimate.position_valid = vehicle.autopilot.position_valid = True
-        estimate.update(0.0)
         _jumped(vehicle, 2)
         vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
 
@@ -117,6 +124,7 @@ def _jumped(vehicle: Vehicle, resets: int = 1, yaw_rad: float = 0.0) -> None:
 
     An absolute goal stays where it is, so the vehicle then flies the difference.
     """
+    vehicle.estimate.update(0.0)
     vehicle.estimate.count_reset(resets)
     for trajectory in _trajectories(vehicle.autopilot.task):
         trajectory.position = vehicle.estimate.position
@@ -203,7 +211,7 @@ def _blowing(speed_mps: float, from_rad: float) -> Vector:
 
 def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
     vehicle.faults.winds.pop(one.number, None)
-    vehicle.reload_wind()
+    vehicle.reload_wind(vehicle.faults.winds.values())
 
 
 # ---- command

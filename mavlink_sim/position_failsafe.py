@@ -4,7 +4,8 @@ A mode that needs a position is refused, and left if it is flown: Position falls
 sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
 (that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
 OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
-When the position comes back in the air, the mode that was wanted is flown again.
+When the position comes back in the air, the mode that was wanted is flown again, or that of a failsafe that a
+user has not ended.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def keep_landing(autopilot: Autopilot) -> None:
 
 def check(autopilot: Autopilot) -> None:
     """Leave a mode that lost its position; go back to the intended one when the position is back."""
-    if not autopilot.armed:
+    if not autopilot.armed or autopilot.terminated:
         return
     if not autopilot.position_valid:
         if not autopilot.blind and needs_position(autopilot.mode):
@@ -87,10 +88,12 @@ def check(autopilot: Autopilot) -> None:
             autopilot.texts.append(Text(CRITICAL, "Failsafe activated\t"))
             autopilot._on_event(f"failsafe: position lost in {autopilot.mode.name}")
             enter_or_fall_back(autopilot, autopilot.mode)
-    elif autopilot.blind:
+    elif autopilot.blind and not autopilot.landed:  # after a blind landing it stays where it is
         autopilot.blind = False
         autopilot._on_event("the position is back")
-        if autopilot.intended_mode is Mode.OFFBOARD:
+        if autopilot.failsafe_is_latched:
+            autopilot._enter(autopilot.latched_mode)
+        elif autopilot.intended_mode is Mode.OFFBOARD:
             if not autopilot.has_setpoints:  # else the check of the setpoints goes back to OFFBOARD
                 autopilot._enter(autopilot._offboard_loss_mode())
         else:
