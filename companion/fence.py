@@ -8,17 +8,20 @@ along it and back the vehicle flies as it likes. Inside and outside are told by 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
 Place = tuple[float, float]
 Polygon = tuple[Place, ...]
+Area = tuple[Polygon, bool]  # with whether to stay inside of it, else out of it
+Row = tuple[float, float, float]  # a direction (north, east), and the speed allowed in it
 
 # So far before an edge the vehicle stops: it is led by an estimate, and answers late.
 MARGIN_M = 0.5
-# What slows down for one edge may push towards another; after so many rounds it stops instead.
-_ROUNDS = 6
+ON_EDGE_M = 1e-6
+# What slows down for one edge may push towards another: so often it is taken back.
+_ROUNDS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +40,7 @@ class Fence:
     exclude: tuple[Polygon, ...] = ()
 
     def __post_init__(self) -> None:
-        for polygon in self._polygons():
+        for polygon, _ in self._areas():
             if len(polygon) < 3:
                 raise ValueError(f"a fence needs three corners or more, got {len(polygon)}")
             if not all(math.isfinite(value) for corner in polygon for value in corner):
@@ -47,81 +50,92 @@ class Fence:
 
     def holds(self, place: Place) -> bool:
         """Whether the vehicle may be there."""
-        return all(not self._breached(polygon, place) for polygon in self._polygons())
+        return not any(_breached(area, place) for area in self._areas())
 
-    def slowed(self, velocity: Place, place: Place, speed_towards: Callable[[float], float]) -> Place:
+    def slowed(
+        self,
+        velocity: Place,
+        place: Place,
+        speed_towards: Callable[[float], float],
+        also: Iterable[Row] = (),
+    ) -> Place:
         """What is left of a velocity over ground so that the vehicle stays inside.
 
         Args:
             velocity: (north, east) m/s. place: (north, east) of home, metres.
             speed_towards: from the way that is left before an edge, metres (0 or less: none), to the speed
                 that may be flown towards it.
+            also: more limits of the kind: (north, east) unit direction, and the speed allowed in it.
 
         Returns:
-            The velocity, in no direction faster. Where a fence is broken already: what does not lead further.
+            The velocity, no faster than it came. Where a fence is broken already: what leads no further.
         """
-        back = [nearest for polygon in self._polygons() if (nearest := self._way_back(polygon, place))]
-        held = [polygon for polygon in self._polygons() if not self._breached(polygon, place)]
+        top = math.hypot(*velocity)
+        rows = [row for row in (*also, *self._rows_at(place, speed_towards)) if row[2] < top]
         for _ in range(_ROUNDS):
             before = velocity
-            for north, east in back:
-                away = -(velocity[0] * north + velocity[1] * east)
-                if away > 0.0:
-                    velocity = (velocity[0] + away * north, velocity[1] + away * east)
-            for polygon in held:
-                velocity = self._slowed_at(polygon, velocity, place, speed_towards)
-            if math.dist(velocity, before) < 1e-9:
+            for north, east, allowed in rows:
+                excess = velocity[0] * north + velocity[1] * east - allowed
+                if excess > 0.0:
+                    velocity = (velocity[0] - excess * north, velocity[1] - excess * east)
+            if velocity == before:
                 return velocity
-        return (0.0, 0.0)
+        # Standing still keeps every limit, so what still breaks one is shortened towards that.
+        share = 1.0
+        for north, east, allowed in rows:
+            towards = velocity[0] * north + velocity[1] * east
+            if towards > allowed + 1e-6:
+                share = min(share, allowed / towards)
+        return (velocity[0] * share, velocity[1] * share)
 
     def clipped(self, start: Place, goal: Place) -> Place:
-        """The farthest place on the straight way to `goal` that lies inside, with a margin."""
+        """The farthest place on the straight way to `goal` that lies inside, half a metre of way before it.
+
+        From outside only a goal that is right is flown to, and only if nothing else lies in between.
+        """
         length = math.dist(start, goal)
+        held = [area for area in self._areas() if not _breached(area, start)]
+        if length == 0.0 or any(_breached(area, goal) for area in self._areas() if area not in held):
+            return start
         first = min(
-            (share for polygon in self._polygons() for share in _crossings(start, goal, polygon)),
-            default=None,
+            (share for polygon, _ in held for share in _crossings(start, goal, polygon)), default=None
         )
-        if length == 0.0 or not self.holds(start):
-            return goal if self.holds(goal) else start
         if first is None:
-            return goal
+            return goal if self.holds(goal) else start
         share = max(0.0, first - MARGIN_M / length)
         return (start[0] + share * (goal[0] - start[0]), start[1] + share * (goal[1] - start[1]))
 
-    def _polygons(self) -> tuple[Polygon, ...]:
-        return (self.include, *self.exclude) if self.include else self.exclude
+    def _areas(self) -> list[Area]:
+        outside = [(polygon, False) for polygon in self.exclude]
+        return [(self.include, True), *outside] if self.include else outside
 
-    def _breached(self, polygon: Polygon, place: Place) -> bool:
-        return _inside(polygon, place) is not (polygon is self.include)
-
-    def _slowed_at(
-        self, polygon: Polygon, velocity: Place, place: Place, speed_towards: Callable[[float], float]
-    ) -> Place:
-        for a, b in _edges(polygon):
-            nearest = _nearest(a, b, place)
-            away = math.dist(nearest, place)
-            if away > 1e-6:
-                north, east = (nearest[0] - place[0]) / away, (nearest[1] - place[1]) / away
-            else:
+    def _rows_at(self, place: Place, speed_towards: Callable[[float], float]) -> Iterator[Row]:
+        """The limits there: towards the edges of what holds, and away from what is broken."""
+        for area in self._areas():
+            polygon, _ = area
+            nearest = [_nearest(a, b, place) for a, b in _edges(polygon)]
+            away = [math.dist(there, place) for there in nearest]
+            if _breached(area, place) and min(away) > ON_EDGE_M:
+                at = away.index(min(away))
+                north, east = ((nearest[at][axis] - place[axis]) / away[at] for axis in range(2))
+                yield (-north, -east, 0.0)
+                continue
+            for (a, b), there, distance in zip(_edges(polygon), nearest, away, strict=True):
+                if distance > ON_EDGE_M:
+                    north, east = ((there[axis] - place[axis]) / distance for axis in range(2))
+                    yield (north, east, speed_towards(distance - MARGIN_M))
+                    continue
                 # On the edge itself: straight across it, to the side that is not allowed.
                 length = math.dist(a, b)
                 north, east = (b[1] - a[1]) / length, -(b[0] - a[0]) / length
-                if not self._breached(polygon, (place[0] + 1e-3 * north, place[1] + 1e-3 * east)):
+                if not _breached(area, (place[0] + 1e-3 * north, place[1] + 1e-3 * east)):
                     north, east = -north, -east
-            excess = velocity[0] * north + velocity[1] * east - speed_towards(away - MARGIN_M)
-            if excess > 0.0:
-                velocity = (velocity[0] - excess * north, velocity[1] - excess * east)
-        return velocity
+                yield (north, east, 0.0)
 
-    def _way_back(self, polygon: Polygon, place: Place) -> Place | None:
-        """Where the nearest edge is, as a direction, of a polygon that is breached."""
-        if not self._breached(polygon, place):
-            return None
-        nearest = min((_nearest(a, b, place) for a, b in _edges(polygon)), key=lambda c: math.dist(c, place))
-        away = math.dist(nearest, place)
-        if away < 1e-9:
-            return None
-        return ((nearest[0] - place[0]) / away, (nearest[1] - place[1]) / away)
+
+def _breached(area: Area, place: Place) -> bool:
+    polygon, to_stay_inside = area
+    return _inside(polygon, place) is not to_stay_inside
 
 
 def _edges(polygon: Polygon) -> Iterator[tuple[Place, Place]]:

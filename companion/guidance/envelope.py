@@ -22,6 +22,10 @@ POSITION_GAIN_PER_S = 1.0
 LONGEST_STEP_S = 0.2
 # Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
 FENCE_BRAKING = 0.5
+# How late a multirotor's velocity follows.
+FENCE_DELAY_S = 0.4
+# Speed for each metre left, at most: a velocity that follows by 0.3 s is then critically damped.
+FENCE_GAIN_PER_S = 0.8
 NO_FENCE = Fence()
 
 
@@ -77,6 +81,7 @@ class Envelope:
     def __init__(self, limits: Limits | None = None) -> None:
         self.limits = limits or Limits()
         self._velocity: Vector3 | None = None
+        self._home: Vector3 | None = None
         self._yaw_rad: float | None = None
 
     def reset(self) -> None:
@@ -96,6 +101,14 @@ class Envelope:
         """
         dt_s = max(0.0, min(dt_s, LONGEST_STEP_S))
         reasons: list[str] = []
+        if state.home_position_ned_m is not None:
+            self._home = state.home_position_ned_m
+        elif self._home is not None:
+            # An autopilot may take a moment to tell it again; where it was is the best guess meanwhile.
+            state = replace(state, home_position_ned_m=self._home)
+        elif self.limits.fence != NO_FENCE:
+            self.reset()
+            return Limited(Setpoint.brake(now_ns), ("home unknown, and there is a fence about it",))
         if setpoint.position_ned_m is not None and state.position_ned_m is None:
             self.reset()
             return Limited(Setpoint.brake(now_ns), ("position unknown",))
@@ -116,22 +129,24 @@ class Envelope:
         self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]
     ) -> Vector3:
         limits = self.limits
-        velocity = _shorten(asked, limits.max_horizontal_speed_mps)
-        if velocity != asked:
-            reasons.append(f"horizontal speed limited to {limits.max_horizontal_speed_mps:g} m/s")
-        north, east, down = velocity
-        vertical = max(-limits.max_climb_mps, min(limits.max_descend_mps, down))
-        if vertical != down:
-            which, limit = (
-                ("climb", limits.max_climb_mps) if down < 0 else ("descent", limits.max_descend_mps)
-            )
-            reasons.append(f"{which} limited to {limit:g} m/s")
-        velocity = self._slew((north, east, vertical), state, dt_s, reasons)
+        parts = (
+            (limits.max_horizontal_speed_mps, math.hypot(asked[0], asked[1]), "horizontal speed"),
+            (limits.max_climb_mps, -asked[2], "climb"),
+            (limits.max_descend_mps, asked[2], "descent"),
+        )
+        scale = 1.0
+        for limit, value, what in parts:
+            if value > limit * (1.0 + 1e-12):
+                # All of it alike, so that a steep way is flown slower and not another way.
+                scale = min(scale, limit / value)
+                reasons.append(f"{what} limited to {limit:g} m/s")
+        north, east, down = (value * scale for value in asked) if scale < 1.0 else asked
+        velocity = self._slew((north, east, down), state, dt_s, reasons)
         # Last, so that no slew delays what a fence takes away.
         return self._slow_at_fences(velocity, state, reasons)
 
     def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
-        """Take away what would carry the vehicle over a fence: √(2·a·s) of speed for s of way left."""
+        """Take away what would carry the vehicle over a fence: no more speed than the way left stops."""
         limits, altitude_m = self.limits, state.altitude_m
         if state.position_ned_m is None or altitude_m is None:
             return velocity
@@ -145,21 +160,26 @@ class Envelope:
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
         away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
         distance_m = math.hypot(*away)
+        # The circle is one more edge, so that what one takes away another cannot give back.
+        circle: list[tuple[float, float, float]] = []
         if distance_m > 0.0:
-            outward = (away[0] / distance_m, away[1] / distance_m)
-            leaving = north * outward[0] + east * outward[1]
-            excess = leaving - self._towards_fence(limits.max_distance_m - distance_m)
-            if leaving > 0.0 and excess > 1e-9:
-                north, east = north - outward[0] * excess, east - outward[1] * excess
+            allowed_mps = self._towards_fence(limits.max_distance_m - distance_m)
+            circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
+            if north * circle[0][0] + east * circle[0][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
-        allowed = limits.fence.slowed((north, east), away, self._towards_fence)
-        if math.dist(allowed, (north, east)) > 1e-6:
-            reasons.append("slowed down at the fence")
-            north, east = allowed
+        over_ground = limits.fence.slowed((north, east), away, self._towards_fence, also=circle)
+        if math.dist(over_ground, (north, east)) > 1e-9:
+            if not reasons or not reasons[-1].startswith("distance from home"):
+                reasons.append("slowed down at the fence")
+            north, east = over_ground
         return (north, east, down)
 
     def _towards_fence(self, left_m: float) -> float:
-        return math.sqrt(2.0 * FENCE_BRAKING * self.limits.max_acceleration_mps2 * max(0.0, left_m))
+        """The speed from which the vehicle stops in so much way, which begins when it answers."""
+        braking = FENCE_BRAKING * self.limits.max_acceleration_mps2
+        late = braking * FENCE_DELAY_S
+        left_m = max(0.0, left_m)
+        return min(math.sqrt(late**2 + 2.0 * braking * left_m) - late, FENCE_GAIN_PER_S * left_m)
 
     def _slew(self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]) -> Vector3:
         """Let the velocity change by the greatest acceleration, without ever being more than asked for."""

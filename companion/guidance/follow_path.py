@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from companion.guidance.behaviour import Situation
-from companion.guidance.motion import laps_text, position_and_yaw
+from companion.guidance.motion import home_of, laps_text, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
 from companion.vehicle.state import Vector3
@@ -16,7 +16,7 @@ class FollowPathBehaviour(PathFlight):
 
     Args:
         points: (north, east) or (north, east, height) metres from home; without a height, the one before's.
-        laps: 0: until another command; more than 1, or 0: from the last point on to the first again.
+        laps: 0: until another command; any but 1: from the last point on to the first again.
     """
 
     name = "follow-path"
@@ -34,7 +34,7 @@ class FollowPathBehaviour(PathFlight):
 
     def _path(self, situation: Situation) -> Path:
         position, _ = position_and_yaw(situation.state)
-        home = situation.state.home_position_ned_m or (0.0, 0.0, 0.0)
+        home = home_of(situation.state)
         down, places = position[2], list[Vector3]()
         for north, east, *height in self._points:
             down = home[2] - height[0] if height else down

@@ -6,12 +6,14 @@ import math
 
 from companion.guidance.behaviour import Situation
 from companion.guidance.geodesy import north_east
-from companion.guidance.motion import position_and_yaw
+from companion.guidance.motion import home_of, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
 from companion.vehicle.state import Vector3
 
 NEAREST_M = 0.05
+# GLOBAL_POSITION_INT comes 5 to 50 times a second.
+GLOBAL_MAX_AGE_S = 0.5
 
 
 class GotoBehaviour(PathFlight):
@@ -52,9 +54,9 @@ class GotoBehaviour(PathFlight):
     def _goal(self, situation: Situation) -> Vector3:
         state = situation.state
         position, yaw_rad = position_and_yaw(state)
-        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
-        down = position[2] if self._altitude_m is None else home[2] - self._altitude_m
+        down = position[2] if self._altitude_m is None else home_of(state)[2] - self._altitude_m
         if self._from_home_m is not None:
+            home = home_of(state)
             return (home[0] + self._from_home_m[0], home[1] + self._from_home_m[1], down)
         if self._from_here_m is not None:
             forward, right = self._from_here_m
@@ -64,6 +66,9 @@ class GotoBehaviour(PathFlight):
         assert self._global_deg is not None
         if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
             raise ValueError("the vehicle does not know its latitude and longitude")
+        age_s = (situation.now_ns - state.global_ns) / 1e9
+        if age_s > GLOBAL_MAX_AGE_S:
+            raise ValueError(f"the vehicle's latitude and longitude are {age_s:.1f} s old")
         north, east = north_east((state.latitude_deg, state.longitude_deg), self._global_deg)
         return (position[0] + north, position[1] + east, down)
 

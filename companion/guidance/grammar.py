@@ -24,8 +24,8 @@ from companion.points import points_from
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0
 
-
 MOST_POINTS = 500
+FARTHEST_M = 5000.0
 
 
 class GrammarError(ValueError):
@@ -223,6 +223,11 @@ class FollowPath(Command):
     @property
     def endless(self) -> bool:
         return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super(FollowPath, self).__post_init__()
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"follow-path: laps must be 0, or 1 or more, got {self.laps:g}")
 
     @property
     def places(self) -> tuple[tuple[float, ...], ...]:
@@ -437,11 +442,17 @@ def _check(word: str, argument: Argument, value: Any, default: Any) -> None:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
         case Points(key):
             try:
-                count = len(points_from(value))
+                points = points_from(str(value))
             except ValueError as error:
                 raise GrammarError(f"{word}: {key}: {error}") from None
-            if not 1 <= count <= MOST_POINTS:
-                raise GrammarError(f"{word}: {key} must be 1 to {MOST_POINTS} points, got {count}")
+            if not 1 <= len(points) <= MOST_POINTS:
+                raise GrammarError(f"{word}: {key} must be 1 to {MOST_POINTS} points, got {len(points)}")
+            for point in points:
+                if max(map(abs, point[:2])) > FARTHEST_M or not all(1 <= high <= 500 for high in point[2:]):
+                    raise GrammarError(
+                        f"{word}: {key} must be within {FARTHEST_M:g} m of home and 1 to 500 m high, "
+                        f"got {point}"
+                    )
         case ClassName(key):
             if value == default:
                 return

@@ -22,6 +22,13 @@ def position_and_yaw(state: VehicleState) -> tuple[Vector3, float]:
     return position, yaw_rad
 
 
+def home_of(state: VehicleState) -> Vector3:
+    """Home, local NED. Raises ValueError with a line for a person while it is not known."""
+    if state.home_position_ned_m is None:
+        raise ValueError("the vehicle has not told where home is")
+    return state.home_position_ned_m
+
+
 def ground_speed(state: VehicleState) -> float:
     """Horizontal speed, m/s; 0 while the velocity is unknown."""
     north, east, _ = state.velocity_ned_mps or (0.0, 0.0, 0.0)

@@ -24,9 +24,14 @@ SAME_M = 0.01
 SLOWEST_MPS = 0.4
 # How late a multirotor's velocity follows: it is led by the path as it will be then.
 DELAY_S = 0.4
-# The vehicle is looked for on the path no further on than it can have flown since, and a little behind.
+# The vehicle is looked for on the path no further on than this and the way of its speed.
 SEARCH_AHEAD_M = 3.0
-LONGEST_M = 20_000.0
+# So near to where the path turns back on itself the vehicle was there.
+CORNER_M = 0.5
+LONGEST_M = 5_000.0
+# Bends are told from the directions two steps of this apart, so a shorter round has none.
+SHORTEST_ROUND_M = 4.0 * BEND_M
+_MOST_PARTS = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +57,10 @@ class Path:
         closed: from the last point back to the first, again and again: nothing is slowed down for an end.
 
     Attributes:
-        length_m: of one round.
+        length_m: of one round. speed_mps: as given.
 
     Raises:
-        ValueError: fewer than two different points, or a path too long to be meant.
+        ValueError: fewer than two different points, a path too long to be meant, or too short to go round.
     """
 
     def __init__(self, points: Sequence[Vector3], speed_mps: float, *, closed: bool = False) -> None:
@@ -65,14 +70,18 @@ class Path:
                 corners.append(point)
         if len(corners) < 2:
             raise ValueError("a path needs at least two different points")
-        self.closed = closed
-        self._points = _spaced(corners)
+        self.closed, self.speed_mps = closed, speed_mps
+        length_m = sum(math.dist(a, b) for a, b in pairwise(corners))
+        if not length_m <= LONGEST_M:
+            raise ValueError(f"a path may be {LONGEST_M:g} m long at most, this one has {length_m:.0f} m")
+        if closed and length_m < SHORTEST_ROUND_M:
+            raise ValueError(
+                f"a path flown round and round must be {SHORTEST_ROUND_M:g} m long at least, "
+                f"this one has {length_m:.1f} m"
+            )
+        self._points = _spaced(corners, max(SPACING_M, length_m / _MOST_PARTS))
         self._at = list(accumulate((math.dist(a, b) for a, b in pairwise(self._points)), initial=0.0))
         self.length_m = self._at[-1]
-        if not self.length_m <= LONGEST_M:
-            raise ValueError(
-                f"a path may be {LONGEST_M:g} m long at most, this one has {self.length_m:.0f} m"
-            )
         self._speeds = self._allowed(speed_mps)
 
     def point(self, along_m: float) -> PathPoint:
@@ -105,7 +114,7 @@ class Path:
         return along_m % self.length_m if self.closed else min(max(along_m, 0.0), self.length_m)
 
     def _allowed(self, speed_mps: float) -> list[float]:
-        """Greatest speed at each point: its bend's, and what can be slowed down from and sped up to."""
+        """Greatest speed at each point: its bend's, and what can be slowed down from before the next."""
         speeds = [min(speed_mps, self._bend_speed(along)) for along in self._at]
         if not self.closed:
             speeds[-1] = 0.0
@@ -150,6 +159,7 @@ class PathFollower:
         self.path = path
         self.along_m = 0.0
         self.off_m = 0.0
+        self._joined = not path.closed
 
     def velocity(self, position: Vector3, speed_mps: float) -> Vector3:
         """The velocity over ground and down that brings it on along the path, and back onto it.
@@ -157,22 +167,41 @@ class PathFollower:
         Args:
             position: of the vehicle, local NED metres. speed_mps: its ground speed.
         """
-        reach_m = self.along_m + SEARCH_AHEAD_M + 2.0 * speed_mps * DELAY_S
+        if not self._joined:
+            start = self.path.point(0.0).position_ned_m
+            to_start = [s - p for s, p in zip(start, position, strict=True)]
+            self.off_m = math.hypot(*to_start)
+            if self.off_m > BEND_M:
+                pace = min(POSITION_GAIN, self.path.speed_mps / self.off_m)
+                north, east, down = (offset * pace for offset in to_start)
+                return (north, east, down)
+            self._joined = True
+        reach_m = self.along_m + min(SEARCH_AHEAD_M + 2.0 * speed_mps * DELAY_S, self.path.length_m / 2)
         if not self.path.closed:
             reach_m = min(reach_m, self.path.length_m)
-        self.along_m = self.path.nearest(position, self.along_m, reach_m)
+        self.along_m = self.path.nearest(position, self.along_m, self._before_turning_back(reach_m))
         here = self.path.point(self.along_m)
         ahead = self.path.point(self.along_m + DELAY_S * here.speed_mps)
         offset = [h - p for h, p in zip(here.position_ned_m, position, strict=True)]
         self.off_m = math.hypot(*offset)
         # Far beside the path it is flown to first, and along it only as far as that leaves speed.
         back_mps = min(POSITION_GAIN * self.off_m, max(MAX_CORRECTION_MPS, here.speed_mps))
-        along_mps = math.sqrt(max(0.0, max(here.speed_mps, SLOWEST_MPS) ** 2 - back_mps**2))
+        slowest = min(SLOWEST_MPS, self.path.speed_mps)
+        along_mps = math.sqrt(max(0.0, max(here.speed_mps, slowest) ** 2 - back_mps**2))
         if not self.path.closed:
             along_mps = min(along_mps, POSITION_GAIN * (self.path.length_m - self.along_m))
         scale = back_mps / self.off_m if self.off_m > 1e-6 else 0.0
         north, east, down = (d * along_mps + o * scale for d, o in zip(ahead.direction, offset, strict=True))
         return (north, east, down)
+
+    def _before_turning_back(self, reach_m: float) -> float:
+        """Where the path turns back on itself both ways look alike: no further before that was flown to."""
+        here, at = self.path.point(self.along_m).direction, self.along_m + CORNER_M
+        while at < reach_m:
+            at += SPACING_M / 2
+            if sum(a * b for a, b in zip(here, self.path.point(at).direction, strict=True)) < -0.1:
+                return min(at, reach_m)
+        return reach_m
 
     def bearing(self) -> float | None:
         """Where the path leads from here, radians from north; None where it goes straight up or down."""
@@ -185,10 +214,8 @@ class PathFollower:
         return max(0.0, self.path.length_m - self.along_m)
 
 
-def _spaced(corners: Sequence[Vector3]) -> list[Vector3]:
-    """The same path with a point at least every `SPACING_M`; on a long one in 8000 parts."""
-    length = sum(math.dist(a, b) for a, b in pairwise(corners))
-    spacing = max(SPACING_M, length / 8000)
+def _spaced(corners: Sequence[Vector3], spacing: float) -> list[Vector3]:
+    """The same path with a point at least every `spacing` metres."""
     points = [corners[0]]
     for start, end in pairwise(corners):
         count = max(1, math.ceil(math.dist(start, end) / spacing))

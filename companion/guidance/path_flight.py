@@ -78,7 +78,7 @@ class PathFlight(Behaviour):
         if follower.path.closed:
             if self._laps and follower.along_m >= self._laps * follower.path.length_m:
                 return Outcome(True, self._flown())
-        elif self._arrived(follower, position, speed_mps, now_ns):
+        elif self._arrived(follower, position, math.hypot(*(state.velocity_ned_mps or ())), now_ns):
             return Outcome(True, self._flown())
         if stuck := self._stuck(follower, now_ns):
             return Outcome(False, stuck)

@@ -64,6 +64,7 @@ class VehicleState:
     heartbeat_ns: int = 0
     attitude_ns: int = 0
     position_ns: int = 0
+    global_ns: int = 0
     landed_ns: int = 0
     armed: bool = False
     mode: FlightMode = FlightMode.UNKNOWN

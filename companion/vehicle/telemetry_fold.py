@@ -75,9 +75,10 @@ def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> Veh
     return replace(state, position_ns=now_ns, position_ned_m=position, velocity_ned_mps=velocity)
 
 
-def _global_position_int(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+def _global_position_int(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     return replace(
         state,
+        global_ns=now_ns,
         latitude_deg=fields["lat"] * 1e-7,
         longitude_deg=fields["lon"] * 1e-7,
         altitude_amsl_m=fields["alt"] * 1e-3,

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -235,3 +236,46 @@ def test_a_position_beyond_a_polygon_is_kept_inside_of_it():
     sent, why = Envelope(limits).apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
     assert sent.position_ned_m == pytest.approx((14.5, 0.0, -5.0))
     assert "kept inside the fence" in why
+
+
+def test_a_steep_velocity_is_shortened_and_not_bent():
+    asked = Setpoint.velocity((8.0, 0.0, -8.0), 1)
+    sent, why = Envelope(Limits(max_acceleration_mps2=20.0)).apply(asked, KinematicVehicle().state, 1, 0.2)
+    north, _, down = sent.velocity_ned_mps
+    assert down == pytest.approx(-2.0)
+    assert north == pytest.approx(2.0)
+    assert any("climb" in reason for reason in why)
+
+
+def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fence_lets_nothing_fly():
+    fence = Fence(((50.0, -50.0), (150.0, -50.0), (150.0, 50.0), (50.0, 50.0)))
+    vehicle = KinematicVehicle(position=[149.0, 0.0, -5.0])
+    homeless = replace(vehicle.state, home_position_ned_m=None)
+    at_home = replace(vehicle.state, home_position_ned_m=(100.0, 0.0, 0.0))
+    limits = Limits(fence=Fence(((-50.0, -50.0), (50.0, -50.0), (50.0, 50.0), (-50.0, 50.0))))
+    out = Setpoint.velocity((5.0, 0.0, 0.0), 1)
+    envelope = Envelope(limits)
+    sent, why = envelope.apply(out, homeless, 1, 0.02)
+    assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert "home unknown" in why[0]
+    first, _ = envelope.apply(out, at_home, 1, 0.02)
+    envelope.reset()
+    again, _ = envelope.apply(out, homeless, 1, 0.02)
+    assert again.velocity_ned_mps == pytest.approx(first.velocity_ned_mps)
+    assert fence.holds((149.0, 0.0))
+
+
+@pytest.mark.parametrize("acceleration_mps2", [2.0, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize("lag_s", [0.2, 0.4])
+def test_strong_braking_does_not_shoot_over_the_fence(acceleration_mps2, lag_s):
+    limits = Limits(
+        max_horizontal_speed_mps=20.0,
+        max_acceleration_mps2=acceleration_mps2,
+        fence=Fence(((-50.0, -50.0), (50.0, -50.0), (50.0, 50.0), (-50.0, 50.0))),
+    )
+    vehicle, envelope = KinematicVehicle(position=[-40.0, 0.0, -5.0], lag_s=lag_s), Envelope(limits)
+    for _ in range(3000):
+        setpoint = Setpoint.velocity((20.0, 0.0, 0.0), vehicle.now_ns)
+        sent, _ = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
+        vehicle.fly(sent, 0.02)
+        assert vehicle.position[0] < 50.0
