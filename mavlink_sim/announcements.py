@@ -12,11 +12,22 @@ INFO = 6  # MAV_SEVERITY_INFO
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A status text, and the event (identifier, log levels, arguments) that says the same, if PX4 has one."""
+    """A status text, and the event (identifier, log levels, arguments) that says the same, if PX4 has one.
+
+    An empty text is not sent: some things PX4 says by an event alone.
+    """
 
     severity: int
     text: str
     event: tuple[int, int, bytes] | None = None
+
+
+def event_identifier(name: str) -> int:
+    """PX4's identifier of an event: 24 bits of its name's FNV-1a hash, marked as the autopilot's (1)."""
+    digest = 0x811C9DC5
+    for byte in name.encode():
+        digest = (digest ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return 0x01000000 | digest & 0xFFFFFF
 
 
 # Event identifiers, log levels and arguments as a PX4 v1.17 emitted them in a recorded flight.

@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from mavlink_sim import flight, position_failsafe, reposition
+from mavlink_sim import flight, manual_flight, position_failsafe, reposition
 from mavlink_sim.announcements import (
     ARMED_EVENT,
     ARMING_DENIED_EVENT,
@@ -34,6 +34,7 @@ from mavlink_sim.orbit import Orbit, OrbitRequest
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
 from mavlink_sim.precision_landing import Precision
+from mavlink_sim.supervision import REASONS, Supervision
 
 ACCEPTED = 0  # MAV_RESULT
 TEMPORARILY_REJECTED = 1
@@ -78,10 +79,9 @@ class Autopilot:
         self.failsafe = False
         self.landed = True
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
-        self.blind = False  # in the fallback for a lost position
-        self.pilot_has_sticks = False  # a remote control is connected, so POSCTL and the like can be flown
         self.home: Vector = airframe.position
         self.texts: deque[Text] = deque()
+        self.supervision = Supervision(self, parameters)
         self.gimbal_commands: deque[GimbalCommand] = deque()
         self.demand = Demand(0.0, 0.0, 0.0, 0.0)
         self._gimbal_schedule: deque[tuple[float, GimbalCommand]] = deque()
@@ -96,10 +96,9 @@ class Autopilot:
         self._contact_since_s: float | None = None
         self._lifting_since_s: float | None = None
         self._has_flown = False
-        self.failsafe_is_latched = False  # it stays until the mode is changed by a user
-        self.latched_mode = Mode.HOLD  # of that failsafe
-        self.terminated = False
         self.navigator = Navigator(self, airframe, parameters, on_event)
+        # collision prevention: it may reduce what the sticks ask for in Position mode
+        self.stick_guard: manual_flight.AccelerationGuard | None = self.navigator.guard_sticks
 
     # ---- what others read -------------------------------------------------------------------------------
 
@@ -112,6 +111,20 @@ class Autopilot:
         return self.now_s - self._last_setpoint_s <= limit
 
     @property
+    def pilot_has_sticks(self) -> bool:
+        """A remote control or a joystick counts, so POSCTL and the like can be flown."""
+        return self.supervision.pilot_has_sticks
+
+    @pilot_has_sticks.setter
+    def pilot_has_sticks(self, attached: bool) -> None:
+        self.supervision.pilot_attached = attached
+
+    @property
+    def terminated(self) -> bool:
+        """The motors stand still for good; it takes a reboot."""
+        return self.supervision.terminated
+
+    @property
     def sensors_ready(self) -> bool:
         return self.now_s >= self._ready_after_s
 
@@ -120,12 +133,14 @@ class Autopilot:
         """PX4's prearm check of the current mode (SYS_STATUS' bit MAV_SYS_STATUS_PREARM_CHECK)."""
         return (
             self.sensors_ready
+            and not self.terminated
             and (self.position_valid or not position_failsafe.needs_position(self.mode))
             and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # no matter once it is
             and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
             and not self.navigator.is_breached
             and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
             and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
+            and self.supervision.allows_arming
         )
 
     @property
@@ -156,10 +171,14 @@ class Autopilot:
 
     # ---- what a client asks for -------------------------------------------------------------------------
 
-    def arm(self) -> int:
-        """MAV_RESULT of an arming request."""
+    def arm(self, by: str = "external command") -> int:
+        """MAV_RESULT of an arming request. `by`: PX4's name of who asks, a key of `supervision.REASONS`."""
         if self.armed:
             return ACCEPTED
+        refusal = self.supervision.refuses_arming(by)
+        if refusal is not None:
+            self.texts.append(refusal)
+            return TEMPORARILY_REJECTED
         if not self.can_arm:
             if not self.sensors_ready:
                 self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
@@ -170,19 +189,20 @@ class Autopilot:
         self._armed_since_s = self.now_s
         self._lifting_since_s = None
         self.home = self._airframe.position
-        self._say(INFO, "Armed by external command\t", ARMED_EVENT)
+        self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
         self._on_event("armed")
         self._start_task()
         return ACCEPTED
 
-    def disarm(self, force: bool = False) -> int:
+    def disarm(self, force: bool = False, by: str = "external command") -> int:
         """MAV_RESULT of a disarming request; `force` stops the motors in the air too."""
         if not self.armed:
             return ACCEPTED
-        if not self.landed and not force:
-            self._say(CRITICAL, "Disarming denied: not landed\t")
+        if not self.landed and not force and not self.supervision.may_disarm_in_the_air(by):
+            if by != "stick gesture":
+                self._say(CRITICAL, "Disarming denied: not landed\t")
             return TEMPORARILY_REJECTED
-        self._disarm("Disarmed by external command\t", "by command")
+        self._disarm(f"Disarmed by {by}\t", "by command" if by == "external command" else f"by {by}")
         return ACCEPTED
 
     def set_mode(self, mode: Mode, tell: bool = False) -> int:
@@ -235,7 +255,7 @@ class Autopilot:
         airframe, parameters = self._airframe, self._parameters
         former = None if self.task is None else self.task.goal
         self._intend(Mode.HOLD)
-        if self.armed:
+        if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
             goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
             if not self.navigator.allows_goal(goal):
                 self._say(CRITICAL, "Reposition is outside geofence\t")
@@ -269,25 +289,12 @@ class Autopilot:
     def hold_at(self, place: Vector) -> None:
         """Change to HOLD, and stay at a local NED position rather than where braking ends."""
         self._intend(Mode.HOLD)
-        self.task = flight.Hold(self._airframe, self._parameters, place)
+        if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
+            self.task = flight.Hold(self._airframe, self._parameters, place)
 
     def restart_task(self) -> None:
         """Begin the current mode's task anew."""
         self._start_task()
-
-    def enter_failsafe(self, mode: Mode) -> None:
-        """A failsafe takes the vehicle until somebody changes the mode or it is disarmed."""
-        self.failsafe = self.failsafe_is_latched = True
-        self.latched_mode = mode
-        self._say(CRITICAL, "Failsafe activated\t")
-        self._on_event(f"failsafe: {mode.name}")
-        position_failsafe.enter_or_fall_back(self, mode)
-
-    def terminate(self) -> None:
-        """Stop the motors in flight until it is disarmed, by itself once it is down: flight termination."""
-        self.terminated = self.failsafe = self.failsafe_is_latched = True
-        self._say(CRITICAL, "Failsafe activated\t")
-        self._on_event("flight terminated")
 
     def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
         """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
@@ -302,10 +309,9 @@ class Autopilot:
     def update(self, dt_s: float) -> None:
         """Check failsafes and detectors, run the flight task, move the airframe."""
         self.now_s += dt_s
-        self._check_offboard()
-        position_failsafe.check(self)
-        position_failsafe.keep_landing(self)
         self.navigator.update()
+        self.supervision.update(dt_s, self._airframe.thrust_mps2)
+        position_failsafe.keep_landing(self)
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
         airframe = self._airframe
@@ -322,7 +328,13 @@ class Autopilot:
         setpoint = task.update(dt_s)
         if task.landing and not was_landing and self.mode is Mode.RTL:
             self._say(INFO, "RTL: land at destination\t")
-        if not isinstance(setpoint, TrajectorySetpoint):
+        if self.supervision.motors_stopped:
+            self._idle(dt_s, 0.0)
+        elif isinstance(task, manual_flight.Stabilized):
+            self._fly_directly(dt_s, task.demand)
+        elif isinstance(task, manual_flight.Acro) and self._spooling():
+            self._idle(dt_s, IDLE_THRUST_MPS2)
+        elif not isinstance(setpoint, TrajectorySetpoint):
             self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
         elif self._on_ground_and_idle(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
@@ -342,8 +354,8 @@ class Autopilot:
         self._disarm_automatically()
         if self.armed and task is self.task and task.finished and self.mode is Mode.TAKEOFF:
             goal = task.goal
-            self._intend(Mode.HOLD)
-            self.task = flight.Hold(airframe, self._parameters, goal)
+            assert goal is not None
+            self.hold_at(goal)
 
     def _idle(self, dt_s: float, thrust_mps2: float) -> None:
         airframe = self._airframe
@@ -351,6 +363,17 @@ class Autopilot:
         self.controller.reset(airframe.yaw_rad)
         self.demand = Demand(thrust_mps2, 0.0, 0.0, 0.0)
         airframe.step(dt_s, thrust_mps2, 0.0, 0.0, 0.0)
+
+    def _fly_directly(self, dt_s: float, demand: Demand) -> None:
+        """Tilt and thrust by the pilot's sticks, without position control."""
+        self.attitude.release()
+        self.controller.reset(self._airframe.yaw_rad)
+        if self._spooling():
+            demand = Demand(IDLE_THRUST_MPS2, 0.0, 0.0, 0.0)
+        self.demand = demand
+        self._airframe.step(
+            dt_s, demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, demand.yaw_rate_radps
+        )
 
     def _spooling(self) -> bool:
         spool = self._parameters.number("COM_SPOOLUP_TIME")
@@ -431,40 +454,32 @@ class Autopilot:
             if delay > 0.0 and self.now_s - self._armed_since_s >= delay + PREFLIGHT_DISARM_MARGIN_S:
                 self._disarm("Disarmed by auto preflight disarming\t", "no takeoff")
 
-    def _check_offboard(self) -> None:
-        """Loss of the setpoint stream, and its return, while OFFBOARD is what the user wants."""
-        if self.intended_mode is not Mode.OFFBOARD or not self.armed or self.failsafe_is_latched:
-            return
-        if self.failsafe and self.has_setpoints:
-            self.failsafe = False
-            self._on_event("offboard setpoints are back")
-            self._enter(Mode.OFFBOARD)
-        elif not self.failsafe and not self.has_setpoints:
-            self.failsafe = True
-            fallback = self._offboard_loss_mode()
-            self._say(CRITICAL, "Failsafe activated\t")
-            self._on_event(f"failsafe: offboard setpoints lost, {fallback.name}")
-            position_failsafe.enter_or_fall_back(self, fallback)
-
-    def _offboard_loss_mode(self) -> Mode:
-        """COM_OBL_RC_ACT; its manual modes need a remote control, else NAV_RCL_ACT decides."""
-        action = int(self._parameters.number("COM_OBL_RC_ACT"))
-        with_sticks = {0: Mode.POSCTL, 1: Mode.ALTCTL, 2: Mode.MANUAL}
-        if action in with_sticks:
-            if self.pilot_has_sticks:
-                return with_sticks[action]
-            action = int(self._parameters.number("NAV_RCL_ACT"))
-            return {1: Mode.HOLD, 3: Mode.LAND}.get(action, Mode.RTL)
-        return {4: Mode.LAND, 5: Mode.HOLD}.get(action, Mode.RTL)
-
     # ---- transitions ------------------------------------------------------------------------------------
 
     def _intend(self, mode: Mode) -> None:
+        self.adopt_intention(mode)
+        self.supervision.mode_was_requested()
+        self._enter(self.supervision.run_failsafes())
+
+    # Several want a say in the mode: the user, the geofence, lost setpoints, links, the battery, a lost
+    # position. None of them sets it: all report to `supervision.conditions` or are asked by `can_run`, and
+    # the failsafe machine picks the worst answer. `_enter` gets its choice alone, so no two of them ever
+    # fight over the vehicle.
+
+    def adopt_intention(self, mode: Mode) -> None:
+        """This is what the user wants now; the failsafes decide whether it is flown."""
         self.intended_mode = mode
         if mode not in MODES_PREVENTING_ARMING:
             self._mode_after_disarming = mode
-        self.failsafe = self.failsafe_is_latched = self.blind = False
-        self._enter(mode)
+
+    def follow_failsafes(self, mode: Mode) -> None:
+        """Fly the mode that the failsafes have decided on."""
+        if mode is not self.mode:
+            self._enter(mode)
+
+    def announce(self, line: str) -> None:
+        """Tell whoever watches the simulation."""
+        self._on_event(line)
 
     def _enter(self, mode: Mode) -> None:
         if mode is not self.mode:
@@ -486,6 +501,10 @@ class Autopilot:
                 self.task = flight.Offboard()
         elif self.mode is Mode.ORBIT:
             self.task = Orbit(airframe, parameters)
+        elif self.mode in MANUAL_MODES:
+            self.task = manual_flight.task_of(
+                self.mode, airframe, parameters, lambda: self.supervision.sticks, self.stick_guard
+            )
         elif self.mode is Mode.TAKEOFF:
             self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
         elif self.mode is Mode.MISSION:
@@ -505,12 +524,14 @@ class Autopilot:
 
     def _disarm(self, text: str, reason: str) -> None:
         self.armed = False
-        self.failsafe = self.failsafe_is_latched = self.terminated = self.blind = False
+        self.failsafe = False
         self.task = None
         self._takeoff_height_m = None
         if self.landed:
             self.home = self._airframe.position
-        self._say(INFO, text, (DISARMED_EVENT, 0x66, b"\x06" if reason == "after landing" else b"\x04"))
+        code = REASONS.get(reason.removeprefix("by "), 6 if reason == "after landing" else 4)
+        self._say(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
+        self.supervision.disarmed()
         self._on_event(f"disarmed ({reason})")
         self.intended_mode = self._mode_after_disarming
         self._enter(self.intended_mode)

@@ -111,6 +111,7 @@ def simulate(
     param: Annotated[
         list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
     ] = None,
+    gimbal: Annotated[bool, typer.Option("--gimbal", help="With a two-axis gimbal.")] = False,
     signing_key: Annotated[
         str | None,
         typer.Option(help="Sign and demand signatures: 64 hexadecimal digits, or a file with the 32 bytes."),
@@ -181,6 +182,7 @@ def simulate(
         speed=speed,
         noise=noise == "on",
         parameters=parameters,
+        gimbal=gimbal,
         signing_key=key,
         faults=tuple(fault or ()),
         console=console,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import parameter_protocol
+from mavlink_sim import gimbal_protocol, parameter_protocol
 from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.geography import geographic, local
@@ -54,6 +54,7 @@ class Command:
     identifier: int
     parameters: tuple[float, float, float, float, float, float, float]
     source_component: int
+    source_system: int = 0
 
 
 def command_of(message: Any) -> Command:
@@ -66,7 +67,7 @@ def command_of(message: Any) -> Command:
     else:
         tail = (message.param5, message.param6, message.param7)
     head = (message.param1, message.param2, message.param3, message.param4)
-    return Command(int(message.command), head + tail, message.get_srcComponent())
+    return Command(int(message.command), head + tail, message.get_srcComponent(), message.get_srcSystem())
 
 
 def is_misencoded(message: Any) -> bool:
@@ -226,7 +227,7 @@ def _identifier(value: float) -> int:
     return round(value) if math.isfinite(value) else -1
 
 
-_HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
+_HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
     NAV_RETURN_TO_LAUNCH: _return_to_launch,
     NAV_LAND: _land,
     NAV_TAKEOFF: _takeoff,
@@ -237,6 +238,9 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     185: _flight_termination,  # DO_FLIGHTTERMINATION
     DO_CHANGE_ALTITUDE: _change_altitude,
     DO_REPOSITION: _reposition,
+    gimbal_protocol.DO_SET_ROI_LOCATION: gimbal_protocol.set_roi_location,
+    gimbal_protocol.DO_SET_ROI_NONE: gimbal_protocol.set_roi_none,
+    gimbal_protocol.DO_SET_ROI: gimbal_protocol.set_roi,
     245: _preflight_storage,  # PREFLIGHT_STORAGE
     300: _mission_start,
     ARM_DISARM: _arm,
@@ -246,6 +250,8 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int]] = {
     REQUEST_MESSAGE: _request_message,
     519: _request_protocol_version,  # REQUEST_PROTOCOL_VERSION
     520: _request_capabilities,  # REQUEST_AUTOPILOT_CAPABILITIES
+    gimbal_protocol.PITCHYAW: gimbal_protocol.pitchyaw,
+    gimbal_protocol.CONFIGURE: gimbal_protocol.configure,
 }
 
 # PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).

@@ -151,18 +151,14 @@ def _attributes(value: object) -> list[object]:
 
 def battery(vehicle: Vehicle, one: ActiveFault) -> None:
     """So much charge is left, and goes on being used while armed."""
-    faults = vehicle.faults
-    faults.battery = one.fault.values["remaining"]
-
-    def each_step(dt_s: float) -> None:
-        if vehicle.autopilot.armed and faults.battery is not None:
-            used = dt_s / vehicle.parameters.positive("SIM_BAT_DRAIN") / 2.0
-            faults.battery = max(faults.battery - used, 0.0)
+    cells = vehicle.autopilot.supervision.battery
+    cells.forced_charge = one.fault.values["remaining"]
+    cells.settle()
 
     def undo() -> None:
-        faults.battery = None
+        cells.forced_charge = None
+        cells.settle()
 
-    one.each_step = each_step
     one.undo.append(undo)
 
 
@@ -218,9 +214,12 @@ def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
 
 
 def pilot_takeover(vehicle: Vehicle, one: ActiveFault) -> None:
-    """A pilot's sticks are there and the mode is switched; at the end the sticks go, the mode stays."""
+    """A pilot's sticks are there and the mode is switched; at the end the sticks go, the mode stays.
+
+    Where a remote control counts (COM_RC_IN_MODE other than 4), it is lost then, and NAV_RCL_ACT follows.
+    """
     mode = Mode[one.fault.values["mode"]]
-    had_sticks = vehicle.autopilot.pilot_has_sticks
+    had_sticks = vehicle.autopilot.supervision.pilot_attached
     if vehicle.autopilot.pilot_takes_over(mode) != 0:
         vehicle.autopilot.pilot_has_sticks = had_sticks
         raise FaultError(f"pilot_takeover: mode {mode.name} cannot be flown now")
@@ -277,7 +276,7 @@ def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
     faults.deaf = True
     faults.boot_offset_us = -vehicle.boot_us
     vehicle.forget_boot()
-    stored = vehicle.autopilot.navigator
+    stored, pilot = vehicle.autopilot.navigator, vehicle.autopilot.supervision
     # the same object starts anew: others hold on to it
     Autopilot.__init__(
         vehicle.autopilot,
@@ -287,6 +286,10 @@ def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
         on_event=vehicle.autopilot._on_event,
     )
     vehicle.autopilot.position_valid = vehicle.estimate.position_valid
+    # neither the battery nor what the pilot holds is part of the autopilot
+    vehicle.autopilot.supervision.battery = pilot.battery
+    vehicle.autopilot.supervision.transmitter = pilot.transmitter
+    vehicle.autopilot.pilot_has_sticks = pilot.pilot_attached
     navigator = vehicle.autopilot.navigator
     navigator.plans, navigator.mission, navigator.fence = stored.plans, stored.mission, stored.fence
 

@@ -83,7 +83,6 @@ class Faults:
         gates: every message the vehicle sends goes through these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
         stalled_us: how long the vehicle stood still in all.
-        battery: what is left of the battery, 0..1, while a fault says so.
         second: other autopilots on the same links; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
@@ -97,7 +96,6 @@ class Faults:
         self.refusals: dict[int, Refusal] = {}
         self.boot_offset_us = 0
         self.stalled_us = 0
-        self.battery: float | None = None
         self.second: dict[int, Vehicle] = {}
         self.winds: dict[int, Vector] = {}
         self.pace = 1.0

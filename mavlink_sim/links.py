@@ -50,7 +50,7 @@ class Link:
 
     def send_text(self, text: Text, now_s: float) -> None:
         """STATUSTEXT, in chunks where it is long, if a ground station's heartbeat arrives on this link."""
-        if now_s - self.ground_station_seen_s >= GROUND_STATION_TIMEOUT_S:
+        if not text.text or now_s - self.ground_station_seen_s >= GROUND_STATION_TIMEOUT_S:
             return
         encoded = text.text.encode()
         if len(encoded) <= STATUS_TEXT_LENGTH:

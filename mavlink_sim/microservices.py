@@ -9,9 +9,11 @@ from mavlink_sim import (
     commands,
     event_protocol,
     file_transfer,
+    gimbal_protocol,
     mission_link,
     mission_transfer,
     parameter_protocol,
+    pilot_link,
     signing,
 )
 from mavlink_sim.announcements import CRITICAL, Text
@@ -38,7 +40,7 @@ COMMANDER_DELAY_S = 0.004
 
 def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
     if message.type == MAV_TYPE_GCS:
-        link.ground_station_seen_s = vehicle.now_s
+        link.ground_station_seen_s = vehicle.autopilot.supervision.ground_station_seen_s = vehicle.now_s
     elif message.type == MAV_TYPE_ONBOARD_CONTROLLER and message.get_srcSystem() == vehicle.system_id:
         vehicle.companion_heard()
 
@@ -139,6 +141,11 @@ HANDLERS: dict[str, Handler] = {
     "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
     "SET_POSITION_TARGET_GLOBAL_INT": _global_setpoint,
     "SET_ATTITUDE_TARGET": _attitude_setpoint,
+    "MANUAL_CONTROL": pilot_link.manual_control,
+    "RC_CHANNELS_OVERRIDE": pilot_link.rc_channels_override,
+    "GIMBAL_MANAGER_SET_ATTITUDE": gimbal_protocol.set_attitude,
+    "GIMBAL_MANAGER_SET_PITCHYAW": gimbal_protocol.set_pitchyaw,
+    "GIMBAL_MANAGER_SET_MANUAL_CONTROL": gimbal_protocol.set_manual_control,
     "TIMESYNC": _timesync,
     "PING": _ping,
     "PARAM_REQUEST_LIST": parameter_protocol.request_list,

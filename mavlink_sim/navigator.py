@@ -295,6 +295,16 @@ class Navigator:
 
         return landing
 
+    def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
+        """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""
+        limited = limited_acceleration(
+            acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
+        )
+        if limited.hold:
+            self._on_event("no distances to obstacles: collision prevention changes to HOLD")
+            self._autopilot.set_mode(Mode.HOLD)
+        return limited.acceleration
+
     # ---- one step ---------------------------------------------------------------------------------------
 
     def update(self) -> None:
@@ -359,14 +369,7 @@ class Navigator:
             self.say(CRITICAL, words)
         if not found or was_breached or not autopilot.armed:
             return
-        self._on_event(f"geofence breached: {found[0]}")
-        if action is Action.WARN:
-            self.say(CRITICAL, "Failsafe warning\t")
-        elif action is Action.TERMINATE:
-            autopilot.terminate()
-        else:
-            modes = {Action.RETURN: Mode.RTL, Action.LAND: Mode.LAND}
-            autopilot.enter_failsafe(modes.get(action, Mode.HOLD))
+        self._on_event(f"geofence breached: {found[0]}")  # what is done about it is up to the failsafes
 
 
 def goes_to_camera(command: int) -> bool:

@@ -18,6 +18,8 @@ REAL32 = 9  # MAV_PARAM_TYPE_REAL32
 UINT32 = 5  # MAV_PARAM_TYPE_UINT32, of _HASH_CHECK alone
 HASH_CHECK = "_HASH_CHECK"
 HASH_CHECK_INDEX = 65535
+_FILES = ("parameters.txt", "parameters_pilot.txt")
+_GIMBAL_FILE = "parameters_gimbal.txt"
 _TYPES = {"INT32": INT32, "REAL32": REAL32}
 # PX4's `volatile` parameters: the vehicle itself changes them, so they are no part of _HASH_CHECK.
 _VOLATILE = re.compile(
@@ -73,24 +75,30 @@ def decode_wire_value(kind: int, wire_value: float) -> int | float:
     return float(wire_value)
 
 
-def default_parameters() -> list[Parameter]:
-    """The selection in `parameters.txt`, in alphabetical order."""
-    text = resources.files("mavlink_sim").joinpath("parameters.txt").read_text(encoding="utf-8")
+def default_parameters(gimbal: bool = False) -> list[Parameter]:
+    """`parameters.txt` and its additions, with `gimbal` those of one too, in alphabetical order."""
+    folder = resources.files("mavlink_sim")
+    files = (*_FILES, _GIMBAL_FILE) if gimbal else _FILES
+    text = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in files)
     found = []
     for line in text.splitlines():
         if line and not line.startswith("#"):
             name, kind, value = line.split()
             number = int(value) if kind == "INT32" else _single(float(value))
             found.append(Parameter(name, _TYPES[kind], number))
-    return sorted(found, key=lambda parameter: parameter.name)
+    unique = {parameter.name: parameter for parameter in found}  # the last of a name counts
+    return sorted(unique.values(), key=lambda parameter: parameter.name)
 
 
 class Parameters:
     """The parameter set of one vehicle, in alphabetical order. `revision` grows with every change."""
 
-    def __init__(self, values: Mapping[str, float] | None = None) -> None:
-        """Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be."""
-        self._defaults = {parameter.name: parameter for parameter in default_parameters()}
+    def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
+        """With `gimbal`, the parameters of one are among them.
+
+        Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be.
+        """
+        self._defaults = {parameter.name: parameter for parameter in default_parameters(gimbal)}
         self._parameters = dict(self._defaults)
         self._names = list(self._parameters)
         self.revision = 0

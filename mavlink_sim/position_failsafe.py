@@ -4,15 +4,14 @@ A mode that needs a position is refused, and left if it is flown: Position falls
 sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
 (that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
 OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
-When the position comes back in the air, the mode that was wanted is flown again, or that of a failsafe that a
-user has not ended.
+When the position comes back in the air, the mode that was wanted is flown again. Which mode that makes is the
+choice of `failsafes`; here is what it has to know, and how to come down.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.control import NAN, TrajectorySetpoint
 from mavlink_sim.flight import Land, Task
 from mavlink_sim.modes import Mode
@@ -52,18 +51,6 @@ def asks_for_position(setpoint: object) -> bool:
     return any(value == value for value in wanted)
 
 
-def enter_or_fall_back(autopilot: Autopilot, mode: Mode) -> None:
-    """Enter a mode of the autopilot's own choice, or what PX4 flies in its place without a position."""
-    if autopilot.position_valid or not needs_position(mode):
-        autopilot._enter(mode)
-        return
-    autopilot.blind = True
-    if mode in (Mode.POSCTL, Mode.POSITION_SLOW) and autopilot.pilot_has_sticks:
-        autopilot._enter(Mode.ALTCTL)
-        return
-    autopilot._enter(Mode.LAND)
-
-
 def landing_task(autopilot: Autopilot) -> Task:
     """How mode LAND is flown: at one place, or blindly down where there is no position."""
     if autopilot.position_valid:
@@ -76,26 +63,3 @@ def keep_landing(autopilot: Autopilot) -> None:
     descending = isinstance(autopilot.task, Descend)
     if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
         autopilot.task = landing_task(autopilot)
-
-
-def check(autopilot: Autopilot) -> None:
-    """Leave a mode that lost its position; go back to the intended one when the position is back."""
-    if not autopilot.armed or autopilot.terminated:
-        return
-    if not autopilot.position_valid:
-        if not autopilot.blind and needs_position(autopilot.mode):
-            autopilot.failsafe = True
-            autopilot.texts.append(Text(CRITICAL, "Failsafe activated\t"))
-            autopilot._on_event(f"failsafe: position lost in {autopilot.mode.name}")
-            enter_or_fall_back(autopilot, autopilot.mode)
-    elif autopilot.blind and not autopilot.landed:  # after a blind landing it stays where it is
-        autopilot.blind = False
-        autopilot._on_event("the position is back")
-        if autopilot.failsafe_is_latched:
-            autopilot._enter(autopilot.latched_mode)
-        elif autopilot.intended_mode is Mode.OFFBOARD:
-            if not autopilot.has_setpoints:  # else the check of the setpoints goes back to OFFBOARD
-                autopilot._enter(autopilot._offboard_loss_mode())
-        else:
-            autopilot.failsafe = False
-            autopilot._enter(autopilot.intended_mode)

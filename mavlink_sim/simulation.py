@@ -21,6 +21,7 @@ from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S, Vehicle
+from vision.rotation import euler_from_quaternion
 from vision.shared_frame import segment_path
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class SimulationOptions:
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
         parameters: PX4 parameters that differ from the defaults.
+        gimbal: with a two-axis gimbal (gimbal protocol version 2); the camera sits on it.
         signing_key: 32 bytes for MAVLink 2 signing on every link; MAV_SIGN_CFG says what is refused.
         faults: begun at the start or at their own time, in the grammar of `fault_grammar`.
         console: read faults from standard input; None: if that is a terminal.
@@ -84,6 +86,7 @@ class SimulationOptions:
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
+    gimbal: bool = False
     signing_key: bytes | None = field(default=None, repr=False)
     faults: tuple[str, ...] = ()
     console: bool | None = None
@@ -115,6 +118,7 @@ class Simulation:
             px4=options.px4,
             noise=options.noise,
             start_ned_m=options.start_ned_m,
+            gimbal=options.gimbal,
             on_event=on_event,
         )
         self.vehicle.clock_ns = self._clock_ns
@@ -266,6 +270,7 @@ class Simulation:
                 self.vehicle.quaternion,
                 time.monotonic_ns(),
                 self._simulated_s,
+                self.camera_turn_rad,
             )
             if self._simulated_s >= self._next_camera_check_s:
                 self._next_camera_check_s = self._simulated_s + CAMERA_CHECK_S
@@ -290,6 +295,12 @@ class Simulation:
         north, east, down = self.vehicle.airframe.position
         start_north, start_east = self.options.start_ned_m
         return (start_north + north, start_east + east, down)
+
+    @property
+    def camera_turn_rad(self) -> Vector | None:
+        """Roll, pitch, yaw from the body to a camera on the gimbal; None for one that sits on the body."""
+        gimbal = self.vehicle.gimbal
+        return None if gimbal is None else euler_from_quaternion(gimbal.body_quaternion)
 
     def truth(self) -> dict[str, Any]:
         """What is really so now: pose, mode, and the range to every object of the world."""

@@ -78,6 +78,14 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "VIBRATION": 0.1,
 }
 
+# What comes on top with a remote control or a gimbal, by PX4's source: (onboard link, any other link).
+EQUIPMENT_RATES_HZ: dict[str, tuple[float, float]] = {
+    "RC_CHANNELS": (20.0, 5.0),
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": (5.0, 5.0),
+    "GIMBAL_MANAGER_STATUS": (0.5, 0.5),
+    "MOUNT_ORIENTATION": (10.0, 10.0),
+}
+
 
 class Streams:
     """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1.

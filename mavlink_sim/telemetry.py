@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import packing
+from mavlink_sim import gimbal_protocol, packing, pilot_link
 from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.messages import current_event_sequence, dialect, time_estimate_to_target
 from mavlink_sim.mission_messages import mission_current
@@ -235,14 +235,14 @@ def _sys_status(vehicle: Vehicle) -> Any:
     present, enabled, health = SENSORS_READY if autopilot.sensors_ready else SENSORS_STARTING
     if autopilot.can_arm:
         health |= PREARM_CHECK
+    receiver = pilot_link.receiver_bits(vehicle)
+    battery = autopilot.supervision.battery
     return dialect.MAVLink_sys_status_message(
-        present,
+        present | receiver,
         enabled,
-        health,
+        health | receiver,
         120,
-        round(vehicle.battery_volts * 1000),
-        -100,
-        round(vehicle.battery_remaining * 100),
+        *battery.system_status,
         *([0] * 6),
         0,
         0,
@@ -325,9 +325,22 @@ def _mission_current(vehicle: Vehicle) -> Any:
 
 
 def _battery_status(vehicle: Vehicle) -> Any:
-    voltages = [round(vehicle.battery_volts * 1000)] + [_U16_UNKNOWN] * 9
-    remaining = round(vehicle.battery_remaining * 100)
-    return dialect.MAVLink_battery_status_message(0, 1, 1, 32767, voltages, -100, 0, -1, remaining, 0, 1)
+    battery = vehicle.autopilot.supervision.battery
+    if not battery.connected:
+        return None
+    return dialect.MAVLink_battery_status_message(
+        0,
+        1,
+        1,
+        32767,
+        [round(battery.volts * 1000)] + [_U16_UNKNOWN] * 9,
+        round(battery.current_a * 100),
+        int(battery.discharged_mah),
+        -1,
+        round(battery.remaining * 100),
+        battery.time_remaining_s,
+        battery.charge_state,
+    )
 
 
 def _current_mode(vehicle: Vehicle) -> Any:
@@ -422,6 +435,10 @@ BUILDERS: dict[str, Builder] = {
     "SERVO_OUTPUT_RAW": _servo_output_raw,
     "VFR_HUD": _vfr_hud,
     "GPS_RAW_INT": _gps_raw_int,
+    "RC_CHANNELS": pilot_link.rc_channels,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": gimbal_protocol.device_attitude_status,
+    "GIMBAL_MANAGER_STATUS": gimbal_protocol.manager_status,
+    "MOUNT_ORIENTATION": gimbal_protocol.mount_orientation,
     "EXTENDED_SYS_STATE": _extended_sys_state,
     "SYS_STATUS": _sys_status,
     "ESTIMATOR_STATUS": _estimator_status,
@@ -443,6 +460,8 @@ BUILDERS: dict[str, Builder] = {
 REQUESTED: dict[str, Builder] = {
     "AUTOPILOT_VERSION": _autopilot_version,
     "COMPONENT_METADATA": metadata_message,
+    "GIMBAL_MANAGER_INFORMATION": gimbal_protocol.manager_information,
+    "GIMBAL_DEVICE_INFORMATION": gimbal_protocol.device_information,
 }
 
 MESSAGE_IDS: dict[int, str] = {

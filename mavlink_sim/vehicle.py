@@ -20,6 +20,8 @@ from mavlink_sim.estimate_errors import FallibleEstimate
 from mavlink_sim.event_protocol import EventBuffer
 from mavlink_sim.faults import Faults
 from mavlink_sim.geography import geographic, start_of_vehicle
+from mavlink_sim.gimbal import Gimbal
+from mavlink_sim.gimbal_protocol import GimbalManager
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.microservices import HANDLERS
@@ -27,7 +29,8 @@ from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.signing import Signing, Streams, timestamp_now
-from mavlink_sim.streams import ONBOARD_RATES_HZ
+from mavlink_sim.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
+from mavlink_sim.transmitter import Transmitter
 from mavlink_sim.vehicle_files import vehicle_files
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
@@ -55,6 +58,7 @@ class Vehicle:
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
         noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
+        gimbal: with a two-axis gimbal and its parameters.
         ready_after_s: how long after boot the estimator allows arming.
         px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
         start_ned_m: where it starts, north and east of SIH's home; its local NED frame begins there.
@@ -77,6 +81,7 @@ class Vehicle:
         gusts_mps: float | None = None,
         noise: bool = True,
         parameters: Mapping[str, float] | None = None,
+        gimbal: bool = False,
         ready_after_s: float = 3.0,
         px4: str = NEWEST,
         start_ned_m: tuple[float, float] = (0.0, 0.0),
@@ -84,7 +89,7 @@ class Vehicle:
     ) -> None:
         self.system_id = system_id
         self.release = release_named(px4)
-        self.parameters = Parameters(parameters)
+        self.parameters = Parameters(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
             direction = random.Random(seed).uniform(0.0, math.tau)
@@ -108,12 +113,12 @@ class Vehicle:
         self.autopilot = Autopilot(
             self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
+        self.gimbal_manager = GimbalManager(self) if gimbal else None
         self._boot_us = 0
         self._steps_to_control = 0
         self._leftover_s = 0.0
         self._ping_sequence = itertools.count()
         self._wind_revision = -1
-        self._used_charge = 0.0
         self._companion_seen_s: float | None = None
         self._companion_lost = False
         self._origin_told = False
@@ -146,16 +151,23 @@ class Vehicle:
         return geographic(self.autopilot.home)[2]
 
     @property
+    def gimbal(self) -> Gimbal | None:
+        """The gimbal, for its pose: angles, `quaternion` and `body_quaternion`; None without one."""
+        return None if self.gimbal_manager is None else self.gimbal_manager.gimbal
+
+    @property
     def battery_remaining(self) -> float:
-        """0..1. Half of it goes in SIM_BAT_DRAIN seconds of armed time; never below SIM_BAT_MIN_PCT."""
-        if self.faults.battery is not None:
-            return self.faults.battery
-        lowest = self.parameters.number("SIM_BAT_MIN_PCT") / 100.0
-        return min(max(0.99 - self._used_charge, lowest, 0.0), 1.0)
+        """0..1, as the autopilot believes it to be."""
+        return self.autopilot.supervision.battery.remaining
 
     @property
     def battery_volts(self) -> float:
-        return 14.4 + 1.8 * self.battery_remaining
+        return self.autopilot.supervision.battery.volts
+
+    @property
+    def transmitter(self) -> Transmitter:
+        """The pilot's remote control, switched off at first (COM_RC_IN_MODE decides whether it counts)."""
+        return self.autopilot.supervision.transmitter
 
     def next_ping(self) -> int:
         """The sequence number of the next PING of its own."""
@@ -165,7 +177,8 @@ class Vehicle:
 
     def add_link(self, name: str, rates_hz: dict[str, float] | None = None) -> Link:
         """Attach a link with the onboard link's rates, or others (`streams.GCS_RATES_HZ`)."""
-        rates = ONBOARD_RATES_HZ if rates_hz is None else rates_hz
+        equipment = {name: rates[rates_hz is not None] for name, rates in EQUIPMENT_RATES_HZ.items()}
+        rates = equipment | (ONBOARD_RATES_HZ if rates_hz is None else rates_hz)
         # links start out of step, so that they do not all send everything in the same millisecond
         link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
         link.gate = self.faults.gate
@@ -287,8 +300,8 @@ class Vehicle:
             self._steps_to_control = STEPS_PER_CONTROL
             self.autopilot.update(CONTROL_STEP_S)
             mission_link.update(self)
-            if self.autopilot.armed:
-                self._used_charge += CONTROL_STEP_S / self.parameters.positive("SIM_BAT_DRAIN") / 2.0
+            if self.gimbal_manager is not None:
+                self.gimbal_manager.step(CONTROL_STEP_S)
             self._watch_companion()
         self.airframe.advance(STEP_S)
         self.estimate.update(STEP_S)
@@ -327,6 +340,10 @@ class Vehicle:
                 self.events.emit(self.links.values(), identifier, self.boot_ms, levels, arguments)
         while autopilot.gimbal_commands:
             command, confirmation, values = autopilot.gimbal_commands.popleft()
+            if self.gimbal_manager is not None:
+                if confirmation:
+                    continue  # the first one was answered
+                self.gimbal_manager.own_command((command, confirmation, values))
             for link in self.links.values():
                 link.send(
                     dialect.MAVLink_command_long_message(self.system_id, 0, command, confirmation, *values)

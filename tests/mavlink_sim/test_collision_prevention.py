@@ -20,6 +20,7 @@ from mavlink_sim.collision_prevention import (
 )
 from mavlink_sim.messages import dialect
 from mavlink_sim.parameters import Parameters
+from mavlink_sim.transmitter import CALIBRATION, Sticks
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
 STILL = (0.0, 0.0)
@@ -216,3 +217,81 @@ def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
     cockpit.offboard(north)
     cockpit.fly(2.0, north)
     assert cockpit.vehicle.airframe.velocity[0] > 1.5
+
+
+class Wall:
+    """A wall north of a hovering vehicle whose pilot flies by remote control, and a sensor that sees it.
+
+    `at_m`: north of where the vehicle was when the wall was put up.
+    """
+
+    def __init__(self, make_cockpit: Any, at_m: float, **values: float) -> None:
+        self.cockpit = make_cockpit(parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, **values})
+        self.vehicle = self.cockpit.vehicle
+        self.vehicle.transmitter.on = True
+        self.cockpit.take_off(5.0)
+        self.cockpit.fly(1.0)
+        self.start_m = self.north_m
+        self.at_m = at_m
+
+    @property
+    def north_m(self) -> float:
+        return float(self.vehicle.airframe.position[0])
+
+    @property
+    def distance_m(self) -> float:
+        return self.start_m + self.at_m - self.north_m
+
+    def fly(self, seconds: float, setpoint: Any = None, *, seen: bool = True, **sticks: float) -> None:
+        """Let time pass with these sticks; the sensor tells at 10 Hz, ahead and 20° to the sides."""
+        self.vehicle.transmitter.sticks = Sticks(**sticks)
+        for _ in range(round(seconds * 10)):
+            distances = [FAR_CM] * SECTORS
+            for sector in range(-4, 5):
+                away = self.distance_m / math.cos(math.radians(5.0 * sector))
+                distances[sector % SECTORS] = min(max(round(away * 100), 21), FAR_CM)
+            if seen:
+                self.cockpit.send(
+                    dialect.MAVLink_obstacle_distance_message(
+                        0, 0, distances, 5, 20, 2000, frame=FRAME_LOCAL_NED
+                    )
+                )
+            self.cockpit.fly(0.1, setpoint)
+
+
+def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: Any) -> None:
+    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+    assert wall.cockpit.set_mode(3, 0) == [0, 0]
+    wall.fly(8.0, pitch=1.0)
+    assert wall.cockpit.mode == "POSCTL"
+    assert 0.7 < wall.distance_m < 2.5
+    assert abs(wall.vehicle.airframe.velocity[0]) < 0.2
+    wall.fly(2.0, pitch=-1.0)  # and away from it as fast as the pilot likes
+    assert wall.distance_m > 3.5
+
+
+def test_without_collision_prevention_the_same_stick_leads_through_the_wall(make_cockpit: Any) -> None:
+    wall = Wall(make_cockpit, 3.0, CP_DIST=-1.0)
+    wall.cockpit.set_mode(3, 0)
+    wall.fly(4.0, pitch=1.0)
+    assert wall.distance_m < 0.0
+
+
+def test_in_offboard_nothing_is_held_back(make_cockpit: Any, velocity_setpoint: Any) -> None:
+    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+    north = velocity_setpoint(2, 0, 0)
+    wall.cockpit.offboard(north)
+    wall.fly(4.0, north)
+    assert wall.cockpit.mode == "OFFBOARD"
+    assert wall.distance_m < 0.0
+
+
+def test_a_sensor_that_falls_silent_ends_position_mode(make_cockpit: Any) -> None:
+    wall = Wall(make_cockpit, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+    wall.cockpit.set_mode(3, 0)
+    wall.fly(1.0)
+    wall.fly(4.5, seen=False)
+    assert wall.cockpit.mode == "POSCTL"
+    assert wall.distance_m > 9.0
+    wall.fly(1.5, seen=False)
+    assert wall.cockpit.mode == "HOLD"

@@ -234,9 +234,31 @@ def test_a_battery_has_what_it_is_given_and_is_used_up(cockpit) -> None:
     begin(cockpit, "battery 0.5")
     assert newest(cockpit, "SYS_STATUS").battery_remaining == 50
     cockpit.fly(6.0)
-    assert newest(cockpit, "SYS_STATUS").battery_remaining == pytest.approx(45, abs=2)
+    assert newest(cockpit, "SYS_STATUS").battery_remaining == pytest.approx(41, abs=2)
     cockpit.vehicle.faults.end()
-    assert newest(cockpit, "SYS_STATUS").battery_remaining > 70
+    assert newest(cockpit, "SYS_STATUS").battery_remaining > 60
+
+
+def test_a_battery_that_fails_brings_the_vehicle_down(make_cockpit) -> None:
+    cockpit = make_cockpit(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
+    cockpit.take_off(5.0)
+    begin(cockpit, "battery emergency")
+    cockpit.fly(0.1)
+    assert cockpit.mode == "LAND"
+    assert "failsafe: battery emergency, LAND" in cockpit.events
+    assert cockpit.heartbeat().system_status == 5
+
+
+def test_of_two_failsafes_the_worse_one_is_flown(make_cockpit, velocity_setpoint) -> None:
+    cockpit = make_cockpit(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
+    cockpit.take_off(8.0)
+    cockpit.offboard(velocity_setpoint(0, 0, 0))
+    cockpit.until(lambda: cockpit.mode == "RTL", 2.0)  # the stream is lost
+    begin(cockpit, "battery emergency for=0.5")
+    cockpit.fly(0.1)
+    assert cockpit.mode == "LAND"
+    cockpit.fly(0.2, velocity_setpoint(0, 0, 0))  # the stream is back, which now changes nothing
+    assert cockpit.mode == "LAND"
 
 
 @pytest.mark.parametrize("motor", [1, 4])
@@ -282,6 +304,25 @@ def test_a_pilot_takes_the_vehicle_out_of_offboard(cockpit, velocity_setpoint) -
     begin(cockpit, "pilot_takeover")
     cockpit.fly(2.0, setpoint)
     assert cockpit.mode == "POSCTL"
+
+
+def test_a_pilot_who_goes_away_again_leaves_the_mode_behind(cockpit) -> None:
+    cockpit.take_off(5.0)
+    begin(cockpit, "pilot_takeover for=1")
+    cockpit.fly(3.0)
+    assert cockpit.mode == "POSCTL"
+
+
+def test_where_a_remote_control_counts_its_pilot_going_away_is_a_failsafe(make_cockpit) -> None:
+    cockpit = make_cockpit(parameters={"COM_RC_IN_MODE": 0})
+    cockpit.take_off(5.0)
+    begin(cockpit, "pilot_takeover for=2")
+    cockpit.fly(1.9)
+    assert cockpit.mode == "POSCTL"
+    cockpit.fly(0.3)
+    assert cockpit.mode == "HOLD"
+    cockpit.until(lambda: cockpit.mode == "RTL", 6.0)
+    assert "failsafe: manual control lost, RTL" in cockpit.events
 
 
 def test_a_mode_is_refused_so_often_and_then_taken(cockpit) -> None:

@@ -12,6 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from plan_client import circle, listen, polygon, upload
 
+from mavlink_sim.announcements import event_identifier
 from mavlink_sim.geofence import Area, inside_polygon
 from mavlink_sim.geography import geographic
 
@@ -133,24 +134,31 @@ def fly_out(cockpit: Any, velocity_setpoint: Any, **parameters: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "mode", "words"),
-    [
-        (1, "OFFBOARD", "Failsafe warning\t"),
-        (2, "HOLD", "Failsafe activated\t"),
-        (3, "RTL", "Failsafe activated\t"),
-        (5, "LAND", "Failsafe activated\t"),
-    ],
+    ("action", "mode"),
+    [(1, "OFFBOARD"), (2, "HOLD"), (3, "RTL"), (5, "LAND")],
 )
 def test_a_breach_does_what_gf_action_says(
-    make_cockpit: Any, velocity_setpoint: Any, action: int, mode: str, words: str
+    make_cockpit: Any, velocity_setpoint: Any, action: int, mode: str
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": action})
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
     fly_out(cockpit, velocity_setpoint)
     assert cockpit.mode == mode
     assert "Geofence: approaching or outside geofence" in cockpit.texts()
-    assert words in cockpit.texts()
+    assert ("Failsafe activated\t" in cockpit.texts()) is (action != 1)
+    warning = event_identifier("commander_failsafe_enter_generic_warn")
+    assert (warning in [event.id for event in cockpit.received("EVENT")]) is (action == 1)
     assert cockpit.heartbeat().system_status == (4 if action == 1 else 5)
     assert any("geofence breached" in event for event in cockpit.events)
+
+
+def test_before_it_returns_it_holds_for_a_pilot_to_take_over(
+    make_cockpit: Any, velocity_setpoint: Any
+) -> None:
+    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 3})
+    fly_out(cockpit, velocity_setpoint)
+    assert cockpit.mode == "HOLD"
+    assert "Failsafe activated: entering Hold for 5 seconds\t" in cockpit.texts()
+    assert cockpit.until(lambda: cockpit.mode == "RTL", 6.0) == pytest.approx(4.8, abs=0.3)
 
 
 def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(

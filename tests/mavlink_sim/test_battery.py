@@ -1,0 +1,160 @@
+"""How the battery drains, what is told of it, and what its warnings do."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavlink_sim.battery import Battery, BatteryWarning
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2
+
+GROUND_STATION = (245, 190)
+CHECKED = {"CBRK_SUPPLY_CHK": 0, "SIM_BAT_MIN_PCT": 0}
+
+
+def drained(seconds: float, thrust_mps2: float = GRAVITY_MPS2, **values: float) -> Battery:
+    battery = Battery(Parameters(values))
+    for _ in range(round(seconds / 0.1)):
+        battery.step(0.1, True, thrust_mps2)
+    return battery
+
+
+def test_the_simulated_battery_drains_and_sinks_as_recorded() -> None:
+    battery = drained(10.0)
+    assert battery.volts == pytest.approx(15.9, abs=0.01)  # 10 s after arming
+    assert battery.remaining == pytest.approx(0.85, abs=0.01)
+    assert battery.current_a == -1.0
+    assert battery.discharged_mah == pytest.approx(-2.8, abs=0.1)
+    battery = drained(60.0)
+    assert (battery.charge, battery.volts) == (0.5, pytest.approx(15.3))  # SIM_BAT_MIN_PCT
+    for _ in range(40):
+        battery.step(0.1, False, 0.0)
+    assert battery.remaining == pytest.approx(1.0, abs=0.02)  # disarmed, it is full again
+
+
+def test_a_battery_of_known_capacity_has_a_current_and_sags() -> None:
+    values = {"BAT1_CAPACITY": 1000.0, "BAT_AVRG_CURRENT": 15.0, "BAT1_R_INTERNAL": 0.01}
+    battery = drained(60.0, **values)
+    assert battery.current_a == pytest.approx(15.5)
+    assert battery.discharged_mah == pytest.approx(15.5 * 1000 / 60, rel=0.01)
+    assert battery.charge == pytest.approx(1 - 0.258, abs=0.01)
+    harder = drained(60.0, MAX_THRUST_MPS2, **values)
+    assert harder.current_a > 2.5 * battery.current_a
+    rest = Battery(Parameters(values))
+    rest.step(0.1, False, 0.0)
+    loaded = Battery(Parameters(values))
+    loaded.step(0.1, True, MAX_THRUST_MPS2)
+    assert loaded.volts < rest.volts - 1.0
+    assert battery.time_remaining_s == pytest.approx(0.742 * 3600 / 15.5, rel=0.1)
+    battery.step(10.0, False, 0.0)
+    assert battery.charge < 0.75  # what is used stays used
+
+
+@given(
+    st.floats(0.0, 30.0),
+    st.floats(-10.0, 1e6),
+    st.lists(st.tuples(st.booleans(), st.floats(0.0, 20.0)), max_size=20),
+)
+def test_a_battery_stays_within_its_bounds(
+    drain_s: float, capacity_mah: float, steps: list[tuple[bool, float]]
+) -> None:
+    battery = Battery(Parameters({"SIM_BAT_DRAIN": drain_s, "BAT1_CAPACITY": capacity_mah}))
+    for armed, thrust in steps:
+        battery.step(1.0, armed, thrust)
+        assert 0.0 <= battery.remaining <= 1.0
+        assert 0.0 <= battery.charge <= 1.0
+        assert math.isfinite(battery.volts)
+
+
+def test_the_warnings_follow_the_thresholds() -> None:
+    parameters = Parameters({"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 100, "CBRK_SUPPLY_CHK": 0})
+    battery = Battery(parameters)
+    seen = {}
+    for number in range(1100):
+        battery.step(0.1, True, 9.8)
+        seen.setdefault(battery.warning, battery.remaining)
+        assert battery.charge_state == 1 + battery.warning
+        assert battery.checked_warning is battery.warning, number
+    assert seen[BatteryWarning.LOW] == pytest.approx(0.15, abs=0.002)
+    assert seen[BatteryWarning.CRITICAL] == pytest.approx(0.07, abs=0.002)
+    assert seen[BatteryWarning.EMERGENCY] == pytest.approx(0.05, abs=0.002)
+
+
+def test_a_battery_that_is_not_checked_warns_nobody() -> None:
+    battery = Battery(Parameters({"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 1}))  # CBRK_SUPPLY_CHK is 894281
+    for _ in range(50):
+        battery.step(0.1, True, 9.8)
+    assert battery.warning is BatteryWarning.EMERGENCY
+    assert battery.checked_warning is BatteryWarning.NONE
+
+
+def flying(make_cockpit: Any, **values: float) -> Any:
+    cockpit = make_cockpit(parameters={**CHECKED, "COM_FAIL_ACT_T": 1, **values})
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.take_off(11.0)
+    return cockpit
+
+
+def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_cockpit: Any) -> None:
+    cockpit = flying(make_cockpit, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.12
+    cockpit.until(lambda: any(line.startswith("battery low") for line in cockpit.events), 8.0)
+    cockpit.fly(0.1)
+    assert "Low battery\t" in cockpit.texts()
+    assert cockpit.mode == "HOLD"
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.06
+    cockpit.until(lambda: "failsafe: battery critical, HOLD" in cockpit.events, 10.0)
+    cockpit.until(lambda: "failsafe: battery critical, RTL" in cockpit.events, 2.0)
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.04
+    cockpit.until(lambda: cockpit.mode == "LAND", 8.0)
+    assert cockpit.heartbeat().system_status == 5
+    cockpit.fly(2.1)
+    assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4
+
+
+def test_by_default_a_battery_does_not_end_a_flight(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 10})
+    cockpit.take_off()
+    cockpit.fly(4.0)
+    assert cockpit.mode == "HOLD"
+    assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4
+
+
+def test_arming_is_refused_on_an_empty_battery(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=CHECKED)
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.wait_ready()
+    cockpit.vehicle.autopilot.supervision.battery.forced_charge = 0.0
+    cockpit.fly(6.0)
+    assert not cockpit.vehicle.autopilot.can_arm
+    assert cockpit.command(400, 1) == [1]
+    assert "Emergency battery level\t" in cockpit.texts()
+    cockpit.vehicle.autopilot.supervision.battery.forced_charge = None
+    cockpit.fly(6.0)
+    assert cockpit.command(400, 1) == [0]
+
+
+def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={**CHECKED, "COM_ARM_BAT_MIN": 0.9, "BAT1_V_CHARGED": 4.2})
+    cockpit.wait_ready()
+    battery = cockpit.vehicle.autopilot.supervision.battery
+    battery.forced_charge = 0.0
+    cockpit.until(lambda: battery.remaining < 0.9, 2.0)
+    assert battery.warning is BatteryWarning.NONE
+    assert cockpit.command(400, 1) == [1]
+    battery.forced_charge = None
+    cockpit.until(lambda: battery.remaining > 0.91, 5.0)
+    assert cockpit.command(400, 1) == [0]
+
+
+def test_a_vehicle_without_a_battery_says_so(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={"SIM_BAT_ENABLE": 0})
+    cockpit.fly(2.2)
+    assert cockpit.received("BATTERY_STATUS") == []
+    status = cockpit.received("SYS_STATUS")[-1]
+    assert (status.voltage_battery, status.current_battery, status.battery_remaining) == (65535, -1, -1)

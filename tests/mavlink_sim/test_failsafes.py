@@ -1,0 +1,382 @@
+"""PX4's failsafe rules: the state machine by itself, and on the vehicle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mavlink_sim.announcements import Text, event_identifier
+from mavlink_sim.battery import BatteryWarning
+from mavlink_sim.failsafe_actions import Action
+from mavlink_sim.failsafes import Conditions, FailsafeMachine
+from mavlink_sim.messages import dialect
+from mavlink_sim.modes import Mode
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.transmitter import CALIBRATION, Sticks
+
+GROUND_STATION = (245, 190)
+REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}
+STEP_S = 0.02
+
+
+class Machine:
+    """A state machine with a vehicle in the air, all links alive."""
+
+    def __init__(self, **values: float) -> None:
+        parameters = Parameters({"COM_RC_IN_MODE": 0, "COM_RCL_EXCEPT": 0, **values})
+        self.said: list[Text] = []
+        self.impossible: set[Mode] = set()
+        self.machine = FailsafeMachine(parameters, lambda mode: mode not in self.impossible, self.said.append)
+        self.conditions = Conditions(
+            manual_control_lost=False, ground_station_lost=False, offboard_signal_lost=False
+        )
+        self.intended = Mode.POSCTL
+        self.run(0.1)
+
+    @property
+    def mode(self) -> Mode:
+        return self.machine.mode(self.intended)
+
+    def run(self, seconds: float, requested: Mode | None = None, sticks: bool = False) -> Mode:
+        if requested is not None:
+            self.intended = requested
+        for number in range(round(seconds / STEP_S)):
+            first = number == 0
+            self.intended = self.machine.update(
+                STEP_S,
+                self.conditions,
+                armed=True,
+                intended=self.intended,
+                mode_requested=first and requested is not None,
+                sticks_request=first and sticks,
+            )
+        return self.mode
+
+    @property
+    def texts(self) -> list[str]:
+        return [text.text for text in self.said if text.text]
+
+
+def test_losing_the_remote_control_holds_five_seconds_and_then_returns() -> None:
+    machine = Machine(NAV_RCL_ACT=2, COM_FAIL_ACT_T=5)
+    machine.conditions.manual_control_lost = True
+    assert machine.run(4.9) is Mode.HOLD
+    assert machine.run(0.2) is Mode.RTL
+    assert machine.texts == ["Failsafe activated: entering Hold for 5 seconds\t", "Failsafe activated\t"]
+
+
+@pytest.mark.parametrize(
+    ("act", "mode"),
+    [
+        pytest.param(0, Mode.POSCTL, id="disabled"),
+        pytest.param(1, Mode.HOLD, id="hold"),
+        pytest.param(2, Mode.RTL, id="return"),
+        pytest.param(3, Mode.LAND, id="land"),
+    ],
+)
+def test_nav_rcl_act_and_nav_dll_act_choose_the_action(act: int, mode: Mode) -> None:
+    for name, condition in (("NAV_RCL_ACT", "manual_control_lost"), ("NAV_DLL_ACT", "ground_station_lost")):
+        machine = Machine(**{name: act, "COM_FAIL_ACT_T": 0})
+        setattr(machine.conditions, condition, True)
+        assert machine.run(0.1) is mode
+
+
+def test_the_last_resorts_disarm_or_stop_at_once() -> None:
+    for act, action in ((6, Action.DISARM), (5, Action.TERMINATE)):
+        machine = Machine(NAV_RCL_ACT=act)
+        machine.conditions.manual_control_lost = True
+        machine.run(0.1)
+        assert machine.machine.action is action
+    machine.conditions.manual_control_lost = False
+    machine.run(1.0, requested=Mode.HOLD)
+    assert machine.machine.action is Action.TERMINATE  # it takes a reboot
+
+
+def test_a_link_that_comes_back_does_not_end_the_return_a_change_of_mode_does() -> None:
+    machine = Machine(COM_FAIL_ACT_T=0)
+    machine.conditions.manual_control_lost = True
+    assert machine.run(0.1) is Mode.RTL
+    machine.conditions.manual_control_lost = False
+    assert machine.run(1.0) is Mode.RTL
+    assert machine.run(0.1, requested=Mode.POSCTL) is Mode.POSCTL
+    assert not machine.machine.in_failsafe
+
+
+def test_a_return_of_the_link_while_still_holding_leaves_the_hold_to_the_pilot() -> None:
+    machine = Machine(COM_FAIL_ACT_T=5)
+    machine.conditions.manual_control_lost = True
+    machine.run(2.0)
+    machine.conditions.manual_control_lost = False
+    assert machine.run(0.2, requested=Mode.ALTCTL) is Mode.ALTCTL
+
+
+def test_sticks_take_over_from_a_return_but_not_during_the_hold_before_it() -> None:
+    machine = Machine(NAV_DLL_ACT=2, COM_FAIL_ACT_T=5)
+    machine.intended = Mode.MISSION
+    machine.conditions.ground_station_lost = True
+    assert machine.run(1.0) is Mode.HOLD
+    assert machine.run(0.1, sticks=True) is Mode.HOLD
+    assert machine.run(5.0) is Mode.RTL
+    assert machine.run(0.1, sticks=True) is Mode.POSCTL
+    assert machine.intended is Mode.POSCTL
+    assert machine.machine.user_took_over
+    assert not machine.machine.in_failsafe
+    assert [text.event[0] for text in machine.said if text.event][-1] == event_identifier(
+        "failsafe_rc_override"
+    )
+
+
+def test_without_the_delay_only_a_mode_switch_takes_over() -> None:
+    machine = Machine(NAV_DLL_ACT=2, COM_FAIL_ACT_T=0)
+    machine.conditions.ground_station_lost = True
+    assert machine.run(0.1) is Mode.RTL
+    assert machine.run(0.1, sticks=True) is Mode.RTL
+    assert machine.run(0.1, requested=Mode.POSCTL) is Mode.POSCTL
+
+
+@pytest.mark.parametrize(
+    ("mode", "exception"),
+    [
+        pytest.param(Mode.MISSION, 1, id="mission"),
+        pytest.param(Mode.HOLD, 2, id="hold"),
+        pytest.param(Mode.TAKEOFF, 2, id="takeoff"),
+        pytest.param(Mode.OFFBOARD, 4, id="offboard"),
+        pytest.param(Mode.POSCTL, 0, id="position, never excepted"),
+    ],
+)
+def test_com_rcl_except_excuses_modes_that_fly_by_themselves(mode: Mode, exception: int) -> None:
+    for bits in (0, 7):
+        machine = Machine(COM_RCL_EXCEPT=bits, COM_FAIL_ACT_T=0)
+        machine.intended = mode
+        machine.conditions.manual_control_lost = True
+        machine.run(0.1)
+        assert machine.machine.in_failsafe is not bool(bits & exception)
+
+
+def test_a_vehicle_armed_without_a_remote_control_never_misses_it() -> None:
+    machine = Machine()
+    machine.machine.update(STEP_S, machine.conditions, armed=False, intended=Mode.HOLD)
+    machine.intended = Mode.HOLD
+    machine.conditions.manual_control_lost = True
+    assert machine.run(1.0) is Mode.HOLD
+    assert not machine.machine.in_failsafe
+    machine.conditions.manual_control_lost = False
+    machine.run(0.1)
+    machine.conditions.manual_control_lost = True
+    machine.run(0.1)
+    assert machine.machine.in_failsafe  # once it was there, it is missed
+
+
+def test_the_worst_of_several_failsafes_wins_and_the_next_one_follows_when_it_clears() -> None:
+    machine = Machine(NAV_DLL_ACT=1, COM_LOW_BAT_ACT=2, COM_FAIL_ACT_T=0)
+    machine.intended = Mode.MISSION
+    machine.conditions.ground_station_lost = True
+    assert machine.run(0.1) is Mode.HOLD
+    machine.conditions.battery_warning = BatteryWarning.CRITICAL
+    assert machine.run(0.1) is Mode.LAND
+    machine.conditions.battery_warning = BatteryWarning.NONE
+    assert machine.run(0.1) is Mode.HOLD
+
+
+@pytest.mark.parametrize(
+    ("act", "critical", "emergency"),
+    [
+        pytest.param(0, Mode.POSCTL, Mode.POSCTL, id="warn"),
+        pytest.param(1, Mode.RTL, Mode.RTL, id="return"),
+        pytest.param(2, Mode.LAND, Mode.LAND, id="land"),
+        pytest.param(3, Mode.RTL, Mode.LAND, id="return, then land"),
+    ],
+)
+def test_com_low_bat_act_chooses_the_action(act: int, critical: Mode, emergency: Mode) -> None:
+    machine = Machine(COM_LOW_BAT_ACT=act, COM_FAIL_ACT_T=0)
+    machine.conditions.battery_warning = BatteryWarning.LOW
+    assert machine.run(0.1) is Mode.POSCTL
+    assert machine.machine.action is Action.WARN
+    machine.conditions.battery_warning = BatteryWarning.CRITICAL
+    assert machine.run(0.1) is critical
+    machine.conditions.battery_warning = BatteryWarning.EMERGENCY
+    assert machine.run(0.1) is emergency
+
+
+def test_a_battery_that_was_critical_at_arming_only_warns() -> None:
+    machine = Machine(COM_LOW_BAT_ACT=3, COM_FAIL_ACT_T=0)
+    machine.conditions.battery_warning = BatteryWarning.CRITICAL
+    machine.machine.update(STEP_S, machine.conditions, armed=False, intended=Mode.POSCTL)
+    assert machine.run(0.1) is Mode.POSCTL
+    machine.conditions.battery_warning = BatteryWarning.EMERGENCY
+    assert machine.run(0.1) is Mode.LAND
+
+
+def test_a_vehicle_that_lands_or_returns_is_not_sent_to_return() -> None:
+    for mode in (Mode.LAND, Mode.RTL):
+        machine = Machine(COM_LOW_BAT_ACT=3)
+        machine.intended = mode
+        machine.conditions.battery_warning = BatteryWarning.CRITICAL
+        assert machine.run(1.0) is mode
+        assert machine.machine.action is Action.WARN
+
+
+def test_offboard_loss_acts_at_once_and_ends_when_the_setpoints_return() -> None:
+    machine = Machine(COM_OBL_RC_ACT=0)
+    machine.intended = Mode.OFFBOARD
+    machine.conditions.offboard_signal_lost = True
+    assert machine.run(0.1) is Mode.POSCTL  # a pilot has sticks
+    machine.conditions.manual_control_lost = True
+    machine.machine._parameters.set("COM_RCL_EXCEPT", 4)
+    assert machine.run(0.1) is Mode.RTL
+    machine.conditions.offboard_signal_lost = False
+    assert machine.run(0.1) is Mode.OFFBOARD
+
+
+def test_an_action_that_cannot_be_flown_becomes_the_next_one() -> None:
+    machine = Machine(COM_FAIL_ACT_T=0)
+    machine.conditions.manual_control_lost = True
+    machine.impossible = {Mode.RTL}
+    assert machine.run(0.1) is Mode.LAND
+    machine.impossible = {Mode.RTL, Mode.LAND, Mode.HOLD, Mode.POSCTL, Mode.ALTCTL}
+    machine.run(0.1)
+    assert machine.machine.action is Action.DESCEND
+
+
+def test_a_breached_fence_can_be_left_by_the_mode_switch_alone() -> None:
+    machine = Machine(GF_ACTION=2)
+    machine.intended = Mode.MISSION
+    machine.conditions.geofence_breached = True
+    assert machine.run(0.1) is Mode.HOLD
+    assert machine.run(0.1, sticks=True) is Mode.HOLD
+    assert machine.run(0.1, requested=Mode.POSCTL) is Mode.POSCTL
+
+
+def test_a_flickering_condition_uses_up_the_delay() -> None:
+    machine = Machine(COM_FAIL_ACT_T=5, NAV_DLL_ACT=2)
+    machine.intended = Mode.MISSION
+    for _ in range(20):
+        machine.conditions.ground_station_lost = True
+        machine.run(1.0)
+        machine.conditions.ground_station_lost = False
+        machine.run(0.2, requested=Mode.MISSION)
+        if machine.mode is Mode.RTL:
+            break
+    machine.conditions.ground_station_lost = True
+    assert machine.run(2.0) is Mode.RTL
+
+
+# ---- on the vehicle
+
+
+def flying(make_cockpit: Any, **values: float) -> Any:
+    cockpit = make_cockpit(parameters={**REMOTE_CONTROL, **values})
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.vehicle.transmitter.on = True
+    cockpit.take_off(12.0)
+    cockpit.set_mode(3)
+    cockpit.fly(1.0)
+    assert cockpit.mode == "POSCTL"
+    return cockpit
+
+
+def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_cockpit: Any) -> None:
+    cockpit = flying(make_cockpit)
+    cockpit.vehicle.transmitter.on = False
+    holding_s = cockpit.until(lambda: cockpit.mode == "HOLD", 2.0)
+    assert holding_s == pytest.approx(0.5, abs=0.1)
+    returning_s = cockpit.until(lambda: cockpit.mode == "RTL", 6.0)
+    assert returning_s == pytest.approx(5.0, abs=0.1)
+    cockpit.fly(0.1)
+    assert "Failsafe activated: entering Hold for 5 seconds\t" in cockpit.texts()
+    assert "Failsafe activated\t" in cockpit.texts()
+    assert cockpit.heartbeat().system_status == 5
+    assert "failsafe: manual control lost, RTL" in cockpit.events
+
+
+def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(make_cockpit: Any) -> None:
+    cockpit = flying(make_cockpit)
+    transmitter = cockpit.vehicle.transmitter
+    transmitter.on = False
+    cockpit.until(lambda: cockpit.mode == "RTL", 7.0)
+    transmitter.on = True
+    cockpit.fly(1.0)
+    assert cockpit.mode == "RTL"
+    transmitter.sticks = Sticks(pitch=0.9)
+    cockpit.until(lambda: cockpit.mode == "POSCTL", 1.0)
+    assert any(
+        message.id == event_identifier("failsafe_rc_override") for message in cockpit.received("EVENT")
+    )
+
+
+def test_nobody_misses_a_remote_control_in_offboard(make_cockpit: Any, velocity_setpoint: Any) -> None:
+    cockpit = flying(make_cockpit)
+    cockpit.offboard(velocity_setpoint(0, 0, 0))
+    cockpit.vehicle.transmitter.on = False
+    cockpit.fly(3.0, velocity_setpoint(0, 0, 0))
+    assert cockpit.mode == "OFFBOARD"
+
+
+def test_losing_the_ground_station_returns_after_the_hold(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 3})
+    cockpit.until(lambda: cockpit.vehicle.autopilot.sensors_ready, 5.0)
+    cockpit.fly(0.2)
+    assert not cockpit.vehicle.autopilot.can_arm
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.take_off(12.0)
+    cockpit.heartbeats.clear()
+    lost_s = cockpit.until(lambda: "failsafe: ground station lost, HOLD" in cockpit.events, 5.0)
+    assert 2.0 < lost_s < 3.1
+    cockpit.until(lambda: cockpit.mode == "RTL", 6.0)
+    assert "the ground station's heartbeat is lost" in cockpit.events
+    cockpit.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", GROUND_STATION)
+    cockpit.fly(0.2)
+    assert "GCS connection regained\t" in cockpit.texts()
+    assert cockpit.mode == "RTL"
+
+
+def test_a_ground_station_that_never_was_is_not_missed_by_default(cockpit: Any) -> None:
+    cockpit.take_off()
+    cockpit.fly(15.0)
+    assert cockpit.mode == "HOLD"
+    assert not any("ground station" in line for line in cockpit.events)
+
+
+# ---- a pilot taking over
+
+
+@pytest.mark.parametrize(
+    ("override", "taken"),
+    [
+        pytest.param(1, True, id="auto"),
+        pytest.param(2, False, id="offboard only"),
+        pytest.param(0, False, id="off"),
+    ],
+)
+def test_sticks_moved_in_an_auto_mode_take_over(make_cockpit: Any, override: int, taken: bool) -> None:
+    cockpit = flying(make_cockpit, COM_RC_OVERRIDE=override)
+    cockpit.set_mode(4, 3)
+    cockpit.fly(0.5)
+    cockpit.vehicle.transmitter.sticks = Sticks(roll=0.5)
+    cockpit.fly(0.3)
+    assert cockpit.mode == ("POSCTL" if taken else "HOLD")
+    assert ("Pilot took over using sticks\t" in cockpit.texts()) is taken
+
+
+@pytest.mark.parametrize(
+    ("override", "taken"), [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")]
+)
+def test_sticks_moved_in_offboard_take_over_if_asked_for(
+    make_cockpit: Any, velocity_setpoint: Any, override: int, taken: bool
+) -> None:
+    cockpit = flying(make_cockpit, COM_RC_OVERRIDE=override)
+    cockpit.offboard(velocity_setpoint(0.5, 0, 0))
+    cockpit.vehicle.transmitter.sticks = Sticks(yaw=0.6)
+    cockpit.fly(0.5, velocity_setpoint(0.5, 0, 0))
+    assert cockpit.mode == ("POSCTL" if taken else "OFFBOARD")
+
+
+def test_sticks_moved_slowly_do_not_take_over(make_cockpit: Any) -> None:
+    cockpit = flying(make_cockpit)
+    cockpit.set_mode(4, 3)
+    cockpit.fly(0.5)
+    for number in range(100):  # 20 % a second; COM_RC_STICK_OV is 30
+        cockpit.vehicle.transmitter.sticks = Sticks(pitch=0.004 * number)
+        cockpit.fly(0.02)
+    assert cockpit.mode == "HOLD"

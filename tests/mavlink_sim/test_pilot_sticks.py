@@ -1,0 +1,331 @@
+"""Joysticks and remote controls: which sticks count, what they say, and what a pilot can do with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavlink_sim.announcements import event_identifier
+from mavlink_sim.manual_control import ManualControl, RequestKind, Source
+from mavlink_sim.messages import dialect
+from mavlink_sim.modes import Mode
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.transmitter import CALIBRATION, Sticks, Switches, Transmitter, read_sticks, read_switches
+
+JOYSTICK = {"COM_RC_IN_MODE": 1}
+REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4, "COM_FLTMODE6": 8}
+MAVLINK_0, MAVLINK_1 = Source.MAVLINK, Source.MAVLINK + 1
+GROUND_STATION = (245, 190)
+
+
+def selector(mode: int, **values: float) -> ManualControl:
+    return ManualControl(Parameters({"COM_RC_IN_MODE": mode, **values}))
+
+
+@pytest.mark.parametrize(
+    ("mode", "order", "chosen"),
+    [
+        pytest.param(0, [MAVLINK_0, Source.REMOTE_CONTROL], Source.REMOTE_CONTROL, id="remote control only"),
+        pytest.param(0, [MAVLINK_0], None, id="remote control only, a joystick does not count"),
+        pytest.param(1, [Source.REMOTE_CONTROL, MAVLINK_1], MAVLINK_1, id="joystick only"),
+        pytest.param(1, [MAVLINK_1, MAVLINK_0], MAVLINK_1, id="joystick only, the first one stays"),
+        pytest.param(
+            2, [Source.REMOTE_CONTROL, MAVLINK_0], Source.REMOTE_CONTROL, id="either, as long as it lasts"
+        ),
+        pytest.param(3, [MAVLINK_0, Source.REMOTE_CONTROL], MAVLINK_0, id="the first forever"),
+        pytest.param(4, [Source.REMOTE_CONTROL, MAVLINK_0], None, id="disabled"),
+        pytest.param(
+            5, [MAVLINK_1, MAVLINK_0, Source.REMOTE_CONTROL], Source.REMOTE_CONTROL, id="remote control first"
+        ),
+        pytest.param(5, [MAVLINK_0, MAVLINK_1], MAVLINK_0, id="then joysticks ascending"),
+        pytest.param(
+            6, [Source.REMOTE_CONTROL, MAVLINK_1, MAVLINK_0], MAVLINK_0, id="joysticks ascending first"
+        ),
+        pytest.param(6, [MAVLINK_0, Source.REMOTE_CONTROL], MAVLINK_0, id="then the remote control"),
+        pytest.param(7, [MAVLINK_0, MAVLINK_1], MAVLINK_1, id="joysticks descending"),
+        pytest.param(
+            7, [MAVLINK_1, Source.REMOTE_CONTROL, MAVLINK_1], Source.REMOTE_CONTROL, id="remote, descending"
+        ),
+        pytest.param(
+            8, [MAVLINK_1, MAVLINK_0, Source.REMOTE_CONTROL], MAVLINK_1, id="joysticks descending first"
+        ),
+    ],
+)
+def test_com_rc_in_mode_decides_which_sticks_count(mode: int, order: list[int], chosen: int | None) -> None:
+    control = selector(mode)
+    for number, source in enumerate(order):
+        control.offer(Sticks(), source, 1.0 + 0.01 * number)
+    assert (control.source if control.valid else None) == chosen
+
+
+def test_another_source_takes_over_once_the_first_is_silent_unless_the_first_is_to_be_kept() -> None:
+    for mode, takes_over in ((2, True), (3, False)):
+        control = selector(mode)
+        control.offer(Sticks(), Source.REMOTE_CONTROL, 1.0)
+        control.offer(Sticks(), MAVLINK_0, 1.6)
+        assert control.valid is takes_over
+
+
+def test_sticks_expire_after_com_rc_loss_t() -> None:
+    control = selector(1, COM_RC_LOSS_T=0.5)
+    control.offer(Sticks(roll=0.5), MAVLINK_0, 1.0)
+    control.update(1.49)
+    assert control.valid
+    assert control.sticks.roll == 0.5
+    control.update(1.51)
+    assert not control.valid
+    assert control.sticks == Sticks()
+
+
+def test_sticks_that_creep_are_not_moved_and_sticks_that_are_pushed_are() -> None:
+    for step, moved in ((0.002, False), (0.02, True)):
+        control = selector(1)
+        for number in range(50):
+            control.offer(Sticks(pitch=step * number), MAVLINK_0, 1.0 + 0.02 * number)
+        assert control.take_moved() is moved
+        assert not control.take_moved()
+
+
+def test_the_arming_gesture_takes_a_second_in_the_corner() -> None:
+    control = selector(1)
+    asked = []
+    for number in range(80):
+        now_s = 1.0 + 0.02 * number
+        control.offer(Sticks(yaw=1.0, throttle=-1.0), MAVLINK_0, now_s)
+        asked += [(now_s, request) for request in control.update(now_s)]
+    assert [request.kind for _, request in asked] == [RequestKind.ARM]
+    assert asked[0][0] == pytest.approx(2.0, abs=0.03)
+    assert asked[0][1].by == "stick gesture"
+
+
+def test_switches_ask_once_and_the_first_frame_of_an_armed_vehicle_asks_nothing() -> None:
+    control = selector(0, COM_FLTMODE1=2, COM_FLTMODE2=4)
+    control.offer(Sticks(), Source.REMOTE_CONTROL, 1.0)
+    control.offer_switches(Switches(mode_slot=1, kill=False), armed=True)
+    assert control.update(1.0) == []
+    control.offer_switches(Switches(mode_slot=2, kill=True), armed=True)
+    requests = control.update(1.0)
+    assert [(request.kind, request.mode) for request in requests] == [
+        (RequestKind.SWITCH_MODE, Mode.HOLD),
+        (RequestKind.KILL, None),
+    ]
+    control.offer_switches(Switches(mode_slot=2, kill=False, back=True), armed=True)
+    control.offer_switches(Switches(mode_slot=2, kill=False, back=False), armed=True)
+    assert [(request.kind, request.mode) for request in control.update(1.0)] == [
+        (RequestKind.SWITCH_MODE, Mode.RTL),
+        (RequestKind.UNKILL, None),
+        (RequestKind.SWITCH_MODE, Mode.HOLD),  # the return switch off: back to the mode switch
+    ]
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.integers(1, 6), st.booleans())
+def test_what_a_transmitter_sends_is_read_back(positions: list[float], slot: int, kill: bool) -> None:
+    parameters = Parameters(CALIBRATION)
+    transmitter = Transmitter(parameters)
+    transmitter.sticks, transmitter.mode_slot, transmitter.kill = Sticks(*positions), slot, kill
+    widths = transmitter.channels()
+    sticks = read_sticks(widths, parameters)
+    assert sticks is not None
+    got = (sticks.roll, sticks.pitch, sticks.yaw, sticks.throttle)
+    assert got == pytest.approx(positions, abs=0.03)  # the dead zone is 2 % of the way
+    switches = read_switches(widths, parameters)
+    assert (switches.mode_slot, switches.kill, switches.back) == (slot, kill, False)
+
+
+@given(st.lists(st.integers(0, 65535), max_size=18))
+def test_any_channels_give_sticks_within_range_or_none(widths: list[int]) -> None:
+    parameters = Parameters(CALIBRATION)
+    sticks = read_sticks(widths, parameters)
+    read_switches(widths, parameters)
+    if sticks is not None:
+        assert all(abs(value) <= 1.0 for value in (sticks.roll, sticks.pitch, sticks.yaw, sticks.throttle))
+
+
+def test_a_position_of_the_mode_switch_without_a_mode_is_named() -> None:
+    transmitter = Transmitter(Parameters({"COM_FLTMODE3": 2}))
+    transmitter.select(Mode.POSCTL)
+    assert transmitter.mode_slot == 3
+    with pytest.raises(ValueError, match="COM_FLTMODE"):
+        transmitter.select(Mode.ACRO)
+
+
+# ---- on the vehicle
+
+
+def stick_message(pitch: int = 0, roll: int = 0, throttle: int = 500, yaw: int = 0, target: int = 1) -> Any:
+    return dialect.MAVLink_manual_control_message(target, pitch, roll, throttle, yaw, 0)
+
+
+def push(cockpit: Any, seconds: float, message: Any, until: Any = None) -> None:
+    """A joystick's stream at 25 Hz."""
+    end_s = cockpit.now_s + seconds
+    while cockpit.now_s < end_s - 1e-9 and not (until is not None and until()):
+        cockpit.send(message)
+        cockpit.fly(0.04)
+
+
+def events(cockpit: Any, name: str) -> list[Any]:
+    return [message for message in cockpit.received("EVENT") if message.id == event_identifier(name)]
+
+
+def test_a_vehicle_as_delivered_ignores_sticks(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    push(cockpit, 0.5, stick_message())
+    assert not cockpit.vehicle.autopilot.pilot_has_sticks
+    assert cockpit.mode == "HOLD"
+
+
+def test_a_joystick_before_any_mode_was_asked_for_makes_position_the_first_mode(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=JOYSTICK)
+    cockpit.wait_ready()
+    push(cockpit, 0.2, stick_message(target=7))
+    assert cockpit.mode == "HOLD"  # it was for another vehicle
+    push(cockpit, 0.2, stick_message())
+    assert cockpit.mode == "POSCTL"
+    assert cockpit.vehicle.autopilot.can_arm
+
+
+def test_sticks_arm_fly_and_disarm(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=JOYSTICK)
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.wait_ready()
+    push(cockpit, 0.2, stick_message())
+    push(cockpit, 1.5, stick_message(throttle=0, yaw=1000), until=lambda: cockpit.armed)
+    assert cockpit.armed
+    assert "Armed by stick gesture\t" in cockpit.texts()
+    push(cockpit, 8.0, stick_message(throttle=1000), until=lambda: cockpit.height_m > 3.0)
+    assert cockpit.height_m > 3.0
+    push(cockpit, 20.0, stick_message(throttle=0), until=lambda: cockpit.vehicle.autopilot.landed)
+    assert cockpit.vehicle.autopilot.landed
+    push(cockpit, 1.5, stick_message(throttle=0, yaw=-1000), until=lambda: not cockpit.armed)
+    assert not cockpit.armed
+    assert "Disarmed by stick gesture\t" in cockpit.texts()
+
+
+def test_arming_is_denied_where_the_throttle_would_surprise(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=JOYSTICK)
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.wait_ready()
+    push(cockpit, 1.2, stick_message(throttle=900))
+    assert cockpit.command(400, 1) == [1]
+    assert "Arming denied: throttle above center\t" in cockpit.texts()
+    cockpit.set_mode(7)
+    push(cockpit, 0.2, stick_message(throttle=500))
+    assert cockpit.command(400, 1) == [1]
+    assert "Arming denied: high throttle\t" in cockpit.texts()
+    cockpit.set_mode(4, 3)
+    push(cockpit, 1.2, stick_message(throttle=0, yaw=1000))
+    assert not cockpit.armed
+    assert "Arming denied: switch to manual mode first\t" in cockpit.texts()
+
+
+def test_losing_and_regaining_the_joystick_is_an_event(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=JOYSTICK)
+    cockpit.wait_ready()
+    push(cockpit, 0.2, stick_message())
+    lost_s = cockpit.until(lambda: bool(events(cockpit, "commander_rc_lost")), 2.0)
+    assert lost_s == pytest.approx(0.5, abs=0.1)
+    cockpit.fly(1.0)
+    push(cockpit, 0.2, stick_message())
+    assert len(events(cockpit, "commander_rc_regained")) == 1
+    assert any("manual control regained" in line for line in cockpit.events)
+
+
+def remote_cockpit(make_cockpit: Any, **values: float) -> Any:
+    cockpit = make_cockpit(parameters={**REMOTE_CONTROL, **values})
+    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
+    cockpit.vehicle.transmitter.on = True
+    return cockpit
+
+
+def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=REMOTE_CONTROL)
+    cockpit.fly(1.0)
+    assert cockpit.received("RC_CHANNELS") == []
+    cockpit.vehicle.transmitter.on = True
+    cockpit.vehicle.transmitter.sticks = Sticks(roll=1.0, throttle=-1.0)
+    cockpit.forget()
+    cockpit.fly(2.0)
+    channels = cockpit.received("RC_CHANNELS")
+    assert len(channels) == pytest.approx(40, abs=2)
+    last = channels[-1]
+    assert (last.chancount, last.chan1_raw, last.chan2_raw, last.chan3_raw) == (8, 2000, 1500, 1000)
+    assert last.chan9_raw == 65535
+    status = cockpit.received("SYS_STATUS")[-1]
+    assert status.onboard_control_sensors_present & status.onboard_control_sensors_health & 0x10000
+    cockpit.vehicle.transmitter.on = False
+    cockpit.fly(0.4)
+    cockpit.forget()
+    cockpit.fly(1.0)
+    assert cockpit.received("RC_CHANNELS") == []
+    assert not cockpit.received("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000
+
+
+def test_rc_channels_override_is_a_remote_control_like_any_other(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters=REMOTE_CONTROL)
+    cockpit.wait_ready()
+    widths = [1500, 1500, 1000, 1500, 1080, 1000, 1000, 65535]
+    message = dialect.MAVLink_rc_channels_override_message(1, 1, *widths, *[0] * 10)
+    for _ in range(10):
+        cockpit.send(message)
+        cockpit.fly(0.05)
+    assert cockpit.vehicle.autopilot.supervision.sticks.throttle == -1.0
+    assert cockpit.mode == "POSCTL"  # the first position of the mode switch, while disarmed
+    assert cockpit.received("RC_CHANNELS")[-1].chancount == 7
+
+
+def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_cockpit: Any) -> None:
+    cockpit = remote_cockpit(make_cockpit, COM_FLTMODE5=3)
+    transmitter = cockpit.vehicle.transmitter
+    cockpit.take_off()
+    transmitter.select(Mode.POSCTL)
+    cockpit.fly(0.1)
+    transmitter.mode_slot = 4
+    cockpit.fly(0.1)
+    assert cockpit.mode == "HOLD"
+    transmitter.select(Mode.STABILIZED)
+    cockpit.fly(0.1)
+    assert cockpit.mode == "STABILIZED"
+    transmitter.mode_slot = 1
+    cockpit.fly(0.1)
+    assert cockpit.mode == "POSCTL"
+    transmitter.mode_slot = 5
+    cockpit.fly(0.1)
+    assert cockpit.mode == "POSCTL"
+    assert "Switching to Mission is currently not available\t" in cockpit.texts()
+
+
+def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_cockpit: Any) -> None:
+    cockpit = remote_cockpit(make_cockpit, COM_DISARM_LAND=-1)
+    cockpit.take_off(6.0)
+    cockpit.vehicle.transmitter.kill = True
+    cockpit.until(lambda: "kill switch engaged" in cockpit.events, 1.0)
+    cockpit.fly(0.02)
+    assert "Kill engaged\t" in cockpit.texts()
+    fell_s = cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 4.0)
+    assert fell_s < 2.5
+    assert cockpit.armed
+    rest_s = cockpit.until(lambda: not cockpit.armed, 6.0)
+    assert fell_s + rest_s == pytest.approx(5.0, abs=0.2)
+    assert "Disarmed by kill-switch\t" in cockpit.texts()
+    assert not cockpit.vehicle.autopilot.can_arm
+    assert cockpit.command(400, 1) == [1]
+    assert "Preflight Fail: Kill switch engaged" in cockpit.texts()
+    cockpit.vehicle.transmitter.kill = False
+    cockpit.fly(0.2)
+    assert "Kill disengaged\t" in cockpit.texts()
+    assert cockpit.vehicle.autopilot.can_arm
+
+
+def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(make_cockpit: Any) -> None:
+    cockpit = remote_cockpit(make_cockpit)
+    cockpit.take_off(15.0)
+    cockpit.vehicle.transmitter.kill = True
+    cockpit.fly(0.4)
+    cockpit.vehicle.transmitter.kill = False
+    cockpit.fly(5.0)
+    assert cockpit.armed
+    assert cockpit.height_m > 8.0
