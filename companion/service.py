@@ -17,7 +17,9 @@ from typing import Any
 from companion.bus import topics
 from companion.bus.session import Bus
 from companion.guidance import grammar
+from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.commands import Command
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
@@ -172,14 +174,14 @@ class Service:
             return {"command": text, "success": False, "reason": reason}
         try:
             command = grammar.parse(text, self._class_names())
-        except grammar.GrammarError as error:
+        except GrammarError as error:
             return {"command": text, "success": False, "reason": str(error)}
         self._event("info", f"command: {command}")
         outcome = await self._outcome_of(command)
         self._event("info" if outcome.success else "warning", f"{command}: {outcome.reason}")
         return {"command": str(command), **asdict(outcome)}
 
-    async def _outcome_of(self, command: grammar.Command) -> Outcome:
+    async def _outcome_of(self, command: Command) -> Outcome:
         behaviour = behaviour_for(command)
         ended = self.pilot.command(behaviour)
         if ended.done() or not command.endless:

@@ -12,6 +12,7 @@ import typer
 
 from companion.cli import app as companion_app
 from companion.guidance import grammar
+from companion.guidance.commands import COMMANDS
 from mavlink_sim.cli import app as simulator_app
 from mavlink_sim.dataset_cli import app as dataset_app
 
@@ -93,4 +94,4 @@ def test_every_file_in_the_architecture_exists() -> None:
 def test_every_flight_command_in_the_table_is_read_and_every_one_there_is_stands_in_it() -> None:
     rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "flight.md").read_text(), re.MULTILINE)
     commands = [grammar.parse(text) for row in rows for text in re.findall(r"`([^`]+)`", row)]
-    assert {type(command) for command in commands} == set(grammar.COMMANDS.values())
+    assert {type(command) for command in commands} == set(COMMANDS.values())

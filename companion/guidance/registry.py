@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.guidance import grammar
+from companion.guidance import commands
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.figure_eight import FigureEightBehaviour
@@ -18,29 +18,29 @@ from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 
 
-def behaviour_for(command: grammar.Command) -> Behaviour:
+def behaviour_for(command: commands.Command) -> Behaviour:
     """A new behaviour, ready for the pilot. Raises TypeError for a command no behaviour is written for."""
     match command:
-        case grammar.Takeoff(altitude_m):
+        case commands.Takeoff(altitude_m):
             return TakeoffBehaviour(altitude_m)
-        case grammar.Land():
+        case commands.Land():
             return LandBehaviour()
-        case grammar.Rtl():
+        case commands.Rtl():
             return ReturnBehaviour()
-        case grammar.Stop():
+        case commands.Stop():
             return StopBehaviour()
-        case grammar.Hold(duration_s):
+        case commands.Hold(duration_s):
             return HoldBehaviour(duration_s)
-        case grammar.Goto():
+        case commands.Goto():
             return _goto(command)
-        case grammar.FollowPath(_, speed_mps, laps, nose):
+        case commands.FollowPath(_, speed_mps, laps, nose):
             return FollowPathBehaviour(command.places, speed_mps, laps=laps, nose_along=nose == "along")
-        case grammar.FigureEight(radius_m, speed_mps, laps, nose):
+        case commands.FigureEight(radius_m, speed_mps, laps, nose):
             return FigureEightBehaviour(radius_m, speed_mps, laps, nose_along=nose == "along")
-        case grammar.Orbit(class_name, radius_m, speed_mps, laps, direction):
+        case commands.Orbit(class_name, radius_m, speed_mps, laps, direction):
             clockwise = direction == "clockwise"
             return OrbitBehaviour(radius_m, speed_mps, laps, clockwise=clockwise, class_name=class_name)
-        case grammar.Seek(class_name, laps, rate_radps, confidence, direction):
+        case commands.Seek(class_name, laps, rate_radps, confidence, direction):
             return SeekBehaviour(
                 class_name,
                 laps=laps,
@@ -48,7 +48,7 @@ def behaviour_for(command: grammar.Command) -> Behaviour:
                 confidence=confidence,
                 clockwise=direction == "clockwise",
             )
-        case grammar.Approach(class_name, distance_m, speed_mps, confidence, lost_timeout_s):
+        case commands.Approach(class_name, distance_m, speed_mps, confidence, lost_timeout_s):
             return ApproachBehaviour(
                 class_name,
                 distance_m=distance_m,
@@ -59,7 +59,7 @@ def behaviour_for(command: grammar.Command) -> Behaviour:
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 
 
-def _goto(command: grammar.Goto) -> GotoBehaviour:
+def _goto(command: commands.Goto) -> GotoBehaviour:
     heading = command.heading_deg
     return GotoBehaviour(
         from_home_m=_pair(command.north_m, command.east_m),

@@ -5,12 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance import grammar
-from companion.guidance.grammar import (
+from companion.guidance.arguments import GrammarError
+from companion.guidance.commands import (
     COMMANDS,
     Approach,
     Command,
-    GrammarError,
     Hold,
     Land,
     Orbit,
@@ -18,9 +17,9 @@ from companion.guidance.grammar import (
     Seek,
     Stop,
     Takeoff,
-    describe,
-    parse,
+    arguments_of,
 )
+from companion.guidance.grammar import describe, parse
 from companion.guidance.registry import behaviour_for
 
 NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
@@ -170,7 +169,7 @@ def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text):
 
 def test_every_field_of_every_command_has_its_place_in_the_grammar():
     for kind in COMMANDS.values():
-        assert len(grammar._arguments(kind)) == len(fields(kind))
+        assert len(arguments_of(kind)) == len(fields(kind))
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from kinematic_vehicle import Flight, KinematicVehicle
 
 from companion.guidance import grammar
+from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Outcome, Situation
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour, lemniscate
@@ -261,7 +262,7 @@ def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_
     ],
 )
 def test_what_cannot_be_meant_is_one_line(text, words):
-    with pytest.raises(grammar.GrammarError, match=words):
+    with pytest.raises(GrammarError, match=words):
         grammar.parse(text)
 
 
