@@ -474,6 +474,9 @@ class Autopilot:
 
     def follow_failsafes(self, mode: Mode) -> None:
         """Fly the mode that the failsafes have decided on."""
+        if mode is not self.mode and self.landed and isinstance(self.task, position_failsafe.Descend):
+            self.adopt_intention(Mode.LAND)  # it came down blindly: a position is no reason to rise again
+            mode = self.supervision.run_failsafes()
         if mode is not self.mode:
             self._enter(mode)
 

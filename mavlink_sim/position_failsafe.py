@@ -4,8 +4,9 @@ A mode that needs a position is refused, and left if it is flown: Position falls
 sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
 (that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
 OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
-When the position comes back in the air, the mode that was wanted is flown again. Which mode that makes is the
-choice of `failsafes`; here is what it has to know, and how to come down.
+When the position comes back in the air, the mode that was wanted is flown again; a vehicle that came down
+blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how to
+come down.
 """
 
 from __future__ import annotations
@@ -61,5 +62,7 @@ def landing_task(autopilot: Autopilot) -> Task:
 def keep_landing(autopilot: Autopilot) -> None:
     """A landing goes on blindly when the position is lost, and at one place when it is back."""
     descending = isinstance(autopilot.task, Descend)
+    if descending and autopilot.landed:
+        return  # it is down
     if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
         autopilot.task = landing_task(autopilot)

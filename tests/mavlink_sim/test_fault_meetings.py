@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect
-from mavlink_sim.modes import Mode
 
-DO_SET_MODE, LAND, RTL, ARM, ORBIT, CHANGE_ALTITUDE, SET_HOME = 176, 21, 20, 400, 34, 186, 179
+ORBIT, CHANGE_ALTITUDE, SET_HOME = 34, 186, 179
+RETURN_ACTION, TERMINATE_ACTION = 3, 4  # GF_ACTION
 
 
 def begin(cockpit: Any, line: str) -> int:
@@ -34,46 +33,76 @@ def position_comes_back(cockpit: Any) -> None:
 # ---- a lost position and failsafes
 
 
+def breach_the_fence(cockpit: Any, action: int, waits_s: float = 0.0) -> None:
+    """Too high for a moment; what GF_ACTION asks for then lasts longer than the breach."""
+    parameters = cockpit.vehicle.parameters
+    parameters.set("COM_FAIL_ACT_T", waits_s)
+    parameters.set("GF_ACTION", action)
+    parameters.set("GF_MAX_VER_DIST", 2.0)
+    cockpit.until(lambda: cockpit.vehicle.autopilot.failsafe, 5.0)
+    parameters.set("GF_MAX_VER_DIST", 0.0)
+    cockpit.fly(0.1)
+
+
+def task_of(cockpit: Any) -> str:
+    return type(cockpit.vehicle.autopilot.task).__name__
+
+
 def test_a_latched_failsafe_goes_on_when_the_position_is_back(cockpit) -> None:
     cockpit.take_off(30.0)
-    cockpit.vehicle.autopilot.enter_failsafe(Mode.RTL)
+    breach_the_fence(cockpit, RETURN_ACTION)
+    assert cockpit.mode == "RTL"
     lose_position(cockpit)
-    assert cockpit.mode == "LAND"
+    assert (cockpit.mode, task_of(cockpit)) == ("LAND", "Descend")
     position_comes_back(cockpit)
     assert cockpit.mode == "RTL"
-    assert cockpit.vehicle.autopilot.failsafe_is_latched
     assert cockpit.vehicle.autopilot.failsafe
+    cockpit.fly(5.0)
+    assert cockpit.mode == "RTL"
 
 
 def test_a_failsafe_without_a_position_sinks_and_returns_when_it_is_back(cockpit) -> None:
     cockpit.take_off(40.0)
     lose_position(cockpit)
-    cockpit.vehicle.autopilot.enter_failsafe(Mode.RTL)
-    assert cockpit.mode == "LAND"
-    assert type(cockpit.vehicle.autopilot.task).__name__ == "Descend"
+    cockpit.vehicle.parameters.set("COM_FAIL_ACT_T", 0.0)
+    cockpit.vehicle.autopilot.supervision.conditions.flight_time_exceeded = True
+    cockpit.fly(0.1)
+    assert (cockpit.mode, task_of(cockpit)) == ("LAND", "Descend")
     position_comes_back(cockpit)
     assert cockpit.mode == "RTL"
 
 
-def test_a_vehicle_that_landed_blindly_stays_down_when_the_position_is_back(cockpit) -> None:
+@pytest.mark.parametrize("mode", ["HOLD", "TAKEOFF", "OFFBOARD", "RTL by the fence"])
+def test_a_vehicle_that_landed_blindly_stays_down_when_the_position_is_back(
+    cockpit, position_setpoint, mode
+) -> None:
+    up = position_setpoint(0.0, 0.0, -20.0)
     cockpit.take_off(4.0)
     cockpit.vehicle.parameters.set("COM_DISARM_LAND", 30.0)
-    lose_position(cockpit)
-    cockpit.until(lambda: cockpit.vehicle.autopilot.landed, 30.0)
-    position_comes_back(cockpit)
-    cockpit.fly(5.0)
+    if mode == "TAKEOFF":
+        assert cockpit.command(22, math.nan, 0, 0, math.nan, math.nan, math.nan, 489.4 + 40.0) == [0]
+    elif mode == "OFFBOARD":
+        cockpit.offboard(position_setpoint(0.0, 0.0, -4.0))
+    elif mode != "HOLD":
+        breach_the_fence(cockpit, RETURN_ACTION)
+    cockpit.vehicle.faults.begin("gps_loss")
+    cockpit.until(lambda: task_of(cockpit) == "Descend", 6.0, position_setpoint(0.0, 0.0, -4.0))
+    cockpit.until(lambda: cockpit.vehicle.autopilot.landed, 60.0, up)
+    cockpit.vehicle.faults.end("gps_loss")
+    cockpit.until(lambda: cockpit.vehicle.autopilot.position_valid, 2.0, up)
+    cockpit.fly(6.0, up)
+    assert cockpit.armed
     assert cockpit.vehicle.autopilot.landed
     assert cockpit.height_m < 0.1
 
 
 def test_a_terminated_flight_is_disarmed_once_it_is_down(cockpit) -> None:
     cockpit.take_off(5.0)
-    cockpit.vehicle.autopilot.terminate()
-    cockpit.fly(0.5)
+    breach_the_fence(cockpit, TERMINATE_ACTION)
+    assert cockpit.vehicle.autopilot.terminated
     assert cockpit.armed
     cockpit.until(lambda: not cockpit.armed, 15.0)
     assert cockpit.vehicle.autopilot.landed
-    assert not cockpit.vehicle.autopilot.terminated
 
 
 @pytest.mark.parametrize(
