@@ -77,7 +77,7 @@ class Autopilot:
         self.mode = Mode.HOLD
         self.intended_mode = Mode.HOLD
         self.failsafe = False
-        self.landed = True
+        self.landed = airframe.on_ground  # it may boot while it falls
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
         self.home: Vector = airframe.position
         self.texts: deque[Text] = deque()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from mavlink_sim.estimator import Estimate
@@ -72,6 +72,19 @@ class FallibleEstimate(Estimate):
             self._errors[number] = (position_m, velocity_mps, yaw_rad)
         self.offset = _sum(error[0] for error in self._errors.values())
         self._yaw_error_rad = sum(error[2] for error in self._errors.values())
+
+    def restart(self, faults: Collection[int]) -> None:
+        """A new start of the filter; what the faults of these numbers spoil is spoiled from the beginning."""
+        for number in [number for number in self._errors if number not in faults]:
+            self.set_error(number, None)
+        self.reset_counter = 0
+        self.held_xy_m = None
+        self.update(0.0)
+        self.position_valid = not self.fix_lost
+        if self.fix_lost:
+            x, y, _ = self.position
+            self.held_xy_m = (x, y)
+            self.update(0.0)
 
     def count_reset(self, resets: int = 1) -> None:
         """The estimate jumped."""

@@ -7,7 +7,7 @@ import random
 from typing import TYPE_CHECKING
 
 from mavlink_sim.announcements import Text
-from mavlink_sim.autopilot import TEMPORARILY_REJECTED, Autopilot
+from mavlink_sim.autopilot import TEMPORARILY_REJECTED
 from mavlink_sim.estimate_errors import ZERO
 from mavlink_sim.fault_grammar import FaultError
 from mavlink_sim.flight import Trajectory
@@ -266,32 +266,11 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
 
 
 def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
-    """Power was lost for a moment: disarmed, deaf and silent for a while, then a new boot.
-
-    Kept: parameters, mission, fence, rally points, position, battery. Forgotten: modes, home, the rates of
-    streams, who was heard.
-    """
+    """Power was lost for a moment: `Vehicle.reboot`, deaf and silent until PX4 has started."""
     faults = vehicle.faults
     one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])
     faults.deaf = True
-    faults.boot_offset_us = -vehicle.boot_us
-    vehicle.forget_boot()
-    stored, pilot = vehicle.autopilot.navigator, vehicle.autopilot.supervision
-    # the same object starts anew: others hold on to it
-    Autopilot.__init__(
-        vehicle.autopilot,
-        vehicle.estimate,
-        vehicle.parameters,
-        ready_after_s=vehicle.ready_after_s,
-        on_event=vehicle.autopilot._on_event,
-    )
-    vehicle.autopilot.position_valid = vehicle.estimate.position_valid
-    # neither the battery nor what the pilot holds is part of the autopilot
-    vehicle.autopilot.supervision.battery = pilot.battery
-    vehicle.autopilot.supervision.transmitter = pilot.transmitter
-    vehicle.autopilot.pilot_has_sticks = pilot.pilot_attached
-    navigator = vehicle.autopilot.navigator
-    navigator.plans, navigator.mission, navigator.fence = stored.plans, stored.mission, stored.fence
+    vehicle.reboot()
 
     def undo() -> None:
         faults.deaf = any(each.fault.kind.name == "reboot" for each in faults.active)

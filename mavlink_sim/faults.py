@@ -26,6 +26,7 @@ from mavlink_sim.fault_effects_link import chosen_links
 from mavlink_sim.fault_effects_messages import shifted
 from mavlink_sim.fault_grammar import Fault, FaultError, parse_fault
 from mavlink_sim.fault_kinds import EFFECTS, KINDS
+from mavlink_sim.geography import start_of_vehicle
 from mavlink_sim.link_faults import LinkStage
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class ActiveFault:
         begins_s, ends_s: on the faults' clock; `ends_s` is infinite without a duration.
         undo: what sets things right again when it ends, last first.
         each_step: called with the step's seconds while it is active.
+        apart: it is not of the vehicle itself, and goes on while that stands still.
     """
 
     number: int
@@ -61,6 +63,7 @@ class ActiveFault:
     active: bool = False
     undo: list[Callable[[], object]] = field(default_factory=list)
     each_step: Callable[[float], None] | None = None
+    apart: bool = False
 
     def __str__(self) -> str:
         return f"{self.number} {self.fault}"
@@ -82,7 +85,6 @@ class Faults:
         refusals: asked before each command is carried out; by fault number.
         gates: every message the vehicle sends goes through these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
-        stalled_us: how long the vehicle stood still in all.
         second: other autopilots on the same links; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
@@ -95,7 +97,6 @@ class Faults:
         self.gates: dict[int, Gate] = {}
         self.refusals: dict[int, Refusal] = {}
         self.boot_offset_us = 0
-        self.stalled_us = 0
         self.second: dict[int, Vehicle] = {}
         self.winds: dict[int, Vector] = {}
         self.pace = 1.0
@@ -106,6 +107,7 @@ class Faults:
         self._all: dict[int, ActiveFault] = {}
         self._stages: dict[str, LinkStage] = {}
         self._held: list[tuple[str, Any]] = []
+        self._reads_held = False
 
     # ---- for whoever makes faults -----------------------------------------------------------------------
 
@@ -113,6 +115,11 @@ class Faults:
     def now_s(self) -> float:
         """Simulated seconds since the vehicle was made."""
         return self._elapsed_us / 1e6
+
+    @property
+    def elapsed_us(self) -> int:
+        """The same in microseconds."""
+        return self._elapsed_us
 
     @property
     def active(self) -> list[ActiveFault]:
@@ -231,35 +238,43 @@ class Faults:
                 self._start_scheduled(one)
             elif one.active and one.ends_s <= now_s:
                 self._finish(one)
+        stands_still = False
         if self.pace < 1.0:
             self._credit += self.pace
             if self._credit < 1.0:
-                self.stalled_us += round(dt_s * 1e6)
-                return True
-            self._credit -= 1.0
+                stands_still = True
+            else:
+                self._credit -= 1.0
         for one in list(self._all.values()):
-            if one.active and one.each_step is not None:
+            if one.active and one.each_step is not None and (one.apart or not stands_still):
                 one.each_step(dt_s)
+        if stands_still:
+            return True
         if self.winds:
             self.vehicle.reload_wind(self.winds.values())
         return False
 
     def intercepts(self, link: str, message: Any) -> bool:
         """Whether a message that arrived is not for the vehicle to handle now."""
+        if not self._reads_held:  # the others have heard those
+            for other in self.second.values():
+                other.handle(link, message)
+            if self.second:
+                start_of_vehicle.set(self.vehicle.start_ned_m)
         if self.deaf:
             return True
         if self.pace == 0.0:
             self._held.append((link, message))
             return True
-        for other in self.second.values():
-            other.handle(link, message)
         return False
 
     def take_in_held(self) -> None:
         """What lay in the sockets of a frozen vehicle is all read when it goes on."""
         held, self._held = self._held, []
+        self._reads_held = True
         for link, message in held:
             self.vehicle.handle(link, message)
+        self._reads_held = False
 
     def gate(self, link: Link, message: Any) -> Any:
         """The message that is sent in place of this one; None: nothing."""
@@ -272,8 +287,8 @@ class Faults:
         estimate = self.vehicle.estimate
         if estimate.reset_counter or estimate.fix_lost:
             message = as_told(estimate, message)
-        if self.boot_offset_us or self.stalled_us:
-            message = shifted(message, self.boot_offset_us, self.boot_offset_us - self.stalled_us)
+        if self.boot_offset_us:
+            message = shifted(message, self.boot_offset_us)
         return message
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:

@@ -111,6 +111,11 @@ class LockstepVehicle:
         """Simulated seconds since boot."""
         return self.vehicle.now_s
 
+    @property
+    def _elapsed_s(self) -> float:
+        """Since it was made: goes on through a reboot and a standstill."""
+        return self.vehicle.faults.now_s
+
     def step(self, dt_s: float) -> None:
         """Let simulated time pass, in steps of 4 ms; a remainder waits for the next call.
 
@@ -131,7 +136,7 @@ class LockstepVehicle:
         left = int(self._owed_s / STEP_S + 1e-6)
         self._owed_s -= left * STEP_S
         while left > 0:
-            now_s = self.now_s
+            now_s = self._elapsed_s
             for repeated in self._repeated:
                 if repeated.next_s <= now_s + 1e-9:
                     repeated.send(self)
@@ -162,9 +167,9 @@ class LockstepVehicle:
         Raises:
             NotReachedError: not within `limit_s` simulated seconds.
         """
-        started_s = self.now_s
+        started_s = self._elapsed_s
         while not condition(self.truth):
-            if self.now_s - started_s >= limit_s:
+            if self._elapsed_s - started_s >= limit_s:
                 truth = self.truth
                 raise NotReachedError(
                     f"not reached within {limit_s:g} s of simulated time: mode {truth.mode}, "
@@ -172,7 +177,7 @@ class LockstepVehicle:
                     f"events so far: {', '.join(self.events[-6:]) or 'none'}"
                 )
             self.step(every_s)
-        return self.now_s - started_s
+        return self._elapsed_s - started_s
 
     # ---- messages ---------------------------------------------------------------------------------------
 
@@ -198,7 +203,7 @@ class LockstepVehicle:
         self, message: Any, rate_hz: float, link: str = "", source: tuple[int, int] = COMPANION
     ) -> Repeat:
         """Send this message at a rate for as long as time passes (setpoints, heartbeats); `stop` ends it."""
-        repeated = _Repeated(message, 1.0 / rate_hz, self.now_s, link, source)
+        repeated = _Repeated(message, 1.0 / rate_hz, self._elapsed_s, link, source)
         self._repeated.append(repeated)
         return Repeat(self._repeated, repeated)
 
@@ -231,8 +236,8 @@ class LockstepVehicle:
         system = self.vehicle.system_id
         self._answers.clear()
         self.send(dialect.MAVLink_command_long_message(system, 1, identifier, 0, *values))
-        started_s = self.now_s
-        while (waited_s := self.now_s - started_s) < ANSWER_LIMIT_S:
+        started_s = self._elapsed_s
+        while (waited_s := self._elapsed_s - started_s) < ANSWER_LIMIT_S:
             results = [result for command, result in self._answers if command == identifier]
             if results and (identifier != _SET_MODE or waited_s > SECOND_ANSWER_S):
                 return _RESULTS[results[-1]] if results[-1] < len(_RESULTS) else str(results[-1])

@@ -5,8 +5,8 @@ sticks, every other mode to Descend, because Return and Land need a position too
 (that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
 OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
 When the position comes back in the air, the mode that was wanted is flown again; a vehicle that came down
-blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how to
-come down.
+blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how
+to come down.
 """
 
 from __future__ import annotations

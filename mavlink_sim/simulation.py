@@ -121,7 +121,7 @@ class Simulation:
             gimbal=options.gimbal,
             on_event=on_event,
         )
-        self.vehicle.clock_ns = self._clock_ns
+        self.vehicle.clock_ns = self._boot_clock_ns
         self.vehicle.utc_ns = time.time_ns
         self._stopped = False
         self._started_ns = time.monotonic_ns()
@@ -206,8 +206,12 @@ class Simulation:
         self._stopped = True
 
     def _clock_ns(self) -> int:
-        """Time since the vehicle's boot at this very moment, between the physics steps too."""
+        """Simulated time at this very moment, between the physics steps too."""
         return int((time.monotonic_ns() - self._started_ns) * self.options.speed)
+
+    def _boot_clock_ns(self) -> int:
+        """The same since the vehicle's boot, without the time that it stood still."""
+        return self._clock_ns() - (self.vehicle.faults.elapsed_us - self.vehicle.boot_us) * 1000
 
     def run(self) -> None:
         """Run until `stop`."""

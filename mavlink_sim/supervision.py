@@ -80,6 +80,11 @@ class Supervision:
         self._disarmed_s = -math.inf
         self._told_in_failsafe = (Action.NONE, Mode.HOLD)
 
+    def keep_equipment(self, before: Supervision) -> None:
+        """A reboot: neither the battery nor what the pilot holds is part of the autopilot."""
+        self.battery, self.transmitter = before.battery, before.transmitter
+        self.pilot_attached = before.pilot_attached
+
     # ---- what others read -------------------------------------------------------------------------------
 
     @property

@@ -101,24 +101,29 @@ class Vehicle:
         self.airframe.on_touch = self._touched
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
-        self.events = EventBuffer()
         self.files = vehicle_files(self.parameters)
         self._signing_streams: Streams = {}
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
-        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self._boot_us * 1000
+        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self.faults.elapsed_us * 1000
         self.start_ned_m = start_ned_m
         self._on_event = on_event or (lambda text: None)
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
-        self.autopilot = Autopilot(
-            self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
-        )
+        self._leftover_s = 0.0
+        self._wind_revision = -1
+        self._boot()
         self.gimbal_manager = GimbalManager(self) if gimbal else None
+
+    def _boot(self) -> None:
+        """Everything that begins with power: whatever is set here does not survive a reboot."""
         self._boot_us = 0
         self._steps_to_control = 0
-        self._leftover_s = 0.0
+        self.autopilot = Autopilot(
+            self.estimate, self.parameters, ready_after_s=self.ready_after_s, on_event=self._on_event
+        )
+        self.autopilot.position_valid = self.estimate.position_valid
+        self.events = EventBuffer()
         self._ping_sequence = itertools.count()
-        self._wind_revision = -1
         self._companion_seen_s: float | None = None
         self._companion_lost = False
         self._origin_told = False
@@ -267,14 +272,23 @@ class Vehicle:
         elif down_mps > HARD_LANDING_MPS:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
-    def forget_boot(self) -> None:
-        """What does not survive a reboot, outside the autopilot."""
-        self._later.clear()
-        self._companion_seen_s, self._companion_lost, self._origin_told = None, False, False
-        self.events = EventBuffer()
-        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
+    def reboot(self) -> None:
+        """Power was lost for a moment: the motors are off, and time since boot begins anew.
+
+        What is stored stays: parameters, plans with the current mission item, signing keys. So does what is
+        no part of the autopilot: the airframe, the battery, the gimbal, what the pilot holds. `autopilot` is
+        another object afterwards.
+        """
+        before = self.autopilot
+        self.estimate.restart([one.number for one in self.faults.active])
+        self._boot()
+        self.autopilot.navigator.take_stored(before.navigator)
+        self.autopilot.supervision.keep_equipment(before.supervision)
         for link in self.links.values():
-            link.forget(self._boot_us)
+            link.forget()
+        if self.gimbal_manager is not None:
+            gimbal, self.gimbal_manager = self.gimbal_manager.gimbal, GimbalManager(self)
+            self.gimbal_manager.gimbal = gimbal
 
     def reload_wind(self, more: Iterable[Vector] = ()) -> None:
         """The wind of SIH_WIND_N and SIH_WIND_E, and what else blows."""
