@@ -90,9 +90,9 @@ class FallibleEstimate(Estimate):
         """The estimate jumped."""
         self.reset_counter = (self.reset_counter + resets) & 0xFF
 
-    def update(self, dt_s: float) -> None:
-        """Look at the truth again, `dt_s` later."""
-        Estimate.update(self, dt_s)  # at every step: super() would be twice as dear
+    def look(self) -> None:
+        """Look at the truth, with every error of this moment."""
+        Estimate.look(self)  # super() would be twice as dear
         if self.held_xy_m is not None:
             self.position = (*self.held_xy_m, self.position[2])
             self.velocity = (0.0, 0.0, self.velocity[2])

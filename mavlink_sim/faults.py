@@ -85,6 +85,7 @@ class Faults:
         refusals: asked before each command is carried out; by fault number.
         gates: every message the vehicle sends goes through these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
+        elapsed_us: `now_s` in microseconds.
         second: other autopilots on the same links; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
@@ -101,7 +102,7 @@ class Faults:
         self.winds: dict[int, Vector] = {}
         self.pace = 1.0
         self._seed = seed
-        self._elapsed_us = 0
+        self.elapsed_us = 0
         self._credit = 0.0
         self._count = 0
         self._all: dict[int, ActiveFault] = {}
@@ -114,12 +115,7 @@ class Faults:
     @property
     def now_s(self) -> float:
         """Simulated seconds since the vehicle was made."""
-        return self._elapsed_us / 1e6
-
-    @property
-    def elapsed_us(self) -> int:
-        """The same in microseconds."""
-        return self._elapsed_us
+        return self.elapsed_us / 1e6
 
     @property
     def active(self) -> list[ActiveFault]:
@@ -229,10 +225,11 @@ class Faults:
 
     def step(self, dt_s: float) -> bool:
         """Time passes: begin and end what is due. True: the vehicle itself stands still in this step."""
-        self._elapsed_us += int(dt_s * 1e6 + 0.5)
+        self.elapsed_us += int(dt_s * 1e6 + 0.5)
         if not self._all:
             return False
         now_s = self.now_s + 1e-9
+        self.vehicle.estimate.look()
         for one in list(self._all.values()):
             if not one.active and one.begins_s <= now_s:
                 self._start_scheduled(one)

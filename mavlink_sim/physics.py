@@ -246,7 +246,9 @@ class Multirotor:
             wanted = self._rate_demand
         p, q, r = rates
         u0, u1, u2, u3 = mixed_thrusts(thrust / MAX_THRUST_MPS2, wanted, rates, self._spin)
-        blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
+        blend = dt_s / ROTOR_TIME_CONSTANT_S
+        if blend > 1.0:
+            blend = 1.0
         t0, t1, t2, t3 = self.rotor_thrusts
         e0, e1, e2, e3 = (0.0, 0.0, 0.0, 0.0) if self.crashed else self.rotor_effectiveness
         t0 += (ROTOR_THRUST_MPS2 * u0 * e0 - t0) * blend

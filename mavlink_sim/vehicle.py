@@ -248,6 +248,7 @@ class Vehicle:
         while self._leftover_s >= STEP_S - 1e-9:
             self._leftover_s -= STEP_S
             self._step()
+        self.estimate.look()
 
     def after(self, delay_s: float, action: Callable[[], None]) -> None:
         """Do something in a later step."""
@@ -305,20 +306,24 @@ class Vehicle:
         if self.faults.step(STEP_S):
             return
         self._boot_us += STEP_US
-        while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
-            heapq.heappop(self._later)[2]()
+        estimate = self.estimate  # it looks at the truth when somebody is about to read it
+        if self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
+            estimate.look()
+            while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
+                heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self.reload_wind(self.faults.winds.values())
         self._steps_to_control -= 1
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
+            estimate.look()
             self.autopilot.update(CONTROL_STEP_S)
             mission_link.update(self)
             if self.gimbal_manager is not None:
                 self.gimbal_manager.step(CONTROL_STEP_S)
             self._watch_companion()
         self.airframe.advance(STEP_S)
-        self.estimate.update(STEP_S)
+        estimate.age(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
@@ -327,11 +332,13 @@ class Vehicle:
             self._tell()
         for link in self.links.values():
             if link.streams.next_us <= self._boot_us:
+                estimate.look()
                 for name in link.streams.due(self._boot_us):
                     self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
-            file_transfer.continue_transfer(link, self.now_s)
+            if link.file_transfer is not None:
+                file_transfer.continue_transfer(link, self.now_s)
 
     def _watch_companion(self) -> None:
         seen = self._companion_seen_s
