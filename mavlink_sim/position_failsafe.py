@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mavlink_sim.control import NAN, TrajectorySetpoint
+from mavlink_sim.control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight import Land, Task
 from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
@@ -48,8 +48,10 @@ def needs_position(mode: Mode) -> bool:
 
 def asks_for_position(setpoint: object) -> bool:
     """Whether an offboard setpoint needs the horizontal position or velocity (attitude setpoints do not)."""
-    wanted = (*getattr(setpoint, "position", ()), *getattr(setpoint, "velocity", ()))
-    return any(value == value for value in wanted)
+    for x, y, z in (getattr(setpoint, "position", NOTHING), getattr(setpoint, "velocity", NOTHING)):
+        if x == x or y == y or z == z:
+            return True
+    return False
 
 
 def landing_task(autopilot: Autopilot) -> Task:
