@@ -60,6 +60,7 @@ class Multirotor:
         quaternion: `ned_from_body`, (w, x, y, z), of length 1.
         rates: body angular rates about FRD, rad/s.
         rotor_thrusts: of each rotor per vehicle mass, m/s².
+        rotor_commands: what each rotor is asked for, 0..1 of its thrust.
         rotor_effectiveness: 0..1 for each rotor; 0 is a dead one. See `fail_motor`.
         on_ground: touching the ground.
         crashed: it hit the ground too hard or upside down: the rotors are broken.
@@ -84,6 +85,7 @@ class Multirotor:
         "position",
         "quaternion",
         "rates",
+        "rotor_commands",
         "rotor_effectiveness",
         "rotor_thrusts",
         "touchdown_mps",
@@ -98,6 +100,7 @@ class Multirotor:
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self.rates: Vector = _STILL
         self.rotor_thrusts: Rotors = (0.0, 0.0, 0.0, 0.0)
+        self.rotor_commands: Rotors = (0.0, 0.0, 0.0, 0.0)
         self.rotor_effectiveness: Rotors = (1.0, 1.0, 1.0, 1.0)
         self.on_ground = True
         self.crashed = False
@@ -227,6 +230,8 @@ class Multirotor:
         if self.on_ground:
             blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
             share = 0.0 if self.crashed else min(max(thrust, 0.0), MAX_THRUST_MPS2) / 4.0
+            command = share / ROTOR_THRUST_MPS2
+            self.rotor_commands = (command, command, command, command)
             lift = 0.0
             thrusts = []
             for now, whole in zip(self.rotor_thrusts, self.rotor_effectiveness, strict=True):
@@ -245,7 +250,9 @@ class Multirotor:
         else:
             wanted = self._rate_demand
         p, q, r = rates
-        u0, u1, u2, u3 = mixed_thrusts(thrust / MAX_THRUST_MPS2, wanted, rates, self._spin)
+        u0, u1, u2, u3 = self.rotor_commands = mixed_thrusts(
+            thrust / MAX_THRUST_MPS2, wanted, rates, self._spin
+        )
         blend = dt_s / ROTOR_TIME_CONSTANT_S
         if blend > 1.0:
             blend = 1.0
@@ -328,6 +335,11 @@ class Multirotor:
             vz = self._touch(vz, matrix[8])
         self.position = (x + vx * dt_s, y + vy * dt_s, z)
         self.velocity = (vx, vy, vz)
+
+    def blow(self, gust: Vector) -> None:
+        """Let this gust blow, NED m/s, in place of one of its own; to be told again every 32 ms."""
+        self._gust = gust
+        self._gust_left_s = 1.0
 
     def _blow(self) -> None:
         """The next gust (a first-order Gauss-Markov process)."""

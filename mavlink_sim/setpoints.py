@@ -174,10 +174,7 @@ def _finite(values: Vector) -> Vector:
 
 
 def _any_finite(*vectors: Vector) -> bool:
-    for x, y, z in vectors:
-        if math.isfinite(x) or math.isfinite(y) or math.isfinite(z):
-            return True
-    return False
+    return any(math.isfinite(x) or math.isfinite(y) or math.isfinite(z) for x, y, z in vectors)
 
 
 def _kept(values: Vector, mask: int, bits: tuple[int, int, int]) -> Vector:

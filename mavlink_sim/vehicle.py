@@ -28,6 +28,7 @@ from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
+from mavlink_sim.shared_air import SharedAir
 from mavlink_sim.signing import Signing, Streams, timestamp_now
 from mavlink_sim.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
 from mavlink_sim.transmitter import Transmitter
@@ -53,7 +54,8 @@ class Vehicle:
 
     Args:
         system_id: its MAVLink system; the component is 1.
-        seed: of wind direction and gusts.
+        seed: of its own chances, and of wind direction and gusts unless they are shared.
+        air_seed: of the wind's direction and gusts, shared by all vehicles of this seed; None: its own.
         wind_mps: steady horizontal wind, from a direction that the seed chooses.
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
         noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
@@ -77,6 +79,7 @@ class Vehicle:
         *,
         system_id: int = 1,
         seed: int = 0,
+        air_seed: int | None = None,
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
         noise: bool = True,
@@ -92,13 +95,14 @@ class Vehicle:
         self.parameters = Parameters(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
-            direction = random.Random(seed).uniform(0.0, math.tau)
+            direction = random.Random(seed if air_seed is None else air_seed).uniform(0.0, math.tau)
             self.parameters.set("SIH_WIND_N", wind_mps * math.cos(direction))
             self.parameters.set("SIH_WIND_E", wind_mps * math.sin(direction))
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
         self.airframe.on_touch = self._touched
+        self._air = None if air_seed is None else SharedAir(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.files = vehicle_files(self.parameters)
@@ -322,6 +326,8 @@ class Vehicle:
             if self.gimbal_manager is not None:
                 self.gimbal_manager.step(CONTROL_STEP_S)
             self._watch_companion()
+        if self._air is not None:
+            self.airframe.blow(self._air.gust_at(self.faults.elapsed_us))
         self.airframe.advance(STEP_S)
         estimate.age(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:

@@ -311,3 +311,28 @@ def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(cockpit) -> N
     cockpit.vehicle.faults.end("stall")
     cockpit.fly(0.1)
     assert len(cockpit.received("COMMAND_ACK")) == 1
+
+
+def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(cockpit) -> None:
+    cockpit.take_off(20.0)
+    begin(cockpit, "motor_failure 2")
+    cockpit.forget()
+    cockpit.fly(0.5)
+    told = cockpit.received("SERVO_OUTPUT_RAW")[-1]
+    widths = [told.servo1_raw, told.servo2_raw, told.servo3_raw, told.servo4_raw]
+    expected = [1000 + round(1000 * command) for command in cockpit.vehicle.airframe.rotor_commands]
+    assert widths == pytest.approx(expected, abs=150)
+    assert len(set(widths)) > 1
+    assert widths[1] > 1000  # it gives nothing, but is asked to
+    assert cockpit.vehicle.airframe.rotor_thrusts[1] < 0.01
+
+
+def test_offboard_right_after_the_first_setpoint_is_no_failsafe(make_cockpit, position_setpoint) -> None:
+    for phase in (0, 2, 4):  # of the watch, which looks every other control step
+        cockpit = make_cockpit()
+        cockpit.take_off(5.0)
+        cockpit.fly(0.004 * phase + 1e-6)
+        cockpit.send(position_setpoint(0.0, 0.0, -5.0))
+        assert cockpit.set_mode(6) == [0, 0]
+        assert [event for event in cockpit.events if "RTL" in event or "failsafe" in event] == []
+        assert cockpit.mode == "OFFBOARD"
