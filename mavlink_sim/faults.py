@@ -86,6 +86,8 @@ class Faults:
         gates: every message the vehicle sends goes through these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
         elapsed_us: `now_s` in microseconds.
+        known: those that go on or wait for their time, by number; without any, `step` need not be called
+            if `elapsed_us` is advanced.
         second: other autopilots on the same links; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
@@ -105,7 +107,7 @@ class Faults:
         self.elapsed_us = 0
         self._credit = 0.0
         self._count = 0
-        self._all: dict[int, ActiveFault] = {}
+        self.known: dict[int, ActiveFault] = {}
         self._stages: dict[str, LinkStage] = {}
         self._held: list[tuple[str, Any]] = []
         self._reads_held = False
@@ -120,12 +122,12 @@ class Faults:
     @property
     def active(self) -> list[ActiveFault]:
         """Those that go on now, oldest first."""
-        return [one for one in self._all.values() if one.active]
+        return [one for one in self.known.values() if one.active]
 
     @property
     def scheduled(self) -> list[ActiveFault]:
         """Those that have not begun."""
-        return [one for one in self._all.values() if not one.active]
+        return [one for one in self.known.values() if not one.active]
 
     def begin(
         self,
@@ -164,7 +166,7 @@ class Faults:
         if begins_s < self.now_s - 1e-9:
             raise FaultError(f"{fault.kind.name}: at={begins_s:g} is over, it is {self.now_s:.1f} s already")
         own_seed = self._seed * 1_000_003 + number if fault.seed is None else fault.seed
-        one = self._all[number] = ActiveFault(number, fault, own_seed, begins_s)
+        one = self.known[number] = ActiveFault(number, fault, own_seed, begins_s)
         if begins_s <= self.now_s + 1e-9:
             self._start(one)
         return number
@@ -177,7 +179,7 @@ class Faults:
         text = str(which)
         chosen = [
             one
-            for one in self._all.values()
+            for one in self.known.values()
             if text == "all" or text == one.fault.kind.name or text == str(one.number)
         ]
         if not chosen and text != "all":
@@ -201,7 +203,7 @@ class Faults:
             number = self.begin(line)
         except FaultError as error:
             return Outcome(False, str(error))
-        one = self._all.get(number)
+        one = self.known.get(number)
         if one is None:
             return Outcome(True, f"fault {number}: done")
         return Outcome(True, f"fault {one}" + ("" if one.active else f" at {one.begins_s:g} s"))
@@ -209,7 +211,7 @@ class Faults:
     def listing(self) -> list[str]:
         """One line for each fault that goes on or waits."""
         lines = []
-        for one in self._all.values():
+        for one in self.known.values():
             if one.active:
                 left = "" if math.isinf(one.ends_s) else f", {one.ends_s - self.now_s:.1f} s left"
                 lines.append(f"{one}: since {one.begins_s:.1f} s{left}")
@@ -226,11 +228,11 @@ class Faults:
     def step(self, dt_s: float) -> bool:
         """Time passes: begin and end what is due. True: the vehicle itself stands still in this step."""
         self.elapsed_us += int(dt_s * 1e6 + 0.5)
-        if not self._all:
+        if not self.known:
             return False
         now_s = self.now_s + 1e-9
         self.vehicle.estimate.look()
-        for one in list(self._all.values()):
+        for one in list(self.known.values()):
             if not one.active and one.begins_s <= now_s:
                 self._start_scheduled(one)
             elif one.active and one.ends_s <= now_s:
@@ -242,7 +244,7 @@ class Faults:
                 stands_still = True
             else:
                 self._credit -= 1.0
-        for one in list(self._all.values()):
+        for one in list(self.known.values()):
             if one.active and one.each_step is not None and (one.apart or not stands_still):
                 one.each_step(dt_s)
         if stands_still:
@@ -301,8 +303,8 @@ class Faults:
 
     def finish(self, number: int) -> None:
         """A fault that ends by itself is over."""
-        if number in self._all:
-            self._finish(self._all[number])
+        if number in self.known:
+            self._finish(self.known[number])
 
     # ---- beginning and ending ---------------------------------------------------------------------------
 
@@ -320,14 +322,14 @@ class Faults:
         try:
             EFFECTS[one.fault.kind.name](self.vehicle, one)
         except FaultError:
-            del self._all[one.number]
+            del self.known[one.number]
             raise
         self._on_event(f"fault {one} begins")
         if one.fault.kind.momentary:
-            self._all.pop(one.number, None)
+            self.known.pop(one.number, None)
 
     def _finish(self, one: ActiveFault) -> None:
-        if self._all.pop(one.number, None) is None:
+        if self.known.pop(one.number, None) is None:
             return
         if one.active:
             one.active = False

@@ -31,6 +31,8 @@ INERTIA_Z_KGM2 = 0.030  # SIH_IZZ
 ARM_M = 0.2  # SIH_L_ROLL, SIH_L_PITCH
 ROTOR_TORQUE_NM = 0.1  # SIH_Q_MAX
 ANGULAR_DRAG_NMS = 0.025  # SIH_KDW
+_COUPLING_KGM2 = INERTIA_XY_KGM2 - INERTIA_Z_KGM2
+_TORQUE_PER_THRUST_M = ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2
 
 GUST_TIME_CONSTANT_S = 1.5
 GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
@@ -265,12 +267,10 @@ class Multirotor:
         self.rotor_thrusts = (t0, t1, t2, t3)
 
         # torques of the rotors (1 kg, so m/s² are newtons), drag, and the gyroscopic coupling of the body
-        coupling = INERTIA_XY_KGM2 - INERTIA_Z_KGM2
+        coupling = _COUPLING_KGM2
         spin_x = (ARM_M * (t1 + t2 - t0 - t3) - ANGULAR_DRAG_NMS * p + coupling * q * r) / INERTIA_XY_KGM2
         spin_y = (ARM_M * (t0 + t2 - t1 - t3) - ANGULAR_DRAG_NMS * q - coupling * p * r) / INERTIA_XY_KGM2
-        spin_z = (
-            ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2 * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r
-        ) / INERTIA_Z_KGM2
+        spin_z = (_TORQUE_PER_THRUST_M * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2
         self._spin = (spin_x, spin_y, spin_z)
         p += spin_x * dt_s
         q += spin_y * dt_s

@@ -180,6 +180,8 @@ def _any_finite(*vectors: Vector) -> bool:
 def _kept(values: Vector, mask: int, bits: tuple[int, int, int]) -> Vector:
     x, y, z = values
     bit_x, bit_y, bit_z = bits
+    if mask & bit_x and mask & bit_y and mask & bit_z:
+        return NOTHING
     return (
         NAN if mask & bit_x else _number(x, NAN),
         NAN if mask & bit_y else _number(y, NAN),

@@ -307,7 +307,10 @@ class Vehicle:
         self.airframe.wind = (north, east, 0.0)
 
     def _step(self) -> None:
-        if self.faults.step(STEP_S):
+        faults = self.faults
+        if not faults.known:
+            faults.elapsed_us += STEP_US
+        elif faults.step(STEP_S):
             return
         self._boot_us += STEP_US
         estimate = self.estimate  # it looks at the truth when somebody is about to read it
