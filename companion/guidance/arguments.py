@@ -54,7 +54,15 @@ class Points:
     meaning: str
 
 
-Argument = Number | ClassName | Choice | Points
+@dataclass(frozen=True, slots=True)
+class FileName:
+    """The name of a file, or a path."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | Choice | Points | FileName
 
 
 def known_class(text: str, class_names: Sequence[str]) -> str:
@@ -90,6 +98,9 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
                         f"{word}: {key} must be within {FARTHEST_M:g} m of home and 1 to 500 m high, "
                         f"got {point}"
                     )
+        case FileName(key):
+            if not isinstance(value, str) or not value.strip() or not value.isprintable():
+                raise GrammarError(f"{word}: {key} must be a name or a path, got {value!r}")
         case ClassName(key):
             if value == default:
                 return

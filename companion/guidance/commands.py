@@ -7,7 +7,16 @@ import re
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
-from companion.guidance.arguments import Argument, Choice, ClassName, GrammarError, Number, Points, check
+from companion.guidance.arguments import (
+    Argument,
+    Choice,
+    ClassName,
+    FileName,
+    GrammarError,
+    Number,
+    Points,
+    check,
+)
 from companion.points import points_from
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
@@ -246,7 +255,30 @@ class Approach(Command):
     ] = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class Mission(Command):
+    word: ClassVar[str] = "mission"
+    meaning: ClassVar[str] = "fly the steps of a mission file, with their time-outs and branches"
+
+    file: Annotated[
+        str, FileName("file", "a path on the service's computer, or the name of one that came along")
+    ]
+
+
 COMMANDS: dict[str, type[Command]] = {
     kind.word: kind
-    for kind in (Takeoff, Land, Rtl, Stop, Hold, Goto, FollowPath, FigureEight, Orbit, Seek, Approach)
+    for kind in (
+        Takeoff,
+        Land,
+        Rtl,
+        Stop,
+        Hold,
+        Goto,
+        FollowPath,
+        FigureEight,
+        Orbit,
+        Seek,
+        Approach,
+        Mission,
+    )
 }
