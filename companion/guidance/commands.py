@@ -11,11 +11,13 @@ from companion.guidance.arguments import (
     Argument,
     Choice,
     ClassName,
+    ClassNames,
     FileName,
     GrammarError,
     Number,
     Points,
     check,
+    names_in,
 )
 from companion.points import points_from
 
@@ -43,12 +45,13 @@ class Command:
 
     def __str__(self) -> str:
         words = [self.word]
-        for field, argument in arguments_of(type(self)):
+        for index, (field, argument) in enumerate(arguments_of(type(self))):
             value = getattr(self, field.name)
             if value == default_of(field):
                 continue
             written = _quoted(value) if isinstance(value, str) else _plain_number(value)
-            required = field.default is MISSING
+            # Words without a key may all belong to the first argument.
+            required = field.default is MISSING and index == 0
             words.append(written if required else f"{argument.key}={written}")
         return " ".join(words)
 
@@ -256,6 +259,48 @@ class Approach(Command):
 
 
 @dataclass(frozen=True, slots=True)
+class Patrol(Command):
+    word: ClassVar[str] = "patrol"
+    meaning: ClassVar[str] = "fly a round of points again and again, and stop for what is seen on the way"
+
+    points: Annotated[str, Points("points", "the round: north,east or north,east,height, metres from home")]
+    class_names: Annotated[str, ClassNames("classes", "what to stop for, parted by commas")]
+    do: Annotated[
+        str, Choice("do", ("hold", "approach"), "look at it from the way, or fly up to `distance`")
+    ] = "hold"
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
+    wait_s: Annotated[float, Number("wait", "s", 0.0, 600.0, "how long it stays there")] = 5.0
+    again_s: Annotated[
+        float, Number("again", "s", 0.0, 3600.0, "the same object does not stop it again within this")
+    ] = 120.0
+    apart_m: Annotated[
+        float, Number("apart", "m", 0.5, 100.0, "nearer than this to where an object was is the same one")
+    ] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super(Patrol, self).__post_init__()
+        if len(self.places) < 2:
+            raise GrammarError("patrol: a round has at least two points")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The classes, each by itself."""
+        return names_in(self.class_names)
+
+
+@dataclass(frozen=True, slots=True)
 class Mission(Command):
     word: ClassVar[str] = "mission"
     meaning: ClassVar[str] = "fly the steps of a mission file, with their time-outs and branches"
@@ -279,6 +324,7 @@ COMMANDS: dict[str, type[Command]] = {
         Orbit,
         Seek,
         Approach,
+        Patrol,
         Mission,
     )
 }

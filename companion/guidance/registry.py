@@ -13,6 +13,7 @@ from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
@@ -55,6 +56,18 @@ def behaviour_for(command: commands.Command) -> Behaviour:
                 speed_mps=speed_mps,
                 confidence=confidence,
                 lost_timeout_s=lost_timeout_s,
+            )
+        case commands.Patrol():
+            return PatrolBehaviour(
+                command.places,
+                command.names,
+                speed_mps=command.speed_mps,
+                laps=command.laps,
+                approach_m=command.distance_m if command.do == "approach" else None,
+                wait_s=command.wait_s,
+                again_s=command.again_s,
+                apart_m=command.apart_m,
+                confidence=command.confidence,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 

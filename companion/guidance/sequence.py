@@ -232,7 +232,7 @@ class SequenceBehaviour(Behaviour):
         if isinstance(follows, int):
             return self._begin(follows, situation)
         if follows == END:
-            return Outcome(True, f"mission {self._plan.name} flown: {len(self.records)} steps")
+            return Outcome(True, f"flown, {len(self.records)} steps")
         if follows == ABORT:
             return Outcome(False, told)
         self._failure = told

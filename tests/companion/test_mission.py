@@ -236,7 +236,7 @@ def test_a_mission_sent_to_the_service_is_flown_and_its_steps_are_told(
         # The service cannot see the file: its text goes with the command.
         done = companion("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
         assert done.returncode == 0, done.stdout + done.stderr
-        assert done.stdout.splitlines()[-1] == "done: mission up and down flown: 4 steps"
+        assert done.stdout.splitlines()[-1] == "done: flown, 4 steps"
         service.wait_for_line("mission up and down: step 4 of 4: land", 5.0)
         assert any("step 2 of 4: hold" in line for line in service.lines)
 

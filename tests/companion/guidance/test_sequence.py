@@ -49,7 +49,7 @@ async def test_a_mission_from_the_ground_and_back_to_it():
         {"do": "land"},
     )
     outcome = await cockpit.outcome(await begun(cockpit, behaviour))
-    assert outcome == Outcome(True, "mission test flown: 4 steps")
+    assert outcome == Outcome(True, "flown, 4 steps")
     assert [record.title for record in behaviour.records] == ["takeoff altitude=5", "out", "wait", "land"]
     assert all(record.success for record in behaviour.records)
     assert cockpit.vehicle.position[0] == pytest.approx(6.0, abs=1.0)
