@@ -30,6 +30,7 @@ from companion.guidance.arguments import GrammarError, nearest
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.commands import Command, Mission
 from companion.guidance.registry import behaviour_for
+from companion.guidance.search_pattern import Footprint
 from companion.guidance.sequence import (
     ABORT,
     CONTINUE,
@@ -98,11 +99,12 @@ def mission_behaviour(
     enclosed: str,
     class_names: Sequence[str] | None,
     refused: Callable[[Behaviour], str | None],
+    footprint: Footprint | None = None,
 ) -> SequenceBehaviour:
     """What flies a mission: of the text that came with the command, or else of the file it names.
 
     Args:
-        refused: as `SequenceBehaviour`.
+        refused: as `SequenceBehaviour`. footprint: as `behaviour_for`.
 
     Raises:
         MissionError: as `find_mission`, `read_mission` and `plan_from`.
@@ -110,7 +112,7 @@ def mission_behaviour(
     if len(enclosed.encode()) > LARGEST_BYTES:
         raise MissionError(f"{command.file}: a mission has at most {LARGEST_BYTES} bytes")
     text = enclosed if enclosed.strip() else read_mission(find_mission(command.file))
-    return SequenceBehaviour(plan_from(text, command.file, class_names), refused)
+    return SequenceBehaviour(plan_from(text, command.file, class_names, footprint), refused)
 
 
 def find_mission(name: str) -> Path:
@@ -143,12 +145,18 @@ def read_mission(path: Path) -> str:
         raise MissionError(f"{path}: cannot be read: {error}") from error
 
 
-def plan_from(text: str, source: str, class_names: Sequence[str] | None = None) -> Plan:
+def plan_from(
+    text: str,
+    source: str,
+    class_names: Sequence[str] | None = None,
+    footprint: Footprint | None = None,
+) -> Plan:
     """A mission, checked.
 
     Args:
         text: of the file. source: its name, for what is said about it.
         class_names: what the detector knows; None: not known, any is taken.
+        footprint: as `behaviour_for`.
 
     Raises:
         MissionError: with every problem found: no TOML, an unknown key, a step that is no command, an unknown
@@ -170,7 +178,7 @@ def plan_from(text: str, source: str, class_names: Sequence[str] | None = None) 
         raise MissionError(*problems)
     return Plan(
         name=table.name or Path(source).stem,
-        steps=tuple(_planned(step) for step in read),
+        steps=tuple(_planned(step, footprint) for step in read),
         way_down=lambda word: behaviour_for(grammar.parse(word)),
         timeout_s=table.timeout_s,
     )
@@ -200,12 +208,12 @@ def _shown(plan: Plan, follows: int | str) -> str:
     return follows if isinstance(follows, str) else f"{plan.steps[follows].title}"
 
 
-def _planned(step: _Read) -> PlannedStep:
+def _planned(step: _Read, footprint: Footprint | None) -> PlannedStep:
     table = step.table
     return PlannedStep(
         title=table.name or str(step.command),
         command=str(step.command),
-        make=lambda: behaviour_for(step.command),
+        make=lambda: behaviour_for(step.command, footprint),
         endless=step.command.endless,
         timeout_s=table.timeout_s,
         repeat=table.repeat,

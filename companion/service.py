@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from companion.guidance.commands import Command, Mission
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
+from companion.guidance.search_pattern import Footprint
 from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.targets import StateHistory
 from companion.messages import (
@@ -191,11 +193,14 @@ class Service:
 
     def _behaviour_for(self, command: Command, enclosed: str) -> Behaviour:
         """Raises GrammarError or MissionError with what is wrong, a line for each."""
+        camera = self.steering.settings.camera
+        footprint = Footprint(math.radians(camera.horizontal_fov_deg), math.radians(-camera.mount_pitch_deg))
         if isinstance(command, Mission):
-            return mission_behaviour(command, enclosed, self._class_names(), self.pilot.refusal_of)
+            names = self._class_names()
+            return mission_behaviour(command, enclosed, names, self.pilot.refusal_of, footprint)
         if enclosed:
             raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
-        return behaviour_for(command)
+        return behaviour_for(command, footprint)
 
     async def _outcome_of(self, command: Command, behaviour: Behaviour) -> Outcome:
         ended = self.pilot.command(behaviour)

@@ -233,7 +233,7 @@ class FigureEight(Command):
 @dataclass(frozen=True, slots=True)
 class Seek(Command):
     word: ClassVar[str] = "seek"
-    meaning: ClassVar[str] = "turn on the spot until an object of the class is seen, then face it"
+    meaning: ClassVar[str] = "turn, or search an area, until an object of the class is seen; then face it"
 
     class_name: Annotated[str, ClassName("class", "what to look for")]
     laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
@@ -242,6 +242,38 @@ class Seek(Command):
     direction: Annotated[str, Choice("direction", ("clockwise", "counterclockwise"), "seen from above")] = (
         "clockwise"
     )
+    pattern: Annotated[
+        str, Choice("pattern", ("turn", "square", "lawnmower"), "on the spot, or over an area about it")
+    ] = "turn"
+    radius_m: Annotated[
+        float | None, Number("radius", "m", 1.0, 500.0, "half a side of the expanding square")
+    ] = None
+    width_m: Annotated[
+        float | None, Number("width", "m", 1.0, 1000.0, "of the lawnmower's area, west to east")
+    ] = None
+    height_m: Annotated[
+        float | None, Number("height", "m", 1.0, 1000.0, "of the lawnmower's area, south to north")
+    ] = None
+    spacing_m: Annotated[
+        float | None, Number("spacing", "m", 1.0, 200.0, "between strips; else what the camera sees")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
+
+    def __post_init__(self) -> None:
+        super(Seek, self).__post_init__()
+        given = {
+            "radius": self.radius_m,
+            "width": self.width_m,
+            "height": self.height_m,
+            "spacing": self.spacing_m,
+        }
+        needed = {"turn": (), "square": ("radius",), "lawnmower": ("width", "height")}[self.pattern]
+        allowed = (*needed, "spacing") if needed else ()
+        for key, value in given.items():
+            if value is None and key in needed:
+                raise GrammarError(f"seek: pattern={self.pattern} needs {' and '.join(needed)}")
+            if value is not None and key not in allowed:
+                raise GrammarError(f"seek: pattern={self.pattern} takes no {key}")
 
 
 @dataclass(frozen=True, slots=True)
