@@ -1,4 +1,4 @@
-"""The command line: `companion run|demo|detect|models|evaluate|send|echo|config|train|bench`.
+"""The command line: `companion run|demo|detect|models|evaluate|send|mission|echo|config|train|bench`.
 
 Heavy parts are imported when their command runs, so that `companion send` starts at once.
 What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
@@ -21,6 +21,7 @@ import typer
 from companion.cli_bench import bench
 from companion.cli_evaluate import evaluate
 from companion.cli_flags import EXIT_BAD_INPUT, plain_errors, with_settings
+from companion.cli_mission import mission
 from companion.cli_models import models
 from companion.settings import Settings
 
@@ -38,6 +39,7 @@ app = typer.Typer(
 
 app.add_typer(models, name="models")
 app.command()(evaluate)
+app.command()(mission)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1

@@ -18,7 +18,6 @@ from typing import Any
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
 from companion.rehearsal import (
-    ALTITUDE_M,
     free_port,
     rehearsal_settings,
     simulator,
@@ -27,18 +26,15 @@ from companion.rehearsal import (
 )
 from companion.service import Event, Service
 
+# Where the mission's approach stops.
 STOP_DISTANCE_M = 5.0
 # Arrival counts when the simulator agrees with it to within this.
 RANGE_TOLERANCE_M = 1.0
 VIDEO_NAME = "flight.webm"
 
-# What is flown, in the service's own grammar. The range is taken at the end of the hold, when all is still.
-STEPS = (
-    f"takeoff {ALTITUDE_M:g}",
-    "seek car",
-    f"approach car distance={STOP_DISTANCE_M:g}",
-    "hold duration=3",
-)
+# What is flown: a mission file that comes with this package. Its steps `find` and `stand` are looked at.
+MISSION = "demo"
+FIND, STAND = "find", "stand"
 
 Say = Callable[[str], None]
 
@@ -154,20 +150,16 @@ async def _watched_mission(service: Service, flight: _Flight) -> None:
 
 
 async def _mission(service: Service, flight: _Flight) -> None:
-    """The steps; the first that fails ends it, and the vehicle comes home all the same."""
+    """The mission; failing, it brings the vehicle home all the same."""
     await until_ready_to_arm(service)
-    for step in STEPS:
-        reply = await service.command(step)
-        if not reply["success"]:
-            flight.failure = f"{step}: {reply['reason']}"
-            break
-        flight.found = flight.found or step.startswith("seek")
-        if step.startswith("hold"):
-            flight.reached_ns = time.monotonic_ns()
-    if service.driver.state.armed:
-        reply = await service.command("rtl")
-        if not reply["success"]:
-            flight.failure = flight.failure or f"rtl: {reply['reason']}"
+    reply = await service.command(f"mission {MISSION}")
+    if not reply["success"]:
+        flight.failure = reply["reason"]
+    for step in reply.get("steps", ()):
+        flight.found = flight.found or (step["title"] == FIND and step["success"])
+        if step["title"] == STAND and step["success"]:
+            # The range is taken at the end of the hold, when all is still.
+            flight.reached_ns = step["ended_ns"]
     flight.ended = not service.driver.state.armed
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,10 +21,12 @@ from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
 from companion.guidance.battery import BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
-from companion.guidance.commands import Command
+from companion.guidance.commands import Command, Mission
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
+from companion.guidance.search_pattern import Footprint
+from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.targets import StateHistory
 from companion.messages import (
     detections_message,
@@ -32,6 +35,7 @@ from companion.messages import (
     tracks_message,
     vehicle_message,
 )
+from companion.mission import MissionError, mission_behaviour
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception import PerceptionKeeper, PerceptionStartError
@@ -174,17 +178,33 @@ class Service:
         if not self.ready or self._ending:
             reason = "the service is ending" if self._ending else "the service is still starting"
             return {"command": text, "success": False, "reason": reason}
+        # Of a mission that is not on this computer the text may follow its name.
+        text, _, enclosed = text.strip().partition("\n")
         try:
             command = grammar.parse(text, self._class_names())
-        except GrammarError as error:
-            return {"command": text, "success": False, "reason": str(error)}
+            behaviour = self._behaviour_for(command, enclosed)
+        except (GrammarError, MissionError) as error:
+            return {"command": text, "success": False, "reason": "; ".join(str(error).splitlines())}
         self._event("info", f"command: {command}")
-        outcome = await self._outcome_of(command)
+        outcome = await self._outcome_of(command, behaviour)
+        more: dict[str, Any] = {}
+        if isinstance(behaviour, SequenceBehaviour):
+            outcome, more = behaviour.told(outcome), {"steps": [asdict(step) for step in behaviour.records]}
         self._event("info" if outcome.success else "warning", f"{command}: {outcome.reason}")
-        return {"command": str(command), **asdict(outcome)}
+        return {"command": str(command), **asdict(outcome), **more}
 
-    async def _outcome_of(self, command: Command) -> Outcome:
-        behaviour = behaviour_for(command)
+    def _behaviour_for(self, command: Command, enclosed: str) -> Behaviour:
+        """Raises GrammarError or MissionError with what is wrong, a line for each."""
+        camera = self.steering.settings.camera
+        footprint = Footprint(math.radians(camera.horizontal_fov_deg), math.radians(-camera.mount_pitch_deg))
+        if isinstance(command, Mission):
+            names = self._class_names()
+            return mission_behaviour(command, enclosed, names, self.pilot.refusal_of, footprint)
+        if enclosed:
+            raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
+        return behaviour_for(command, footprint)
+
+    async def _outcome_of(self, command: Command, behaviour: Behaviour) -> Outcome:
         ended = self.pilot.command(behaviour)
         if ended.done() or not command.endless:
             return await asyncio.shield(ended)

@@ -24,6 +24,7 @@ FLOORS = {
     "cli_flags": 3,
     "messages": 3,
     "operator": 4,
+    "mission": 4,
     "views": 4,
     "service": 5,
     "rehearsal": 6,

@@ -54,7 +54,28 @@ class Points:
     meaning: str
 
 
-Argument = Number | ClassName | Choice | Points
+@dataclass(frozen=True, slots=True)
+class FileName:
+    """The name of a file, or a path."""
+
+    key: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClassNames:
+    """The names of some object classes, parted by commas."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | Choice | Points | FileName | ClassNames
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """The names in a list parted by commas."""
+    return tuple(name.strip() for name in text.split(","))
 
 
 def known_class(text: str, class_names: Sequence[str]) -> str:
@@ -90,6 +111,15 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
                         f"{word}: {key} must be within {FARTHEST_M:g} m of home and 1 to 500 m high, "
                         f"got {point}"
                     )
+        case FileName(key):
+            if not isinstance(value, str) or not value.strip() or not value.isprintable():
+                raise GrammarError(f"{word}: {key} must be a name or a path, got {value!r}")
+        case ClassNames(key):
+            names = names_in(value) if isinstance(value, str) and value.isprintable() else ()
+            if not names or not all(names):
+                raise GrammarError(
+                    f"{word}: {key} must be names of classes such as person,car, got {value!r}"
+                )
         case ClassName(key):
             if value == default:
                 return

@@ -56,6 +56,8 @@ class Authority:
         if mode is FlightMode.TAKEOFF:
             self._leaving |= {FlightMode.HOLD}
             self._takeoff_altitude_m = altitude_m if altitude_m is not None else 0.0
+            # From the ground, disarmed after a landing of ours, it begins anew.
+            self._was_armed = state.armed
         self._mode = mode
         self._leaving_until_ns = float("inf")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -87,6 +88,14 @@ class Behaviour(ABC):
 
     def on_deactivate(self) -> None:  # noqa: B027  (a hook that may be left out)
         """Called once, when it ended or was replaced."""
+
+    def request_failed(self, why: str) -> bool:
+        """The autopilot did not do what was asked. True: another way is known; False: that is the end."""
+        return False
+
+    def take_notes(self) -> Sequence[str]:
+        """What happened that people should know, since it was last asked for."""
+        return ()
 
     @property
     def status(self) -> str:

@@ -7,7 +7,18 @@ import re
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
-from companion.guidance.arguments import Argument, Choice, ClassName, GrammarError, Number, Points, check
+from companion.guidance.arguments import (
+    Argument,
+    Choice,
+    ClassName,
+    ClassNames,
+    FileName,
+    GrammarError,
+    Number,
+    Points,
+    check,
+    names_in,
+)
 from companion.points import points_from
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
@@ -34,12 +45,13 @@ class Command:
 
     def __str__(self) -> str:
         words = [self.word]
-        for field, argument in arguments_of(type(self)):
+        for index, (field, argument) in enumerate(arguments_of(type(self))):
             value = getattr(self, field.name)
             if value == default_of(field):
                 continue
             written = _quoted(value) if isinstance(value, str) else _plain_number(value)
-            required = field.default is MISSING
+            # Words without a key may all belong to the first argument.
+            required = field.default is MISSING and index == 0
             words.append(written if required else f"{argument.key}={written}")
         return " ".join(words)
 
@@ -221,7 +233,7 @@ class FigureEight(Command):
 @dataclass(frozen=True, slots=True)
 class Seek(Command):
     word: ClassVar[str] = "seek"
-    meaning: ClassVar[str] = "turn on the spot until an object of the class is seen, then face it"
+    meaning: ClassVar[str] = "turn, or search an area, until an object of the class is seen; then face it"
 
     class_name: Annotated[str, ClassName("class", "what to look for")]
     laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
@@ -230,6 +242,38 @@ class Seek(Command):
     direction: Annotated[str, Choice("direction", ("clockwise", "counterclockwise"), "seen from above")] = (
         "clockwise"
     )
+    pattern: Annotated[
+        str, Choice("pattern", ("turn", "square", "lawnmower"), "on the spot, or over an area about it")
+    ] = "turn"
+    radius_m: Annotated[
+        float | None, Number("radius", "m", 1.0, 500.0, "half a side of the expanding square")
+    ] = None
+    width_m: Annotated[
+        float | None, Number("width", "m", 1.0, 1000.0, "of the lawnmower's area, west to east")
+    ] = None
+    height_m: Annotated[
+        float | None, Number("height", "m", 1.0, 1000.0, "of the lawnmower's area, south to north")
+    ] = None
+    spacing_m: Annotated[
+        float | None, Number("spacing", "m", 1.0, 200.0, "between strips; else what the camera sees")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
+
+    def __post_init__(self) -> None:
+        super(Seek, self).__post_init__()
+        given = {
+            "radius": self.radius_m,
+            "width": self.width_m,
+            "height": self.height_m,
+            "spacing": self.spacing_m,
+        }
+        needed = {"turn": (), "square": ("radius",), "lawnmower": ("width", "height")}[self.pattern]
+        allowed = (*needed, "spacing") if needed else ()
+        for key, value in given.items():
+            if value is None and key in needed:
+                raise GrammarError(f"seek: pattern={self.pattern} needs {' and '.join(needed)}")
+            if value is not None and key not in allowed:
+                raise GrammarError(f"seek: pattern={self.pattern} takes no {key}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +323,74 @@ class Follow(Command):
         return self.duration_s == 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Patrol(Command):
+    word: ClassVar[str] = "patrol"
+    meaning: ClassVar[str] = "fly a round of points again and again, and stop for what is seen on the way"
+
+    points: Annotated[str, Points("points", "the round: north,east or north,east,height, metres from home")]
+    class_names: Annotated[str, ClassNames("classes", "what to stop for, parted by commas")]
+    do: Annotated[
+        str, Choice("do", ("hold", "approach"), "look at it from the way, or fly up to `distance`")
+    ] = "hold"
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
+    wait_s: Annotated[float, Number("wait", "s", 0.0, 600.0, "how long it stays there")] = 5.0
+    again_s: Annotated[
+        float, Number("again", "s", 0.0, 3600.0, "the same object does not stop it again within this")
+    ] = 120.0
+    apart_m: Annotated[
+        float, Number("apart", "m", 0.5, 100.0, "nearer than this to where an object was is the same one")
+    ] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super(Patrol, self).__post_init__()
+        if len(self.places) < 2:
+            raise GrammarError("patrol: a round has at least two points")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The classes, each by itself."""
+        return names_in(self.class_names)
+
+
+@dataclass(frozen=True, slots=True)
+class Mission(Command):
+    word: ClassVar[str] = "mission"
+    meaning: ClassVar[str] = "fly the steps of a mission file, with their time-outs and branches"
+
+    file: Annotated[
+        str, FileName("file", "a path on the service's computer, or the name of one that came along")
+    ]
+
+
 COMMANDS: dict[str, type[Command]] = {
     kind.word: kind
-    for kind in (Takeoff, Land, Rtl, Stop, Hold, Goto, FollowPath, FigureEight, Orbit, Seek, Approach, Follow)
+    for kind in (
+        Takeoff,
+        Land,
+        Rtl,
+        Stop,
+        Hold,
+        Goto,
+        FollowPath,
+        FigureEight,
+        Orbit,
+        Seek,
+        Approach,
+        Follow,
+        Patrol,
+        Mission,
+    )
 }

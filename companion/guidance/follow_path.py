@@ -17,6 +17,7 @@ class FollowPathBehaviour(PathFlight):
     Args:
         points: (north, east) or (north, east, height) metres from home; without a height, the one before's.
         laps: 0: until another command; any but 1: from the last point on to the first again.
+        round_trip: that also for a single lap.
     """
 
     name = "follow-path"
@@ -28,9 +29,11 @@ class FollowPathBehaviour(PathFlight):
         *,
         laps: float = 1.0,
         nose_along: bool = True,
+        round_trip: bool = False,
     ) -> None:
         super().__init__(speed_mps, laps=laps, nose_along=nose_along)
         self._points = tuple(points)
+        self._round_trip = round_trip or laps != 1.0
 
     def _path(self, situation: Situation) -> Path:
         position, _ = position_and_yaw(situation.state)
@@ -39,11 +42,11 @@ class FollowPathBehaviour(PathFlight):
         for north, east, *height in self._points:
             down = home[2] - height[0] if height else down
             places.append((home[0] + north, home[1] + east, down))
-        if self._laps != 1.0:
+        if self._round_trip:
             return Path(places, self._speed_mps, closed=True)
         return Path([position, *places], self._speed_mps)
 
     def _flown(self) -> str:
-        if self._laps == 1.0:
+        if not self._round_trip:
             return f"all {len(self._points)} points flown"
         return f"{laps_text(self._laps)} of {len(self._points)} points flown"

@@ -20,10 +20,13 @@ from companion.guidance.arguments import (
     Argument,
     Choice,
     ClassName,
+    ClassNames,
+    FileName,
     GrammarError,
     Number,
     Points,
     known_class,
+    names_in,
     nearest,
     range_of,
 )
@@ -89,7 +92,12 @@ def describe() -> str:
                     lines.append(f"    {key}: {meaning} ({low:g} to {high:g}{' ' + unit if unit else ''})")
                 case Choice(key, words, meaning):
                     lines.append(f"    {key}: {meaning} ({' or '.join(words)})")
-                case ClassName(key, meaning) | Points(key, meaning):
+                case (
+                    ClassName(key, meaning)
+                    | ClassNames(key, meaning)
+                    | Points(key, meaning)
+                    | FileName(key, meaning)
+                ):
                     lines.append(f"    {key}: {meaning}")
     return "\n".join(lines)
 
@@ -159,7 +167,10 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {text!r}") from None
         case Choice():
             return text.lower()
-        case Points():
+        case Points() | FileName():
             return text
+        case ClassNames():
+            names = names_in(text)
+            return ",".join(names if class_names is None else (known_class(n, class_names) for n in names))
         case ClassName():
             return text if class_names is None else known_class(text, class_names)

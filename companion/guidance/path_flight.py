@@ -67,6 +67,11 @@ class PathFlight(Behaviour):
         except ValueError as error:
             self._problem = str(error)
 
+    def resume(self, situation: Situation) -> None:
+        """Something else was flown in between: the way goes on where it was left."""
+        self._best_m, self._best_ns = -math.inf, situation.now_ns
+        self._arrived_since_ns = [None] * len(ARRIVALS)
+
     def update(self, dt_s: float, situation: Situation) -> Step:
         follower = self._follower
         if follower is None:

@@ -39,6 +39,7 @@ class PilotEventKind(StrEnum):
 
     STARTED = "started"
     ENGAGED = "engaged"  # the vehicle shows OFFBOARD and flies our setpoints
+    NOTED = "noted"  # something on the way that people should know
     ENDED = "ended"
     REFUSED = "refused"
     LOST = "lost"  # command was taken from us
@@ -148,7 +149,7 @@ class Pilot:
         Refused when something it needs is missing: the future is then done, and the current one goes on.
         """
         future: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-        missing = refusal(behaviour, self._situation, self._class_names(), self._battery.minimum)
+        missing = self.refusal_of(behaviour)
         if missing is not None or self._situation is None:
             outcome = Outcome(False, missing or "the vehicle's state is not known yet")
             future.set_result(outcome)
@@ -166,6 +167,10 @@ class Pilot:
         self._begin(behaviour, future)
         self._tell(PilotEventKind.STARTED, behaviour, "started")
         return future
+
+    def refusal_of(self, behaviour: Behaviour) -> str | None:
+        """Why this behaviour could not begin now; None: it could."""
+        return refusal(behaviour, self._situation, self._class_names(), self._battery.minimum)
 
     def update(self, situation: Situation) -> None:
         """One turn of the guidance loop. Never waits."""
@@ -211,6 +216,8 @@ class Pilot:
                 behaviour.on_activate(situation)
             dt_s = 0.0 if self._stepped_ns is None else (situation.now_ns - self._stepped_ns) / 1e9
             step: Step = behaviour.update(dt_s, situation)
+            for note in behaviour.take_notes():
+                self._tell(PilotEventKind.NOTED, behaviour, note)
         except Exception as error:
             # Whatever a behaviour does wrong, the vehicle must be held; the traceback is in the log.
             logger.exception("%s failed", behaviour.name)
@@ -349,6 +356,15 @@ class Pilot:
 
     def _fail(self, why: str) -> None:
         """The autopilot did not do what was asked."""
+        behaviour, situation = self._behaviour, self._situation
+        if behaviour is not None and situation is not None and behaviour.request_failed(why):
+            flying = self._phase is _Phase.REQUESTING and self._streaming
+            if not flying:
+                self._silence()
+            # What shows now is the mode from before: a pilot's would have ended our command already.
+            self._authority.refused(FlightMode.OFFBOARD if flying else situation.state.mode)
+            self._phase, self._requested = _Phase.OFFBOARD if flying else _Phase.READY, None
+            return
         self._end(Outcome(False, why))
         if self._phase is _Phase.REQUESTING and self._streaming:
             # Still flying setpoints: hold. If the mode changed after all, that ends our command.

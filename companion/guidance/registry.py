@@ -14,13 +14,20 @@ from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.patrol import PatrolBehaviour
+from companion.guidance.search import SearchBehaviour
+from companion.guidance.search_pattern import Footprint
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 
 
-def behaviour_for(command: commands.Command) -> Behaviour:
-    """A new behaviour, ready for the pilot. Raises TypeError for a command no behaviour is written for."""
+def behaviour_for(command: commands.Command, footprint: Footprint | None = None) -> Behaviour:
+    """A new behaviour, ready for the pilot. Raises TypeError for a command no behaviour is written for.
+
+    Args:
+        footprint: of the camera that steers; where it is not known, searches must be given a spacing.
+    """
     match command:
         case commands.Takeoff(altitude_m):
             return TakeoffBehaviour(altitude_m)
@@ -41,6 +48,16 @@ def behaviour_for(command: commands.Command) -> Behaviour:
         case commands.Orbit(class_name, radius_m, speed_mps, laps, direction):
             clockwise = direction == "clockwise"
             return OrbitBehaviour(radius_m, speed_mps, laps, clockwise=clockwise, class_name=class_name)
+        case commands.Seek() if command.pattern != "turn":
+            return SearchBehaviour(
+                command.class_name,
+                radius_m=command.radius_m,
+                size_m=_pair(command.width_m, command.height_m),
+                spacing_m=command.spacing_m,
+                footprint=footprint,
+                speed_mps=command.speed_mps,
+                confidence=command.confidence,
+            )
         case commands.Seek(class_name, laps, rate_radps, confidence, direction):
             return SeekBehaviour(
                 class_name,
@@ -59,6 +76,18 @@ def behaviour_for(command: commands.Command) -> Behaviour:
             )
         case commands.Follow():
             return _follow(command)
+        case commands.Patrol():
+            return PatrolBehaviour(
+                command.places,
+                command.names,
+                speed_mps=command.speed_mps,
+                laps=command.laps,
+                approach_m=command.distance_m if command.do == "approach" else None,
+                wait_s=command.wait_s,
+                again_s=command.again_s,
+                apart_m=command.apart_m,
+                confidence=command.confidence,
+            )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 
 

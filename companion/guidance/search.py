@@ -1,0 +1,118 @@
+"""Search an area along a pattern until an object of a class is found, then stop and face it."""
+
+from __future__ import annotations
+
+from companion.guidance.behaviour import Outcome, Requirement, Situation, Step
+from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
+from companion.guidance.path import Path
+from companion.guidance.path_flight import PathFlight
+from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
+from companion.guidance.seek import BLIND_TIMEOUT_S, found_text
+from companion.guidance.sighting import Gaze, Sightings
+from companion.guidance.target import DOUBTED
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+
+STANDING_MPS = 0.4
+
+
+class SearchBehaviour(PathFlight):
+    """Flies an expanding square or a lawnmower's way about where it begins, nose along the way.
+
+    Args:
+        radius_m: half a side of the expanding square. size_m: (west to east, south to north) of the
+            lawnmower's area. Exactly one of them.
+        spacing_m: of neighbouring strips; None: as `footprint` allows at the height flown.
+    """
+
+    name = "seek"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+
+    def __init__(
+        self,
+        class_name: str,
+        *,
+        radius_m: float | None = None,
+        size_m: tuple[float, float] | None = None,
+        spacing_m: float | None = None,
+        footprint: Footprint | None = None,
+        speed_mps: float = 2.0,
+        confidence: float = 0.4,
+    ) -> None:
+        super().__init__(speed_mps)
+        if (radius_m is None) == (size_m is None):
+            raise ValueError("a search needs exactly one of radius_m and size_m")
+        self.class_names = (class_name,)
+        self._class_name = class_name
+        self._radius_m, self._size_m = radius_m, size_m
+        self._spacing_m, self._footprint = spacing_m, footprint
+        self._sightings = Sightings((class_name,), confidence)
+        self._gaze: Gaze | None = None
+        self._stop: Vector3 | None = None
+        self._blind_since_ns: int | None = None
+
+    def on_activate(self, situation: Situation) -> None:
+        super().on_activate(situation)
+        self._sightings.reset(situation.now_ns)
+        self._gaze = self._stop = self._blind_since_ns = None
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        now_ns = situation.now_ns
+        position, yaw_rad = position_and_yaw(situation.state)
+        if not situation.perception_fresh:
+            self._blind_since_ns = now_ns if self._blind_since_ns is None else self._blind_since_ns
+            if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
+                return Outcome(False, f"nothing came from the detector for {BLIND_TIMEOUT_S:g} s")
+            return self._stand(situation, position, yaw_rad)
+        self._blind_since_ns = None
+        if self._gaze is not None:
+            self._gaze.follow(self._sightings.fresh(situation))
+            if self._gaze.faced(yaw_rad, now_ns):
+                return Outcome(True, found_text(self._gaze.target))
+            if not self._gaze.lost(now_ns):
+                return self._stand(situation, position, self._gaze.target.bearing_rad)
+            self._gaze = None
+            self._sightings.forget()
+        elif (found := self._sightings.look(situation)) is not None:
+            self._gaze, self._stop = Gaze(found, now_ns), None
+            return self._stand(situation, position, found.bearing_rad)
+        if self._stop is not None:
+            self._stop = None
+            self.resume(situation)
+        step = super().update(dt_s, situation)
+        if isinstance(step, Outcome) and step.success:
+            why = f": {DOUBTED}" if self._sightings.doubted else ""
+            return Outcome(False, f"no {self._class_name} seen in the whole area{why}")
+        return step
+
+    @property
+    def status(self) -> str:
+        if self._gaze is not None:
+            return f"facing the {self._class_name}"
+        return f"looking for a {self._class_name} over an area{super().status.removeprefix(self.name)}"
+
+    def _stand(self, situation: Situation, position: Vector3, bearing_rad: float) -> Setpoint:
+        if self._stop is None and ground_speed(situation.state) < STANDING_MPS:
+            self._stop = position
+        velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=bearing_rad)
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        spacing_m = self._spacing_m
+        if spacing_m is None:
+            if self._footprint is None:
+                raise ValueError("the camera's footprint is not known: give spacing")
+            spacing_m = self._footprint.spacing_m(situation.state.altitude_m or 0.0)
+        if self._radius_m is not None:
+            points = expanding_square(self._radius_m, spacing_m)
+        else:
+            assert self._size_m is not None
+            points = lawnmower(*self._size_m, spacing_m)
+        places = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
+        if self._radius_m is not None and len(points) == 1:
+            raise ValueError(f"from here strips {spacing_m:.0f} m apart show it all: use pattern=turn")
+        return Path([position, *places], self._speed_mps)
+
+    def _flown(self) -> str:
+        return "the whole area flown"

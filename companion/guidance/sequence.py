@@ -1,0 +1,292 @@
+"""A mission: behaviours in turn, each with its time-out and where to go on when it worked or did not.
+
+It is one behaviour to the pilot, so what holds for one holds for all of its steps. One setpoint follows the
+other where steps change, in the same turn of the loop. An operator's next command takes its place as a whole,
+and a pilot's mode change ends it as a whole: between two steps our command is never given up and taken again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+
+logger = logging.getLogger(__name__)
+
+# Where a step may lead besides another step.
+CONTINUE, END, ABORT, RTL, LAND = "continue", "end", "abort", "rtl", "land"
+# Failing, the vehicle may be taken down by the autopilot; the mission has failed all the same.
+WAYS_DOWN = (RTL, LAND)
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStep:
+    """One step of a plan.
+
+    Attributes:
+        title: its name, or its number; for people.
+        command: what is flown, in the grammar's words.
+        make: a new behaviour that flies it.
+        endless: it ends by its time-out, and that is a success.
+        timeout_s: after which it has failed (or, endless, is done); None: the behaviour's own limits alone.
+        repeat: how often it is flown, one time after the other succeeding.
+        visits: how often it may be begun; once more fails the mission. None: no limit.
+        on_success, on_failure: index of the next step, or `end`, `abort`, `rtl` or `land`.
+    """
+
+    title: str
+    command: str
+    make: Callable[[], Behaviour]
+    endless: bool = False
+    timeout_s: float | None = None
+    repeat: int = 1
+    visits: int | None = None
+    on_success: int | str = END
+    on_failure: int | str = ABORT
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A mission that was checked: every index is one of a step, and it has an end.
+
+    Attributes:
+        name: for people. steps: in the order of the file; the first one begins.
+        way_down: makes the behaviour for `rtl` and `land`. timeout_s: of the whole; None: no limit.
+    """
+
+    name: str
+    steps: tuple[PlannedStep, ...]
+    way_down: Callable[[str], Behaviour]
+    timeout_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """What became of one step that was flown."""
+
+    title: str
+    command: str
+    success: bool
+    reason: str
+    started_ns: int
+    ended_ns: int
+
+
+class SequenceBehaviour(Behaviour):
+    """Flies a plan.
+
+    Args:
+        refused: why a behaviour cannot begin now, None if it can; the pilot's own rule, asked at every step.
+
+    Attributes:
+        records: the steps that have ended, in the order in which they were flown.
+    """
+
+    name = "mission"
+
+    def __init__(self, plan: Plan, refused: Callable[[Behaviour], str | None]) -> None:
+        self._plan, self._refused = plan, refused
+        self.records: list[StepRecord] = []
+        self._at = 0
+        self._flown: Behaviour | None = None
+        # The first one, made at once, tells what the mission needs to begin.
+        self._first: Behaviour | None = plan.steps[0].make()
+        self._activated = False
+        self._visits: Counter[int] = Counter()
+        self._repeats = 0
+        self._begun_ns = self._started_ns = 0
+        self._request_failure = ""
+        self._failure = ""
+        self._ended = False
+        self._notes: list[str] = []
+        known = {name for step in plan.steps for name in step.make().class_names}
+        self.class_names = tuple(sorted(known))
+
+    @property
+    def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
+        """Of the step that is flown; before, of the first one, if the mission ends with its failure."""
+        if self._flown is not None:
+            return self._flown.requirements
+        if self._first is None or self._plan.steps[0].on_failure != ABORT:
+            return frozenset()
+        return self._first.requirements
+
+    @property
+    def where(self) -> str:
+        """Which step it is at: `step 2 of 6 (find)`."""
+        step = self._plan.steps[self._at]
+        if self._failure:
+            return f"way down after {self._failure}"
+        return f"step {self._at + 1} of {len(self._plan.steps)} ({step.title})"
+
+    @property
+    def status(self) -> str:
+        doing = "" if self._flown is None else f": {self._flown.status}"
+        return f"mission {self._plan.name}, {self.where}{doing}"
+
+    def told(self, outcome: Outcome) -> Outcome:
+        """The same with the step it was at: what ended it from outside (a pilot, a command) knows of none."""
+        if outcome.success or self._ended or self._flown is None:
+            return outcome
+        return Outcome(False, f"{self.where}: {outcome.reason}")
+
+    def take_notes(self) -> Sequence[str]:
+        inner = () if self._flown is None else tuple(self._flown.take_notes())
+        notes, self._notes = (*self._notes, *inner), []
+        return notes
+
+    def request_failed(self, why: str) -> bool:
+        """The autopilot refused a step's mode: that fails the step, not more."""
+        if self._flown is None:
+            return False
+        self._request_failure = why
+        return True
+
+    def on_activate(self, situation: Situation) -> None:
+        self._started_ns = situation.now_ns
+        self.records.clear()
+        self._visits.clear()
+        self._request_failure = self._failure = ""
+        self._ended = False
+        self._at, self._repeats, self._flown = 0, 0, None
+
+    def on_deactivate(self) -> None:
+        self._leave()
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        step = self._update(dt_s, situation)
+        self._ended = isinstance(step, Outcome)
+        return step
+
+    def _update(self, dt_s: float, situation: Situation) -> Step:
+        if self._flown is None:
+            if (ended := self._begin(0, situation)) is not None:
+                return ended
+            dt_s = 0.0
+        # Steps may end as soon as they begin; so many in one turn go round in circles.
+        for _ in range(2 * len(self._plan.steps) + 2):
+            if not self._failure and self._out_of_time(situation):
+                ended = self._give_up(situation)
+            else:
+                step = self._fly(dt_s, situation)
+                if not isinstance(step, Outcome):
+                    return step
+                ended = self._after(step, situation)
+            if ended is not None:
+                return ended
+            dt_s = 0.0
+        return Outcome(False, f"{self.where}: its steps end as soon as they begin: {self.records[-1].reason}")
+
+    def _fly(self, dt_s: float, situation: Situation) -> Step:
+        """One turn of the step that is flown."""
+        flown, planned = self._flown, self._plan.steps[self._at]
+        assert flown is not None
+        if self._request_failure:
+            why, self._request_failure = self._request_failure, ""
+            return Outcome(False, why)
+        if not self._failure and (late := self._late(planned, situation.now_ns)) is not None:
+            return late
+        try:
+            if not self._activated:
+                if (refused := self._refused(flown)) is not None:
+                    return Outcome(False, f"refused: {refused}")
+                self._activated = True
+                flown.on_activate(situation)
+            return flown.update(dt_s, situation)
+        except Exception as error:
+            # What goes wrong in one step is that step's failure: the plan says what then.
+            logger.exception("%s failed", flown.name)
+            return Outcome(False, f"{flown.name} failed: {type(error).__name__}: {error}")
+
+    def _late(self, planned: PlannedStep, now_ns: int) -> Outcome | None:
+        flown_s, limit_s = (now_ns - self._begun_ns) / 1e9, planned.timeout_s
+        if limit_s is None or flown_s < limit_s:
+            return None
+        if planned.endless and self._activated:
+            return Outcome(True, f"flown for {limit_s:g} s")
+        return Outcome(False, f"timed out after {limit_s:g} s: {self._status_of_flown()}")
+
+    def _status_of_flown(self) -> str:
+        return self._flown.status if self._flown is not None else "not begun"
+
+    def _after(self, outcome: Outcome, situation: Situation) -> Outcome | None:
+        """What follows a step that has ended; the outcome of all, if nothing does."""
+        planned, where = self._plan.steps[self._at], self.where
+        self._take_last_notes()
+        self._leave()
+        if self._failure:
+            return Outcome(False, f"{self._failure}; {outcome.reason}")
+        told = (planned.title, planned.command, outcome.success, outcome.reason)
+        self.records.append(StepRecord(*told, self._begun_ns, situation.now_ns))
+        self._repeats += 1
+        if outcome.success and self._repeats < planned.repeat:
+            return self._begin(self._at, situation, again=True)
+        follows = planned.on_success if outcome.success else planned.on_failure
+        self._notes.append(f"mission {self._plan.name}: {where} {_done(outcome)}{_then(self._plan, follows)}")
+        return self._go_on(follows, f"{where}: {outcome.reason}", situation)
+
+    def _go_on(self, follows: int | str, told: str, situation: Situation) -> Outcome | None:
+        if isinstance(follows, int):
+            return self._begin(follows, situation)
+        if follows == END:
+            return Outcome(True, f"flown, {len(self.records)} steps")
+        if follows == ABORT:
+            return Outcome(False, told)
+        self._failure = told
+        self._flown, self._activated, self._begun_ns = self._plan.way_down(follows), False, situation.now_ns
+        return None
+
+    def _begin(self, index: int, situation: Situation, *, again: bool = False) -> Outcome | None:
+        planned = self._plan.steps[index]
+        self._at, self._begun_ns, self._activated = index, situation.now_ns, False
+        if not again:
+            self._repeats = 0
+            self._visits[index] += 1
+            if planned.visits is not None and self._visits[index] > planned.visits:
+                told = f"{self.where}: begun {planned.visits} times already"
+                return self._go_on(_final(planned.on_failure), told, situation)
+        self._flown, self._first = self._first or planned.make(), None
+        times = f", {self._repeats + 1} of {planned.repeat} times" if planned.repeat > 1 else ""
+        number = f"step {index + 1} of {len(self._plan.steps)}"
+        self._notes.append(f"mission {self._plan.name}: {number}{times}: {planned.command}")
+        return None
+
+    def _out_of_time(self, situation: Situation) -> bool:
+        limit_s = self._plan.timeout_s
+        return limit_s is not None and situation.now_ns - self._started_ns > limit_s * 1e9
+
+    def _give_up(self, situation: Situation) -> Outcome | None:
+        """The time of the whole mission is over: the step that is flown fails for good."""
+        told = f"{self.where}: the mission's {self._plan.timeout_s:g} s are over"
+        self._take_last_notes()
+        self._leave()
+        self._notes.append(f"mission {self._plan.name}: {told}")
+        return self._go_on(_final(self._plan.steps[self._at].on_failure), told, situation)
+
+    def _take_last_notes(self) -> None:
+        if self._flown is not None:
+            self._notes.extend(self._flown.take_notes())
+
+    def _leave(self) -> None:
+        if self._flown is not None and self._activated:
+            self._activated = False
+            self._flown.on_deactivate()
+
+
+def _done(outcome: Outcome) -> str:
+    return f"{'done' if outcome.success else 'failed'}: {outcome.reason}"
+
+
+def _then(plan: Plan, follows: int | str) -> str:
+    """Where it goes on, if that is anywhere a person would not expect."""
+    if isinstance(follows, str):
+        return "" if follows == END else f"; {follows}"
+    return f"; on with {plan.steps[follows].title}"
+
+
+def _final(follows: int | str) -> str:
+    """A step begun too often may be followed by a way down, not by more steps."""
+    return follows if isinstance(follows, str) and follows in WAYS_DOWN else ABORT

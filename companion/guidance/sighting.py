@@ -1,0 +1,136 @@
+"""When what is seen counts as found, and turning the nose to it: what `seek`, `patrol` and searches share.
+
+One detection is a rumour. Several frames that agree on a direction, of an object that counts as true, make a
+find; it is confirmed when the vehicle faces it and still sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection
+
+from companion.guidance.behaviour import Situation
+from companion.guidance.target import Target
+from vision.rotation import wrap_angle
+
+# So many frames of the last so many seconds must agree on a direction.
+FRAMES_NEEDED = 3
+FRAMES_WINDOW_S = 1.5
+SAME_BEARING_RAD = math.radians(12.0)
+# After a first sighting a turn waits this long for the others to come.
+LOOK_S = 1.0
+# Facing the object: how well, for how long it must last, and when to give the sighting up.
+FACING_RAD = math.radians(4.0)
+FACING_S = 0.4
+FACING_TIMEOUT_S = 12.0
+SIGHT_LOST_S = 2.0
+# Found means seen now, not a moment ago.
+SIGHT_FRESH_S = 0.7
+
+
+class Sightings:
+    """What was seen lately of some classes.
+
+    Attributes:
+        doubted: something was seen often enough, and did not count as true.
+        look_until_ns: something was seen just now; by then there should be more of it.
+    """
+
+    def __init__(self, class_names: Collection[str], confidence: float) -> None:
+        self._class_names, self._confidence = frozenset(class_names), confidence
+        self._seen: deque[Target] = deque(maxlen=64)
+        self._newest_ns = 0
+        self.doubted = False
+        self.look_until_ns: float = 0
+
+    def reset(self, now_ns: int) -> None:
+        """Forget everything. Frames captured before now do not count: they may be of another place."""
+        self._seen.clear()
+        self._newest_ns = now_ns
+        self.doubted, self.look_until_ns = False, 0
+
+    def forget(self) -> None:
+        """Forget what was seen; frames that were looked at stay looked at."""
+        self._seen.clear()
+
+    def fresh(self, situation: Situation) -> list[Target]:
+        """The targets of frames not looked at before that are of these classes, and sure enough."""
+        fresh = [target for target in situation.targets if target.captured_ns > self._newest_ns]
+        if fresh:
+            self._newest_ns = max(target.captured_ns for target in fresh)
+        return [t for t in fresh if t.class_name in self._class_names and t.score >= self._confidence]
+
+    def look(
+        self, situation: Situation, wanted: Callable[[Target], bool] = lambda target: True
+    ) -> Target | None:
+        """Take what new frames show. A target: found now. `wanted` may leave some out."""
+        seen = [target for target in self.fresh(situation) if wanted(target)]
+        if not seen:
+            return None
+        if not self._seen or seen[0].captured_ns - self._seen[-1].captured_ns > LOOK_S * 1e9:
+            self.look_until_ns = situation.now_ns + LOOK_S * 1e9
+        self._seen.extend(seen)
+        oldest_ns = self._newest_ns - FRAMES_WINDOW_S * 1e9
+        recent = [target for target in self._seen if target.captured_ns >= oldest_ns]
+        for target in sorted(seen, key=lambda target: -target.confidence):
+            agreeing = {
+                t.captured_ns
+                for t in recent
+                if t.class_name == target.class_name and apart_rad(t, target) <= SAME_BEARING_RAD
+            }
+            if len(agreeing) < FRAMES_NEEDED:
+                continue
+            if target.trusted:
+                return target
+            self.doubted = True
+        return None
+
+
+class Gaze:
+    """The nose on its way to what was found.
+
+    Attributes:
+        target: it, as it was seen last.
+    """
+
+    def __init__(self, found: Target, now_ns: int) -> None:
+        self.target = found
+        self._since_ns = now_ns
+        self._facing_since_ns: int | None = None
+
+    def follow(self, seen: Collection[Target]) -> None:
+        """Take what new frames show of it."""
+        found = self.target
+        same = [
+            target
+            for target in seen
+            if target.trusted
+            and target.class_name == found.class_name
+            and apart_rad(target, found) <= SAME_BEARING_RAD
+        ]
+        if same:
+            self.target = min(
+                same,
+                key=lambda t: (t.track_id is None or t.track_id != found.track_id, apart_rad(t, found)),
+            )
+
+    def lost(self, now_ns: int) -> bool:
+        """It was not there after all, or it went away."""
+        unseen_s = (now_ns - self.target.captured_ns) / 1e9
+        return unseen_s > SIGHT_LOST_S or now_ns - self._since_ns > FACING_TIMEOUT_S * 1e9
+
+    def faced(self, yaw_rad: float, now_ns: int) -> bool:
+        """Whether the nose has pointed at it for long enough, and it is still seen."""
+        unseen_s = (now_ns - self.target.captured_ns) / 1e9
+        off_rad = abs(wrap_angle(self.target.bearing_rad - yaw_rad))
+        if unseen_s > SIGHT_FRESH_S or off_rad > FACING_RAD:
+            self._facing_since_ns = None
+        elif self._facing_since_ns is None:
+            self._facing_since_ns = now_ns
+        return self._facing_since_ns is not None and now_ns - self._facing_since_ns >= FACING_S * 1e9
+
+
+def apart_rad(first: Target, second: Target) -> float:
+    """The angle between the directions of two targets, level."""
+    return abs(wrap_angle(first.bearing_rad - second.bearing_rad))

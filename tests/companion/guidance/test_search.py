@@ -1,0 +1,105 @@
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+
+from companion.guidance.grammar import parse
+from companion.guidance.registry import behaviour_for
+from companion.guidance.search import SearchBehaviour
+from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
+
+
+def beside(place, points):
+    """The least distance of a place to a row of points, the greater of north and east."""
+    nearest = max(abs(p - q) for p, q in zip(place, points[0], strict=True))
+    for start, end in pairwise(points):
+        # Legs go north or east: the nearest point is found axis by axis.
+        near = [min(max(p, min(a, b)), max(a, b)) for p, a, b in zip(place, start, end, strict=True)]
+        nearest = min(nearest, max(abs(p - q) for p, q in zip(place, near, strict=True)))
+    return nearest
+
+
+unit = st.floats(-1.0, 1.0)
+
+
+@given(st.floats(1, 100), st.floats(2, 40), unit, unit)
+def test_every_place_of_the_square_is_passed_within_half_a_spacing(radius, spacing, north, east):
+    points = expanding_square(radius, spacing)
+    assert beside((north * radius, east * radius), points) <= spacing / 2 + 1e-6
+    assert all(max(map(abs, point)) <= radius + spacing / 2 + 1e-6 for point in points)
+
+
+@given(st.floats(1, 200), st.floats(1, 200), st.floats(2, 40), unit, unit)
+def test_every_place_of_the_area_is_passed_within_half_a_spacing(width, height, spacing, north, east):
+    points = lawnmower(width, height, spacing)
+    assert beside((north * height / 2, east * width / 2), points) <= spacing / 2 + 1e-6
+    assert all(abs(p[0]) <= height / 2 + 1e-9 and abs(p[1]) <= width / 2 + 1e-9 for p in points)
+
+
+@settings(max_examples=30)
+@given(st.floats(0.2, 2.5), st.floats(-0.5, 1.5), st.floats(1, 60))
+def test_the_spacing_is_less_than_what_the_camera_sees(fov, depression, height):
+    spacing = Footprint(fov, depression).spacing_m(height)
+    assert 1.0 <= spacing <= max(1.0, 2 * 25.0 * math.tan(fov / 2))
+    assert Footprint(fov, depression).spacing_m(height * 2) >= spacing
+
+
+def test_a_camera_that_looks_steeply_down_needs_narrow_strips():
+    down = Footprint(math.radians(80), math.radians(90)).spacing_m(10.0)
+    assert down == pytest.approx(0.8 * 2 * 10 * math.tan(math.radians(40)))
+    assert Footprint(math.radians(80), 0.0).spacing_m(10.0) == pytest.approx(
+        0.8 * 2 * 25 * math.tan(math.radians(40))
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["pattern=square radius=12 spacing=8", "pattern=lawnmower width=24 height=16 spacing=8"]
+)
+def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text):
+    car = SeenObject("car", 6.0, -9.0, track_id=4)
+
+    def each(seconds, vehicle):
+        # Small things are seen from near alone.
+        car.visible = math.dist((car.north, car.east), vehicle.position[:2]) < 9.0
+
+    vehicle = KinematicVehicle()
+    outcome = Flight(behaviour_for(parse(f"seek car {text}")), vehicle, [car]).run(240.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    bearing = math.atan2(car.east - vehicle.position[1], car.north - vehicle.position[0])
+    assert abs(math.remainder(bearing - vehicle.yaw_rad, math.tau)) < math.radians(5)
+    assert outcome.reason.startswith("found a car: bearing ")
+
+
+def test_an_area_without_the_object_is_flown_whole_and_the_reason_is_told():
+    doubtful = SeenObject("car", 6.0, 2.0, trusted=False)
+    flight = Flight(SearchBehaviour("car", radius_m=8.0, spacing_m=8.0), KinematicVehicle(), [doubtful])
+    outcome = flight.run(120.0)
+    assert outcome is not None
+    assert outcome.reason == (
+        "no car seen in the whole area: what was seen does not count as true (tracker.true_score)"
+    )
+
+
+def test_without_spacing_or_camera_a_search_says_what_is_missing():
+    outcome = Flight(SearchBehaviour("car", radius_m=30.0), KinematicVehicle()).run(1.0)
+    assert outcome is not None
+    assert outcome.reason == "seek: the camera's footprint is not known: give spacing"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("seek car pattern=square", "pattern=square needs radius"),
+        ("seek car pattern=lawnmower width=10", "needs width and height"),
+        ("seek car radius=10", "pattern=turn takes no radius"),
+        ("seek car pattern=square radius=10 width=3", "takes no width"),
+        ("seek car pattern=zigzag", "turn or square or lawnmower"),
+    ],
+)
+def test_the_area_fits_the_pattern(text, said):
+    with pytest.raises(ValueError, match=said):
+        parse(text)
