@@ -1,0 +1,158 @@
+"""Apart from each other: no vehicle is flown nearer to another than a least distance.
+
+Towards a neighbour no more speed is left than can be taken off in the way that is there, and the neighbour's own
+way of stopping counts: one that flies ahead goes on for a while even when it brakes, one that comes nearer
+needs room itself. That is the car-following law of Gipps (1981, "A behavioural car-following model for
+computer simulation"): v <= sqrt((b·t)² + 2·b·way + v_ahead²) - b·t, with both braking at b and t the time until
+we answer, which grows with the age of what we know. Each neighbour so makes a half-space of velocities; what
+was asked for is brought into all of them by the least change, one after the other (van den Berg et al. 2011,
+"Reciprocal n-body collision avoidance", with the line of centres for the plane). Standing still is in
+every half-space: a limit only takes away, and never makes anybody flee.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from companion.guidance.neighbours import Neighbour
+from companion.vehicle.state import Vector3
+
+# Kept on top of the least distance: places are estimates, and the vehicle answers late.
+MARGIN_M = 0.5
+# How late a multirotor's velocity follows.
+ANSWER_S = 0.4
+# Closing speed for each metre left, at most: a velocity that follows by 0.3 s is then critically damped.
+GAIN_PER_S = 0.8
+# What slows down for one may push towards another: so often it is taken back.
+_ROUNDS = 20
+
+
+class Row(NamedTuple):
+    """One limit: a unit direction (NED) towards a neighbour, and the speed allowed in it."""
+
+    north: float
+    east: float
+    down: float
+    allowed_mps: float
+    name: str
+
+
+def allowed_speed(left_m: float, ahead_mps: float, age_s: float, braking_mps2: float) -> float:
+    """The speed towards a neighbour from which both can stop in time; never less than 0.
+
+    Args:
+        left_m: way that is left. ahead_mps: of the neighbour, away from us; negative: towards us.
+        age_s: of what is known of it. braking_mps2: of both.
+    """
+    answer_s = ANSWER_S + age_s
+    if ahead_mps < 0.0:
+        left_m -= -ahead_mps * answer_s + ahead_mps**2 / (2.0 * braking_mps2)
+        ahead_mps = 0.0
+    late = braking_mps2 * answer_s
+    square = late**2 + 2.0 * braking_mps2 * left_m + ahead_mps**2
+    stopping = math.sqrt(max(0.0, square)) - late
+    return max(0.0, min(stopping, ahead_mps + GAIN_PER_S * max(0.0, left_m)))
+
+
+def rows_at(
+    position: Vector3, neighbours: Sequence[Neighbour], separation_m: float, braking_mps2: float
+) -> list[Row]:
+    """The limits at a place (local NED): one for every neighbour that is really there."""
+    rows = []
+    for neighbour in neighbours:
+        if neighbour.virtual:
+            continue
+        offset = [n - p for n, p in zip(neighbour.position_ned_m, position, strict=True)]
+        distance_m = math.hypot(*offset)
+        # In the same place every way leads apart.
+        north, east, down = (part / distance_m for part in offset) if distance_m > 1e-6 else (0.0, 0.0, 0.0)
+        ahead = sum(
+            v * d for v, d in zip(neighbour.velocity_ned_mps, (north, east, down), strict=True)
+        )
+        left_m = distance_m - separation_m - MARGIN_M
+        # A silent one is at rest; how late we answer does not grow with its silence.
+        age_s = 0.0 if neighbour.silent else neighbour.age_s
+        rows.append(Row(north, east, down, allowed_speed(left_m, ahead, age_s, braking_mps2), neighbour.name))
+    return rows
+
+
+def apart(velocity: Vector3, rows: Sequence[Row]) -> tuple[Vector3, tuple[str, ...]]:
+    """What is left of a velocity (NED), no faster than it came, and because of whom."""
+    top = math.hypot(*velocity)
+    acting = [row for row in rows if row.allowed_mps < top]
+    names: dict[str, None] = {}
+    for _ in range(_ROUNDS):
+        before = velocity
+        for row in acting:
+            excess = _towards(velocity, row) - row.allowed_mps
+            if excess > 1e-9:
+                names[row.name] = None
+                velocity = (
+                    velocity[0] - excess * row.north,
+                    velocity[1] - excess * row.east,
+                    velocity[2] - excess * row.down,
+                )
+        if velocity == before:
+            return velocity, tuple(names)
+    # Standing still keeps every limit, so what still breaks one is shortened towards that.
+    share = 1.0
+    for row in acting:
+        towards = _towards(velocity, row)
+        if towards > row.allowed_mps + 1e-6:
+            share = min(share, row.allowed_mps / towards)
+    return (velocity[0] * share, velocity[1] * share, velocity[2] * share), tuple(names)
+
+
+def level_rows(rows: Sequence[Row], down_mps: float) -> list[tuple[float, float, float]]:
+    """The same limits for a velocity over ground (north, east, speed), beside this one downwards."""
+    level = []
+    for row in rows:
+        share = math.hypot(row.north, row.east)
+        if share > 1e-3:
+            allowed = max(0.0, (row.allowed_mps - down_mps * row.down) / share)
+            level.append((row.north / share, row.east / share, allowed))
+    return level
+
+
+def around(
+    wanted: tuple[float, float],
+    way_m: float,
+    position: Vector3,
+    standing: Sequence[Neighbour],
+    clearance_m: float,
+) -> tuple[float, float]:
+    """A velocity over ground (north, east) that leads past whoever stands in the way, on the nearer side.
+
+    Straight at somebody it leads past on the right, as vehicles that meet head on both do.
+
+    Args:
+        wanted: relative to those who stand. way_m: how far it is to go. standing: local NED.
+        clearance_m: wanted to everybody.
+    """
+    speed = math.hypot(*wanted)
+    if speed < 1e-6:
+        return wanted
+    ahead = (wanted[0] / speed, wanted[1] / speed)
+    nearest: tuple[float, float, float] | None = None
+    for neighbour in standing:
+        offset = [n - p for n, p in zip(neighbour.position_ned_m, position, strict=True)]
+        along = offset[0] * ahead[0] + offset[1] * ahead[1]
+        right = offset[1] * ahead[0] - offset[0] * ahead[1]
+        in_the_way = abs(offset[2]) < clearance_m and abs(right) < clearance_m and 0.0 < along < way_m
+        if in_the_way and (nearest is None or along < nearest[0]):
+            nearest = (along, right, math.hypot(along, right))
+    if nearest is None:
+        return wanted
+    along, right, distance = nearest
+    # To the tangent of the circle about it; from within the circle, square to the line of centres.
+    bearing = math.atan2(right, along)
+    side = -1.0 if right > 0.2 else 1.0
+    turn = bearing + side * (math.asin(min(1.0, clearance_m / max(distance, 1e-6))))
+    cosine, sine = math.cos(turn), math.sin(turn)
+    return (wanted[0] * cosine - wanted[1] * sine, wanted[0] * sine + wanted[1] * cosine)
+
+
+def _towards(velocity: Vector3, row: Row) -> float:
+    return velocity[0] * row.north + velocity[1] * row.east + velocity[2] * row.down
