@@ -18,6 +18,7 @@ from companion.bus import topics
 from companion.bus.session import Bus
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
+from companion.guidance.battery import BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.commands import Command
 from companion.guidance.envelope import Envelope, Limits
@@ -98,6 +99,7 @@ class Service:
             on_event=self._pilot_event,
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
+            battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
         )
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
@@ -416,7 +418,7 @@ class Service:
         )
 
     def _pilot_event(self, event: PilotEvent) -> None:
-        lost = event.kind is PilotEventKind.LOST
+        lost = event.kind in (PilotEventKind.LOST, PilotEventKind.BATTERY)
         # What is refused or ended is told with the command's own outcome.
         if event.kind not in (PilotEventKind.REFUSED, PilotEventKind.ENDED, PilotEventKind.STARTED):
             self._event("warning" if lost else "info", event.message)

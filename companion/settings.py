@@ -307,6 +307,10 @@ class GuidanceSection(Section):
     """a setpoint older than this is not sent any more, seconds"""
     brake_s: Annotated[float, Field(ge=0, le=5)] = 0.5
     """after that a brake is sent for so long, then nothing, and the autopilot's failsafe acts; seconds"""
+    min_battery_percent: Annotated[float, Field(ge=0, le=100)] = 15.0
+    """no flight begins with less charge than this, and one ends below it; percent, 0: not watched"""
+    low_battery: Literal["rtl", "land", "hold"] = "rtl"
+    """what follows a flight that ended for its battery: return, land here, or hold under our command"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """detections older than this do not steer, seconds from capture"""
     view: Annotated[str | None, _VIEW_NAME] = None

@@ -18,6 +18,11 @@ class Requirement(StrEnum):
     IN_AIR = "in_air"
     ON_GROUND = "on_ground"
     PERCEPTION = "perception"  # a perception worker that delivers
+    BATTERY = "battery"  # more charge than guidance.min_battery_percent
+    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, or a class of known size
+    MARKER = "marker"  # perception that looks for markers
+    GIMBAL = "gimbal"  # one that answers
+    NEIGHBOURS = "neighbours"  # other vehicles whose poses are fresh
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,6 +66,7 @@ class VehicleState:
     position_ns: int = 0
     global_ns: int = 0
     landed_ns: int = 0
+    battery_ns: int = 0
     armed: bool = False
     mode: FlightMode = FlightMode.UNKNOWN
     landed: LandedState = LandedState.UNKNOWN
