@@ -54,7 +54,15 @@ class Points:
     meaning: str
 
 
-Argument = Number | ClassName | Choice | Points
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A word that is not one of a few, such as a vehicle's name."""
+
+    key: str
+    meaning: str
+
+
+Argument = Number | ClassName | Choice | Points | Word
 
 
 def known_class(text: str, class_names: Sequence[str]) -> str:
@@ -77,6 +85,9 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
         case Choice(key, words):
             if value not in words:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
+        case Word(key):
+            if not isinstance(value, str) or not re.fullmatch(r"[\w.-]+", value):
+                raise GrammarError(f"{word}: {key} must be a word, got {value!r}")
         case Points(key):
             try:
                 points = points_from(str(value))

@@ -59,6 +59,10 @@ class FormationBehaviour(Behaviour):
         slot: the one to take, from 1; None: the one that suits all best.
         points, speed_mps, laps: the path of a virtual structure, as `follow-path` has it.
         lost_timeout_s: so long is waited for a leader that is not heard.
+
+    Attributes:
+        note: what the others are told; None while nothing is flown.
+        slot_offset_ned_m: from the leader to the slot, as it was last flown.
     """
 
     name = "formation"
@@ -76,7 +80,7 @@ class FormationBehaviour(Behaviour):
         laps: float = 1.0,
         lost_timeout_s: float = LOST_TIMEOUT_S,
     ) -> None:
-        self._shape, self._leader_name, self._spacing_m, self._slot = shape, leader, spacing_m, slot
+        self._shape, self.leader_name, self._spacing_m, self._slot = shape, leader, spacing_m, slot
         self._structure = VirtualStructure(points, speed_mps, laps) if leader == VIRTUAL else None
         self._lost_timeout_s = lost_timeout_s
         self.neighbour_names = () if leader == VIRTUAL else (leader,)
@@ -94,6 +98,7 @@ class FormationBehaviour(Behaviour):
         self._over_since_ns: int | None = None
         self._words = "waiting for the others"
         self.note: FormationNote | None = None
+        self.slot_offset_ned_m: Vector3 | None = None
 
     def on_activate(self, situation: Situation) -> None:
         self._reset()
@@ -104,7 +109,9 @@ class FormationBehaviour(Behaviour):
     def update(self, dt_s: float, situation: Situation) -> Step:
         hood = situation.neighbourhood
         if hood is None or hood.problem is not None or hood.anchor is None:
-            return self._without_leader(situation, "the others are not heard" if hood is None else hood.problem)
+            return self._without_leader(
+                situation, "the others are not heard" if hood is None else hood.problem
+            )
         leader = self._leader(dt_s, situation, hood)
         if isinstance(leader, Outcome):
             return leader
@@ -133,11 +140,11 @@ class FormationBehaviour(Behaviour):
         """What is followed; or why it cannot be now; or why it cannot be at all."""
         if self._structure is not None:
             return self._virtual_leader(dt_s, situation, hood, self._structure)
-        if self._leader_name == hood.own:
+        if self.leader_name == hood.own:
             return Outcome(False, f"{hood.own} cannot follow itself: name another leader")
-        leader = hood.named(self._leader_name)
+        leader = hood.named(self.leader_name)
         if leader is None or leader.silent:
-            return f"{self._leader_name}, the leader, is not heard"
+            return f"{self.leader_name}, the leader, is not heard"
         if leader.formation is not None and leader.formation.leader == hood.own:
             return Outcome(False, f"{leader.name} follows {hood.own}: two cannot follow each other")
         if not (leader.airborne or leader.virtual):
@@ -157,7 +164,9 @@ class FormationBehaviour(Behaviour):
                 return f"{mover} has not told yet where the structure is"
             other, where = told[mover]
             place = hood.anchor.local(*where.place)
-            north, east, down = (p + v * other.age_s for p, v in zip(place, where.velocity_ned_mps, strict=True))
+            north, east, down = (
+                p + v * other.age_s for p, v in zip(place, where.velocity_ned_mps, strict=True)
+            )
             return _Leader((north, east, down), where.velocity_ned_mps, where.heading_rad, 0.0, where.over)
         try:
             if not structure.begun:
@@ -182,7 +191,7 @@ class FormationBehaviour(Behaviour):
         return [
             other
             for other in hood.vehicles
-            if other.formation is not None and other.formation.leader == self._leader_name
+            if other.formation is not None and other.formation.leader == self.leader_name
         ]
 
     def _told_structures(self, hood: Neighbourhood) -> dict[str, tuple[Neighbour, Structure]]:
@@ -193,14 +202,14 @@ class FormationBehaviour(Behaviour):
         }
 
     def _centre_taken(self, hood: Neighbourhood) -> bool:
-        leader = hood.named(self._leader_name)
+        leader = hood.named(self.leader_name)
         return self._structure is None and not (leader is not None and leader.virtual)
 
     # ---- the others -------------------------------------------------------------------------------------
 
     def _agree(self, hood: Neighbourhood, leader: _Leader, position: Vector3) -> Agreement:
         if self._group is None:
-            self._group = Group(hood.own, self._leader_name, self._shape, self._spacing_m, self._slot)
+            self._group = Group(hood.own, self.leader_name, self._shape, self._spacing_m, self._slot)
         self._group.centre_taken = self._centre_taken(hood)
         heading = self._heading_rad or 0.0
         places = {other.name: _in_frame(other.position_ned_m, leader, heading) for other in hood.vehicles}
@@ -251,7 +260,7 @@ class FormationBehaviour(Behaviour):
     def _tell(self, hood: Neighbourhood, agreement: Agreement) -> None:
         assigning = agreement.by == hood.own
         note = FormationNote(
-            self._leader_name,
+            self.leader_name,
             agreement.plan,
             self._slot,
             self._error_m,
@@ -271,7 +280,7 @@ class FormationBehaviour(Behaviour):
         """Until the leader is heard nothing is assigned, but the others know who waits."""
         plan = Plan(0, hood.own, self._shape, self._spacing_m)
         held = self.note
-        self.note = FormationNote(self._leader_name, plan if held is None else held.plan, self._slot)
+        self.note = FormationNote(self.leader_name, plan if held is None else held.plan, self._slot)
 
     # ---- flying -----------------------------------------------------------------------------------------
 
@@ -288,6 +297,8 @@ class FormationBehaviour(Behaviour):
         slot, moving = slot_motion(
             leader.position, leader.velocity, self._heading_rad, self._turn_rate_radps, offset
         )
+        north, east, down = (s - p for s, p in zip(slot, leader.position, strict=True))
+        self.slot_offset_ned_m = (north, east, down)
         missing = (slot[0] - position[0], slot[1] - position[1], slot[2] - position[2])
         self._error_m = math.hypot(*missing)
         way_m = math.hypot(missing[0], missing[1])
@@ -305,9 +316,7 @@ class FormationBehaviour(Behaviour):
         self._words = (
             f"slot {agreement.slots[hood.own]} of {agreement.plan.shape}, {self._error_m:.1f} m from it"
         )
-        return Setpoint.velocity(
-            (north, east, moving[2] + down), situation.now_ns, yaw_rad=self._heading_rad
-        )
+        return Setpoint.velocity((north, east, moving[2] + down), situation.now_ns, yaw_rad=self._heading_rad)
 
     def _without_leader(self, situation: Situation, why: str | None) -> Step:
         """Brake and hold; not for ever."""

@@ -45,9 +45,7 @@ class Agreement:
 
     def reach_m(self, *, centre_taken: bool) -> float:
         """How far out the outermost slot is."""
-        return radius_m(
-            slots(self.plan.shape, self.count, self.plan.spacing_m, centre_taken=centre_taken)
-        )
+        return radius_m(slots(self.plan.shape, self.count, self.plan.spacing_m, centre_taken=centre_taken))
 
 
 @dataclass

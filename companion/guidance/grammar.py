@@ -23,6 +23,7 @@ from companion.guidance.arguments import (
     GrammarError,
     Number,
     Points,
+    Word,
     known_class,
     nearest,
     range_of,
@@ -89,7 +90,7 @@ def describe() -> str:
                     lines.append(f"    {key}: {meaning} ({low:g} to {high:g}{' ' + unit if unit else ''})")
                 case Choice(key, words, meaning):
                     lines.append(f"    {key}: {meaning} ({' or '.join(words)})")
-                case ClassName(key, meaning) | Points(key, meaning):
+                case ClassName(key, meaning) | Points(key, meaning) | Word(key, meaning):
                     lines.append(f"    {key}: {meaning}")
     return "\n".join(lines)
 
@@ -159,7 +160,7 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {text!r}") from None
         case Choice():
             return text.lower()
-        case Points():
+        case Points() | Word():
             return text
         case ClassName():
             return text if class_names is None else known_class(text, class_names)

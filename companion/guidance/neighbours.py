@@ -1,15 +1,16 @@
 """Who flies nearby: the poses the others tell, brought to now and into the own local frame.
 
 How old a pose is. Sender and receiver have clocks of their own, whose difference nobody knows. What is known
-of each message is its receipt minus its sending: that difference plus the message's delay. The least of it over
-the last minute belongs to the message that was delayed least; what a message is above that, it was delayed
-more. So the age of a pose is its own age when it was sent, plus that measured delay, plus the time since
-its receipt; it is too small by the network's least delay alone, which is a millisecond or a few on a radio
-network, and at 5 m/s a centimetre or two. Clocks drift by some 50 parts in a million: 3 ms in that minute.
+of each message is its receipt minus its sending: that difference plus the message's delay. The least of it
+over the last minute belongs to the message that was delayed least; what a message is above that, it was
+delayed more. So the age of a pose is its own age when it was sent, plus that measured delay, plus the time
+since its receipt; it is too small by the network's least delay alone, which is a millisecond or a few on a
+radio network, and at 5 m/s a centimetre or two. Clocks drift by some 50 parts in a million: 3 ms in a minute.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from companion.guidance.geodesy import north_east
@@ -73,6 +74,26 @@ class Neighbourhood:
 
     def named(self, name: str) -> Neighbour | None:
         return next((vehicle for vehicle in self.vehicles if vehicle.name == name), None)
+
+
+def missing_neighbours(neighbourhood: Neighbourhood | None, names: Sequence[str]) -> list[str]:
+    """What a behaviour that needs these vehicles lacks, in words; none: nothing."""
+    if neighbourhood is None:
+        return ["neighbours (this service does not share poses)"]
+    if neighbourhood.problem is not None:
+        return [f"neighbours ({neighbourhood.problem})"]
+    heard = [vehicle.name for vehicle in neighbourhood.vehicles if not vehicle.silent]
+    known = f"heard are {', '.join(heard)}" if heard else "nobody is heard"
+    missing = []
+    for name in names:
+        vehicle = neighbourhood.named(name)
+        if name == neighbourhood.own:
+            missing.append(f"another leader than itself ({known})")
+        elif vehicle is None:
+            missing.append(f"the pose of {name} (none came; {known})")
+        elif vehicle.silent:
+            missing.append(f"the pose of {name} (it is {vehicle.age_s:.1f} s old)")
+    return missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +205,11 @@ class Neighbours:
             _placed(name, heard, anchor, _age_s(heard, now_ns)) for name, heard in sorted(self._heard.items())
         )
         return Neighbourhood(self.own, vehicles, None, anchor)
+
+    def leads(self) -> bool:
+        """Somebody says that it follows this vehicle."""
+        notes = (heard.pose.formation for heard in self._heard.values())
+        return any(note is not None and note.leader == self.own for note in notes)
 
     def ages_s(self, now_ns: int) -> dict[str, float]:
         """How old what is known of everybody is."""

@@ -197,7 +197,11 @@ def _note_message(note: FormationNote) -> dict[str, Any]:
         "structure": None
         if structure is None
         else {
-            "place": [round(structure.place[0], 8), round(structure.place[1], 8), round(structure.place[2], 3)],
+            "place": [
+                round(structure.place[0], 8),
+                round(structure.place[1], 8),
+                round(structure.place[2], 3),
+            ],
             "velocity_ned_mps": [round(value, 3) for value in structure.velocity_ned_mps],
             "heading_rad": round(structure.heading_rad, 4),
             "origin": list(structure.origin),

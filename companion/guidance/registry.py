@@ -9,6 +9,7 @@ from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.formation import FormationBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
@@ -55,6 +56,17 @@ def behaviour_for(command: commands.Command) -> Behaviour:
                 speed_mps=speed_mps,
                 confidence=confidence,
                 lost_timeout_s=lost_timeout_s,
+            )
+        case commands.Formation(shape, leader, spacing_m):
+            return FormationBehaviour(
+                shape,
+                leader,
+                spacing_m,
+                command.slot_number,
+                points=command.places,
+                speed_mps=command.speed_mps,
+                laps=command.laps,
+                lost_timeout_s=command.lost_timeout_s,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 

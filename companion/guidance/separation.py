@@ -1,12 +1,12 @@
 """Apart from each other: no vehicle is flown nearer to another than a least distance.
 
-Towards a neighbour no more speed is left than can be taken off in the way that is there, and the neighbour's own
-way of stopping counts: one that flies ahead goes on for a while even when it brakes, one that comes nearer
-needs room itself. That is the car-following law of Gipps (1981, "A behavioural car-following model for
-computer simulation"): v <= sqrt((b·t)² + 2·b·way + v_ahead²) - b·t, with both braking at b and t the time until
-we answer, which grows with the age of what we know. Each neighbour so makes a half-space of velocities; what
-was asked for is brought into all of them by the least change, one after the other (van den Berg et al. 2011,
-"Reciprocal n-body collision avoidance", with the line of centres for the plane). Standing still is in
+Towards a neighbour no more speed is left than can be taken off in the way that is there, and the neighbour's
+own way of stopping counts: one that flies ahead goes on for a while even when it brakes, one that comes
+nearer needs room itself. That is the car-following law of Gipps (1981, "A behavioural car-following model for
+computer simulation"): v <= sqrt((b·t)² + 2·b·way + v_ahead²) - b·t, with both braking at b and t the time
+until we answer, which grows with the age of what we know. Each neighbour so makes a half-space of velocities;
+what was asked for is brought into all of them by the least change, one after the other (van den Berg et al.
+2011, "Reciprocal n-body collision avoidance", with the line of centres for the plane). Standing still is in
 every half-space: a limit only takes away, and never makes anybody flee.
 """
 
@@ -68,9 +68,7 @@ def rows_at(
         distance_m = math.hypot(*offset)
         # In the same place every way leads apart.
         north, east, down = (part / distance_m for part in offset) if distance_m > 1e-6 else (0.0, 0.0, 0.0)
-        ahead = sum(
-            v * d for v, d in zip(neighbour.velocity_ned_mps, (north, east, down), strict=True)
-        )
+        ahead = sum(v * d for v, d in zip(neighbour.velocity_ned_mps, (north, east, down), strict=True))
         left_m = distance_m - separation_m - MARGIN_M
         # A silent one is at rest; how late we answer does not grow with its silence.
         age_s = 0.0 if neighbour.silent else neighbour.age_s

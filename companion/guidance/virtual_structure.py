@@ -2,9 +2,9 @@
 
 Every vehicle holds its place in the structure, and the structure goes on only as fast as they do (Lewis, Tan
 1997, "High precision formation control of mobile robots using virtual structures"; the feedback from the
-vehicles to the structure as in Ren, Beard 2004, "Formation feedback control for multiple spacecraft via virtual
-structures"). The vehicle that assigns the slots moves it and tells where it is; if that one falls silent,
-the next goes on from there.
+vehicles to the structure as in Ren, Beard 2004, "Formation feedback control for multiple spacecraft via
+virtual structures"). The vehicle that assigns the slots moves it and tells where it is; if that one falls
+silent, the next goes on from there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from companion.guidance.pose import Structure
 from companion.vehicle.state import Vector3
 from vision.rotation import wrap_angle
 
-# The structure moves on at full speed with the worst slot error below the first, not at all from the second on.
+# It moves on at full speed with the worst slot error below the first, not at all from the second on.
 FULL_SPEED_ERROR_M = 0.7
 NO_SPEED_ERROR_M = 2.5
 ACCELERATION_MPS2 = 0.7

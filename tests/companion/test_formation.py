@@ -54,7 +54,9 @@ def test_what_is_no_formation_is_refused(arguments, words):
 @given(st.integers(1, 5).flatmap(lambda n: st.tuples(st.just(n), st.integers(n, 6))), st.randoms())
 def test_the_assignment_costs_least_of_all(size, random):
     rows, columns = size
-    cost = np.array([[random.choice((0.0, 1.0, random.uniform(0, 9))) for _ in range(columns)] for _ in range(rows)])
+    cost = np.array(
+        [[random.choice((0.0, 1.0, random.uniform(0, 9))) for _ in range(columns)] for _ in range(rows)]
+    )
     found = least_cost(cost)
     assert len(set(found)) == rows
     best = min(
