@@ -1,8 +1,8 @@
 """Five built-in vehicles in formation through turns: wind, noise, poses that come late or not at all.
 
-The shape goes by the seed. The leader flies a path with right-angled turns; four vehicles that hover beside it
-in any order take their slots and follow. All are of the built-in kind, each with its own origin, clock, gusts and
-errors of estimate.
+The shape goes by the seed. The leader flies a path with right-angled turns; four vehicles that hover about it
+in any order take their slots and follow. All are of the built-in kind, each with its own origin, clock, gusts
+and errors of estimate.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ ASSEMBLED_M = 1.5
 
 
 def hovering(fleet: Fleet, count: int, seed: int, wind_mps: float = WIND_MPS) -> list[str]:
-    """That many built-in vehicles, hovering on a grid 5 m wide in an order of the seed's."""
+    """That many built-in vehicles, hovering 7 m apart on a grid in an order of the seed's."""
     chance = random.Random(seed)
-    places = [(-5.0 * (index // 3), 5.0 * (index % 3)) for index in range(count)]
+    places = [(-7.0 * (index // 3), 7.0 * (index % 3)) for index in range(count)]
     chance.shuffle(places)
     direction = chance.uniform(0.0, math.tau)
     wind = (wind_mps * math.cos(direction), wind_mps * math.sin(direction))
