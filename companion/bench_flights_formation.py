@@ -24,8 +24,8 @@ SPACING_M = 5.0
 WIND_MPS = 3.0
 LEADER_SPEED_MPS = 2.5
 HEIGHT_M = 6.0
-# About the leader's home: two turns to the right and one to the left.
-PATH = ((30.0, 0.0), (30.0, 25.0), (0.0, 25.0), (0.0, 50.0))
+# About the leader's home: a turn to the right and one to the left.
+PATH = ((25.0, 0.0), (25.0, 25.0), (50.0, 25.0))
 ASSEMBLED_M = 1.5
 
 

@@ -18,7 +18,7 @@ from companion.guidance.formation_group import Agreement, Group
 from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed
 from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.pose import FormationNote, Plan, Structure
-from companion.guidance.separation import around
+from companion.guidance.separation import MARGIN_M, around, pushed_apart
 from companion.guidance.virtual_structure import VirtualStructure
 from companion.vehicle.setpoint import Setpoint
 from vision.rotation import wrap_angle
@@ -36,6 +36,8 @@ SWING_MPS2 = 0.7
 STANDING_MPS = 0.5
 # A neighbour slower than this beside the formation stands in the way and is flown around.
 IN_THE_WAY_MPS = 0.6
+# Ways past others are flown so far outside of the least distance.
+CLEARANCE_M = 1.0
 # Of a virtual structure: all are there, so near and for so long; then the others are told so for a while.
 THERE_M, THERE_S, TELL_S = 1.2, 1.0, 1.5
 
@@ -97,6 +99,7 @@ class FormationBehaviour(Behaviour):
         self._there_since_ns: int | None = None
         self._over_since_ns: int | None = None
         self._words = "waiting for the others"
+        self._side = 1.0
         self.note: FormationNote | None = None
         self.slot_offset_ned_m: Vector3 | None = None
 
@@ -162,6 +165,7 @@ class FormationBehaviour(Behaviour):
         if mover < hood.own:
             if mover not in told:
                 return f"{mover} has not told yet where the structure is"
+            structure.leave()
             other, where = told[mover]
             place = hood.anchor.local(*where.place)
             north, east, down = (
@@ -224,6 +228,13 @@ class FormationBehaviour(Behaviour):
             holder = next((name for name, number in agreement.slots.items() if number == self._slot), None)
             if holder is not None:
                 return Outcome(False, f"slot {self._slot} is {holder}'s: choose another, or slot=auto")
+        if agreement.plan.spacing_m < situation.min_separation_m + MARGIN_M:
+            least_m = situation.min_separation_m + MARGIN_M
+            return Outcome(
+                False,
+                f"spacing must be {least_m:g} m at least with guidance.min_separation_m at "
+                f"{situation.min_separation_m:g} m, got {agreement.plan.spacing_m:g} m",
+            )
         if self._structure is None:
             return None
         now_ns = situation.now_ns
@@ -303,15 +314,20 @@ class FormationBehaviour(Behaviour):
         self._error_m = math.hypot(*missing)
         way_m = math.hypot(missing[0], missing[1])
         gain = min(SLOT_GAIN_PER_S, CATCH_UP_MPS / way_m) if way_m > 1e-6 else 0.0
-        closing = around(
+        nearest_m = situation.min_separation_m
+        closing, self._side = around(
             (missing[0] * gain, missing[1] * gain),
             way_m,
             position,
             [other for other in hood.vehicles if _stands(other, moving)],
-            situation.min_separation_m + 1.0,
+            nearest_m + CLEARANCE_M,
+            self._side,
         )
+        # Neighbours in their slots do not push each other.
+        soft_m = min(nearest_m + CLEARANCE_M, max(nearest_m + MARGIN_M, 0.9 * agreement.plan.spacing_m))
+        push = pushed_apart(position, hood.vehicles, soft_m)
         down = max(-CLIMB_MPS, min(CLIMB_MPS, SLOT_GAIN_PER_S * missing[2]))
-        wanted = (moving[0] + closing[0], moving[1] + closing[1])
+        wanted = (moving[0] + closing[0] + push[0], moving[1] + closing[1] + push[1])
         north, east = pressed(wanted, situation.state, math.hypot(*wanted) + 1.0)
         self._words = (
             f"slot {agreement.slots[hood.own]} of {agreement.plan.shape}, {self._error_m:.1f} m from it"

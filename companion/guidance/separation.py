@@ -25,6 +25,14 @@ MARGIN_M = 0.5
 ANSWER_S = 0.4
 # Closing speed for each metre left, at most: a velocity that follows by 0.3 s is then critically damped.
 GAIN_PER_S = 0.8
+# Ways around somebody are looked for so far ahead, in steps of so much to either side.
+LOOK_M = 12.0
+TURN_RAD = math.radians(15.0)
+_TURNS = 10
+_FAVOUR = 2
+# Speed away from somebody too near, for each metre that is missing, and at most.
+PUSH_PER_S = 0.8
+PUSH_MPS = 1.0
 # What slows down for one may push towards another: so often it is taken back.
 _ROUNDS = 20
 
@@ -120,36 +128,81 @@ def around(
     position: Vector3,
     standing: Sequence[Neighbour],
     clearance_m: float,
-) -> tuple[float, float]:
-    """A velocity over ground (north, east) that leads past whoever stands in the way, on the nearer side.
+    side: float = 1.0,
+) -> tuple[tuple[float, float], float]:
+    """A velocity over ground (north, east) that leads past whoever stands in the way.
 
-    Straight at somebody it leads past on the right, as vehicles that meet head on both do.
+    The straight way if it is free, else the free one that turns off it least. Both sides alike, the one it
+    turned to last is kept; first that is the right, as vehicles that meet head on both pass there.
 
     Args:
         wanted: relative to those who stand. way_m: how far it is to go. standing: local NED.
-        clearance_m: wanted to everybody.
+        clearance_m: wanted to everybody on the way.
+        side: what this told last: 1 right, -1 left.
+
+    Returns:
+        The velocity, as fast as the wanted one where any way is free, and the side it turns to.
     """
     speed = math.hypot(*wanted)
     if speed < 1e-6:
-        return wanted
-    ahead = (wanted[0] / speed, wanted[1] / speed)
-    nearest: tuple[float, float, float] | None = None
-    for neighbour in standing:
-        offset = [n - p for n, p in zip(neighbour.position_ned_m, position, strict=True)]
-        along = offset[0] * ahead[0] + offset[1] * ahead[1]
-        right = offset[1] * ahead[0] - offset[0] * ahead[1]
-        in_the_way = abs(offset[2]) < clearance_m and abs(right) < clearance_m and 0.0 < along < way_m
-        if in_the_way and (nearest is None or along < nearest[0]):
-            nearest = (along, right, math.hypot(along, right))
-    if nearest is None:
-        return wanted
-    along, right, distance = nearest
-    # To the tangent of the circle about it; from within the circle, square to the line of centres.
-    bearing = math.atan2(right, along)
-    side = -1.0 if right > 0.2 else 1.0
-    turn = bearing + side * (math.asin(min(1.0, clearance_m / max(distance, 1e-6))))
-    cosine, sine = math.cos(turn), math.sin(turn)
-    return (wanted[0] * cosine - wanted[1] * sine, wanted[0] * sine + wanted[1] * cosine)
+        return wanted, side
+    near = [
+        (offset[0], offset[1])
+        for offset in (
+            tuple(n - p for n, p in zip(other.position_ned_m, position, strict=True)) for other in standing
+        )
+        if abs(offset[2]) < clearance_m
+    ]
+    reach_m = min(way_m, LOOK_M)
+    # The other side must be better by _FAVOUR steps to be changed to.
+    turns = [
+        0.0,
+        *(
+            turn
+            for step in range(1, _TURNS + _FAVOUR + 1)
+            for turn in (side * step, -side * (step - _FAVOUR))
+            if 0.0 < abs(turn) <= _TURNS and (turn * side > 0.0 or step > _FAVOUR)
+        ),
+    ]
+    for turn in turns:
+        cosine, sine = math.cos(turn * TURN_RAD), math.sin(turn * TURN_RAD)
+        way = (wanted[0] * cosine - wanted[1] * sine, wanted[0] * sine + wanted[1] * cosine)
+        if all(_clear((way[0] / speed, way[1] / speed), reach_m, there, clearance_m) for there in near):
+            return way, side if turn == 0.0 else math.copysign(1.0, turn)
+    return (0.0, 0.0), side
+
+
+def _clear(
+    ahead: tuple[float, float], reach_m: float, there: tuple[float, float], clearance_m: float
+) -> bool:
+    """Whether a straight way keeps clear of a place; from too near already: whether it leads away."""
+    along = there[0] * ahead[0] + there[1] * ahead[1]
+    if along <= 0.0:
+        return True
+    if math.hypot(*there) < clearance_m:
+        return False
+    nearest = min(along, reach_m)
+    return math.hypot(there[0] - nearest * ahead[0], there[1] - nearest * ahead[1]) >= clearance_m
+
+
+def pushed_apart(
+    position: Vector3, neighbours: Sequence[Neighbour], distance_m: float
+) -> tuple[float, float]:
+    """A velocity over ground (north, east) away from everybody nearer than a distance.
+
+    A limit cannot undo what a gust has done; a behaviour that flies among others can.
+    """
+    north = east = 0.0
+    for neighbour in neighbours:
+        offset = [p - n for n, p in zip(neighbour.position_ned_m, position, strict=True)]
+        away_m = math.hypot(*offset)
+        level_m = math.hypot(offset[0], offset[1])
+        if not neighbour.virtual and 1e-6 < level_m and away_m < distance_m:
+            push = PUSH_PER_S * (distance_m - away_m) / level_m
+            north, east = north + push * offset[0], east + push * offset[1]
+    speed = math.hypot(north, east)
+    scale = min(1.0, PUSH_MPS / speed) if speed > 1e-6 else 1.0
+    return (north * scale, east * scale)
 
 
 def _towards(velocity: Vector3, row: Row) -> float:

@@ -82,6 +82,10 @@ class VirtualStructure:
             places.insert(0, (places[0][0], places[0][1], places[0][2] - 0.05))
         self._path = Path(places, self._speed_mps, closed=self._laps != 1.0)
 
+    def leave(self) -> None:
+        """Another vehicle moves it; what this one knew of where it is counts no more."""
+        self._path = None
+
     def move(self, dt_s: float, worst_error_m: float, heading_error_rad: float) -> None:
         """Go on for a moment, as fast as the vehicles keep up and the formation has turned."""
         assert self._path is not None

@@ -12,7 +12,7 @@ from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.neighbours import Neighbour
-from companion.guidance.separation import Row, allowed_speed, apart, around, level_rows, rows_at
+from companion.guidance.separation import Row, allowed_speed, apart, around, level_rows, pushed_apart, rows_at
 from companion.vehicle.setpoint import Setpoint
 
 speeds = st.floats(-5, 5)
@@ -77,16 +77,33 @@ def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not():
 
 def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right():
     def side(east):
-        way = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
+        way, _ = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
         assert math.hypot(*way) == pytest.approx(2.0)
         return way[1]
 
     assert side(0.0) > 0.5
-    assert side(2.0) < -0.3
-    assert side(-2.0) > 0.3
+    assert side(3.0) < -0.3
+    assert side(-3.0) > 0.3
     assert side(6.0) == 0.0
-    assert around((2.0, 0.0), 5.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0) == (2.0, 0.0)
-    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, -9.0))], 4.0) == (2.0, 0.0)
+    straight = ((2.0, 0.0), 1.0)
+    # Not as far as there; and far above.
+    assert around((2.0, 0.0), 4.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0) == straight
+    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, -9.0))], 4.0) == straight
+    # The side it turned to is kept while the other is not much better.
+    (_, east), side_now = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0, -1.0)
+    assert (east < 0.0, side_now) == (True, -1.0)
+    # Hemmed in on all sides it stays.
+    ring = [neighbour((3.0 * math.cos(a), 3.0 * math.sin(a), 0.0)) for a in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
+    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), ring, 4.0)[0] == (0.0, 0.0)
+
+
+def test_who_is_too_near_is_pushed_away_and_nobody_else():
+    assert pushed_apart((0, 0, 0), [neighbour((3.0, 0.0, 0.0)), neighbour((0.0, 9.0, 0.0))], 4.0) == (
+        -0.8,
+        0.0,
+    )
+    assert pushed_apart((0, 0, 0), [neighbour((0.5, 0.0, 0.0))], 9.0) == (-1.0, 0.0)
+    assert pushed_apart((0, 0, 0), [neighbour((0.5, 0.0, 0.0), role="virtual")], 9.0) == (0.0, 0.0)
 
 
 @settings(max_examples=25, deadline=None)
