@@ -111,7 +111,7 @@ class Service:
             on_event=self._event,
             on_command=self.command,
             views=tuple(settings.views),
-            listeners={topics.POSE: self.poses.hear},
+            listeners=[(topics.POSE, self.poses.hear)],
         )
         self.ready = False
         self._told: dict[str, Any] | None = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -58,7 +58,7 @@ class Bus:
         on_event: called with (level, text) when the network is lost or found.
         on_command: answers a command's text with a JSON-able reply; called in the loop, one task each.
         views: names of the views that publish besides the first.
-        listeners: topic → called in the loop with every message on it, of any vehicle, this one too.
+        listeners: topics, each with what is called in the loop with its messages, of any vehicle and this one.
 
     Attributes:
         published: path of a topic (`Topic.path`) → messages handed to zenoh.
@@ -73,7 +73,7 @@ class Bus:
         on_event: Callable[[str, str], None],
         on_command: CommandHandler,
         views: Sequence[str] = (),
-        listeners: Mapping[Topic, Callable[[bytes], None]] | None = None,
+        listeners: Sequence[tuple[Topic, Callable[[bytes], None]]] = (),
     ) -> None:
         self._settings = settings
         self._vehicle = vehicle
@@ -88,7 +88,7 @@ class Bus:
         self._watching: asyncio.Task[None] | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._queryable: zenoh.Queryable[None] | None = None
-        self._listeners = dict(listeners or {})
+        self._listeners = tuple(listeners)
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._streams: list[tuple[Topic, str | None]] = [(topic, None) for topic in TOPICS]
         self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
@@ -209,7 +209,7 @@ class Bus:
         self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
         self._subscribers = [
             session.declare_subscriber(everybodys_key(topic), partial(self._heard_on_zenoh_thread, listener))
-            for topic, listener in self._listeners.items()
+            for topic, listener in self._listeners
         ]
 
     def _heard_on_zenoh_thread(self, listener: Callable[[bytes], None], sample: zenoh.Sample) -> None:
