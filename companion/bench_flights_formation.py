@@ -20,9 +20,9 @@ from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.formation import FormationBehaviour
 
 VEHICLES = 5
-SPACING_M = 5.0
+SPACING_M = 6.0
 WIND_MPS = 3.0
-LEADER_SPEED_MPS = 2.5
+LEADER_SPEED_MPS = 2.0
 HEIGHT_M = 6.0
 # About the leader's home: a turn to the right and one to the left.
 PATH = ((25.0, 0.0), (25.0, 25.0), (50.0, 25.0))

@@ -58,7 +58,7 @@ class Bus:
         on_event: called with (level, text) when the network is lost or found.
         on_command: answers a command's text with a JSON-able reply; called in the loop, one task each.
         views: names of the views that publish besides the first.
-        listeners: topics, each with what is called in the loop with its messages, of any vehicle and this one.
+        listeners: topics, each with what is called in the loop with its messages, of any vehicle.
 
     Attributes:
         published: path of a topic (`Topic.path`) → messages handed to zenoh.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from companion.fence import Fence
 from companion.guidance.neighbours import Neighbour
-from companion.guidance.separation import Row, apart, level_rows, rows_at
+from companion.guidance.separation import BRAKING, Row, apart, level_rows, rows_at
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from vision.rotation import wrap_angle
@@ -194,7 +194,9 @@ class Envelope:
 
     def _rows(self, place: Vector3) -> list[Row]:
         limits = self.limits
-        return rows_at(place, self._neighbours, limits.min_separation_m, limits.max_acceleration_mps2)
+        return rows_at(
+            place, self._neighbours, limits.min_separation_m, BRAKING * limits.max_acceleration_mps2
+        )
 
     def _keep_apart(self, velocity: Vector3, rows: Sequence[Row], reasons: list[str]) -> Vector3:
         """Take away what would carry the vehicle nearer to another than they may be."""

@@ -27,7 +27,7 @@ VIRTUAL = "virtual"
 LOST_TIMEOUT_S = 5.0
 # Answer to an error of place, 1/s, and the speed over ground and up or down it may ask for.
 SLOT_GAIN_PER_S = 0.8
-CATCH_UP_MPS = 2.0
+CATCH_UP_MPS = 1.8
 CLIMB_MPS = 1.0
 # The outermost slot is swung round no faster than this, and set into that motion at this.
 SWING_MPS = 1.5
@@ -37,7 +37,9 @@ STANDING_MPS = 0.5
 # A neighbour slower than this beside the formation stands in the way and is flown around.
 IN_THE_WAY_MPS = 0.6
 # Ways past others are flown so far outside of the least distance.
-CLEARANCE_M = 1.0
+CLEARANCE_M = 1.2
+# Nearer than this to its slot a vehicle flies straight there.
+FAR_M = 3.0
 # Of a virtual structure: all are there, so near and for so long; then the others are told so for a while.
 THERE_M, THERE_S, TELL_S = 1.2, 1.0, 1.5
 
@@ -315,14 +317,12 @@ class FormationBehaviour(Behaviour):
         way_m = math.hypot(missing[0], missing[1])
         gain = min(SLOT_GAIN_PER_S, CATCH_UP_MPS / way_m) if way_m > 1e-6 else 0.0
         nearest_m = situation.min_separation_m
-        closing, self._side = around(
-            (missing[0] * gain, missing[1] * gain),
-            way_m,
-            position,
-            [other for other in hood.vehicles if _stands(other, moving)],
-            nearest_m + CLEARANCE_M,
-            self._side,
-        )
+        closing = (missing[0] * gain, missing[1] * gain)
+        if way_m > FAR_M:
+            standing = [other for other in hood.vehicles if _stands(other, moving)]
+            closing, self._side = around(
+                closing, way_m, position, standing, nearest_m + CLEARANCE_M, self._side
+            )
         # Neighbours in their slots do not push each other.
         soft_m = min(nearest_m + CLEARANCE_M, max(nearest_m + MARGIN_M, 0.9 * agreement.plan.spacing_m))
         push = pushed_apart(position, hood.vehicles, soft_m)

@@ -19,12 +19,15 @@ from typing import NamedTuple
 from companion.guidance.neighbours import Neighbour
 from companion.vehicle.state import Vector3
 
-# Kept on top of the least distance: places are estimates, and the vehicle answers late.
-MARGIN_M = 0.5
+# Kept on top of the least distance: two places are estimates, each some 0.4 m wrong, and gusts push.
+MARGIN_M = 1.0
 # How late a multirotor's velocity follows.
 ANSWER_S = 0.4
-# Closing speed for each metre left, at most: a velocity that follows by 0.3 s is then critically damped.
-GAIN_PER_S = 0.8
+# Closing speed for each metre left, at most. Both close, so it is half of what one could have alone:
+# velocities that follow by 0.3 s are then damped critically.
+GAIN_PER_S = 0.4
+# Part of the greatest acceleration that is kept for stopping, against a vehicle that answers late.
+BRAKING = 0.5
 # Ways around somebody are looked for so far ahead, in steps of so much to either side.
 LOOK_M = 12.0
 TURN_RAD = math.radians(15.0)
