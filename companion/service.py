@@ -40,6 +40,7 @@ from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception import PerceptionKeeper, PerceptionStartError
 from companion.perception_messages import Preview
+from companion.pose_sharing import PoseSharing
 from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
@@ -107,12 +108,14 @@ class Service:
         )
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
+        self.poses = PoseSharing(settings.vehicle.name, self._event)
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
             on_event=self._event,
             on_command=self.command,
             views=tuple(settings.views),
+            listeners=[(topics.POSE, self.poses.hear)],
         )
         self.ready = False
         self._told: dict[str, Any] | None = None
@@ -313,6 +316,9 @@ class Service:
         while True:
             now_ns = time.monotonic_ns()
             self.bus.publish(topics.VEHICLE, vehicle_message(self.driver.state, now_ns))
+            pose = self.poses.message(self.driver.state, self.pilot.behaviour, now_ns)
+            if pose is not None:
+                self.bus.publish(topics.POSE, pose)
             for view in self.views:
                 view.keeper.watch(self.bus.watched(topics.IMAGE, view.name))
             if self.pilot.in_command:
@@ -363,6 +369,7 @@ class Service:
                 "count": len(self.steering.targets),
                 "problem": self.steering.unplaced,
             },
+            "neighbours": self.poses.status(now_ns),
             "bus": {
                 "connected": self.bus.connected,
                 "published": dict(self.bus.published),
@@ -380,6 +387,8 @@ class Service:
             age_s,
             fresh,
             self.streamer.last_sent,
+            self.poses.around(self.driver.state, now_ns),
+            self.settings.guidance.min_separation_m,
         )
 
     def _healthy(self, now_ns: int) -> bool:
@@ -477,4 +486,5 @@ def _limits(settings: Settings) -> Limits:
         max_altitude_m=guidance.max_altitude_m,
         max_distance_m=guidance.max_distance_m,
         fence=guidance.fence(),
+        min_separation_m=guidance.min_separation_m,
     )

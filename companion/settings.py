@@ -301,6 +301,8 @@ class GuidanceSection(Section):
     """corners of the area never left, north,east of home in metres: "-50,-50 50,-50 50,50"; empty: none"""
     fence_exclude: str = ""
     """areas never entered, written the same way and parted by |"""
+    min_separation_m: Annotated[float, Field(gt=0, le=100)] = 3.0
+    """never asks to fly nearer than this to another vehicle that shares its pose, metres"""
     setpoint_rate_hz: Annotated[float, Field(ge=5, le=250)] = 50.0
     """setpoints a second on the link; PX4 needs more than 2"""
     setpoint_lifetime_s: Annotated[float, Field(ge=0.02, le=2)] = 0.3

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
@@ -37,6 +38,8 @@ class Situation:
         perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
         perception_fresh: that age is within the declared maximum.
         sent: what the envelope let through of the last setpoint; None before the first.
+        neighbourhood: the other vehicles; None: nobody listens for them.
+        min_separation_m: what is kept to each of them.
     """
 
     now_ns: int
@@ -45,6 +48,13 @@ class Situation:
     perception_age_s: float | None = None
     perception_fresh: bool = False
     sent: Setpoint | None = None
+    neighbourhood: Neighbourhood | None = None
+    min_separation_m: float = 3.0
+
+    @property
+    def neighbours(self) -> tuple[Neighbour, ...]:
+        """The other vehicles that are known and placed."""
+        return () if self.neighbourhood is None else self.neighbourhood.vehicles
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +88,8 @@ class Behaviour(ABC):
     requirements: frozenset[Requirement] = frozenset()
     # Classes that perception must know for this behaviour to make sense.
     class_names: tuple[str, ...] = ()
+    # Vehicles whose poses must be fresh, where it requires NEIGHBOURS.
+    neighbour_names: tuple[str, ...] = ()
 
     def on_activate(self, situation: Situation) -> None:  # noqa: B027  (a hook that may be left out)
         """Called once, before the first update."""

@@ -7,6 +7,7 @@ import re
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
+from companion.formation import SHAPES
 from companion.guidance.arguments import (
     Argument,
     Choice,
@@ -16,6 +17,7 @@ from companion.guidance.arguments import (
     GrammarError,
     Number,
     Points,
+    Word,
     check,
     names_in,
 )
@@ -23,6 +25,8 @@ from companion.points import points_from
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0
+# More vehicles than have been flown, even on paper.
+MOST_SLOTS = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,6 +379,50 @@ class Mission(Command):
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class Formation(Command):
+    word: ClassVar[str] = "formation"
+    meaning: ClassVar[str] = "hold a slot about a leader: another vehicle, or a virtual one on a path"
+
+    shape: Annotated[str, Choice("shape", SHAPES, "of the formation")]
+    leader: Annotated[str, Word("leader", 'vehicle.name of the leader, or "virtual"')]
+    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 5.0
+    slot: Annotated[str, Word("slot", "number of the slot to take, from 1, or auto")] = "auto"
+    points: Annotated[
+        str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long for a leader not heard")
+    ] = 5.0
+
+    @property
+    def endless(self) -> bool:
+        return self.points is None or self.laps == 0.0
+
+    @property
+    def slot_number(self) -> int | None:
+        """None: auto."""
+        return None if self.slot == "auto" else int(self.slot)
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point of the path, metres from home."""
+        return points_from(self.points or "")
+
+    def __post_init__(self) -> None:
+        super(Formation, self).__post_init__()
+        if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
+            raise GrammarError(f"formation: slot must be auto or 1 to {MOST_SLOTS}, got {self.slot!r}")
+        if (self.leader == "virtual") != (self.points is not None):
+            raise GrammarError(
+                "formation: leader=virtual and points=… belong together; one of them is missing"
+            )
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
+
+
 COMMANDS: dict[str, type[Command]] = {
     kind.word: kind
     for kind in (
@@ -392,5 +440,6 @@ COMMANDS: dict[str, type[Command]] = {
         Follow,
         Patrol,
         Mission,
+        Formation,
     )
 }

@@ -237,7 +237,7 @@ class Pilot:
                 deadline_ns = situation.now_ns + round(self._lifetime_s * 1e9)
                 self.asked = replace(step, deadline_ns=deadline_ns)
                 self.sent, self.limited_by = self._envelope.apply(
-                    self.asked, situation.state, situation.now_ns, dt_s
+                    self.asked, situation.state, situation.now_ns, dt_s, situation.neighbours
                 )
                 self._streamer.submit(self.sent)
             case Setpoint() if self._phase is not _Phase.ENGAGING:

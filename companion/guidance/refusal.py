@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.neighbours import missing_neighbours
 from companion.vehicle.state import LandedState
 
 PERCEPTION_GAP_S = 1.5
@@ -47,6 +48,8 @@ def refusal(
                 missing.append(f"to be on the ground ({_where(situation)})")
             case Requirement.PERCEPTION if not _perceiving(situation):
                 missing.append(f"perception ({_perception_age(situation)})")
+            case Requirement.NEIGHBOURS:
+                missing += missing_neighbours(situation.neighbourhood, behaviour.neighbour_names)
     if (charge := battery.missing(behaviour, state, now_ns)) is not None:
         missing.append(charge)
     if class_names is not None:

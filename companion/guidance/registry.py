@@ -10,6 +10,7 @@ from companion.guidance.behaviour import Behaviour
 from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.follow import FollowBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.formation import FormationBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
@@ -87,6 +88,17 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 again_s=command.again_s,
                 apart_m=command.apart_m,
                 confidence=command.confidence,
+            )
+        case commands.Formation(shape, leader, spacing_m):
+            return FormationBehaviour(
+                shape,
+                leader,
+                spacing_m,
+                command.slot_number,
+                points=command.places,
+                speed_mps=command.speed_mps,
+                laps=command.laps,
+                lost_timeout_s=command.lost_timeout_s,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 
