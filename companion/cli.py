@@ -122,6 +122,9 @@ def detect(
     ] = False,
     tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the frame")] = 640,
     tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
+    track: Annotated[
+        bool, typer.Option("--track", help="tell which object is which from frame to frame")
+    ] = False,
     save: Annotated[Path | None, typer.Option(help="folder for inputs and annotated images")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object a frame")] = False,
     width: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
@@ -135,14 +138,17 @@ def detect(
     from vision.pipeline import FrameDetector
     from vision.sources import SourceError, SourceSettings, open_source
     from vision.tiling import TiledDetector
+    from vision.tracking import Tracker, TrackerSettings
     from vision.yolo.checkpoint import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    following = TrackerSettings(keep_confidence=confidence)
     with plain_errors(CheckpointError, ValueError):
         detector = Detector(
             model,
             classes=parse_classes(classes),
-            confidence=confidence,
+            # A tracker wants to see the weak ones too, and leaves them out again.
+            confidence=min(confidence, following.low_confidence) if track else confidence,
             iou=iou,
             image_size=image_size,
             precision=precision,  # type: ignore[arg-type]
@@ -160,7 +166,14 @@ def detect(
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         looked_at = detect_source(
-            frames, looking, every=every, limit=limit, save=save, as_json=as_json, write=write
+            frames,
+            looking,
+            every=every,
+            limit=limit,
+            save=save,
+            as_json=as_json,
+            tracker=Tracker(following) if track else None,
+            write=write,
         )
     if not looked_at:
         typer.echo(f"companion: {source} had no frames", err=True)

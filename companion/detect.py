@@ -17,12 +17,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vision.annotate import annotate
-from vision.detections import Detections
+from vision.detections import TRACK_CONFIRMED, DetectionRecord, Detections
 from vision.frame import Frame
 from vision.pipeline import FrameDetector
 from vision.sources import Source
+from vision.tracking import Tracker
 
 logger = logging.getLogger(__name__)
+
+TRACK_FIELDS = ("track_id", "track_score", "track_state")
 
 
 def detect_source(
@@ -33,11 +36,13 @@ def detect_source(
     limit: int | None = None,
     save: Path | None = None,
     as_json: bool = False,
+    tracker: Tracker | None = None,
     write: Callable[[str], None],
 ) -> int:
     """Detect in every `every`-th frame, at most `limit` of them.
 
     Args:
+        tracker: gives the detections their tracks; a recording's go by its own time, however fast it is read.
         save: folder for `<sequence>.jpg` (the input) and `<sequence>_detections.jpg` (annotated).
         as_json: one JSON object a frame instead of a readable line.
         write: takes each line.
@@ -56,6 +61,8 @@ def detect_source(
             if index % every:
                 continue
             detections = detector.detect(frame.image)
+            if tracker is not None:
+                detections = tracker.update(detections, _stamp_ns(frame)).detections
             write(_line(frame, detections, detector, as_json))
             if save is not None:
                 _save(save, frame, detections)
@@ -69,15 +76,19 @@ def detect_source(
     return looked_at
 
 
+def _stamp_ns(frame: Frame) -> int:
+    return frame.captured_ns if frame.media_s is None else round(frame.media_s * 1e9)
+
+
 def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json: bool) -> str:
     timing = detector.last_timing
     assert timing is not None
     if not as_json:
         total_ms = timing.preprocess_ms + timing.inference_ms + timing.postprocess_ms
-        seen = ", ".join(
-            f"{record['class_name']} {record['confidence']:.2f}" for record in detections.records()
-        )
+        seen = ", ".join(_words(record) for record in detections.records())
         return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {seen or 'no objects detected'}"
+    # Nobody measures ranges here, and without a tracker there are no tracks.
+    left_out = ("range_m",) if detections.track_id is not None else ("range_m", *TRACK_FIELDS)
     message: dict[str, Any] = {
         "sequence": frame.sequence,
         "captured_ns": frame.captured_ns,
@@ -85,11 +96,19 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         "height": frame.height,
         "inference_ms": round(timing.inference_ms, 2),
         "detections": [
-            {key: value for key, value in record.items() if key != "range_m" and not key.startswith("track_")}
+            {key: value for key, value in record.items() if key not in left_out}
             for record in detections.records()
         ],
     }
     return json.dumps(message)
+
+
+def _words(record: DetectionRecord) -> str:
+    """`car 0.83 #7`, with a question mark while the track may be a mistake."""
+    words = f"{record['class_name']} {record['confidence']:.2f}"
+    if (track_id := record.get("track_id")) is None:
+        return words
+    return f"{words} #{track_id}{'' if record.get('track_state') == TRACK_CONFIRMED else '?'}"
 
 
 def _save(folder: Path, frame: Frame, detections: Detections) -> None:

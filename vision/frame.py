@@ -21,6 +21,7 @@ class Frame:
             no depth.
         ready_ns: CLOCK_MONOTONIC nanoseconds when the source had the picture decoded; 0 if it does not tell.
         decode_ms: how long making a picture of its bytes took, milliseconds.
+        media_s: where it is in the recording that it comes from, seconds; None where it is none.
     """
 
     image: NDArray[np.uint8]
@@ -29,6 +30,7 @@ class Frame:
     depth_m: NDArray[np.float32] | None = None
     ready_ns: int = 0
     decode_ms: float = 0.0
+    media_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:

@@ -69,6 +69,19 @@ def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path
     assert cv2.imread(str(tmp_path / "saved" / "000000_detections.jpg")).shape == (120, 160, 3)
 
 
+def test_detect_tells_tracks_when_asked(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    done = companion(
+        "detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "0",
+        "--json", "--limit", "2", "--track", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = [record for line in done.stdout.splitlines() for record in json.loads(line)["detections"]]
+    assert found
+    for record in found:
+        assert {"track_id", "track_score", "track_state"} < set(record)
+        assert record["track_state"] in ("none", "tentative", "confirmed")
+
+
 def test_detect_without_json_writes_a_readable_line_a_frame(
     small_model: Path, pictures: Path, tmp_path: Path
 ) -> None:

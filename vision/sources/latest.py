@@ -247,7 +247,13 @@ class LatestSource(Source):
         unreadable = self._unreadable_before + feed.unreadable
         self._sequence += picture.skipped + unreadable - self._statistics.unreadable
         frame = Frame(
-            picture.image, captured_ns, self._sequence, picture.depth_m, ready_ns, picture.decode_ms
+            picture.image,
+            captured_ns,
+            self._sequence,
+            picture.depth_m,
+            ready_ns,
+            picture.decode_ms,
+            picture.media_s,
         )
         self._sequence += 1
         if self._settings.on_frame is not None:

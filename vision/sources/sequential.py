@@ -83,7 +83,13 @@ class SequentialSource(Source):
         ready_ns = time.monotonic_ns()
         captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
         frame = Frame(
-            picture.image, captured_ns, self._sequence, picture.depth_m, ready_ns, picture.decode_ms
+            picture.image,
+            captured_ns,
+            self._sequence,
+            picture.depth_m,
+            ready_ns,
+            picture.decode_ms,
+            picture.media_s,
         )
         self._sequence += 1
         self._delivered += 1

@@ -1,0 +1,252 @@
+"""The commands: what an operator, a mission or a program may ask for."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import MISSING, Field, dataclass, fields
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints
+
+from companion.guidance.arguments import Argument, Choice, ClassName, GrammarError, Number, Points, check
+from companion.points import points_from
+
+# What a circle may ask of the vehicle sideways; the envelope's default acceleration.
+MAX_CENTRIPETAL_MPS2 = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What an operator asks for. `word` is how it is called, `meaning` what it does."""
+
+    word: ClassVar[str]
+    meaning: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        for field, argument in arguments_of(type(self)):
+            value = getattr(self, field.name)
+            if value is not None or field.default is not None:
+                check(self.word, argument, value, default_of(field))
+
+    @property
+    def endless(self) -> bool:
+        """It goes on until another command comes."""
+        return False
+
+    def __str__(self) -> str:
+        words = [self.word]
+        for field, argument in arguments_of(type(self)):
+            value = getattr(self, field.name)
+            if value == default_of(field):
+                continue
+            written = _quoted(value) if isinstance(value, str) else _plain_number(value)
+            required = field.default is MISSING
+            words.append(written if required else f"{argument.key}={written}")
+        return " ".join(words)
+
+
+def arguments_of(kind: type[Command]) -> list[tuple[Field[Any], Argument]]:
+    """Each field of a command and what its argument may be, in their order."""
+    hints = get_type_hints(kind, include_extras=True)
+    return [(field, get_args(hints[field.name])[1]) for field in fields(kind)]
+
+
+def default_of(field: Field[Any]) -> Any:
+    """What the field is when the argument is left out; None where it may not be."""
+    return None if field.default is MISSING else field.default
+
+
+def _quoted(text: str) -> str:
+    if re.fullmatch(r"[\w.:/+-]+", text):
+        return text
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _plain_number(value: float) -> str:
+    """As people write it, where nothing is lost by that."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Takeoff(Command):
+    word: ClassVar[str] = "takeoff"
+    meaning: ClassVar[str] = "arm, climb to a height above home and stay there"
+
+    altitude_m: Annotated[float, Number("altitude", "m", 1.0, 50.0, "height above home")] = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Land(Command):
+    word: ClassVar[str] = "land"
+    meaning: ClassVar[str] = "land here and disarm"
+
+
+@dataclass(frozen=True, slots=True)
+class Rtl(Command):
+    word: ClassVar[str] = "rtl"
+    meaning: ClassVar[str] = "return to home, land and disarm"
+
+
+@dataclass(frozen=True, slots=True)
+class Stop(Command):
+    word: ClassVar[str] = "stop"
+    meaning: ClassVar[str] = "end our command; the autopilot holds its position by itself"
+
+
+@dataclass(frozen=True, slots=True)
+class Hold(Command):
+    word: ClassVar[str] = "hold"
+    meaning: ClassVar[str] = "stay here, under our command"
+
+    duration_s: Annotated[
+        float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
+    ] = 0.0
+
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Orbit(Command):
+    word: ClassVar[str] = "orbit"
+    meaning: ClassVar[str] = "circle, nose to the centre: the point `radius` ahead, or an object of a class"
+
+    class_name: Annotated[str, ClassName("class", "circle about this object, if given")] = ""
+    radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 10.0, "along the circle")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 100.0, "how many; 0: until another command")] = 0.0
+    direction: Annotated[str, Choice("direction", ("clockwise", "counterclockwise"), "seen from above")] = (
+        "clockwise"
+    )
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super(Orbit, self).__post_init__()
+        fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
+        if self.speed_mps > fastest:
+            raise GrammarError(
+                f"orbit: speed must be at most {math.floor(fastest * 100) / 100:g} m/s on a radius of "
+                f"{self.radius_m:g} m, got {self.speed_mps:g}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Goto(Command):
+    word: ClassVar[str] = "goto"
+    meaning: ClassVar[str] = "fly straight to a place, given by one pair of its arguments"
+
+    north_m: Annotated[float | None, Number("north", "m", -5000.0, 5000.0, "of home, with east")] = None
+    east_m: Annotated[float | None, Number("east", "m", -5000.0, 5000.0, "of home, with north")] = None
+    altitude_m: Annotated[float | None, Number("altitude", "m", 1.0, 500.0, "above home; else as it is")] = (
+        None
+    )
+    forward_m: Annotated[float | None, Number("forward", "m", -5000.0, 5000.0, "of here, with right")] = None
+    right_m: Annotated[float | None, Number("right", "m", -5000.0, 5000.0, "of here, with forward")] = None
+    latitude_deg: Annotated[
+        float | None, Number("latitude", "deg", -90.0, 90.0, "WGS 84, with longitude")
+    ] = None
+    longitude_deg: Annotated[
+        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84, with latitude")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    heading_deg: Annotated[
+        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; else along the way")
+    ] = None
+
+    def __post_init__(self) -> None:
+        super(Goto, self).__post_init__()
+        pairs = {
+            "north and east": (self.north_m, self.east_m),
+            "forward and right": (self.forward_m, self.right_m),
+            "latitude and longitude": (self.latitude_deg, self.longitude_deg),
+        }
+        begun = [name for name, pair in pairs.items() if pair != (None, None)]
+        if len(begun) != 1:
+            got = " and ".join(begun) if begun else "none of them"
+            raise GrammarError(f"goto: give exactly one pair of {', '.join(pairs)}; got {got}")
+        if None in pairs[begun[0]]:
+            raise GrammarError(f"goto: {begun[0]} belong together; one of them is missing")
+
+
+@dataclass(frozen=True, slots=True)
+class FollowPath(Command):
+    word: ClassVar[str] = "follow-path"
+    meaning: ClassVar[str] = "fly along a row of points, slowing down for corners"
+
+    points: Annotated[
+        str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
+    ]
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, Choice("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super(FollowPath, self).__post_init__()
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"follow-path: laps must be 0, or 1 or more, got {self.laps:g}")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class FigureEight(Command):
+    word: ClassVar[str] = "figure-eight"
+    meaning: ClassVar[str] = "fly a level eight about this place, first towards the nose"
+
+    radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its middle to either end")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most; bends are slower")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, Choice("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Seek(Command):
+    word: ClassVar[str] = "seek"
+    meaning: ClassVar[str] = "turn on the spot until an object of the class is seen, then face it"
+
+    class_name: Annotated[str, ClassName("class", "what to look for")]
+    laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
+    rate_radps: Annotated[float, Number("rate", "rad/s", 0.05, 1.0, "how fast to turn")] = 0.5
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+    direction: Annotated[str, Choice("direction", ("clockwise", "counterclockwise"), "seen from above")] = (
+        "clockwise"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Approach(Command):
+    word: ClassVar[str] = "approach"
+    meaning: ClassVar[str] = "fly to an object of the class, keeping the height, and stop before it"
+
+    class_name: Annotated[str, ClassName("class", "what to fly to")]
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "at most")] = 2.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 60.0, "wait for a lost object this long")
+    ] = 5.0
+
+
+COMMANDS: dict[str, type[Command]] = {
+    kind.word: kind
+    for kind in (Takeoff, Land, Rtl, Stop, Hold, Goto, FollowPath, FigureEight, Orbit, Seek, Approach)
+}
