@@ -6,7 +6,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.marker_target import NO_MARKERS, MarkerSight
 from companion.guidance.target import Target
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 
@@ -36,6 +38,7 @@ class Situation:
         perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
         perception_fresh: that age is within the declared maximum.
         sent: what the envelope let through of the last setpoint; None before the first.
+        markers: what is seen of markers, or why none can be.
     """
 
     now_ns: int
@@ -44,6 +47,7 @@ class Situation:
     perception_age_s: float | None = None
     perception_fresh: bool = False
     sent: Setpoint | None = None
+    markers: MarkerSight = NO_MARKERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +91,11 @@ class Behaviour(ABC):
 
     def on_deactivate(self) -> None:  # noqa: B027  (a hook that may be left out)
         """Called once, when it ended or was replaced."""
+
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
+        return None
 
     @property
     def status(self) -> str:

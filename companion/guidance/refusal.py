@@ -47,6 +47,8 @@ def refusal(
                 missing.append(f"to be on the ground ({_where(situation)})")
             case Requirement.PERCEPTION if not _perceiving(situation):
                 missing.append(f"perception ({_perception_age(situation)})")
+            case Requirement.MARKER if (what := situation.markers.unavailable(PERCEPTION_GAP_S)) is not None:
+                missing.append(what)
     if (charge := battery.missing(behaviour, state, now_ns)) is not None:
         missing.append(charge)
     if class_names is not None:

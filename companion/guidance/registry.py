@@ -12,6 +12,7 @@ from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.stop import StopBehaviour
@@ -55,6 +56,15 @@ def behaviour_for(command: commands.Command) -> Behaviour:
                 speed_mps=speed_mps,
                 confidence=confidence,
                 lost_timeout_s=lost_timeout_s,
+            )
+        case commands.LandOnMarker(identifier, method, pad, attempts, search_m, speed_mps):
+            return LandOnMarkerBehaviour(
+                int(identifier),
+                by_autopilot=method == "autopilot",
+                moving=pad == "moving",
+                attempts=int(attempts),
+                search_m=search_m,
+                speed_mps=speed_mps,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 
