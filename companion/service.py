@@ -48,6 +48,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 from companion.views import View, open_views
+from companion.views_markers import MarkerWatch
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -109,6 +110,8 @@ class Service:
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
         self.poses = PoseSharing(settings.vehicle.name, self._event)
+        self.markers = MarkerWatch(self.views)
+        self._landing_target_ns = 0
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
@@ -285,6 +288,7 @@ class Service:
             now_ns = time.monotonic_ns()
             self._watch_link(now_ns)
             self.pilot.update(self._situation(now_ns))
+            self._tell_landing_target()
             if seen:
                 self.streamer.hasten(now_ns)
             self._answer_under_way()
@@ -387,9 +391,18 @@ class Service:
             age_s,
             fresh,
             self.streamer.last_sent,
-            self.poses.around(self.driver.state, now_ns),
-            self.settings.guidance.min_separation_m,
+            neighbourhood=self.poses.around(self.driver.state, now_ns),
+            min_separation_m=self.settings.guidance.min_separation_m,
+            markers=self.markers.sight(now_ns, self.settings.guidance.perception_max_age_s),
         )
+
+    def _tell_landing_target(self) -> None:
+        """What the autopilot lands on by itself, once for every picture that shows it."""
+        behaviour = self.pilot.behaviour
+        target = None if behaviour is None else behaviour.landing_target
+        if target is not None and target.captured_ns > self._landing_target_ns:
+            self._landing_target_ns = target.captured_ns
+            self.driver.send_landing_target(target)
 
     def _healthy(self, now_ns: int) -> bool:
         return all(view.seeing(now_ns) for view in self.views) and self.driver.state.connected(now_ns)
@@ -419,6 +432,10 @@ class Service:
         self.bus.publish(topics.LABELS, labels_message(result), view.name)
         if result.track_events:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+        if result.markers is not None:
+            seen = self.markers.take(view, result, self._history, name, now_ns)
+            self.bus.publish(topics.MARKERS, seen, view.name)
+            self._seen.set()
         if view is self.steering:
             view.place(result, self._history)
             self._seen.set()

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.marker_target import NO_MARKERS, MarkerSight
 from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.target import Target
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 
@@ -40,6 +42,7 @@ class Situation:
         sent: what the envelope let through of the last setpoint; None before the first.
         neighbourhood: the other vehicles; None: nobody listens for them.
         min_separation_m: what is kept to each of them.
+        markers: what is seen of markers, or why none can be.
     """
 
     now_ns: int
@@ -48,6 +51,7 @@ class Situation:
     perception_age_s: float | None = None
     perception_fresh: bool = False
     sent: Setpoint | None = None
+    markers: MarkerSight = NO_MARKERS
     neighbourhood: Neighbourhood | None = None
     min_separation_m: float = 3.0
 
@@ -108,6 +112,11 @@ class Behaviour(ABC):
     def take_notes(self) -> Sequence[str]:
         """What happened that people should know, since it was last asked for."""
         return ()
+
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
+        return None
 
     @property
     def status(self) -> str:

@@ -423,6 +423,30 @@ class Formation(Command):
             raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
 
 
+@dataclass(frozen=True, slots=True)
+class LandOnMarker(Command):
+    word: ClassVar[str] = "land-on-marker"
+    meaning: ClassVar[str] = "find a marker below, descend onto it in a narrowing cone, land and disarm"
+
+    identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "of the marker whose pad to land on")]
+    method: Annotated[
+        str,
+        Choice("method", ("offboard", "autopilot"), "who flies: we, or the autopilot by LANDING_TARGET"),
+    ] = "offboard"
+    pad: Annotated[str, Choice("pad", ("still", "moving"), "whether the pad may move")] = "still"
+    attempts: Annotated[float, Number("attempts", "", 1.0, 10.0, "descents before giving up")] = 3.0
+    search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "how far around to look for it")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "over ground, at most")] = 1.5
+
+    def __post_init__(self) -> None:
+        super(LandOnMarker, self).__post_init__()
+        for key, value in (("id", self.identifier), ("attempts", self.attempts)):
+            if value != int(value):
+                raise GrammarError(f"land-on-marker: {key} must be a whole number, got {value:g}")
+        if self.method == "autopilot" and self.pad == "moving":
+            raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
+
+
 COMMANDS: dict[str, type[Command]] = {
     kind.word: kind
     for kind in (
@@ -441,5 +465,6 @@ COMMANDS: dict[str, type[Command]] = {
         Patrol,
         Mission,
         Formation,
+        LandOnMarker,
     )
 }

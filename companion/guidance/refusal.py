@@ -50,6 +50,8 @@ def refusal(
                 missing.append(f"perception ({_perception_age(situation)})")
             case Requirement.NEIGHBOURS:
                 missing += missing_neighbours(situation.neighbourhood, behaviour.neighbour_names)
+            case Requirement.MARKER if (what := situation.markers.unavailable(PERCEPTION_GAP_S)) is not None:
+                missing.append(what)
     if (charge := battery.missing(behaviour, state, now_ns)) is not None:
         missing.append(charge)
     if class_names is not None:

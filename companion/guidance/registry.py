@@ -14,6 +14,7 @@ from companion.guidance.formation import FormationBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.search import SearchBehaviour
@@ -99,6 +100,15 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 speed_mps=command.speed_mps,
                 laps=command.laps,
                 lost_timeout_s=command.lost_timeout_s,
+            )
+        case commands.LandOnMarker(identifier, method, pad, attempts, search_m, speed_mps):
+            return LandOnMarkerBehaviour(
+                int(identifier),
+                by_autopilot=method == "autopilot",
+                moving=pad == "moving",
+                attempts=int(attempts),
+                search_m=search_m,
+                speed_mps=speed_mps,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 

@@ -22,6 +22,7 @@ from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.clock_sync import ClockSync
 from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, pack_frame
+from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.px4_modes import request_of_mode
 from companion.vehicle.setpoint import Setpoint
@@ -136,7 +137,7 @@ class AutopilotDriver(ABC):
         """Decode frames of the chosen system; call `_handle` with what they say."""
 
     @abstractmethod
-    def _send_message(self, name: str, fields: dict[str, int | float]) -> None:
+    def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         """Put one message on the wire."""
 
     @abstractmethod
@@ -417,6 +418,11 @@ class AutopilotDriver(ABC):
                 "yaw_rate": setpoint.yaw_rate_radps or 0.0,
             },
         )
+
+    def send_landing_target(self, target: LandingTarget) -> None:
+        """See Driver."""
+        if self._link is not None and self._system_id is not None:
+            self._send_message("LANDING_TARGET", landing_target_fields(target, self._autopilot_kind or 0))
 
     # --- commands -----------------------------------------------------------------------------------
 
