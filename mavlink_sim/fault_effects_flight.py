@@ -7,7 +7,7 @@ import random
 from typing import TYPE_CHECKING
 
 from mavlink_sim.announcements import Text
-from mavlink_sim.autopilot import TEMPORARILY_REJECTED, Autopilot
+from mavlink_sim.autopilot import TEMPORARILY_REJECTED
 from mavlink_sim.estimate_errors import ZERO
 from mavlink_sim.fault_grammar import FaultError
 from mavlink_sim.flight import Trajectory
@@ -270,7 +270,7 @@ def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
     vehicle.forget_boot()
     stored, pilot = vehicle.autopilot.navigator, vehicle.autopilot.supervision
     # the same object starts anew: others hold on to it
-    Autopilot.__init__(
+    type(vehicle.autopilot).__init__(
         vehicle.autopilot,
         vehicle.estimate,
         vehicle.parameters,

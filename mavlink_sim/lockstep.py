@@ -20,8 +20,9 @@ from typing import Any
 
 from mavlink_sim.messages import Outgoing, dialect, parser
 from mavlink_sim.modes import Mode
+from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.streams import ONBOARD_RATES_HZ
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicle import STEP_S
 
 COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
 ANSWER_LIMIT_S = 1.0
@@ -77,6 +78,8 @@ class LockstepVehicle:
         links: its connections by name, each with the rates of its streams in Hz; None is one link "onboard"
             with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends answers
             alone, which is the fastest.
+        autopilot: whose manners it has, "px4" or "ardupilot" (`personality`); the latter's streams are asked
+            for by messages, whatever `links` says.
         options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`…
 
     Attributes:
@@ -86,9 +89,15 @@ class LockstepVehicle:
         dropped: of each link, how many messages were let go because nobody took them.
     """
 
-    def __init__(self, links: Mapping[str, Mapping[str, float]] | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        links: Mapping[str, Mapping[str, float]] | None = None,
+        *,
+        autopilot: str = PX4,
+        **options: Any,
+    ) -> None:
         self.events: list[str] = []
-        self.vehicle = Vehicle(on_event=self.events.append, **options)
+        self.vehicle = vehicle_class(autopilot)(on_event=self.events.append, **options)
         self.newest: dict[str, dict[str, Any]] = {}
         self.dropped: dict[str, int] = {}
         self._waiting: dict[str, deque[Outgoing]] = {}

@@ -70,7 +70,14 @@ class Vehicle:
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
         events: the newest EVENTs. files: what MAVLink FTP reaches.
+
+    What another autopilot does otherwise, a subclass says (see `personality`): the classes of its autopilot
+    and parameters, who answers which message, and what is sent.
     """
+
+    autopilot_class: type[Autopilot] = Autopilot
+    parameters_class: type[Parameters] = Parameters
+    handlers: Mapping[str, Callable[[Any, Link, Any], None]] = HANDLERS
 
     def __init__(
         self,
@@ -89,7 +96,7 @@ class Vehicle:
     ) -> None:
         self.system_id = system_id
         self.release = release_named(px4)
-        self.parameters = Parameters(parameters, gimbal)
+        self.parameters = self.parameters_class(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
             direction = random.Random(seed).uniform(0.0, math.tau)
@@ -110,7 +117,7 @@ class Vehicle:
         self._on_event = on_event or (lambda text: None)
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
-        self.autopilot = Autopilot(
+        self.autopilot = self.autopilot_class(
             self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
         )
         self.gimbal_manager = GimbalManager(self) if gimbal else None
@@ -217,7 +224,7 @@ class Vehicle:
         forward(message, link, self.links.values(), self.system_id)
         system, component = target_of(message)
         if system in (0, self.system_id) and component in (0, AUTOPILOT_COMPONENT):
-            handler = HANDLERS.get(message.get_type())
+            handler = self.handlers.get(message.get_type())
             if handler is not None:
                 handler(self, link, message)
 
