@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavlink_sim.messages import Outgoing, dialect, parser
-from mavlink_sim.modes import Mode
 from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 from mavlink_sim.vehicle import STEP_S
@@ -258,15 +257,17 @@ class LockstepVehicle:
         self._demand("arming", _ARM_DISARM, 1.0)
 
     def take_off(self, height_m: float = 2.5, limit_s: float = 60.0) -> None:
-        """Arm, take off to a height above home, and wait for HOLD.
+        """Arm, take off to a height above home, and wait until that is over (HOLD; ArduPilot: GUIDED).
 
         Raises:
             NotReachedError: not within `limit_s`. CommandRefusedError: it refuses.
         """
+        mode, altitude_m, is_over = self.vehicle.takeoff_plan(height_m)
+        if mode is not None:
+            self.set_mode(mode)
         self.arm()
-        altitude_m = self.vehicle.home_altitude_m + height_m
         self._demand("taking off", _TAKEOFF, math.nan, 0.0, 0.0, math.nan, math.nan, math.nan, altitude_m)
-        self.run_until(lambda truth: truth.mode == "HOLD", limit_s)
+        self.run_until(lambda truth: is_over(), limit_s)
 
     def land(self, limit_s: float = 120.0) -> None:
         """Land where it is and wait until it has disarmed itself. Raises as `take_off`."""
@@ -274,20 +275,17 @@ class LockstepVehicle:
         self.run_until(lambda truth: not truth.armed, limit_s)
 
     def set_mode(self, name: str) -> None:
-        """Ask for a mode by PX4's name (`OFFBOARD`, `HOLD`, `RTL`…).
+        """Ask for a mode by its autopilot's name (PX4: `OFFBOARD`, `HOLD`…; ArduPilot: `GUIDED`…).
 
         Raises:
             ValueError: there is no such mode. CommandRefusedError: it cannot be flown now.
         """
         try:
-            mode = Mode[name]
+            mode = self.vehicle.modes[name]
         except KeyError:
-            raise ValueError(
-                f"mode {name!r}: expected one of {', '.join(mode.name for mode in Mode)}"
-            ) from None
-        self._demand(
-            f"mode {name}", _SET_MODE, 1.0, mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24 & 0xFF
-        )
+            names = ", ".join(mode.name for mode in self.vehicle.modes)
+            raise ValueError(f"mode {name!r}: expected one of {names}") from None
+        self._demand(f"mode {name}", _SET_MODE, 1.0, *self.vehicle.mode_parameters(mode))
 
     def _demand(self, what: str, identifier: int, *parameters: float) -> None:
         result = self.command(identifier, *parameters)

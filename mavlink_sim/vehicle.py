@@ -11,6 +11,7 @@ import itertools
 import math
 import random
 from collections.abc import Callable, Iterable, Mapping
+from enum import Enum
 from typing import Any
 
 from mavlink_sim import file_transfer, mission_link, parameter_protocol, telemetry
@@ -25,6 +26,7 @@ from mavlink_sim.gimbal_protocol import GimbalManager
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
@@ -78,6 +80,7 @@ class Vehicle:
     autopilot_class: type[Autopilot] = Autopilot
     parameters_class: type[Parameters] = Parameters
     handlers: Mapping[str, Callable[[Any, Link, Any], None]] = HANDLERS
+    modes: type[Enum] = Mode
 
     def __init__(
         self,
@@ -175,6 +178,14 @@ class Vehicle:
     def transmitter(self) -> Transmitter:
         """The pilot's remote control, switched off at first (COM_RC_IN_MODE decides whether it counts)."""
         return self.autopilot.supervision.transmitter
+
+    def mode_parameters(self, mode: Any) -> tuple[float, float]:
+        """DO_SET_MODE's parameters 2 and 3 for one of `modes`."""
+        return mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24 & 0xFF
+
+    def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
+        """The mode to be in, NAV_TAKEOFF's altitude for a height above home, and whether it is over."""
+        return None, self.home_altitude_m + height_m, lambda: self.autopilot.mode is Mode.HOLD
 
     def next_ping(self) -> int:
         """The sequence number of the next PING of its own."""

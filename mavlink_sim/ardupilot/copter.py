@@ -9,6 +9,7 @@ from typing import Any, cast
 from mavlink_sim.announcements import Text
 from mavlink_sim.ardupilot import services, streams, telemetry
 from mavlink_sim.ardupilot.autopilot import CopterAutopilot
+from mavlink_sim.ardupilot.modes import CopterMode
 from mavlink_sim.ardupilot.parameters import CopterParameters
 from mavlink_sim.links import Link
 from mavlink_sim.vehicle import Vehicle
@@ -36,6 +37,20 @@ class CopterVehicle(Vehicle):
         self._told_mode_changes = 0
         self._was_armed = False
         super().__init__(**options)
+
+    modes = CopterMode
+
+    def mode_parameters(self, mode: CopterMode) -> tuple[float, float]:
+        return mode.custom_mode, 0.0
+
+    def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
+        """In GUIDED, to a height that is one above home."""
+
+        def is_over() -> bool:
+            copter = self.copter
+            return not copter.landed and copter.guided is not None and not copter.guided.is_taking_off
+
+        return "GUIDED", height_m, is_over
 
     @property
     def copter(self) -> CopterAutopilot:

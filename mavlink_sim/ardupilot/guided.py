@@ -18,7 +18,7 @@ from vision.rotation import Quaternion, quaternion_from_euler
 
 # A target that runs ahead of the vehicle waits for it (ArduPilot's leash).
 LEASH_M = 2.0
-TAKEOFF_DONE_SHARE = 0.9  # of the height: ArduPilot counts a take-off as complete
+TAKEOFF_DONE_M = 0.3  # so near to the height a take-off counts as complete
 CLIMB_GAIN_PER_S = 4.0
 FACING_SPEED_MPS = 1.0  # above it "the direction of flight" is known
 THRUST_AS_THRUST = 8  # GUID_OPTIONS: SET_ATTITUDE_TARGET's thrust is no climb rate
@@ -78,7 +78,7 @@ class Guided(flight.Task):
         self._parameters = parameters
         self._trajectory = flight.Trajectory(airframe, parameters)
         self._takeoff: flight.Takeoff | None = None
-        self._from_down_m = 0.0
+        self._reached = False  # the height of the take-off
         self._attitude: Attitude | None = None
         self._target = STOP
         self._age_s = 0.0
@@ -89,7 +89,7 @@ class Guided(flight.Task):
     def take_off(self, down_m: float) -> None:
         """Climb straight up to this NED z."""
         self._begin()
-        self._from_down_m = self._airframe.position[2]
+        self._reached = False
         self._takeoff = flight.Takeoff(self._airframe, self._parameters, down_m)
         self.goal = self._takeoff.goal
         self.heading.take(NAN, 0.0)
@@ -128,8 +128,8 @@ class Guided(flight.Task):
         """On the climb of a take-off."""
         if self._takeoff is None or self._takeoff.goal is None:
             return False
-        climb = self._from_down_m - self._takeoff.goal[2]
-        return self._from_down_m - self._airframe.position[2] < TAKEOFF_DONE_SHARE * climb
+        self._reached |= self._airframe.position[2] - self._takeoff.goal[2] < TAKEOFF_DONE_M
+        return not self._reached
 
     @staticmethod
     def _kind(target: GuidedTarget) -> tuple[bool, bool, bool]:

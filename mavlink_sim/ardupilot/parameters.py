@@ -129,6 +129,7 @@ _LOOPS: dict[str, Callable[[Parameters], float]] = {
     "MPC_ACC_DOWN_MAX": lambda own: max(own.number("WPNAV_ACCEL_Z"), own.number("PILOT_ACCEL_Z")) / 100.0,
     "MPC_ACC_UP_MAX": lambda own: max(own.number("WPNAV_ACCEL_Z"), own.number("PILOT_ACCEL_Z")) / 100.0,
     "MPC_LAND_SPEED": _hundredth("LAND_SPEED"),
+    "MPC_XY_ERR_MAX": lambda own: 4.0,  # ArduPilot runs faster, and its target leads farther
     "MPC_TKO_SPEED": _hundredth("WPNAV_SPEED_UP"),
     "MPC_TILTMAX_AIR": _hundredth("ANGLE_MAX"),
     "MPC_YAWRAUTO_MAX": _hundredth("ATC_SLEW_YAW"),
