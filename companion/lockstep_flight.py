@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
 from companion.guidance.envelope import Envelope, Limits
@@ -118,7 +119,7 @@ class LockstepFlight:
         wind_mps: float = 0.0,
         sight: Sight | None = None,
         limits: Limits | None = None,
-        **options: object,
+        **options: Any,
     ) -> None:
         self.vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, wind_mps=wind_mps, **options)
         self.limits = limits or Limits()

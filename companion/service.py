@@ -45,6 +45,7 @@ from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
+from companion.vehicle.signing import read_key
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 from companion.views import View, open_views
@@ -94,6 +95,9 @@ class Service:
             settings.vehicle.url,
             system_id=settings.vehicle.system_id,
             own_system_id=settings.vehicle.system_id,
+            signing_key=None
+            if settings.vehicle.signing_key_file is None
+            else read_key(settings.vehicle.signing_key_file),
         )
         self.streamer = Streamer(
             self.driver.send_setpoint, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s

@@ -17,6 +17,7 @@ import typer
 from mavlink_sim.endpoint import PortInUseError
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.parameters import UnknownParameterError
+from mavlink_sim.personality import AUTOPILOTS, PX4
 from mavlink_sim.releases import NEWEST
 from mavlink_sim.signing import ALWAYS, key_of
 from mavlink_sim.simulation import SimulationOptions
@@ -98,6 +99,7 @@ def simulate(
     ready_after: Annotated[
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
     ] = 3.0,
+    autopilot: Annotated[str, typer.Option(help="Whose manners it has: px4 or ardupilot (Copter).")] = PX4,
     px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     noise: Annotated[
@@ -109,7 +111,7 @@ def simulate(
     spacing: Annotated[float, typer.Option(help="Metres between the vehicles of a fleet, on a grid.")] = 5.0,
     camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
     param: Annotated[
-        list[str] | None, typer.Option(help="Set a PX4 parameter, NAME=VALUE; may be repeated.")
+        list[str] | None, typer.Option(help="Set a parameter of the autopilot, NAME=VALUE; may be repeated.")
     ] = None,
     gimbal: Annotated[bool, typer.Option("--gimbal", help="With a two-axis gimbal.")] = False,
     signing_key: Annotated[
@@ -159,7 +161,9 @@ def simulate(
         key = None if signing_key is None else key_of(signing_key)
     except ValueError as error:
         _fail(f"--signing-key: {error}")
-    if key is not None:
+    if autopilot not in AUTOPILOTS:
+        _fail(f"--autopilot {autopilot!r}: expected {' or '.join(AUTOPILOTS)}")
+    if key is not None and autopilot == PX4:
         parameters.setdefault("MAV_SIGN_CFG", ALWAYS)
     options = SimulationOptions(
         host=host,
@@ -178,6 +182,7 @@ def simulate(
         truth=truth,
         record=record,
         ready_after_s=ready_after,
+        autopilot=autopilot,
         px4=px4,
         speed=speed,
         noise=noise == "on",

@@ -20,9 +20,9 @@ from typing import Any
 
 from mavlink_sim.lockstep_wire import LockstepWire
 from mavlink_sim.messages import Outgoing, dialect
-from mavlink_sim.modes import Mode
+from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.streams import ONBOARD_RATES_HZ
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicle import STEP_S
 
 COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
 ANSWER_LIMIT_S = 1.0
@@ -78,6 +78,8 @@ class LockstepVehicle:
         links: its connections by name, each with the rates of its streams in Hz; None is one link "onboard"
             with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends answers
             alone, which is the fastest.
+        autopilot: whose manners it has, "px4" or "ardupilot" (`personality`); the latter's streams are asked
+            for by messages, whatever `links` says.
         options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`…
 
     Attributes:
@@ -87,9 +89,15 @@ class LockstepVehicle:
         dropped: of each link, how many messages were let go because nobody took them.
     """
 
-    def __init__(self, links: Mapping[str, Mapping[str, float]] | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        links: Mapping[str, Mapping[str, float]] | None = None,
+        *,
+        autopilot: str = PX4,
+        **options: Any,
+    ) -> None:
         self.events: list[str] = []
-        self.vehicle = Vehicle(on_event=self.events.append, **options)
+        self.vehicle = vehicle_class(autopilot)(on_event=self.events.append, **options)
         self.newest: dict[str, dict[str, Any]] = {}
         self.dropped: dict[str, int] = {}
         self._waiting: dict[str, deque[Outgoing]] = {}
@@ -279,15 +287,17 @@ class LockstepVehicle:
         self._demand("arming", _ARM_DISARM, 1.0)
 
     def take_off(self, height_m: float = 2.5, limit_s: float = 60.0) -> None:
-        """Arm, take off to a height above home, and wait for HOLD.
+        """Arm, take off to a height above home, and wait until that is over (HOLD; ArduPilot: GUIDED).
 
         Raises:
             NotReachedError: not within `limit_s`. CommandRefusedError: it refuses.
         """
+        mode, altitude_m, is_over = self.vehicle.takeoff_plan(height_m)
+        if mode is not None:
+            self.set_mode(mode)
         self.arm()
-        altitude_m = self.vehicle.home_altitude_m + height_m
         self._demand("taking off", _TAKEOFF, math.nan, 0.0, 0.0, math.nan, math.nan, math.nan, altitude_m)
-        self.run_until(lambda truth: truth.mode == "HOLD", limit_s)
+        self.run_until(lambda truth: is_over(), limit_s)
 
     def land(self, limit_s: float = 120.0) -> None:
         """Land where it is and wait until it has disarmed itself. Raises as `take_off`."""
@@ -295,20 +305,17 @@ class LockstepVehicle:
         self.run_until(lambda truth: not truth.armed, limit_s)
 
     def set_mode(self, name: str) -> None:
-        """Ask for a mode by PX4's name (`OFFBOARD`, `HOLD`, `RTL`…).
+        """Ask for a mode by its autopilot's name (PX4: `OFFBOARD`, `HOLD`…; ArduPilot: `GUIDED`…).
 
         Raises:
             ValueError: there is no such mode. CommandRefusedError: it cannot be flown now.
         """
         try:
-            mode = Mode[name]
+            mode = self.vehicle.modes[name]
         except KeyError:
-            raise ValueError(
-                f"mode {name!r}: expected one of {', '.join(mode.name for mode in Mode)}"
-            ) from None
-        self._demand(
-            f"mode {name}", _SET_MODE, 1.0, mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24 & 0xFF
-        )
+            names = ", ".join(mode.name for mode in self.vehicle.modes)
+            raise ValueError(f"mode {name!r}: expected one of {names}") from None
+        self._demand(f"mode {name}", _SET_MODE, 1.0, *self.vehicle.mode_parameters(mode))
 
     def _demand(self, what: str, identifier: int, *parameters: float) -> None:
         result = self.command(identifier, *parameters)

@@ -17,10 +17,11 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.endpoint import UdpEndpoint
 from mavlink_sim.fault_room import fault_room
+from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.releases import NEWEST
 from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.traffic_log import recording
-from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.vehicle import STEP_S
 from vision.rotation import euler_from_quaternion
 from vision.shared_frame import segment_path
 
@@ -54,6 +55,7 @@ class SimulationOptions:
         truth: file for the truth, one JSON object a line; None for none.
         record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
+        autopilot: whose manners it has, `personality.AUTOPILOTS`.
         px4: the release of PX4 to be like, where they differ.
         speed: simulated seconds per real second.
         noise: whether sensors and estimates err as a real vehicle's do.
@@ -83,6 +85,7 @@ class SimulationOptions:
     truth: Path | None = None
     record: Path | None = None
     ready_after_s: float = 3.0
+    autopilot: str = PX4
     px4: str = NEWEST
     speed: float = 1.0
     noise: bool = True
@@ -111,7 +114,7 @@ class Simulation:
 
     def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
         self.options = options
-        self.vehicle = Vehicle(
+        self.vehicle = vehicle_class(options.autopilot)(
             system_id=options.system_id,
             seed=options.seed,
             air_seed=options.world_seed,

@@ -11,6 +11,7 @@ import itertools
 import math
 import random
 from collections.abc import Callable, Iterable, Mapping
+from enum import Enum
 from typing import Any
 
 from mavlink_sim import file_transfer, mission_link, parameter_protocol, telemetry
@@ -25,6 +26,7 @@ from mavlink_sim.gimbal_protocol import GimbalManager
 from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
@@ -72,7 +74,15 @@ class Vehicle:
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
         events: the newest EVENTs. files: what MAVLink FTP reaches.
+
+    What another autopilot does otherwise, a subclass says (see `personality`): the classes of its autopilot
+    and parameters, who answers which message, and what is sent.
     """
+
+    autopilot_class: type[Autopilot] = Autopilot
+    parameters_class: type[Parameters] = Parameters
+    handlers: Mapping[str, Callable[[Any, Link, Any], None]] = HANDLERS
+    modes: type[Enum] = Mode
 
     def __init__(
         self,
@@ -92,7 +102,7 @@ class Vehicle:
     ) -> None:
         self.system_id = system_id
         self.release = release_named(px4)
-        self.parameters = Parameters(parameters, gimbal)
+        self.parameters = self.parameters_class(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
             direction = random.Random(seed if air_seed is None else air_seed).uniform(0.0, math.tau)
@@ -122,7 +132,7 @@ class Vehicle:
         """Everything that begins with power: whatever is set here does not survive a reboot."""
         self._boot_us = 0
         self._steps_to_control = 0
-        self.autopilot = Autopilot(
+        self.autopilot = self.autopilot_class(
             self.estimate, self.parameters, ready_after_s=self.ready_after_s, on_event=self._on_event
         )
         self.autopilot.position_valid = self.estimate.position_valid
@@ -178,6 +188,14 @@ class Vehicle:
         """The pilot's remote control, switched off at first (COM_RC_IN_MODE decides whether it counts)."""
         return self.autopilot.supervision.transmitter
 
+    def mode_parameters(self, mode: Any) -> tuple[float, float]:
+        """DO_SET_MODE's parameters 2 and 3 for one of `modes`."""
+        return mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24 & 0xFF
+
+    def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
+        """The mode to be in, NAV_TAKEOFF's altitude for a height above home, and whether it is over."""
+        return None, self.home_altitude_m + height_m, lambda: self.autopilot.mode is Mode.HOLD
+
     def next_ping(self) -> int:
         """The sequence number of the next PING of its own."""
         return next(self._ping_sequence)
@@ -226,7 +244,7 @@ class Vehicle:
         forward(message, link, self.links.values(), self.system_id)
         system, component = target_of(message)
         if system in (0, self.system_id) and component in (0, AUTOPILOT_COMPONENT):
-            handler = HANDLERS.get(message.get_type())
+            handler = self.handlers.get(message.get_type())
             if handler is not None:
                 handler(self, link, message)
 

@@ -21,11 +21,12 @@ from typing import Any
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.clock_sync import ClockSync
 from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
-from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, pack_frame
+from companion.vehicle.framing import Frame, Framer, pack_frame
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
-from companion.vehicle.px4_modes import request_of_mode
+from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
 from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
 from companion.vehicle.telemetry_fold import Fields, fold
 
@@ -35,7 +36,6 @@ logger = logging.getLogger(__name__)
 HEARTBEAT_ID = 0
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 _AUTOPILOT_INVALID = 8  # MAV_AUTOPILOT: not an autopilot
-_AUTOPILOT_PX4 = 12
 _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
 _ONBOARD_CONTROLLER = 18  # MAV_TYPE
 _HEARTBEAT = struct.Struct(
@@ -49,7 +49,6 @@ _NAV_TAKEOFF = 22
 _COMPONENT_ARM_DISARM = 400
 _SET_MESSAGE_INTERVAL = 511
 _REQUEST_MESSAGE = 512
-_HOME_POSITION_ID = 242
 
 ACCEPTED, IN_PROGRESS = 0, 5
 RESULT_NAMES = {
@@ -62,15 +61,6 @@ RESULT_NAMES = {
     6: "cancelled",
 }
 
-# What we read, and the rate control needs. PX4's onboard link has most of it already.
-WANTED_RATES_HZ = {
-    31: 50.0,  # ATTITUDE_QUATERNION
-    32: 30.0,  # LOCAL_POSITION_NED
-    33: 5.0,  # GLOBAL_POSITION_INT
-    1: 2.0,  # SYS_STATUS
-    245: 5.0,  # EXTENDED_SYS_STATE
-    CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late
-}
 _MEASURE_S = 1.5
 _RATE_TOLERANCE = 0.7
 _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
@@ -87,10 +77,19 @@ _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 class AutopilotDriver(ABC):
     """The part of a driver above the encoding. See `companion.vehicle.driver.Driver` for the promises."""
 
+    flown_autopilots: frozenset[int] = frozenset({PX4})  # MAV_AUTOPILOT
+
     def __init__(
-        self, url: LinkUrl, *, system_id: int | None, own_system_id: int, own_component_id: int
+        self,
+        url: LinkUrl,
+        *,
+        system_id: int | None,
+        own_system_id: int,
+        own_component_id: int,
+        signing_key: bytes | None = None,
     ) -> None:
         self.url = url
+        self._signer = None if signing_key is None else FrameSigner(signing_key)
         self._wanted_system_id = system_id
         self._own_system_id = own_system_id
         self._own_component_id = own_component_id
@@ -106,6 +105,7 @@ class AutopilotDriver(ABC):
         self._framer = Framer()
         self._system_id: int | None = None
         self._autopilot_kind: int | None = None
+        self._manners: Manners = Px4Manners()
         self._source: Source = None
         self._newest_heartbeat: Frame | None = None
         self._boot_ms = 0
@@ -167,13 +167,13 @@ class AutopilotDriver(ABC):
             raise LinkError(f"{self.url}: no answer to opening it within {timeout_s:g} s") from error
         try:
             await self._first_heartbeat(timeout_s)
-            if self._autopilot_kind != _AUTOPILOT_PX4:
-                raise LinkError(self._why_not_px4())
+            if self._autopilot_kind not in self.flown_autopilots:
+                raise LinkError(self._why_not_flown())
             await self._attach(max(deadline - time.monotonic(), 1.0))
         except BaseException:
             await self.close()
             raise
-        logger.info("%s: PX4, system %s, answers", self.url, self._system_id)
+        logger.info("%s: %s, system %s, answers", self.url, self._manners.name, self._system_id)
         self._keeper = asyncio.create_task(self._keep(), name=f"keeper of {self.url}")
         self._synchroniser = asyncio.create_task(self._synchronise(), name=f"clock of {self.url}")
 
@@ -208,6 +208,9 @@ class AutopilotDriver(ABC):
         if self._others:
             heard = ", ".join(f"{sender[0]}/{sender[1]}" for sender in sorted(self._others))
             advice = f"heard only system/component {heard}; check the system id and what is connected"
+        elif self._signer is not None and self._signer.refused:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in self._signer.refused.items())
+            advice = f"its frames were refused by signing ({reasons}); check that both ends have the same key"
         elif self._framer.skipped_bytes:
             count = self._framer.skipped_bytes
             advice = f"{count} bytes came that are not MAVLink; check the baud rate and what is connected"
@@ -217,10 +220,15 @@ class AutopilotDriver(ABC):
             advice = "nothing came at all; check that the vehicle is on, and the address or device"
         return f"no {which} answered on {self.url} within {timeout_s:g} s: {advice}"
 
-    def _why_not_px4(self) -> str:
+    def _why_not_flown(self) -> str:
         kind = self._autopilot_kind
         name = _AUTOPILOT_NAMES.get(kind or 0, f"MAV_AUTOPILOT {kind}")
-        return f"{self.url}: only PX4 is supported so far, and system {self._system_id} is {name}"
+        if kind == ARDUPILOT:
+            return (
+                f"{self.url}: the mavsdk driver flies PX4 alone, and system {self._system_id} is {name}; "
+                'set vehicle.driver = "pymavlink"'
+            )
+        return f"{self.url}: only PX4 and ArduPilot are flown, and system {self._system_id} is {name}"
 
     # --- receiving ----------------------------------------------------------------------------------
 
@@ -230,6 +238,8 @@ class AutopilotDriver(ABC):
             return
         ours: list[Frame] = []
         for frame in self._framer.feed(data, datagram=link.datagrams):
+            if self._signer is not None and not self._signer.accepts(frame):
+                continue
             if frame.message_id == HEARTBEAT_ID:
                 self._heartbeat_from(frame, source)
             if frame.system_id == self._system_id and source == self._source:
@@ -238,7 +248,7 @@ class AutopilotDriver(ABC):
                     self._received_count[frame.message_id] += 1
                     if frame.message_id == _TIMESYNC_ID:
                         self._time_from(frame)
-        if ours and self._autopilot_kind == _AUTOPILOT_PX4:
+        if ours and self._autopilot_kind in self.flown_autopilots:
             self._take_frames(ours)
 
     def _heartbeat_from(self, frame: Frame, source: Source) -> None:
@@ -253,6 +263,7 @@ class AutopilotDriver(ABC):
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
+            self._manners = manners_of(autopilot)
         elif source != self._source and self._state.connected(time.monotonic_ns()):
             # Obeying whoever spoke last would fly two vehicles by turns.
             self._note_other(
@@ -288,6 +299,10 @@ class AutopilotDriver(ABC):
 
     def _handle(self, name: str, fields: Fields) -> None:
         """One message of the autopilot: into the state, and to whoever waits for it."""
+        for told, its_fields in self._manners.heard(name, fields, self._state):
+            self._take_in(told, its_fields)
+
+    def _take_in(self, name: str, fields: Fields) -> None:
         now_ns = time.monotonic_ns()
         if name == "LOCAL_POSITION_NED":
             self._watch_clock(fields["time_boot_ms"], now_ns)
@@ -377,7 +392,7 @@ class AutopilotDriver(ABC):
 
     def _transmit(self, frame: bytes) -> None:
         if self._link is not None:
-            self._link.send(frame)
+            self._link.send(frame if self._signer is None else self._signer.signed(frame))
 
     def _next_sequence(self) -> int:
         sequence, self._sequence = self._sequence, (self._sequence + 1) & 0xFF
@@ -407,16 +422,20 @@ class AutopilotDriver(ABC):
         kinematics = (*(setpoint.position_ned_m or zero), *(setpoint.velocity_ned_mps or zero), *zero)
         self._send_message(
             "SET_POSITION_TARGET_LOCAL_NED",
-            {
-                "time_boot_ms": (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF,
-                "target_system": self._system_id,
-                "target_component": AUTOPILOT_COMPONENT,
-                "coordinate_frame": _FRAME_LOCAL_NED,
-                "type_mask": setpoint.type_mask,
-                **dict(zip(("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz"), kinematics, strict=True)),
-                "yaw": setpoint.yaw_rad or 0.0,
-                "yaw_rate": setpoint.yaw_rate_radps or 0.0,
-            },
+            self._manners.setpoint_fields(
+                {
+                    "time_boot_ms": (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF,
+                    "target_system": self._system_id,
+                    "target_component": AUTOPILOT_COMPONENT,
+                    "coordinate_frame": _FRAME_LOCAL_NED,
+                    "type_mask": setpoint.type_mask,
+                    **dict(
+                        zip(("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz"), kinematics, strict=True)
+                    ),
+                    "yaw": setpoint.yaw_rad or 0.0,
+                    "yaw_rate": setpoint.yaw_rate_radps or 0.0,
+                }
+            ),
         )
 
     def send_landing_target(self, target: LandingTarget) -> None:
@@ -465,7 +484,7 @@ class AutopilotDriver(ABC):
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
         """See Driver."""
-        main, sub = request_of_mode(mode)
+        shown_mode, main, sub = self._manners.mode_request(mode, self._state)
         refusals: list[int] = []
 
         def watch(name: str, fields: Fields) -> None:
@@ -479,7 +498,7 @@ class AutopilotDriver(ABC):
         deadline = time.monotonic() + timeout_s
 
         def shown() -> bool:
-            return self._mode_ns > asked_ns and self._state.mode is mode
+            return self._mode_ns > asked_ns and self._state.mode is shown_mode
 
         async with self._watching(watch):
             result = await self._command(_DO_SET_MODE, _MODE_FLAG_CUSTOM, main, sub)
@@ -487,11 +506,13 @@ class AutopilotDriver(ABC):
                 refusals.append(result)
             await self._until(lambda: bool(refusals) or shown(), max(deadline - time.monotonic(), 0.0))
         if refusals:
+            self._manners.forget()
             hint = " (is a setpoint stream running?)" if mode is FlightMode.OFFBOARD else ""
             raise CommandRefusedError(
                 f"the vehicle refused mode {mode} ({_named(refusals[0])}){hint}: it shows {self._state.mode}"
             )
         if not shown():
+            self._manners.forget()
             raise CommandRefusedError(
                 f"the vehicle did not enter mode {mode} within {timeout_s:g} s: it shows {self._state.mode}"
             )
@@ -500,17 +521,14 @@ class AutopilotDriver(ABC):
         """See Driver."""
         if not (math.isfinite(altitude_m) and altitude_m > 0.0):
             raise CommandRefusedError(f"a take-off altitude must be above 0 m, got {altitude_m}")
-        if not await self._until(lambda: self._state.home_altitude_amsl_m is not None, _SHOWN_TIMEOUT_S):
-            raise CommandRefusedError(
-                "take-off needs home's altitude, and the vehicle has not told it (no position yet?)"
-            )
-        target_amsl_m = (self._state.home_altitude_amsl_m or 0.0) + altitude_m
-        nan = math.nan  # PX4: here, with this heading
-        result = await self._command(_NAV_TAKEOFF, nan, nan, nan, nan, nan, nan, target_amsl_m)
+        await self._until(lambda: self._state.home_altitude_amsl_m is not None, _SHOWN_TIMEOUT_S)
+        result = await self._command(_NAV_TAKEOFF, *self._manners.takeoff_parameters(altitude_m, self._state))
         if result != ACCEPTED:
             raise CommandRefusedError(
                 f"the vehicle refused to take off ({_named(result)}) in mode {self._state.mode}"
             )
+        for told, fields in self._manners.takes_off():
+            self._take_in(told, fields)
 
     def _ack_is_ours(self, fields: Fields) -> bool:
         """MAVLink 1 and broadcasting autopilots leave the target 0."""
@@ -560,11 +578,11 @@ class AutopilotDriver(ABC):
         elapsed_s = time.monotonic() - began
         requests: list[tuple[int, tuple[Any, ...]]] = [
             (_SET_MESSAGE_INTERVAL, (message_id, round(1e6 / rate_hz)))
-            for message_id, rate_hz in WANTED_RATES_HZ.items()
+            for message_id, rate_hz in self._manners.rates_hz.items()
             if self._received_count[message_id] / elapsed_s < _RATE_TOLERANCE * rate_hz
         ]
         if self._state.home_altitude_amsl_m is None:
-            requests.append((_REQUEST_MESSAGE, (_HOME_POSITION_ID,)))
+            requests += [(_REQUEST_MESSAGE, (message_id,)) for message_id in self._manners.requested]
         for command, parameters in requests:
             try:
                 result = await self._command(command, *parameters)
@@ -580,6 +598,15 @@ class AutopilotDriver(ABC):
                     what,
                     _named(result),
                 )
+
+
+def manners_of(autopilot: int) -> Manners:
+    """The ways of a MAV_AUTOPILOT; PX4's for one that is not flown at all."""
+    if autopilot == ARDUPILOT:
+        from companion.vehicle.ardupilot_manners import ArduPilotManners
+
+        return ArduPilotManners()
+    return Px4Manners()
 
 
 async def _happens(event: asyncio.Event, timeout_s: float) -> bool:

@@ -17,6 +17,7 @@ def open_driver(
     system_id: int | None = None,
     own_system_id: int = 1,
     own_component_id: int = 191,
+    signing_key: bytes | None = None,
 ) -> Driver:
     """A driver, not connected yet.
 
@@ -26,6 +27,7 @@ def open_driver(
         system_id: the autopilot's MAVLink system id; None takes the first autopilot heard.
         own_system_id, own_component_id: whom our messages say they are from; 191 is
             MAV_COMP_ID_ONBOARD_COMPUTER.
+        signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is taken.
 
     Raises:
         LinkUrlError: the url has none of these shapes (a ValueError and a LinkError).
@@ -44,10 +46,18 @@ def open_driver(
         from companion.vehicle.mavsdk_driver import MavsdkDriver
 
         return MavsdkDriver(
-            link_url, system_id=system_id, own_system_id=own_system_id, own_component_id=own_component_id
+            link_url,
+            system_id=system_id,
+            own_system_id=own_system_id,
+            own_component_id=own_component_id,
+            signing_key=signing_key,
         )
     from companion.vehicle.pymavlink_driver import PymavlinkDriver
 
     return PymavlinkDriver(
-        link_url, system_id=system_id, own_system_id=own_system_id, own_component_id=own_component_id
+        link_url,
+        system_id=system_id,
+        own_system_id=own_system_id,
+        own_component_id=own_component_id,
+        signing_key=signing_key,
     )

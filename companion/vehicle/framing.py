@@ -13,7 +13,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
 _MAGICS = (MAGIC_V1, MAGIC_V2)
-_HEADER_V1, _HEADER_V2, _CHECKSUM, _SIGNATURE = 6, 10, 2, 13
+SIGNATURE_LENGTH = 13  # link id, 48-bit timestamp, 48 bits of SHA-256
+_HEADER_V1, _HEADER_V2, _CHECKSUM, _SIGNATURE = 6, 10, 2, SIGNATURE_LENGTH
 _FLAG_SIGNED = 0x01
 
 # MAVLink common, 436, sent by PX4 >= 1.15. Not in pymavlink 2.4.50's "common".
@@ -93,6 +94,20 @@ def with_sequence(frame: Frame, sequence: int) -> bytes:
     at = 4 if frame.raw[0] == MAGIC_V2 else 2
     body = frame.raw[:at] + bytes((sequence,)) + frame.raw[at + 1 : -_CHECKSUM]
     return _with_checksum(body, frame.message_id)
+
+
+def is_signed(raw: bytes) -> bool:
+    """Whether a whole frame carries a signature."""
+    return raw[0] == MAGIC_V2 and bool(raw[2] & _FLAG_SIGNED)
+
+
+def marked_signed(raw: bytes) -> bytes:
+    """An unsigned MAVLink 2 frame with the flag of a signed one set: its signature is over that.
+
+    Raises KeyError for a message id without a definition here.
+    """
+    body = raw[:2] + bytes((raw[2] | _FLAG_SIGNED,)) + raw[3:-_CHECKSUM]
+    return _with_checksum(body, int.from_bytes(raw[7:10], "little"))
 
 
 def frames_of(data: bytes) -> Iterator[Frame]:

@@ -15,6 +15,7 @@ from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame
 from companion.vehicle.link_url import LinkUrl
+from companion.vehicle.manners import ARDUPILOT, PX4
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, Fields
 
 logger = logging.getLogger(__name__)
@@ -26,7 +27,7 @@ _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; stand
 _DECODED_IDS = {
     message_id
     for message_id, message in mavlink.mavlink_map.items()
-    if message.msgname in FOLDED_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR"}
+    if message.msgname in FOLDED_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
 } - {HEARTBEAT_ID}
 
 # Command protocol: 5 attempts half a second apart; after IN_PROGRESS no more attempts, only patience.
@@ -52,11 +53,23 @@ _PARAM_ERRORS = {
 class PymavlinkDriver(AutopilotDriver):
     """See `companion.vehicle.driver.Driver`."""
 
+    flown_autopilots = frozenset({PX4, ARDUPILOT})
+
     def __init__(
-        self, url: LinkUrl, *, system_id: int | None, own_system_id: int, own_component_id: int
+        self,
+        url: LinkUrl,
+        *,
+        system_id: int | None,
+        own_system_id: int,
+        own_component_id: int,
+        signing_key: bytes | None = None,
     ) -> None:
         super().__init__(
-            url, system_id=system_id, own_system_id=own_system_id, own_component_id=own_component_id
+            url,
+            system_id=system_id,
+            own_system_id=own_system_id,
+            own_component_id=own_component_id,
+            signing_key=signing_key,
         )
         self._codec = mavlink.MAVLink(None, own_system_id, own_component_id)
 
@@ -139,7 +152,7 @@ class PymavlinkDriver(AutopilotDriver):
     async def set_parameter(self, name: str, value: float) -> None:
         """See Driver."""
         _, kind = await self._read_parameter(name)
-        wanted = _parameter_bytes(name, value, kind)
+        wanted = _parameter_bytes(name, value, kind, bytewise=self._manners.parameters_bytewise)
         payload = _PARAM_SET.pack(
             wanted, self._system_id or 0, AUTOPILOT_COMPONENT, _parameter_id(name), kind
         )
@@ -168,8 +181,9 @@ class PymavlinkDriver(AutopilotDriver):
             )
         kind = fields["param_type"]
         if kind not in _PARAM_LAYOUT:
-            raise CommandRefusedError(f"parameter {name} has type {kind}, which PX4 does not use")
-        return float(struct.unpack(_PARAM_LAYOUT[kind], fields["value_bytes"])[0]), kind
+            raise CommandRefusedError(f"parameter {name} has type {kind}, which no autopilot here uses")
+        layout = _PARAM_LAYOUT[kind if self._manners.parameters_bytewise else _REAL32]
+        return float(struct.unpack(layout, fields["value_bytes"])[0]), kind
 
     async def _exchange_parameter(
         self, name: str, send: Callable[[], None], awaited: Callable[[Fields], bool]
@@ -214,10 +228,11 @@ def _parameter_id(name: str) -> bytes:
     return encoded
 
 
-def _parameter_bytes(name: str, value: float, kind: int) -> bytes:
+def _parameter_bytes(name: str, value: float, kind: int, *, bytewise: bool) -> bytes:
     if kind != _REAL32 and not float(value).is_integer():
         raise CommandRefusedError(f"parameter {name} is an integer and cannot take {value}")
     try:
-        return struct.pack(_PARAM_LAYOUT[kind], value if kind == _REAL32 else int(value))
+        packed = struct.pack(_PARAM_LAYOUT[kind], value if kind == _REAL32 else int(value))
+        return packed if bytewise else struct.pack("<f", value)
     except (struct.error, OverflowError) as error:
         raise CommandRefusedError(f"parameter {name} cannot hold {value}: {error}") from error

@@ -43,13 +43,13 @@ def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState
         state,
         heartbeat_ns=now_ns,
         armed=bool(fields["base_mode"] & _SAFETY_ARMED),
-        mode=mode_of_custom_mode(fields["custom_mode"]),
+        mode=_mode(fields),
         failsafe=fields["system_status"] in (_STATE_CRITICAL, _STATE_EMERGENCY),
     )
 
 
 def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
-    mode = mode_of_custom_mode(fields["custom_mode"])
+    mode = _mode(fields)
     return state if mode in (state.mode, FlightMode.UNKNOWN) else replace(state, mode=mode)
 
 
@@ -104,6 +104,12 @@ def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> Vehicle
         return state
     fraction = min(fields["battery_remaining"] / 100.0, 1.0)
     return replace(state, battery_ns=now_ns, battery_fraction=fraction)
+
+
+def _mode(fields: Fields) -> FlightMode:
+    """As a driver has named it (`flight_mode`), else by PX4's number."""
+    named: FlightMode | None = fields.get("flight_mode")
+    return mode_of_custom_mode(fields["custom_mode"]) if named is None else named
 
 
 def _number(value: float | None) -> float:

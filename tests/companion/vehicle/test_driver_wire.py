@@ -416,14 +416,27 @@ async def test_the_wanted_system_is_waited_for(kind, port, autopilot) -> None:
         await open_driver(kind, f"udpin://127.0.0.1:{port}", system_id=9).connect(0.5)
 
 
-async def test_only_px4_is_flown(kind, port) -> None:
-    ardupilot = FakeAutopilot(port, autopilot=3)
-    ardupilot.start()
+@pytest.mark.parametrize(
+    ("kind", "autopilot_kind", "reason"),
+    [
+        (
+            "mavsdk",
+            3,
+            'the mavsdk driver flies PX4 alone, and system 1 is ArduPilot; set vehicle.driver = "py',
+        ),
+        ("pymavlink", 0, "only PX4 and ArduPilot are flown, and system 1 is a generic autopilot"),
+    ],
+)
+async def test_an_autopilot_that_a_driver_cannot_fly_is_refused_in_one_line(
+    kind, autopilot_kind, reason, port
+) -> None:
+    other = FakeAutopilot(port, autopilot=autopilot_kind)
+    other.start()
     try:
-        with pytest.raises(LinkError, match="only PX4 is supported so far, and system 1 is ArduPilot"):
+        with pytest.raises(LinkError, match=reason):
             await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
     finally:
-        await ardupilot.stop()
+        await other.stop()
 
 
 async def test_a_busy_port_is_named_with_its_likely_holder(kind, driver, port) -> None:

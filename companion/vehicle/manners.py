@@ -1,0 +1,87 @@
+"""What a driver must know of the autopilot it speaks to: modes, streams, take-off, how parameters travel.
+
+`Px4Manners` here, `ArduPilotManners` in `ardupilot_manners.py`; the first heartbeat decides which.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.framing import CURRENT_MODE_ID
+from companion.vehicle.px4_modes import request_of_mode
+from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.telemetry_fold import Fields
+
+PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
+HOME_POSITION_ID = 242
+
+
+class Manners(ABC):
+    """One autopilot's ways. Whoever is asked for a mode or a take-off may remember it (`forget` undoes it).
+
+    Attributes:
+        name: for people. rates_hz: what is read, by message id, and the rate that control needs.
+        requested: messages that are asked for once while home is not known.
+        parameters_bytewise: integer parameters travel as their bytes; else as numbers.
+    """
+
+    name: str
+    rates_hz: dict[int, float]
+    requested: tuple[int, ...] = (HOME_POSITION_ID,)
+    parameters_bytewise: bool
+
+    def heard(self, name: str, fields: Fields, state: VehicleState) -> list[tuple[str, Fields]]:
+        """A message of the autopilot in PX4's terms: what is to be taken in for it, often itself."""
+        return [(name, fields)]
+
+    @abstractmethod
+    def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
+        """The mode that will be shown, and DO_SET_MODE's parameters 2 and 3.
+
+        Raises ValueError for a mode that cannot be asked for.
+        """
+
+    @abstractmethod
+    def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
+        """NAV_TAKEOFF's parameters for a height above home. Raises CommandRefusedError."""
+
+    def takes_off(self) -> list[tuple[str, Fields]]:
+        """A take-off was accepted; what is to be taken in for that."""
+        return []
+
+    def forget(self) -> None:  # noqa: B027 - PX4 shows what was asked for by itself
+        """What was asked for was refused."""
+
+    def setpoint_fields(self, fields: dict[str, Any]) -> dict[str, Any]:
+        """SET_POSITION_TARGET_LOCAL_NED, so that this autopilot understands it as PX4 does."""
+        return fields
+
+
+class Px4Manners(Manners):
+    """PX4's. Its onboard link has most of the streams unasked."""
+
+    name = "PX4"
+    parameters_bytewise = True
+    rates_hz = {  # noqa: RUF012 - a table, never changed
+        31: 50.0,  # ATTITUDE_QUATERNION
+        32: 30.0,  # LOCAL_POSITION_NED
+        33: 5.0,  # GLOBAL_POSITION_INT
+        1: 2.0,  # SYS_STATUS
+        245: 5.0,  # EXTENDED_SYS_STATE
+        CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late
+    }
+
+    def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
+        main, sub = request_of_mode(mode)
+        return mode, main, sub
+
+    def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
+        if state.home_altitude_amsl_m is None:
+            raise CommandRefusedError(
+                "take-off needs home's altitude, and the vehicle has not told it (no position yet?)"
+            )
+        nan = math.nan  # here, with this heading
+        return (nan, nan, nan, nan, nan, nan, state.home_altitude_amsl_m + altitude_m)

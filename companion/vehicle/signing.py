@@ -1,0 +1,141 @@
+"""MAVLink 2 message signing (https://mavlink.io/en/guide/message_signing.html) of one link.
+
+Every frame that leaves is signed; what comes in unsigned, with another key or a second time is refused and
+counted, except what a telemetry radio says of itself, as the specification advises.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import stat
+import time
+from collections import Counter
+from pathlib import Path
+
+from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
+
+logger = logging.getLogger(__name__)
+
+KEY_LENGTH = 32
+MAX_KEY_FILE_BYTES = 4096
+_EPOCH_S = 1_420_070_400  # 2015-01-01, from which signatures count time in units of 10 us
+_ONE_MINUTE = 6_000_000
+_TIMESTAMP_MASK = (1 << 48) - 1
+_RADIO_STATUS_ID, _HEARTBEAT_ID = 109, 0
+_TELEMETRY_RADIO = 68  # MAV_COMP_ID_TELEMETRY_RADIO
+_LINK_ID = 0
+
+
+class SigningKeyError(ValueError):
+    """The key file cannot be used. The message never holds what is in it."""
+
+
+def read_key(path: str | Path) -> bytes:
+    """The signing key in a file that its owner alone can read: 32 bytes as they are, or a passphrase.
+
+    A passphrase is text of any other length; its SHA-256 is the key, as ground stations make it, without the
+    white space at its ends.
+
+    Raises:
+        SigningKeyError: no such file, others can read it, it is not ours, it is empty or no text.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise SigningKeyError(f"signing key {path}: expected a regular file")
+            if status.st_mode & 0o077:
+                mode = stat.S_IMODE(status.st_mode)
+                raise SigningKeyError(f"signing key {path}: others can read it ({mode:o}); chmod 600 {path}")
+            if status.st_uid not in (os.geteuid(), 0):
+                raise SigningKeyError(f"signing key {path}: it belongs to another user; make it your own")
+            content = file.read(MAX_KEY_FILE_BYTES + 1)
+    except OSError as error:
+        raise SigningKeyError(f"signing key {path}: cannot be read: {error.strerror}") from error
+    if len(content) == KEY_LENGTH:
+        return content
+    if len(content) > MAX_KEY_FILE_BYTES:
+        raise SigningKeyError(f"signing key {path}: more than {MAX_KEY_FILE_BYTES} bytes is no passphrase")
+    try:
+        passphrase = content.decode("utf-8").strip()
+    except UnicodeDecodeError:
+        passphrase = ""
+    if not passphrase or "\0" in passphrase:
+        raise SigningKeyError(
+            f"signing key {path}: expected {KEY_LENGTH} bytes or a passphrase, got {len(content)} bytes that "
+            "are neither"
+        )
+    return hashlib.sha256(passphrase.encode()).digest()
+
+
+class FrameSigner:
+    """Signs what leaves one link and judges what comes in.
+
+    Attributes:
+        refused: how many frames were refused, by reason.
+    """
+
+    def __init__(self, key: bytes) -> None:
+        """Raises ValueError for a key of another length than 32 bytes."""
+        if len(key) != KEY_LENGTH:
+            raise ValueError(f"a signing key has {KEY_LENGTH} bytes, this one has {len(key)}")
+        self._key = key
+        self._timestamp = 0
+        self._newest: dict[tuple[int, int, int], int] = {}
+        self.refused: Counter[str] = Counter()
+
+    def __repr__(self) -> str:
+        return f"FrameSigner({sum(self.refused.values())} refused)"
+
+    def signed(self, frame: bytes) -> bytes:
+        """A packed MAVLink 2 frame with its signature; MAVLink 1 cannot be signed and stays as it is."""
+        if frame[0] != MAGIC_V2 or is_signed(frame):
+            return frame
+        now = int((time.time() - _EPOCH_S) * 1e5)
+        self._timestamp = max(self._timestamp + 1, now) & _TIMESTAMP_MASK
+        marked = marked_signed(frame) + bytes((_LINK_ID,)) + self._timestamp.to_bytes(6, "little")
+        return marked + hashlib.sha256(self._key + marked).digest()[:6]
+
+    def accepts(self, frame: Frame) -> bool:
+        """Whether a frame that came may be used; if not, it is counted, and the first of a kind logged."""
+        reason = self._objection(frame)
+        if reason is None:
+            return True
+        self.refused[reason] += 1
+        if self.refused[reason] == 1:
+            logger.warning(
+                "a frame of %d/%d was refused by signing: %s; more are counted, not told",
+                frame.system_id,
+                frame.component_id,
+                reason,
+            )
+        return False
+
+    def _objection(self, frame: Frame) -> str | None:
+        raw = frame.raw
+        if not is_signed(raw):
+            return None if _is_of_a_radio(frame) else "unsigned"
+        if hashlib.sha256(self._key + raw[:-6]).digest()[:6] != raw[-6:]:
+            return "wrong signature"
+        stream = (frame.system_id, frame.component_id, raw[-SIGNATURE_LENGTH])
+        timestamp = int.from_bytes(raw[-12:-6], "little")
+        newest = self._newest.get(stream)
+        if newest is None:
+            now = max(self._timestamp, int((time.time() - _EPOCH_S) * 1e5))
+            if timestamp + _ONE_MINUTE < now:
+                return "old timestamp"
+        elif timestamp <= newest:
+            return "replayed"
+        self._newest[stream] = timestamp
+        self._timestamp = max(self._timestamp, timestamp)
+        return None
+
+
+def _is_of_a_radio(frame: Frame) -> bool:
+    """What a telemetry radio puts on the link knows no key."""
+    if frame.message_id == _RADIO_STATUS_ID:
+        return True
+    return frame.message_id == _HEARTBEAT_ID and frame.component_id == _TELEMETRY_RADIO

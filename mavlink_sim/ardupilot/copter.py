@@ -1,0 +1,137 @@
+"""A vehicle that speaks and decides as an ArduPilot Copter does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+from mavlink_sim.announcements import Text
+from mavlink_sim.ardupilot import services, streams, telemetry
+from mavlink_sim.ardupilot.autopilot import CopterAutopilot
+from mavlink_sim.ardupilot.modes import CopterMode
+from mavlink_sim.ardupilot.parameters import CopterParameters
+from mavlink_sim.links import Link
+from mavlink_sim.vehicle import Vehicle
+
+
+class CopterVehicle(Vehicle):
+    """See `Vehicle`, with Copter's parameters; there is no gimbal and no choice of a PX4 release.
+
+    Attributes:
+        own_intervals: by link, the messages whose interval was set one by one.
+
+    Raises:
+        ValueError: a gimbal was asked for.
+    """
+
+    autopilot_class = CopterAutopilot
+    parameters_class = CopterParameters
+    handlers: Mapping[str, Callable[[Any, Link, Any], None]] = services.HANDLERS
+
+    def __init__(self, **options: Any) -> None:
+        if options.get("gimbal"):
+            raise ValueError("an ArduPilot vehicle has no gimbal here: leave it out, or fly a PX4")
+        self.own_intervals: dict[str, set[str]] = {}
+        super().__init__(**options)
+
+    modes = CopterMode
+
+    def mode_parameters(self, mode: CopterMode) -> tuple[float, float]:
+        return mode.custom_mode, 0.0
+
+    def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
+        """In GUIDED, to a height that is one above home."""
+
+        def is_over() -> bool:
+            copter = self.copter
+            return not copter.landed and copter.guided is not None and not copter.guided.is_taking_off
+
+        return "GUIDED", height_m, is_over
+
+    @property
+    def copter(self) -> CopterAutopilot:
+        """The autopilot, by its own class."""
+        return cast(CopterAutopilot, self.autopilot)
+
+    def add_link(self, name: str, rates_hz: dict[str, float] | None = None) -> Link:
+        """Attach a link. Rates of PX4's links mean nothing here: SR0_* and SR1_* do."""
+        link = super().add_link(name, streams.RATES_HZ)
+        self.own_intervals[name] = set()
+        streams.follow_parameters(self, link)
+        return link
+
+    def say(self, severity: int, text: str) -> None:
+        """A STATUSTEXT to everyone."""
+        self.autopilot.texts.append(Text(severity, text))
+
+    def say_once(self, severity: int, text: str) -> None:
+        if text not in self._said:
+            self._said.add(text)
+            self.say(severity, text)
+
+    def tell_home(self) -> None:
+        """HOME_POSITION to every link, as when it changes."""
+        for link in self.links.values():
+            self.send_built(link, "HOME_POSITION")
+
+    def message_named(self, identifier: float) -> str | None:
+        """The name of a message that can be sent, by its number."""
+        if not math.isfinite(identifier):
+            return None
+        return telemetry.MESSAGE_IDS.get(round(identifier))
+
+    def send_built(self, link: Link, name: str) -> bool:
+        builder = telemetry.BUILDERS.get(name)
+        message = None if builder is None else builder(self)
+        if message is not None:
+            link.send(message)
+        return message is not None
+
+    def send_soon(self, link: Link, name: str) -> None:
+        """In the next step: after the acknowledgement that is sent now."""
+
+        def send() -> None:
+            self.send_built(link, name)
+
+        self.after(0.0, send)
+
+    def _boot(self) -> None:
+        super()._boot()
+        self._said: set[str] = set()
+        self._told_mode_changes = 0
+        self._was_armed = False
+
+    def reboot(self) -> None:
+        """See Vehicle. What was asked of the streams one by one is forgotten."""
+        super().reboot()
+        for link in self.links.values():
+            self.own_intervals[link.name].clear()
+            streams.follow_parameters(self, link)
+
+    def _tell_parameters(self) -> None:
+        """Nothing is told unasked."""
+
+    def _watch_companion(self) -> None:
+        """A companion's heartbeat is nothing that Copter misses."""
+
+    def _step(self) -> None:
+        super()._step()
+        copter = self.copter
+        if copter.mode_changes != self._told_mode_changes:
+            self._told_mode_changes = copter.mode_changes
+            for link in self.links.values():
+                self.send_built(link, "HEARTBEAT")
+        if copter.armed and not self._was_armed:
+            self.tell_home()  # home is where it was armed
+        self._was_armed = copter.armed
+
+    def _tell(self) -> None:
+        """Texts to every link on which somebody speaks; no events, no commands to a gimbal."""
+        while self.autopilot.texts:
+            text = self.autopilot.texts.popleft()
+            for link in self.links.values():
+                if link.components:
+                    link.ground_station_seen_s = self.now_s
+                    link.send_text(text, self.now_s)
+        self.autopilot.gimbal_commands.clear()

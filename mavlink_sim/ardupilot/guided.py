@@ -1,0 +1,238 @@
+"""GUIDED: take-off, and what the newest target asks for; what is not renewed for GUID_TIMEOUT ends in a stop.
+
+A position is flown to and kept, however old it is. A velocity, an acceleration or an attitude that is older
+than GUID_TIMEOUT seconds becomes zero, and the vehicle stands still; it stays in GUIDED.
+"""
+
+from __future__ import annotations
+
+import math
+
+from mavlink_sim import flight
+from mavlink_sim.ardupilot.targets import STOP, GuidedTarget
+from mavlink_sim.attitude_control import AttitudeSetpoint, RatesSetpoint
+from mavlink_sim.control import NAN, NOTHING, TrajectorySetpoint
+from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor, Vector
+from vision.rotation import Quaternion, quaternion_from_euler
+
+# A target that runs ahead of the vehicle waits for it (ArduPilot's leash).
+LEASH_M = 2.0
+TAKEOFF_DONE_M = 0.3  # so near to the height a take-off counts as complete
+CLIMB_GAIN_PER_S = 4.0
+FACING_SPEED_MPS = 1.0  # above it "the direction of flight" is known
+THRUST_AS_THRUST = 8  # GUID_OPTIONS: SET_ATTITUDE_TARGET's thrust is no climb rate
+ZERO: Vector = (0.0, 0.0, 0.0)
+
+
+class Heading:
+    """Where the nose goes: a heading, a turning rate, or along the flight (WP_YAW_BEHAVIOR)."""
+
+    def __init__(self, parameters: Parameters, yaw_rad: float) -> None:
+        self._parameters = parameters
+        self.yaw_rad = yaw_rad
+        self._goal_rad = NAN
+        self._rate_radps = NAN
+        self._slew_radps = NAN
+
+    def take(self, yaw_rad: float, rate_radps: float, slew_radps: float = NAN) -> None:
+        self._goal_rad, self._rate_radps, self._slew_radps = yaw_rad, rate_radps, slew_radps
+
+    def hold(self) -> None:
+        """Turn no more, if it turned by a rate."""
+        if math.isnan(self._goal_rad) and not math.isnan(self._rate_radps):
+            self._rate_radps = 0.0
+
+    def advance(self, dt_s: float, velocity: Vector) -> float:
+        goal = self._goal_rad
+        if math.isnan(goal) and not math.isnan(self._rate_radps):
+            self.yaw_rad = math.remainder(self.yaw_rad + self._rate_radps * dt_s, math.tau)
+            return self.yaw_rad
+        if math.isnan(goal):
+            faces_flight = self._parameters.number("WP_YAW_BEHAVIOR") in (1, 2)
+            if not faces_flight or math.hypot(velocity[0], velocity[1]) < FACING_SPEED_MPS:
+                return self.yaw_rad
+            goal = math.atan2(velocity[1], velocity[0])
+        slew = math.radians(self._parameters.positive("ATC_SLEW_YAW") / 100.0)
+        slew = min(slew, self._slew_radps) if self._slew_radps > 0.0 else slew
+        error = math.remainder(goal - self.yaw_rad, math.tau)
+        step = min(max(error, -slew * dt_s), slew * dt_s)
+        self.yaw_rad = math.remainder(self.yaw_rad + step, math.tau)
+        return self.yaw_rad
+
+
+class Attitude:
+    """An attitude or body rates with a climb rate (m/s, up) or a thrust (0..1)."""
+
+    def __init__(
+        self, quaternion: Quaternion | None, rates: Vector | None, climb_mps: float, thrust: float = NAN
+    ) -> None:
+        self.quaternion, self.rates, self.climb_mps, self.thrust = quaternion, rates, climb_mps, thrust
+
+
+class Guided(flight.Task):
+    """The task of GUIDED. It begins by stopping where it is."""
+
+    def __init__(self, airframe: Multirotor, parameters: Parameters) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._trajectory = flight.Trajectory(airframe, parameters)
+        self._takeoff: flight.Takeoff | None = None
+        self._reached = False  # the height of the take-off
+        self._attitude: Attitude | None = None
+        self._target = STOP
+        self._age_s = 0.0
+        self.heading = Heading(parameters, airframe.yaw_rad)
+
+    # ---- what is asked of it ----------------------------------------------------------------------------
+
+    def take_off(self, down_m: float) -> None:
+        """Climb straight up to this NED z."""
+        self._begin()
+        self._reached = False
+        self._takeoff = flight.Takeoff(self._airframe, self._parameters, down_m)
+        self.goal = self._takeoff.goal
+        self.heading.take(NAN, 0.0)
+
+    def fly(self, target: GuidedTarget) -> None:
+        """A new target in place of whatever went on."""
+        same_kind = self._kind(target) == self._kind(self._target)
+        if self._takeoff is not None or self._attitude is not None or not same_kind:
+            self._begin()
+        self._target, self._age_s = target, 0.0
+        self.goal = target.position
+        self.heading.take(target.yaw_rad, target.yaw_rate_radps)
+
+    def fly_attitude(self, attitude: Attitude) -> None:
+        if self._attitude is None:
+            self._begin()
+        self._attitude, self._age_s, self.goal = attitude, 0.0, None
+
+    def cruise_at(self, speed_mps: float) -> None:
+        self._trajectory.cruise_mps = speed_mps
+
+    @property
+    def target(self) -> GuidedTarget | None:
+        """What POSITION_TARGET_LOCAL_NED tells; None while an attitude is flown."""
+        if self._takeoff is not None:
+            return GuidedTarget(position=self._takeoff.goal)
+        return None if self._attitude is not None else self._target
+
+    @property
+    def starting(self) -> bool:
+        """A take-off was asked for: the one thing that leads off the ground."""
+        return self._takeoff is not None
+
+    @property
+    def is_taking_off(self) -> bool:
+        """On the climb of a take-off."""
+        if self._takeoff is None or self._takeoff.goal is None:
+            return False
+        self._reached |= self._airframe.position[2] - self._takeoff.goal[2] < TAKEOFF_DONE_M
+        return not self._reached
+
+    @staticmethod
+    def _kind(target: GuidedTarget) -> tuple[bool, bool, bool]:
+        return (
+            target.position is not None,
+            target.velocity is not None,
+            target.acceleration is not None and target.velocity is None,
+        )
+
+    def _begin(self) -> None:
+        cruise = self._trajectory.cruise_mps
+        self._trajectory = flight.Trajectory(self._airframe, self._parameters)
+        self._trajectory.cruise_mps = cruise
+        self._takeoff = self._attitude = None
+        self._target = STOP
+        self.heading.yaw_rad = self._airframe.yaw_rad
+
+    # ---- one step ---------------------------------------------------------------------------------------
+
+    def update(self, dt_s: float) -> flight.Setpoint:
+        self._age_s += dt_s
+        stale = self._age_s > self._parameters.number("GUID_TIMEOUT")
+        if self._attitude is not None:
+            return self._by_attitude(self._attitude, stale)
+        if self._takeoff is not None:
+            setpoint = self._takeoff.update(dt_s)
+        elif self._target.position is None:
+            setpoint = self._by_velocity(dt_s, stale)
+        elif self._target.velocity is None:
+            setpoint = self._trajectory.towards(self._target.position, dt_s)
+        else:
+            setpoint = self._by_moving_place(dt_s, stale)
+        if stale and self._target.velocity is not None:
+            self.heading.hold()
+        setpoint.yaw_rad = self.heading.advance(dt_s, self._trajectory.velocity)
+        return setpoint
+
+    def _by_moving_place(self, dt_s: float, stale: bool) -> TrajectorySetpoint:
+        target = self._target
+        assert target.position is not None
+        assert target.velocity is not None
+        velocity = ZERO if stale else target.velocity
+        x, y, z = (place + speed * dt_s for place, speed in zip(target.position, velocity, strict=True))
+        self._target = GuidedTarget((x, y, z), velocity, None, target.yaw_rad, target.yaw_rate_radps)
+        self._trajectory.velocity = velocity
+        return TrajectorySetpoint((x, y, z), velocity, NOTHING)
+
+    def _by_velocity(self, dt_s: float, stale: bool) -> TrajectorySetpoint:
+        """A place that moves as asked, within the accelerations, and on a leash."""
+        value, target, trajectory = self._parameters.number, self._target, self._trajectory
+        if stale or (target.velocity is None and target.acceleration is None):
+            wanted = ZERO
+        elif target.velocity is not None:
+            wanted = target.velocity
+        else:
+            assert target.acceleration is not None
+            ax, ay, az = target.acceleration
+            vx, vy, vz = trajectory.velocity
+            wanted = (vx + ax * dt_s, vy + ay * dt_s, vz + az * dt_s)
+        trajectory.velocity = velocity = _towards(
+            trajectory.velocity,
+            _within(wanted, value("MPC_XY_CRUISE"), value("MPC_Z_V_AUTO_UP"), value("MPC_Z_V_AUTO_DN")),
+            self._parameters.positive("MPC_ACC_HOR") * dt_s,
+            self._parameters.positive("MPC_ACC_DOWN_MAX") * dt_s,
+        )
+        x, y, z = (
+            min(max(place + speed * dt_s, here - LEASH_M), here + LEASH_M)
+            for place, speed, here in zip(trajectory.position, velocity, self._airframe.position, strict=True)
+        )
+        trajectory.position = (x, y, z)
+        return TrajectorySetpoint((x, y, z), velocity, NOTHING)
+
+    def _by_attitude(self, attitude: Attitude, stale: bool) -> AttitudeSetpoint | RatesSetpoint:
+        frame = self._airframe
+        self._trajectory.velocity = frame.velocity
+        climb, thrust = attitude.climb_mps, attitude.thrust
+        if stale:
+            attitude = Attitude(quaternion_from_euler(0.0, 0.0, frame.yaw_rad), None, 0.0)
+            climb, thrust = 0.0, NAN
+        if math.isnan(thrust):
+            upright = max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.3)
+            lift = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (climb + frame.velocity[2])
+            thrust = min(max(lift / upright / MAX_THRUST_MPS2, 0.06), 1.0)
+        if attitude.quaternion is None:
+            return RatesSetpoint(attitude.rates or ZERO, thrust)
+        rate = NAN if attitude.rates is None else attitude.rates[2]
+        return AttitudeSetpoint(attitude.quaternion, rate, thrust)
+
+
+def _within(velocity: Vector, horizontal: float, up: float, down: float) -> Vector:
+    x, y, z = velocity
+    speed = math.hypot(x, y)
+    share = horizontal / speed if speed > horizontal else 1.0
+    return (x * share, y * share, min(max(z, -up), down))
+
+
+def _towards(velocity: Vector, wanted: Vector, horizontal: float, vertical: float) -> Vector:
+    """The velocity after one step of bounded change."""
+    x, y, z = (goal - now for goal, now in zip(wanted, velocity, strict=True))
+    change = math.hypot(x, y)
+    share = horizontal / change if change > horizontal else 1.0
+    return (
+        velocity[0] + x * share,
+        velocity[1] + y * share,
+        velocity[2] + min(max(z, -vertical), vertical),
+    )

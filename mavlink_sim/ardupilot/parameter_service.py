@@ -1,0 +1,72 @@
+"""The parameter protocol as ArduPilot speaks it: no hash, no errors; a set is told to every link.
+
+What cannot be (an unknown name, a number that is none) is passed over in silence. Values are numbers whatever
+their type, and a wrong `param_type` does not matter. An answer to a name, and to a set, has the index 65535.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.ardupilot import streams
+from mavlink_sim.messages import dialect
+from mavlink_sim.parameters import Parameter
+
+if TYPE_CHECKING:
+    from mavlink_sim.ardupilot.copter import CopterVehicle
+    from mavlink_sim.links import Link
+
+logger = logging.getLogger(__name__)
+
+NO_INDEX = 65535
+FIRST_ANSWER_S = 0.01
+
+
+def request_list(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_LIST: all of them in the order of their indices."""
+
+    def begin() -> None:
+        link.parameters_left = deque(vehicle.parameters)
+        link.parameter_credit = 0.0
+
+    vehicle.after(FIRST_ANSWER_S, begin)
+
+
+def request_read(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+    """PARAM_REQUEST_READ, by index or (index -1) by name."""
+    index = int(message.param_index)
+    parameters = vehicle.parameters
+    parameter = parameters.at(index) if index >= 0 else parameters.get(_text_of(message.param_id))
+    if parameter is not None:
+        vehicle.after(0.0, lambda: _tell(vehicle, link, parameter, index if index >= 0 else NO_INDEX))
+
+
+def set_parameter(vehicle: CopterVehicle, link: Link, message: Any) -> None:
+    """PARAM_SET: rounded and cut to what the type holds, then told on every link."""
+    name = _text_of(message.param_id)
+    if name not in vehicle.parameters:
+        return
+    try:
+        parameter = vehicle.parameters.set(name, float(message.param_value))
+    except ValueError as error:
+        logger.info("PARAM_SET is passed over: %s", error)
+        return
+    for each in vehicle.links.values():
+        if name.startswith(streams.prefix(vehicle, each)):
+            streams.follow_parameters(vehicle, each)
+        _tell(vehicle, each, parameter, NO_INDEX)
+
+
+def _tell(vehicle: CopterVehicle, link: Link, parameter: Parameter, index: int) -> None:
+    link.send(
+        dialect.MAVLink_param_value_message(
+            parameter.name.encode(), parameter.wire_value, parameter.kind, len(vehicle.parameters), index
+        )
+    )
+
+
+def _text_of(field: str | bytes) -> str:
+    text = field.decode(errors="replace") if isinstance(field, bytes) else field
+    return text.split("\0", 1)[0]

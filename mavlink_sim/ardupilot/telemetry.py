@@ -1,0 +1,177 @@
+"""What a Copter's messages say where they differ from a PX4's; the others are shared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from pymavlink.dialects.v20 import ardupilotmega
+
+from mavlink_sim import telemetry
+from mavlink_sim.geography import geographic
+from mavlink_sim.messages import dialect
+
+if TYPE_CHECKING:
+    from mavlink_sim.ardupilot.copter import CopterVehicle
+
+QUADROTOR, ARDUPILOTMEGA = 2, 3  # MAV_TYPE, MAV_AUTOPILOT
+VERSION = 0x040500FF  # 4.5.0, an official release
+# MAV_PROTOCOL_CAPABILITY of what is here: PARAM_FLOAT, COMMAND_INT, SET_ATTITUDE_TARGET, the two
+# SET_POSITION_TARGETs, FLIGHT_TERMINATION, MAVLINK2, PARAM_ENCODE_C_CAST.
+CAPABILITIES = 2 | 8 | 64 | 128 | 256 | 2048 | 8192 | 131072
+# gyros, accelerometers, compass, barometer, GPS, attitude, yaw, height and position control, motors, AHRS
+SENSORS = 0x20FC2F
+PREARM_CHECK = telemetry.PREARM_CHECK
+BATTERY = 0x2000000
+# EKF_STATUS_REPORT.flags: attitude to predicted absolute position; while starting: attitude alone
+EKF_READY, EKF_STARTING, EKF_BLIND = 831, 1, 167
+IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION, IGNORE_YAWS = 7, 56, 448, 3072
+MILLI_G = 1000.0 / 9.80665
+NOTHING = (0.0, 0.0, 0.0)
+
+
+def _heartbeat(vehicle: CopterVehicle) -> Any:
+    copter = vehicle.copter
+    return dialect.MAVLink_heartbeat_message(
+        QUADROTOR, ARDUPILOTMEGA, copter.base_mode, copter.mode.custom_mode, int(copter.system_status), 3
+    )
+
+
+def _sys_status(vehicle: CopterVehicle) -> Any:
+    copter = vehicle.copter
+    health = SENSORS | BATTERY if copter.sensors_ready and copter.position_valid else BATTERY
+    if copter.armed or copter.can_arm:
+        health |= PREARM_CHECK
+    present = SENSORS | BATTERY | PREARM_CHECK
+    return dialect.MAVLink_sys_status_message(
+        present, present, health, 120, *copter.supervision.battery.system_status, *([0] * 6)
+    )
+
+
+def _home_position(vehicle: CopterVehicle) -> Any:
+    """The local position in it is always zero with ArduPilot, wherever home is."""
+    if not vehicle.copter.sensors_ready:
+        return None
+    latitude, longitude, altitude = geographic(vehicle.copter.home)
+    return dialect.MAVLink_home_position_message(
+        round(latitude * 1e7),
+        round(longitude * 1e7),
+        round(altitude * 1000),
+        *NOTHING,
+        [1.0, 0.0, 0.0, 0.0],
+        *NOTHING,
+        vehicle.boot_us,
+    )
+
+
+def _position_target_local_ned(vehicle: CopterVehicle) -> Any:
+    """In GUIDED alone, with what was asked for; nothing while an attitude is flown."""
+    guided = vehicle.copter.guided
+    target = None if guided is None else guided.target
+    if target is None:
+        return None
+    mask = IGNORE_YAWS
+    mask |= IGNORE_POSITION if target.position is None else 0
+    mask |= IGNORE_VELOCITY if target.velocity is None else 0
+    mask |= IGNORE_ACCELERATION if target.position is not None and target.velocity is None else 0
+    return dialect.MAVLink_position_target_local_ned_message(
+        vehicle.boot_ms,
+        1,
+        mask,
+        *(target.position or NOTHING),
+        *(target.velocity or NOTHING),
+        *(target.acceleration or NOTHING),
+        0.0,
+        0.0,
+    )
+
+
+def _raw_imu(vehicle: CopterVehicle) -> Any:
+    frame = vehicle.estimate
+    cosine, sine = math.cos(frame.yaw_rad), math.sin(frame.yaw_rad)
+    return dialect.MAVLink_raw_imu_message(
+        vehicle.boot_us,
+        *(_int16(value * MILLI_G) for value in frame.specific_force),
+        *(_int16(value * 1000.0) for value in frame.rates),
+        round(210 * cosine),
+        round(-210 * sine),
+        430,
+    )
+
+
+def _int16(value: float) -> int:
+    return min(max(round(value), -32768), 32767)
+
+
+def _ekf_status_report(vehicle: CopterVehicle) -> Any:
+    copter = vehicle.copter
+    flags = EKF_STARTING
+    if copter.sensors_ready:
+        flags = EKF_READY if copter.position_valid else EKF_BLIND
+    return ardupilotmega.MAVLink_ekf_status_report_message(flags, 0.05, 0.02, 0.03, 0.02, 0.0)
+
+
+def _gps_global_origin(vehicle: CopterVehicle) -> Any:
+    if not vehicle.copter.sensors_ready:
+        return None
+    return telemetry.BUILDERS["GPS_GLOBAL_ORIGIN"](vehicle)
+
+
+def _autopilot_version(vehicle: CopterVehicle) -> Any:
+    return dialect.MAVLink_autopilot_version_message(
+        capabilities=CAPABILITIES,
+        flight_sw_version=VERSION,
+        middleware_sw_version=0,
+        os_sw_version=0,
+        board_version=0,
+        flight_custom_version=list(b"2a3dc4b7"),
+        middleware_custom_version=[0] * 8,
+        os_custom_version=[0] * 8,
+        vendor_id=0,
+        product_id=0,
+        uid=0,
+    )
+
+
+def _mission_current(vehicle: CopterVehicle) -> Any:
+    return dialect.MAVLink_mission_current_message(0)
+
+
+Builder = Callable[["CopterVehicle"], Any]
+
+_SHARED = (
+    "ATTITUDE",
+    "ATTITUDE_QUATERNION",
+    "ATTITUDE_TARGET",
+    "BATTERY_STATUS",
+    "DISTANCE_SENSOR",
+    "EXTENDED_SYS_STATE",
+    "GLOBAL_POSITION_INT",
+    "GPS_RAW_INT",
+    "LOCAL_POSITION_NED",
+    "POSITION_TARGET_GLOBAL_INT",
+    "RC_CHANNELS",
+    "SCALED_PRESSURE",
+    "SERVO_OUTPUT_RAW",
+    "SYSTEM_TIME",
+    "TIMESYNC",
+    "VFR_HUD",
+    "VIBRATION",
+)
+BUILDERS: dict[str, Builder] = {name: telemetry.BUILDERS[name] for name in _SHARED} | {
+    "HEARTBEAT": _heartbeat,
+    "SYS_STATUS": _sys_status,
+    "HOME_POSITION": _home_position,
+    "POSITION_TARGET_LOCAL_NED": _position_target_local_ned,
+    "RAW_IMU": _raw_imu,
+    "EKF_STATUS_REPORT": _ekf_status_report,
+    "GPS_GLOBAL_ORIGIN": _gps_global_origin,
+    "MISSION_CURRENT": _mission_current,
+    "AUTOPILOT_VERSION": _autopilot_version,
+}
+MESSAGE_IDS: dict[int, str] = {
+    identifier: message.msgname
+    for identifier, message in ardupilotmega.mavlink_map.items()
+    if message.msgname in BUILDERS
+}
