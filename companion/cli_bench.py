@@ -1,4 +1,4 @@
-"""The command line of measurements: `companion bench detector|tracking|latency|setpoints`."""
+"""The command line of measurements: `companion bench detector|tracking|latency|setpoints|flights`."""
 
 from __future__ import annotations
 
@@ -113,6 +113,29 @@ def bench_tracking(
     else:
         Console().print(tracking_table(figures))
         typer.echo(f"tracker: {figures['tracker_ms']}")
+
+
+@bench.command("flights")
+def bench_flights(
+    behaviour: Annotated[str, typer.Argument(help="which flight; any other word lists them")],
+    runs: Annotated[int, typer.Option(min=1, help="flights, one for each seed")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="the first one")] = 0,
+    processes: Annotated[int, typer.Option(min=1, help="flights at once")] = 1,
+    as_json: _JSON = False,
+) -> None:
+    """How well a behaviour flies over many seeds, in lockstep with the built-in vehicle."""
+    from rich.console import Console
+
+    from companion.bench_flights import UnknownFlightError, flights_table, fly, summary
+
+    with plain_errors(UnknownFlightError):
+        figures = summary(behaviour, list(fly(behaviour, range(seed, seed + runs), processes)))
+    if as_json:
+        typer.echo(json.dumps(figures))
+        return
+    Console().print(flights_table(figures))
+    for failed, reason in figures["failures"].items():
+        typer.echo(f"seed {failed}: {reason}")
 
 
 def _print_figures(figures: dict[str, Any], as_json: bool) -> None:

@@ -9,6 +9,7 @@ import math
 from typing import Any
 
 from companion.bus.topics import NO_OBJECTS
+from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
@@ -16,11 +17,20 @@ from vision.tracking import TrackEvent
 
 
 def detections_message(
-    result: PerceptionResult, vehicle: str, published_ns: int, view: str | None = None
+    result: PerceptionResult,
+    vehicle: str,
+    published_ns: int,
+    view: str | None = None,
+    clock: ClockOffset | None = None,
 ) -> dict[str, Any]:
-    """One frame's detections, with the three stamps: captured, inferred, published."""
+    """One frame's detections, with the three stamps: captured, inferred, published.
+
+    Where the autopilot's clock is known, the capture is told by that too, and how far that may be off.
+    """
     return {
         **_of_frame(result, vehicle, published_ns, view),
+        "captured_boot_ns": None if clock is None else result.captured_ns + clock.offset_ns,
+        "captured_boot_error_ns": None if clock is None else clock.error_ns,
         "inferred_ns": result.inferred_ns,
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
@@ -81,6 +91,8 @@ def vehicle_message(state: VehicleState, now_ns: int) -> dict[str, Any]:
         "connected": state.connected(now_ns),
         "heartbeat_age_s": _age_s(state.heartbeat_ns, now_ns),
         "position_age_s": _age_s(state.position_ns, now_ns),
+        "boot_offset_ns": None if state.clock is None else state.clock.offset_ns,
+        "boot_error_ns": None if state.clock is None else state.clock.error_ns,
         "armed": state.armed,
         "mode": state.mode.value,
         "landed": state.landed.value,

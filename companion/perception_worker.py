@@ -40,6 +40,7 @@ from companion.perception_preview import PreviewEncoder
 from companion.settings import Settings
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.markers import Marker, MarkerDetector
 from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
@@ -173,6 +174,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             recorder=perception,
             tracker=_tracker(begin),
             view_at=_view_at(settings, orders.attitudes),
+            find_markers=_find_markers(settings),
         )
         try:
             _run(pipeline, perception, orders, outbox)
@@ -277,6 +279,15 @@ def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame]
         return CameraView(settings.camera.model(frame.width, frame.height), ned_from_body @ body_from_optical)
 
     return view_at
+
+
+def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] | None:
+    """What looks for markers in a frame; None where the settings do not ask for it."""
+    kind = settings.markers.kind()
+    if kind is None:
+        return None
+    detector = MarkerDetector(kind)
+    return lambda frame: detector.detect(frame.image, settings.camera.model(frame.width, frame.height))
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

@@ -19,6 +19,7 @@ from companion.bus import topics
 from companion.bus.session import Bus
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
+from companion.guidance.battery import BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.commands import Command, Mission
 from companion.guidance.envelope import Envelope, Limits
@@ -39,6 +40,7 @@ from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception import PerceptionKeeper, PerceptionStartError
 from companion.perception_messages import Preview
+from companion.pose_sharing import PoseSharing
 from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
@@ -46,6 +48,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 from companion.views import View, open_views
+from companion.views_markers import MarkerWatch
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -102,15 +105,20 @@ class Service:
             on_event=self._pilot_event,
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
+            battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
         )
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
+        self.poses = PoseSharing(settings.vehicle.name, self._event)
+        self.markers = MarkerWatch(self.views)
+        self._landing_target_ns = 0
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
             on_event=self._event,
             on_command=self.command,
             views=tuple(settings.views),
+            listeners=[(topics.POSE, self.poses.hear)],
         )
         self.ready = False
         self._told: dict[str, Any] | None = None
@@ -280,6 +288,7 @@ class Service:
             now_ns = time.monotonic_ns()
             self._watch_link(now_ns)
             self.pilot.update(self._situation(now_ns))
+            self._tell_landing_target()
             if seen:
                 self.streamer.hasten(now_ns)
             self._answer_under_way()
@@ -311,6 +320,9 @@ class Service:
         while True:
             now_ns = time.monotonic_ns()
             self.bus.publish(topics.VEHICLE, vehicle_message(self.driver.state, now_ns))
+            pose = self.poses.message(self.driver.state, self.pilot.behaviour, now_ns)
+            if pose is not None:
+                self.bus.publish(topics.POSE, pose)
             for view in self.views:
                 view.keeper.watch(self.bus.watched(topics.IMAGE, view.name))
             if self.pilot.in_command:
@@ -361,6 +373,7 @@ class Service:
                 "count": len(self.steering.targets),
                 "problem": self.steering.unplaced,
             },
+            "neighbours": self.poses.status(now_ns),
             "bus": {
                 "connected": self.bus.connected,
                 "published": dict(self.bus.published),
@@ -378,7 +391,18 @@ class Service:
             age_s,
             fresh,
             self.streamer.last_sent,
+            neighbourhood=self.poses.around(self.driver.state, now_ns),
+            min_separation_m=self.settings.guidance.min_separation_m,
+            markers=self.markers.sight(now_ns, self.settings.guidance.perception_max_age_s),
         )
+
+    def _tell_landing_target(self) -> None:
+        """What the autopilot lands on by itself, once for every picture that shows it."""
+        behaviour = self.pilot.behaviour
+        target = None if behaviour is None else behaviour.landing_target
+        if target is not None and target.captured_ns > self._landing_target_ns:
+            self._landing_target_ns = target.captured_ns
+            self.driver.send_landing_target(target)
 
     def _healthy(self, now_ns: int) -> bool:
         return all(view.seeing(now_ns) for view in self.views) and self.driver.state.connected(now_ns)
@@ -402,10 +426,16 @@ class Service:
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Publish what a view saw; work out where it is, if that view steers."""
         name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
-        self.bus.publish(topics.DETECTIONS, detections_message(result, name, now_ns, view.name), view.name)
+        clock = self.driver.state.clock
+        message = detections_message(result, name, now_ns, view.name, clock)
+        self.bus.publish(topics.DETECTIONS, message, view.name)
         self.bus.publish(topics.LABELS, labels_message(result), view.name)
         if result.track_events:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+        if result.markers is not None:
+            seen = self.markers.take(view, result, self._history, name, now_ns)
+            self.bus.publish(topics.MARKERS, seen, view.name)
+            self._seen.set()
         if view is self.steering:
             view.place(result, self._history)
             self._seen.set()
@@ -436,7 +466,7 @@ class Service:
         )
 
     def _pilot_event(self, event: PilotEvent) -> None:
-        lost = event.kind is PilotEventKind.LOST
+        lost = event.kind in (PilotEventKind.LOST, PilotEventKind.BATTERY)
         # What is refused or ended is told with the command's own outcome.
         if event.kind not in (PilotEventKind.REFUSED, PilotEventKind.ENDED, PilotEventKind.STARTED):
             self._event("warning" if lost else "info", event.message)
@@ -473,4 +503,5 @@ def _limits(settings: Settings) -> Limits:
         max_altitude_m=guidance.max_altitude_m,
         max_distance_m=guidance.max_distance_m,
         fence=guidance.fence(),
+        min_separation_m=guidance.min_separation_m,
     )

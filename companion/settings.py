@@ -17,6 +17,7 @@ from companion.points import points_from
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.frame_selection import Selection
+from vision.markers import MarkerKind, PadMarker, markers_in
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
 
@@ -42,6 +43,8 @@ ViewName = Annotated[str, _VIEW_NAME]
 VehicleUrl = Annotated[
     str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
 ]
+# ID:SIZE of a marker of its own size; with @PAD, and :RIGHT:UP where it does not lie on the pad's centre.
+_MARKER_TEXT = StringConstraints(pattern=r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$", max_length=80)
 ZenohEndpoint = Annotated[
     str,
     StringConstraints(pattern=r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$"),
@@ -54,6 +57,9 @@ PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
+    ),
+    r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$": (
+        "ID:SIZE, ID:SIZE@PAD or ID:SIZE@PAD:RIGHT:UP such as 17:0.15@4:0.75:0"
     ),
     r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$": (
         "a zenoh endpoint such as tcp/192.168.1.5:7447"
@@ -264,6 +270,46 @@ class TrackerSection(Section):
         return TrackerSettings(keep_confidence=confidence, **values)
 
 
+class MarkersSection(Section):
+    """Printed markers (ArUco, AprilTag) that are looked for in the frames, to land on."""
+
+    dictionary: str | None = None
+    """OpenCV's name of it without DICT_: APRILTAG_36h11, 4X4_50; unset: no markers are looked for"""
+    size_m: Annotated[float, Field(ge=0.01, le=50)] = 0.5
+    """side of a marker's black square, metres"""
+    others: tuple[Annotated[str, _MARKER_TEXT], ...] = ()
+    """of another size: ID:SIZE; on the pad of marker PAD: ID:SIZE@PAD, off its centre ID:SIZE@PAD:RIGHT:UP"""
+
+    @model_validator(mode="after")
+    def _can_be_found(self) -> Self:
+        self.kind()
+        count = None if self.dictionary is None else markers_in(self.dictionary)
+        for marker in self.pad_markers():
+            if marker.identifier == marker.pad or (count is not None and marker.pad >= count):
+                raise ValueError(f"others: {marker.identifier} cannot lie on the pad of {marker.pad}")
+        return self
+
+    def kind(self) -> MarkerKind | None:
+        """What is looked for; None: nothing. Raises ValueError for what cannot be."""
+        sizes = {identifier: size for identifier, size, _ in map(_other_marker, self.others)}
+        if len(sizes) < len(self.others):
+            raise ValueError(f"others: an id is given twice in {', '.join(self.others)}")
+        return None if self.dictionary is None else MarkerKind(self.dictionary, self.size_m, sizes)
+
+    def pad_markers(self) -> tuple[PadMarker, ...]:
+        """Those that lie on the pad of another."""
+        return tuple(pad for _, _, pad in map(_other_marker, self.others) if pad is not None)
+
+
+def _other_marker(text: str) -> tuple[int, float, PadMarker | None]:
+    own, _, place = text.partition("@")
+    identifier, size = own.split(":")
+    if not place:
+        return int(identifier), float(size), None
+    pad, *offset = place.split(":")
+    return int(identifier), float(size), PadMarker(int(identifier), int(pad), *map(float, offset))
+
+
 def _corners(key: str, text: str) -> Polygon:
     try:
         points = points_from(text)
@@ -301,12 +347,18 @@ class GuidanceSection(Section):
     """corners of the area never left, north,east of home in metres: "-50,-50 50,-50 50,50"; empty: none"""
     fence_exclude: str = ""
     """areas never entered, written the same way and parted by |"""
+    min_separation_m: Annotated[float, Field(gt=0, le=100)] = 3.0
+    """never asks to fly nearer than this to another vehicle that shares its pose, metres"""
     setpoint_rate_hz: Annotated[float, Field(ge=5, le=250)] = 50.0
     """setpoints a second on the link; PX4 needs more than 2"""
     setpoint_lifetime_s: Annotated[float, Field(ge=0.02, le=2)] = 0.3
     """a setpoint older than this is not sent any more, seconds"""
     brake_s: Annotated[float, Field(ge=0, le=5)] = 0.5
     """after that a brake is sent for so long, then nothing, and the autopilot's failsafe acts; seconds"""
+    min_battery_percent: Annotated[float, Field(ge=0, le=100)] = 15.0
+    """no flight begins with less charge than this, and one ends below it; percent, 0: not watched"""
+    low_battery: Literal["rtl", "land", "hold"] = "rtl"
+    """what follows a flight that ended for its battery: return, land here, or hold under our command"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """detections older than this do not steer, seconds from capture"""
     view: Annotated[str | None, _VIEW_NAME] = None
@@ -402,6 +454,7 @@ class ViewSections(Section):
     camera: CameraSection = CameraSection()
     detector: DetectorSection = DetectorSection()
     tracker: TrackerSection = TrackerSection()
+    markers: MarkersSection = MarkersSection()
     recording: RecordingSection = RecordingSection()
 
 
@@ -413,6 +466,7 @@ class Settings(Section):
     camera: CameraSection = CameraSection()
     detector: DetectorSection = DetectorSection()
     tracker: TrackerSection = TrackerSection()
+    markers: MarkersSection = MarkersSection()
     guidance: GuidanceSection = GuidanceSection()
     zenoh: ZenohSection = ZenohSection()
     recording: RecordingSection = RecordingSection()

@@ -1,6 +1,6 @@
 """PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, auto-disarming.
 
-`update` runs once a physics step. Whatever PX4 would tell a ground station is queued in `texts`.
+`update` runs once a control step. Whatever PX4 would tell a ground station is queued in `texts`.
 Times are seconds since boot. Names in capitals are PX4's parameters.
 """
 
@@ -77,7 +77,7 @@ class Autopilot:
         self.mode = Mode.HOLD
         self.intended_mode = Mode.HOLD
         self.failsafe = False
-        self.landed = True
+        self.landed = airframe.on_ground  # it may boot while it falls
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
         self.home: Vector = airframe.position
         self.texts: deque[Text] = deque()
@@ -319,6 +319,8 @@ class Autopilot:
             self._idle(dt_s, 0.0)
             if not self.landed and airframe.on_ground:
                 self._has_landed()
+            if self.armed:
+                self._disarm_automatically()
             return
         task = self.task
         assert task is not None
@@ -432,6 +434,8 @@ class Autopilot:
     def _has_landed(self) -> None:
         self._contact_since_s = None
         self.landed = True
+        if not self.armed:  # it fell
+            self.home = self._airframe.position
         self._landed_since_s = self.now_s
         self._say(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
@@ -439,7 +443,7 @@ class Autopilot:
     def _disarm_automatically(self) -> None:
         if not self.landed:
             return
-        if self._has_flown and self.navigator.in_progress:
+        if self._has_flown and self.navigator.in_progress and not self.terminated:
             return
         if self._has_flown:
             delay = self._parameters.number("COM_DISARM_LAND")
@@ -470,6 +474,9 @@ class Autopilot:
 
     def follow_failsafes(self, mode: Mode) -> None:
         """Fly the mode that the failsafes have decided on."""
+        if mode is not self.mode and self.landed and isinstance(self.task, position_failsafe.Descend):
+            self.adopt_intention(Mode.LAND)  # it came down blindly: a position is no reason to rise again
+            mode = self.supervision.run_failsafes()
         if mode is not self.mode:
             self._enter(mode)
 

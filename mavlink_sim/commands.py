@@ -79,9 +79,6 @@ def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
     if command.identifier == 0:
         return None
-    refused = vehicle.faults.refuses(command.identifier, command.parameters)
-    if refused is not None:
-        return refused
     handler = _HANDLERS.get(command.identifier)
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 
@@ -171,7 +168,7 @@ def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
     if command.parameters[0] == 1.0:
-        vehicle.autopilot.home = vehicle.airframe.position
+        vehicle.autopilot.home = vehicle.estimate.position
         return ACCEPTED
     place = command.parameters[4:7]
     if not _is_on_earth(*place):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from mavlink_sim.estimator import Estimate
@@ -65,22 +65,34 @@ class FallibleEstimate(Estimate):
     def set_error(
         self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
     ) -> None:
-        """What a fault adds to the estimate (NED); None: nothing any more."""
+        """What a fault adds to the estimate (NED) from its next update on; None: nothing any more."""
         if position_m is None:
             self._errors.pop(number, None)
         else:
             self._errors[number] = (position_m, velocity_mps, yaw_rad)
         self.offset = _sum(error[0] for error in self._errors.values())
         self._yaw_error_rad = sum(error[2] for error in self._errors.values())
+
+    def restart(self, faults: Collection[int]) -> None:
+        """A new start of the filter; what the faults of these numbers spoil is spoiled from the beginning."""
+        for number in [number for number in self._errors if number not in faults]:
+            self.set_error(number, None)
+        self.reset_counter = 0
+        self.held_xy_m = None
         self.update(0.0)
+        self.position_valid = not self.fix_lost
+        if self.fix_lost:
+            x, y, _ = self.position
+            self.held_xy_m = (x, y)
+            self.update(0.0)
 
     def count_reset(self, resets: int = 1) -> None:
         """The estimate jumped."""
         self.reset_counter = (self.reset_counter + resets) & 0xFF
 
-    def update(self, dt_s: float) -> None:
-        """Look at the truth again, `dt_s` later."""
-        Estimate.update(self, dt_s)  # at every step: super() would be twice as dear
+    def look(self) -> None:
+        """Look at the truth, with every error of this moment."""
+        Estimate.look(self)  # super() would be twice as dear
         if self.held_xy_m is not None:
             self.position = (*self.held_xy_m, self.position[2])
             self.velocity = (0.0, 0.0, self.velocity[2])

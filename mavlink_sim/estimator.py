@@ -118,15 +118,24 @@ class Estimate(Multirotor):
 
     def update(self, dt_s: float) -> None:
         """Look at the truth again, `dt_s` later."""
+        self.age(dt_s)
+        self.look()
+
+    def age(self, dt_s: float) -> None:
+        """Let the errors move on; what is read stays as it was at the last `look`."""
+        if self._noise:
+            self._rate_left_s -= dt_s
+            if self._rate_left_s <= 1e-9:
+                self._shake()
+
+    def look(self) -> None:
+        """Look at the truth, with the errors of this moment."""
         truth = self.truth
         self.on_ground = truth.on_ground
         self.acceleration = truth.acceleration
         self.rotor_thrusts = truth.rotor_thrusts
         self.crashed = truth.crashed
         if self._noise:
-            self._rate_left_s -= dt_s
-            if self._rate_left_s <= 1e-9:
-                self._shake()
             p, q, r = truth.rates
             dx, dy, dz = self.rate_error
             self.rates = (p + dx, q + dy, r + dz)
@@ -151,7 +160,7 @@ class Estimate(Multirotor):
         """White noise on the rates; every third time the errors of velocity and position move on."""
         self._rate_left_s += RATE_STEP_S
         self._place = place = (self._place + 1) % _TABLE_LENGTH
-        share = SHARE_ON_GROUND if self.on_ground else 1.0
+        share = SHARE_ON_GROUND if self.truth.on_ground else 1.0
         self.rate_error = self._table[place] if share == 1.0 else _scaled(self._table[place], share)
         self._drift_left_s -= RATE_STEP_S
         if self._drift_left_s <= 1e-9:

@@ -7,7 +7,7 @@ import random
 from typing import TYPE_CHECKING
 
 from mavlink_sim.announcements import Text
-from mavlink_sim.autopilot import TEMPORARILY_REJECTED, Autopilot
+from mavlink_sim.autopilot import TEMPORARILY_REJECTED
 from mavlink_sim.estimate_errors import ZERO
 from mavlink_sim.fault_grammar import FaultError
 from mavlink_sim.flight import Trajectory
@@ -26,7 +26,15 @@ GUST_S = 4.0
 WARNING, INFO = 4, 6  # MAV_SEVERITY
 
 # Commands that are a request for a mode; DO_SET_MODE (176) names it in its parameters.
-_MODE_OF_COMMAND = {20: Mode.RTL, 21: Mode.LAND, 22: Mode.TAKEOFF, 192: Mode.HOLD, 300: Mode.MISSION}
+_MODE_OF_COMMAND = {
+    20: Mode.RTL,
+    21: Mode.LAND,
+    22: Mode.TAKEOFF,
+    34: Mode.ORBIT,
+    186: Mode.HOLD,
+    192: Mode.HOLD,
+    300: Mode.MISSION,
+}
 _DO_SET_MODE = 176
 
 
@@ -55,13 +63,12 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
             estimate.position_valid = vehicle.autopilot.position_valid = False
 
     def fuse_again() -> None:
+        estimate.set_error(one.number, None)
         if estimate.fix_lost:
             return
-        vehicle.estimate.set_error(one.number, None)
         if estimate.held_xy_m is not None:
             estimate.held_xy_m = None
             estimate.position_valid = vehicle.autopilot.position_valid = True
-        estimate.update(0.0)
         _jumped(vehicle, 2)
         vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
 
@@ -117,6 +124,7 @@ def _jumped(vehicle: Vehicle, resets: int = 1, yaw_rad: float = 0.0) -> None:
 
     An absolute goal stays where it is, so the vehicle then flies the difference.
     """
+    vehicle.estimate.update(0.0)
     vehicle.estimate.count_reset(resets)
     for trajectory in _trajectories(vehicle.autopilot.task):
         trajectory.position = vehicle.estimate.position
@@ -199,7 +207,7 @@ def _blowing(speed_mps: float, from_rad: float) -> Vector:
 
 def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
     vehicle.faults.winds.pop(one.number, None)
-    vehicle.reload_wind()
+    vehicle.reload_wind(vehicle.faults.winds.values())
 
 
 # ---- command
@@ -258,32 +266,11 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
 
 
 def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
-    """Power was lost for a moment: disarmed, deaf and silent for a while, then a new boot.
-
-    Kept: parameters, mission, fence, rally points, position, battery. Forgotten: modes, home, the rates of
-    streams, who was heard.
-    """
+    """Power was lost for a moment: `Vehicle.reboot`, deaf and silent until PX4 has started."""
     faults = vehicle.faults
     one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])
     faults.deaf = True
-    faults.boot_offset_us = -vehicle.boot_us
-    vehicle.forget_boot()
-    stored, pilot = vehicle.autopilot.navigator, vehicle.autopilot.supervision
-    # the same object starts anew: others hold on to it
-    Autopilot.__init__(
-        vehicle.autopilot,
-        vehicle.estimate,
-        vehicle.parameters,
-        ready_after_s=vehicle.ready_after_s,
-        on_event=vehicle.autopilot._on_event,
-    )
-    vehicle.autopilot.position_valid = vehicle.estimate.position_valid
-    # neither the battery nor what the pilot holds is part of the autopilot
-    vehicle.autopilot.supervision.battery = pilot.battery
-    vehicle.autopilot.supervision.transmitter = pilot.transmitter
-    vehicle.autopilot.pilot_has_sticks = pilot.pilot_attached
-    navigator = vehicle.autopilot.navigator
-    navigator.plans, navigator.mission, navigator.fence = stored.plans, stored.mission, stored.fence
+    vehicle.reboot()
 
     def undo() -> None:
         faults.deaf = any(each.fault.kind.name == "reboot" for each in faults.active)

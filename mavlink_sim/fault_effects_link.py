@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 def chosen_links(vehicle: Vehicle, link: str) -> list[str]:
     """The names of the links that are meant. Raises FaultError for one that the vehicle does not have."""
+    if not vehicle.links:
+        raise FaultError("a fault of the link: this vehicle has no links")
     if link == "all":
         return list(vehicle.links)
     if link not in vehicle.links:

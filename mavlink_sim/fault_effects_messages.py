@@ -7,6 +7,7 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.fault_effects_link import chosen_links
+from mavlink_sim.geography import start_of_vehicle
 from mavlink_sim.messages import Outgoing, parser
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 
@@ -28,8 +29,8 @@ _BOOT_TIME_USEC = {
     "ODOMETRY",
     "VIBRATION",
 }
-# The second autopilot stands so far from where the vehicle started, NED metres.
-SECOND_PLACE = (0.0, 25.0, 0.0)
+# The second autopilot starts so far east of where the vehicle did.
+SECOND_PLACE_EAST_M = 25.0
 
 
 def heartbeat_only(vehicle: Vehicle, one: ActiveFault) -> None:
@@ -85,13 +86,13 @@ def time_jump(vehicle: Vehicle, one: ActiveFault) -> None:
     one.undo.append(undo)
 
 
-def shifted(message: Any, boot_offset_us: int, clock_offset_us: int) -> Any:
-    """The message with its stamps moved: boot times by the first offset, TIMESYNC's clock by the second."""
+def shifted(message: Any, boot_offset_us: int) -> Any:
+    """The message with its boot times moved, TIMESYNC's among them."""
     kind = message.get_type()
     moved = copy.copy(message)
     if kind == "TIMESYNC":
         field = "ts1" if message.tc1 == 0 else "tc1"
-        stamp = getattr(message, field) + clock_offset_us * 1000
+        stamp = getattr(message, field) + boot_offset_us * 1000
         setattr(moved, field, max(min(stamp, _I64_MAX), -_I64_MAX))
     elif kind in _BOOT_TIME_USEC or (kind == "PING" and message.target_system == 0):
         moved.time_usec = (message.time_usec + boot_offset_us) % _U64
@@ -133,8 +134,10 @@ class _Spoken:
 def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
     """Another vehicle's autopilot speaks and listens on every link of this one, disarmed on the ground."""
     system = one.fault.values["system"] or vehicle.system_id
-    other = type(vehicle)(system_id=system, seed=one.seed, ready_after_s=0.0)
-    other.airframe.position = SECOND_PLACE
+    north, east = vehicle.start_ned_m
+    other = type(vehicle)(
+        system_id=system, seed=one.seed, ready_after_s=0.0, start_ned_m=(north, east + SECOND_PLACE_EAST_M)
+    )
     codecs = {}
     for name, link in vehicle.links.items():
         intervals = {stream: link.streams.interval_us(stream) for stream in ONBOARD_RATES_HZ}
@@ -143,6 +146,7 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
 
     def speak(dt_s: float) -> None:
         other.step(dt_s)
+        start_of_vehicle.set(vehicle.start_ned_m)
         for name, codec in codecs.items():
             for item in other.outgoing(name):
                 if not item.forwarded:  # what it would pass on has been on these links already
@@ -150,7 +154,7 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
                     vehicle.links[name].outbox.append(Outgoing(spoken, system, item.component, True))
 
     vehicle.faults.second[one.number] = other
-    one.each_step = speak
+    one.each_step, one.apart = speak, True
     one.undo.append(lambda: vehicle.faults.second.pop(one.number))
 
 

@@ -244,7 +244,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
     (
         Kind(
             "stall",
-            "the simulator stands still, or goes at a part of its pace",
+            "the vehicle stands still, or goes at a part of its pace",
             (Field("pace", number(0.0, 0.99), 0.0, "simulated seconds per second"),),
         ),
         messages.stall,

@@ -26,6 +26,7 @@ from mavlink_sim.fault_effects_link import chosen_links
 from mavlink_sim.fault_effects_messages import shifted
 from mavlink_sim.fault_grammar import Fault, FaultError, parse_fault
 from mavlink_sim.fault_kinds import EFFECTS, KINDS
+from mavlink_sim.geography import start_of_vehicle
 from mavlink_sim.link_faults import LinkStage
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class ActiveFault:
         begins_s, ends_s: on the faults' clock; `ends_s` is infinite without a duration.
         undo: what sets things right again when it ends, last first.
         each_step: called with the step's seconds while it is active.
+        apart: it is not of the vehicle itself, and goes on while that stands still.
     """
 
     number: int
@@ -61,6 +63,7 @@ class ActiveFault:
     active: bool = False
     undo: list[Callable[[], object]] = field(default_factory=list)
     each_step: Callable[[float], None] | None = None
+    apart: bool = False
 
     def __str__(self) -> str:
         return f"{self.number} {self.fault}"
@@ -82,7 +85,9 @@ class Faults:
         refusals: asked before each command is carried out; by fault number.
         gates: every message the vehicle sends goes through these; by fault number.
         boot_offset_us: added to the boot time in everything that is sent.
-        stalled_us: how long the vehicle stood still in all.
+        elapsed_us: `now_s` in microseconds.
+        known: those that go on or wait for their time, by number; without any, `step` need not be called
+            if `elapsed_us` is advanced.
         second: other autopilots on the same links; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
@@ -95,34 +100,34 @@ class Faults:
         self.gates: dict[int, Gate] = {}
         self.refusals: dict[int, Refusal] = {}
         self.boot_offset_us = 0
-        self.stalled_us = 0
         self.second: dict[int, Vehicle] = {}
         self.winds: dict[int, Vector] = {}
         self.pace = 1.0
         self._seed = seed
-        self._elapsed_us = 0
+        self.elapsed_us = 0
         self._credit = 0.0
         self._count = 0
-        self._all: dict[int, ActiveFault] = {}
+        self.known: dict[int, ActiveFault] = {}
         self._stages: dict[str, LinkStage] = {}
         self._held: list[tuple[str, Any]] = []
+        self._reads_held = False
 
     # ---- for whoever makes faults -----------------------------------------------------------------------
 
     @property
     def now_s(self) -> float:
         """Simulated seconds since the vehicle was made."""
-        return self._elapsed_us / 1e6
+        return self.elapsed_us / 1e6
 
     @property
     def active(self) -> list[ActiveFault]:
         """Those that go on now, oldest first."""
-        return [one for one in self._all.values() if one.active]
+        return [one for one in self.known.values() if one.active]
 
     @property
     def scheduled(self) -> list[ActiveFault]:
         """Those that have not begun."""
-        return [one for one in self._all.values() if not one.active]
+        return [one for one in self.known.values() if not one.active]
 
     def begin(
         self,
@@ -161,7 +166,7 @@ class Faults:
         if begins_s < self.now_s - 1e-9:
             raise FaultError(f"{fault.kind.name}: at={begins_s:g} is over, it is {self.now_s:.1f} s already")
         own_seed = self._seed * 1_000_003 + number if fault.seed is None else fault.seed
-        one = self._all[number] = ActiveFault(number, fault, own_seed, begins_s)
+        one = self.known[number] = ActiveFault(number, fault, own_seed, begins_s)
         if begins_s <= self.now_s + 1e-9:
             self._start(one)
         return number
@@ -174,7 +179,7 @@ class Faults:
         text = str(which)
         chosen = [
             one
-            for one in self._all.values()
+            for one in self.known.values()
             if text == "all" or text == one.fault.kind.name or text == str(one.number)
         ]
         if not chosen and text != "all":
@@ -198,7 +203,7 @@ class Faults:
             number = self.begin(line)
         except FaultError as error:
             return Outcome(False, str(error))
-        one = self._all.get(number)
+        one = self.known.get(number)
         if one is None:
             return Outcome(True, f"fault {number}: done")
         return Outcome(True, f"fault {one}" + ("" if one.active else f" at {one.begins_s:g} s"))
@@ -206,7 +211,7 @@ class Faults:
     def listing(self) -> list[str]:
         """One line for each fault that goes on or waits."""
         lines = []
-        for one in self._all.values():
+        for one in self.known.values():
             if one.active:
                 left = "" if math.isinf(one.ends_s) else f", {one.ends_s - self.now_s:.1f} s left"
                 lines.append(f"{one}: since {one.begins_s:.1f} s{left}")
@@ -222,44 +227,53 @@ class Faults:
 
     def step(self, dt_s: float) -> bool:
         """Time passes: begin and end what is due. True: the vehicle itself stands still in this step."""
-        self._elapsed_us += int(dt_s * 1e6 + 0.5)
-        if not self._all:
+        self.elapsed_us += int(dt_s * 1e6 + 0.5)
+        if not self.known:
             return False
         now_s = self.now_s + 1e-9
-        for one in list(self._all.values()):
+        self.vehicle.estimate.look()
+        for one in list(self.known.values()):
             if not one.active and one.begins_s <= now_s:
                 self._start_scheduled(one)
             elif one.active and one.ends_s <= now_s:
                 self._finish(one)
+        stands_still = False
         if self.pace < 1.0:
             self._credit += self.pace
             if self._credit < 1.0:
-                self.stalled_us += round(dt_s * 1e6)
-                return True
-            self._credit -= 1.0
-        for one in list(self._all.values()):
-            if one.active and one.each_step is not None:
+                stands_still = True
+            else:
+                self._credit -= 1.0
+        for one in list(self.known.values()):
+            if one.active and one.each_step is not None and (one.apart or not stands_still):
                 one.each_step(dt_s)
+        if stands_still:
+            return True
         if self.winds:
             self.vehicle.reload_wind(self.winds.values())
         return False
 
     def intercepts(self, link: str, message: Any) -> bool:
         """Whether a message that arrived is not for the vehicle to handle now."""
+        if not self._reads_held:  # the others have heard those
+            for other in self.second.values():
+                other.handle(link, message)
+            if self.second:
+                start_of_vehicle.set(self.vehicle.start_ned_m)
         if self.deaf:
             return True
         if self.pace == 0.0:
             self._held.append((link, message))
             return True
-        for other in self.second.values():
-            other.handle(link, message)
         return False
 
     def take_in_held(self) -> None:
         """What lay in the sockets of a frozen vehicle is all read when it goes on."""
         held, self._held = self._held, []
+        self._reads_held = True
         for link, message in held:
             self.vehicle.handle(link, message)
+        self._reads_held = False
 
     def gate(self, link: Link, message: Any) -> Any:
         """The message that is sent in place of this one; None: nothing."""
@@ -272,8 +286,8 @@ class Faults:
         estimate = self.vehicle.estimate
         if estimate.reset_counter or estimate.fix_lost:
             message = as_told(estimate, message)
-        if self.boot_offset_us or self.stalled_us:
-            message = shifted(message, self.boot_offset_us, self.boot_offset_us - self.stalled_us)
+        if self.boot_offset_us:
+            message = shifted(message, self.boot_offset_us)
         return message
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:
@@ -289,8 +303,8 @@ class Faults:
 
     def finish(self, number: int) -> None:
         """A fault that ends by itself is over."""
-        if number in self._all:
-            self._finish(self._all[number])
+        if number in self.known:
+            self._finish(self.known[number])
 
     # ---- beginning and ending ---------------------------------------------------------------------------
 
@@ -308,14 +322,14 @@ class Faults:
         try:
             EFFECTS[one.fault.kind.name](self.vehicle, one)
         except FaultError:
-            del self._all[one.number]
+            del self.known[one.number]
             raise
         self._on_event(f"fault {one} begins")
         if one.fault.kind.momentary:
-            self._all.pop(one.number, None)
+            self.known.pop(one.number, None)
 
     def _finish(self, one: ActiveFault) -> None:
-        if self._all.pop(one.number, None) is None:
+        if self.known.pop(one.number, None) is None:
             return
         if one.active:
             one.active = False

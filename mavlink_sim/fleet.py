@@ -31,6 +31,7 @@ def instance_options(
 ) -> list[SimulationOptions]:
     """What each vehicle of a fleet is told; `options` are the first one's.
 
+    They share one world, wind and gusts, those of the first one's seed; noise and faults are each one's own.
     A bind port of 0 stays 0 (a free one each). The camera goes to `camera_vehicle` (counted from 1) alone; a
     truth file gets the system id into its name for all but the first. Faults are every vehicle's, each with
     its own chance; the console is the first one's, the zenoh key each vehicle's own.
@@ -56,6 +57,7 @@ def instance_options(
                 options,
                 system_id=system_id,
                 seed=options.seed + index,
+                world_seed=options.seed if count > 1 and options.world_seed is None else options.world_seed,
                 start_ned_m=start,
                 onboard_port=options.onboard_port + index,
                 onboard_bind=options.onboard_bind + index if options.onboard_bind else 0,

@@ -63,9 +63,11 @@ class Link:
                 dialect.MAVLink_statustext_message(text.severity, chunk, self._text_identifier, sequence)
             )
 
-    def forget(self, now_us: int) -> None:
+    def forget(self) -> None:
         """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
-        self.streams.restart(now_us)
+        self.streams.restart(0)
+        self.sent = self.received = self._text_identifier = 0
+        self.parameter_credit = 0.0
         self.outbox.clear()
         self.components.clear()
         self.ground_station_seen_s = -math.inf

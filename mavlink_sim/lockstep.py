@@ -18,7 +18,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mavlink_sim.messages import Outgoing, dialect, parser
+from mavlink_sim.lockstep_wire import LockstepWire
+from mavlink_sim.messages import Outgoing, dialect
 from mavlink_sim.modes import Mode
 from mavlink_sim.streams import ONBOARD_RATES_HZ
 from mavlink_sim.vehicle import STEP_S, Vehicle
@@ -92,7 +93,7 @@ class LockstepVehicle:
         self.newest: dict[str, dict[str, Any]] = {}
         self.dropped: dict[str, int] = {}
         self._waiting: dict[str, deque[Outgoing]] = {}
-        self._codecs: dict[str, Any] = {}
+        self._wires: dict[str, LockstepWire] = {}
         self._repeated: list[_Repeated] = []
         self._answers: list[tuple[int, int]] = []
         self._owed_s = 0.0
@@ -101,7 +102,7 @@ class LockstepVehicle:
             self.newest[name] = {}
             self.dropped[name] = 0
             self._waiting[name] = deque(maxlen=MAX_WAITING)
-            self._codecs[name] = parser(self.vehicle.system_id)
+            self._wires[name] = LockstepWire(self.vehicle, self.vehicle.links[name])
         self._main_link = next(iter(self._waiting), "")
 
     # ---- time -------------------------------------------------------------------------------------------
@@ -111,6 +112,11 @@ class LockstepVehicle:
         """Simulated seconds since boot."""
         return self.vehicle.now_s
 
+    @property
+    def _elapsed_s(self) -> float:
+        """Since it was made: goes on through a reboot and a standstill."""
+        return self.vehicle.faults.now_s
+
     def step(self, dt_s: float) -> None:
         """Let simulated time pass, in steps of 4 ms; a remainder waits for the next call.
 
@@ -119,30 +125,48 @@ class LockstepVehicle:
         """
         if not dt_s >= 0.0:
             raise ValueError(f"step: expected seconds, zero or more, got {dt_s}")
-        if not self._repeated:
+        faults = self.vehicle.faults
+        wired = bool(faults.active or faults.scheduled) or any(wire.engaged for wire in self._wires.values())
+        if not (self._repeated or wired):
             self.vehicle.step(dt_s)
         else:
-            self._step_and_repeat(dt_s)
+            self._step_and_repeat(dt_s, wired)
         self._take()
 
-    def _step_and_repeat(self, dt_s: float) -> None:
-        """From one repeated message to the next; each goes out with the first step at or after its time."""
+    def _step_and_repeat(self, dt_s: float, wired: bool) -> None:
+        """From one repeated message to the next; each goes out with the first step at or after its time.
+
+        `wired`: step by step, since a fault may hold, deliver or begin something at any of them.
+        """
         self._owed_s += dt_s
         left = int(self._owed_s / STEP_S + 1e-6)
         self._owed_s -= left * STEP_S
         while left > 0:
-            now_s = self.now_s
+            now_s = self._elapsed_s
             for repeated in self._repeated:
                 if repeated.next_s <= now_s + 1e-9:
                     repeated.send(self)
-            until_next_s = min(repeated.next_s for repeated in self._repeated) - now_s
-            steps = min(max(math.ceil(until_next_s / STEP_S - 1e-6), 1), left)
+            steps = 1
+            if not wired:
+                until_next_s = min(repeated.next_s for repeated in self._repeated) - now_s
+                steps = min(max(math.ceil(until_next_s / STEP_S - 1e-6), 1), left)
             self.vehicle.step(steps * STEP_S)
             left -= steps
+            if wired:
+                for wire in self._wires.values():
+                    wire.deliver()
+                self._take()
 
     def _take(self) -> None:
         for name, waiting in self._waiting.items():
             outgoing = self.vehicle.outgoing(name)
+            wire = self._wires[name]
+            if wire.matters:
+                if waiting and not waiting[-1].forwarded:  # those came before, and have their numbers before
+                    sealed = wire.sealed(waiting)
+                    waiting.clear()
+                    waiting.extend(sealed)
+                outgoing = wire.outbound(outgoing)
             if outgoing:
                 self.dropped[name] += max(0, len(waiting) + len(outgoing) - MAX_WAITING)
                 waiting.extend(outgoing)
@@ -162,9 +186,9 @@ class LockstepVehicle:
         Raises:
             NotReachedError: not within `limit_s` simulated seconds.
         """
-        started_s = self.now_s
+        started_s = self._elapsed_s
         while not condition(self.truth):
-            if self.now_s - started_s >= limit_s:
+            if self._elapsed_s - started_s >= limit_s:
                 truth = self.truth
                 raise NotReachedError(
                     f"not reached within {limit_s:g} s of simulated time: mode {truth.mode}, "
@@ -172,25 +196,31 @@ class LockstepVehicle:
                     f"events so far: {', '.join(self.events[-6:]) or 'none'}"
                 )
             self.step(every_s)
-        return self.now_s - started_s
+        return self._elapsed_s - started_s
 
     # ---- messages ---------------------------------------------------------------------------------------
 
     def send(self, message: Any, link: str = "", source: tuple[int, int] = COMPANION) -> None:
-        """Hand it a message (of any pymavlink dialect) as if it came in on a link, the first by default."""
-        header = message.get_header()
-        header.srcSystem, header.srcComponent = source
-        self.vehicle.handle(link or self._main_link, message)
+        """Hand it a message (of any pymavlink dialect) as if it came in on a link, the first by default.
+
+        It is not signed: a link with a signing key takes it as MAV_SIGN_CFG
+        says; `send_bytes` is for signed ones.
+        """
+        name = link or self._main_link
+        if name in self._wires and self._wires[name].matters:
+            self._wires[name].send(message, source)
+        else:
+            header = message.get_header()
+            header.srcSystem, header.srcComponent = source
+            self.vehicle.handle(name, message)
         self._take()
 
     def send_bytes(self, data: bytes, link: str = "") -> int:
-        """Hand it bytes off a wire; returns how many whole messages were in them and what was left before."""
-        name = link or self._main_link
-        count = 0
-        for message in self._codecs[name].parse_buffer(data) or []:
-            if message.get_type() != "BAD_DATA":
-                self.vehicle.handle(name, message)
-                count += 1
+        """Hand it bytes off a wire; returns how many whole messages it took out of them and of what was left.
+
+        A fault of the link may hold or lose them, and a link with a signing key may refuse them.
+        """
+        count = self._wires[link or self._main_link].send_bytes(data)
         self._take()
         return count
 
@@ -198,21 +228,21 @@ class LockstepVehicle:
         self, message: Any, rate_hz: float, link: str = "", source: tuple[int, int] = COMPANION
     ) -> Repeat:
         """Send this message at a rate for as long as time passes (setpoints, heartbeats); `stop` ends it."""
-        repeated = _Repeated(message, 1.0 / rate_hz, self.now_s, link, source)
+        repeated = _Repeated(message, 1.0 / rate_hz, self._elapsed_s, link, source)
         self._repeated.append(repeated)
         return Repeat(self._repeated, repeated)
 
     def receive(self, link: str = "") -> list[Any]:
         """Every message it sent on a link since the last call, in order: pymavlink messages or like them."""
         waiting = self._waiting[link or self._main_link]
-        messages = [item.message for item in waiting]
+        messages = [item.message for item in waiting if item.message.get_type() != "BAD_DATA"]
         waiting.clear()
         return messages
 
     def receive_bytes(self, link: str = "") -> bytes:
         """The same as the bytes on the wire."""
         name = link or self._main_link
-        codec, waiting = self._codecs[name], self._waiting[name]
+        codec, waiting = self._wires[name].codec, self._waiting[name]
         packed = b"".join(item.pack(codec) for item in waiting)
         waiting.clear()
         return packed
@@ -231,8 +261,8 @@ class LockstepVehicle:
         system = self.vehicle.system_id
         self._answers.clear()
         self.send(dialect.MAVLink_command_long_message(system, 1, identifier, 0, *values))
-        started_s = self.now_s
-        while (waited_s := self.now_s - started_s) < ANSWER_LIMIT_S:
+        started_s = self._elapsed_s
+        while (waited_s := self._elapsed_s - started_s) < ANSWER_LIMIT_S:
             results = [result for command, result in self._answers if command == identifier]
             if results and (identifier != _SET_MODE or waited_s > SECOND_ANSWER_S):
                 return _RESULTS[results[-1]] if results[-1] < len(_RESULTS) else str(results[-1])

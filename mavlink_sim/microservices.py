@@ -59,7 +59,9 @@ def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 
 def _execute(vehicle: Vehicle, link: Link, message: Any, command: commands.Command) -> None:
-    result = commands.execute(vehicle, link, command)
+    result = vehicle.faults.refuses(command.identifier, command.parameters)
+    if result is None:
+        result = commands.execute(vehicle, link, command)
     if result is not None:
         _acknowledge(link, message, command.identifier, result)
 

@@ -73,7 +73,7 @@ def landing_target(vehicle: Vehicle, link: Link, message: Any) -> None:
         return
     place = (message.x, message.y, message.z)
     if all(abs(value) < MAX_PLACE_M for value in place):
-        vehicle.autopilot.navigator.target = LandingTarget(place, vehicle.now_s)
+        vehicle.autopilot.navigator.target = LandingTarget(place, vehicle.autopilot.now_s)
 
 
 def obstacle_distance(vehicle: Vehicle, link: Link, message: Any) -> None:
@@ -88,7 +88,7 @@ def obstacle_distance(vehicle: Vehicle, link: Link, message: Any) -> None:
             message.max_distance,
             message.frame,
             vehicle.estimate.yaw_rad,
-            vehicle.now_s,
+            vehicle.autopilot.now_s,
         )
     except ValueError as error:
         vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))

@@ -161,6 +161,12 @@ class Navigator:
         self._held_for_obstacles = limited.hold
         return limited.acceleration
 
+    def take_stored(self, before: Navigator) -> None:
+        """A reboot: the plans and the current item are on PX4's card, all else is forgotten."""
+        self.plans, self.fence = before.plans, before.fence
+        mission = before.mission
+        self.mission = Mission(mission.items, mission.current, jumps=mission.jumps)
+
     # ---- what clients do --------------------------------------------------------------------------------
 
     def store(self, plan_type: PlanType, plan: Plan, current: int = -1) -> None:

@@ -31,6 +31,8 @@ INERTIA_Z_KGM2 = 0.030  # SIH_IZZ
 ARM_M = 0.2  # SIH_L_ROLL, SIH_L_PITCH
 ROTOR_TORQUE_NM = 0.1  # SIH_Q_MAX
 ANGULAR_DRAG_NMS = 0.025  # SIH_KDW
+_COUPLING_KGM2 = INERTIA_XY_KGM2 - INERTIA_Z_KGM2
+_TORQUE_PER_THRUST_M = ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2
 
 GUST_TIME_CONSTANT_S = 1.5
 GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
@@ -60,6 +62,7 @@ class Multirotor:
         quaternion: `ned_from_body`, (w, x, y, z), of length 1.
         rates: body angular rates about FRD, rad/s.
         rotor_thrusts: of each rotor per vehicle mass, m/s².
+        rotor_commands: what each rotor is asked for, 0..1 of its thrust.
         rotor_effectiveness: 0..1 for each rotor; 0 is a dead one. See `fail_motor`.
         on_ground: touching the ground.
         crashed: it hit the ground too hard or upside down: the rotors are broken.
@@ -84,6 +87,7 @@ class Multirotor:
         "position",
         "quaternion",
         "rates",
+        "rotor_commands",
         "rotor_effectiveness",
         "rotor_thrusts",
         "touchdown_mps",
@@ -98,6 +102,7 @@ class Multirotor:
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self.rates: Vector = _STILL
         self.rotor_thrusts: Rotors = (0.0, 0.0, 0.0, 0.0)
+        self.rotor_commands: Rotors = (0.0, 0.0, 0.0, 0.0)
         self.rotor_effectiveness: Rotors = (1.0, 1.0, 1.0, 1.0)
         self.on_ground = True
         self.crashed = False
@@ -227,6 +232,8 @@ class Multirotor:
         if self.on_ground:
             blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
             share = 0.0 if self.crashed else min(max(thrust, 0.0), MAX_THRUST_MPS2) / 4.0
+            command = share / ROTOR_THRUST_MPS2
+            self.rotor_commands = (command, command, command, command)
             lift = 0.0
             thrusts = []
             for now, whole in zip(self.rotor_thrusts, self.rotor_effectiveness, strict=True):
@@ -245,8 +252,12 @@ class Multirotor:
         else:
             wanted = self._rate_demand
         p, q, r = rates
-        u0, u1, u2, u3 = mixed_thrusts(thrust / MAX_THRUST_MPS2, wanted, rates, self._spin)
-        blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
+        u0, u1, u2, u3 = self.rotor_commands = mixed_thrusts(
+            thrust / MAX_THRUST_MPS2, wanted, rates, self._spin
+        )
+        blend = dt_s / ROTOR_TIME_CONSTANT_S
+        if blend > 1.0:
+            blend = 1.0
         t0, t1, t2, t3 = self.rotor_thrusts
         e0, e1, e2, e3 = (0.0, 0.0, 0.0, 0.0) if self.crashed else self.rotor_effectiveness
         t0 += (ROTOR_THRUST_MPS2 * u0 * e0 - t0) * blend
@@ -256,12 +267,10 @@ class Multirotor:
         self.rotor_thrusts = (t0, t1, t2, t3)
 
         # torques of the rotors (1 kg, so m/s² are newtons), drag, and the gyroscopic coupling of the body
-        coupling = INERTIA_XY_KGM2 - INERTIA_Z_KGM2
+        coupling = _COUPLING_KGM2
         spin_x = (ARM_M * (t1 + t2 - t0 - t3) - ANGULAR_DRAG_NMS * p + coupling * q * r) / INERTIA_XY_KGM2
         spin_y = (ARM_M * (t0 + t2 - t1 - t3) - ANGULAR_DRAG_NMS * q - coupling * p * r) / INERTIA_XY_KGM2
-        spin_z = (
-            ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2 * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r
-        ) / INERTIA_Z_KGM2
+        spin_z = (_TORQUE_PER_THRUST_M * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2
         self._spin = (spin_x, spin_y, spin_z)
         p += spin_x * dt_s
         q += spin_y * dt_s
@@ -326,6 +335,11 @@ class Multirotor:
             vz = self._touch(vz, matrix[8])
         self.position = (x + vx * dt_s, y + vy * dt_s, z)
         self.velocity = (vx, vy, vz)
+
+    def blow(self, gust: Vector) -> None:
+        """Let this gust blow, NED m/s, in place of one of its own; to be told again every 32 ms."""
+        self._gust = gust
+        self._gust_left_s = 1.0
 
     def _blow(self) -> None:
         """The next gust (a first-order Gauss-Markov process)."""

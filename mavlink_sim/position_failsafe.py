@@ -4,15 +4,16 @@ A mode that needs a position is refused, and left if it is flown: Position falls
 sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
 (that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
 OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
-When the position comes back in the air, the mode that was wanted is flown again. Which mode that makes is the
-choice of `failsafes`; here is what it has to know, and how to come down.
+When the position comes back in the air, the mode that was wanted is flown again; a vehicle that came down
+blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how
+to come down.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mavlink_sim.control import NAN, TrajectorySetpoint
+from mavlink_sim.control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight import Land, Task
 from mavlink_sim.modes import Mode
 from mavlink_sim.parameters import Parameters
@@ -47,8 +48,10 @@ def needs_position(mode: Mode) -> bool:
 
 def asks_for_position(setpoint: object) -> bool:
     """Whether an offboard setpoint needs the horizontal position or velocity (attitude setpoints do not)."""
-    wanted = (*getattr(setpoint, "position", ()), *getattr(setpoint, "velocity", ()))
-    return any(value == value for value in wanted)
+    for x, y, z in (getattr(setpoint, "position", NOTHING), getattr(setpoint, "velocity", NOTHING)):
+        if x == x or y == y or z == z:
+            return True
+    return False
 
 
 def landing_task(autopilot: Autopilot) -> Task:
@@ -61,5 +64,7 @@ def landing_task(autopilot: Autopilot) -> Task:
 def keep_landing(autopilot: Autopilot) -> None:
     """A landing goes on blindly when the position is lost, and at one place when it is back."""
     descending = isinstance(autopilot.task, Descend)
+    if descending and autopilot.landed:
+        return  # it is down
     if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
         autopilot.task = landing_task(autopilot)

@@ -143,9 +143,16 @@ def flyable(setpoint: TrajectorySetpoint) -> TrajectorySetpoint:
 
     Every axis needs a position, a velocity or an acceleration, and north and east of each come in pairs.
     """
-    groups = (setpoint.position, setpoint.velocity, setpoint.acceleration)
-    complete = all(any(group[axis] == group[axis] for group in groups) for axis in range(3))
-    paired = all((group[0] == group[0]) == (group[1] == group[1]) for group in groups)
+    # spelt out, as all that is done for every setpoint: a stream of them is a tenth of a flight in lockstep
+    x, y, z = setpoint.position
+    vx, vy, vz = setpoint.velocity
+    ax, ay, az = setpoint.acceleration
+    complete = (
+        (x == x or vx == vx or ax == ax)
+        and (y == y or vy == vy or ay == ay)
+        and (z == z or vz == vz or az == az)
+    )
+    paired = (x == x) == (y == y) and (vx == vx) == (vy == vy) and (ax == ax) == (ay == ay)
     return setpoint if complete and paired else TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))
 
 
@@ -167,12 +174,19 @@ def _finite(values: Vector) -> Vector:
 
 
 def _any_finite(*vectors: Vector) -> bool:
-    return any(math.isfinite(value) for vector in vectors for value in vector)
+    return any(math.isfinite(x) or math.isfinite(y) or math.isfinite(z) for x, y, z in vectors)
 
 
 def _kept(values: Vector, mask: int, bits: tuple[int, int, int]) -> Vector:
-    x, y, z = (NAN if mask & bit else _number(value, NAN) for value, bit in zip(values, bits, strict=True))
-    return (x, y, z)
+    x, y, z = values
+    bit_x, bit_y, bit_z = bits
+    if mask & bit_x and mask & bit_y and mask & bit_z:
+        return NOTHING
+    return (
+        NAN if mask & bit_x else _number(x, NAN),
+        NAN if mask & bit_y else _number(y, NAN),
+        NAN if mask & bit_z else _number(z, NAN),
+    )
 
 
 def _turned(values: Vector, roll_rad: float, pitch_rad: float, yaw_rad: float) -> Vector:

@@ -46,6 +46,7 @@ class SimulationOptions:
         onboard_port, gcs_port: UDP ports the vehicle sends to at first.
         onboard_bind, gcs_bind: UDP ports it binds; 0 chooses free ones.
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
+        world_seed: chooses them instead, the same for all vehicles of a fleet; None: `seed`.
         camera: name of the shared-memory segment the camera's frames go to; None for no shared memory.
         camera_outputs: further addresses the frames go to (`video_outputs`).
         camera_truth: file for what is in each frame, one JSON object a line.
@@ -72,6 +73,7 @@ class SimulationOptions:
     gcs_bind: int = 18570
     system_id: int = 1
     seed: int = 0
+    world_seed: int | None = None
     wind_mps: float = 0.0
     camera: str | None = None
     camera_rate_hz: float | None = None
@@ -112,6 +114,7 @@ class Simulation:
         self.vehicle = Vehicle(
             system_id=options.system_id,
             seed=options.seed,
+            air_seed=options.world_seed,
             wind_mps=options.wind_mps,
             parameters=options.parameters,
             ready_after_s=options.ready_after_s,
@@ -121,7 +124,7 @@ class Simulation:
             gimbal=options.gimbal,
             on_event=on_event,
         )
-        self.vehicle.clock_ns = self._clock_ns
+        self.vehicle.clock_ns = self._boot_clock_ns
         self.vehicle.utc_ns = time.time_ns
         self._stopped = False
         self._started_ns = time.monotonic_ns()
@@ -174,7 +177,9 @@ class Simulation:
         from mavlink_sim.scene_file import scene_or_demo
 
         options = self.options
-        self._scene = scene_or_demo(options.scene, options.seed)
+        self._scene = scene_or_demo(
+            options.scene, options.seed if options.world_seed is None else options.world_seed
+        )
         if not options.shows_world:
             return
         from mavlink_sim.camera_process import CameraProcess
@@ -206,8 +211,12 @@ class Simulation:
         self._stopped = True
 
     def _clock_ns(self) -> int:
-        """Time since the vehicle's boot at this very moment, between the physics steps too."""
+        """Simulated time at this very moment, between the physics steps too."""
         return int((time.monotonic_ns() - self._started_ns) * self.options.speed)
+
+    def _boot_clock_ns(self) -> int:
+        """The same since the vehicle's boot, without the time that it stood still."""
+        return self._clock_ns() - (self.vehicle.faults.elapsed_us - self.vehicle.boot_us) * 1000
 
     def run(self) -> None:
         """Run until `stop`."""

@@ -80,6 +80,11 @@ class Supervision:
         self._disarmed_s = -math.inf
         self._told_in_failsafe = (Action.NONE, Mode.HOLD)
 
+    def keep_equipment(self, before: Supervision) -> None:
+        """A reboot: neither the battery nor what the pilot holds is part of the autopilot."""
+        self.battery, self.transmitter = before.battery, before.transmitter
+        self.pilot_attached = before.pilot_attached
+
     # ---- what others read -------------------------------------------------------------------------------
 
     @property
@@ -195,7 +200,6 @@ class Supervision:
         self._watch_ground_station()
         self._watch_battery()
         self._watch_position()
-        self.conditions.offboard_signal_lost = not autopilot.has_setpoints
         self.conditions.geofence_breached = autopilot.navigator.is_breached
         sticks_request = self._watch_sticks()
         autopilot.follow_failsafes(self.run_failsafes(dt_s, sticks_request))
@@ -208,6 +212,8 @@ class Supervision:
     def run_failsafes(self, dt_s: float = 0.0, sticks_request: bool = False) -> Mode:
         """Let the state machine decide. Returns the mode to fly."""
         autopilot, machine = self._autopilot, self.failsafes
+        # of this very moment: OFFBOARD is asked for right after the first setpoint, before the next watch
+        self.conditions.offboard_signal_lost = not autopilot.has_setpoints
         was_in_failsafe, reason = machine.in_failsafe, machine.reason
         wanted = autopilot.intended_mode
         intended = machine.update(

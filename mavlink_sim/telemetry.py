@@ -182,13 +182,11 @@ def _position_target_global_int(vehicle: Vehicle) -> Any:
 
 
 def _servo_output_raw(vehicle: Vehicle) -> Any:
-    power = 900
+    widths = [900] * 4
     if vehicle.autopilot.armed:
-        power = 1000 + round(1000 * vehicle.estimate.thrust_mps2 / MAX_THRUST_MPS2)
+        widths = [1000 + round(1000 * command) for command in vehicle.airframe.rotor_commands]
     rest = {f"servo{number}_raw": 900 for number in range(9, 17)}
-    return packing.servo_output_raw(
-        vehicle.boot_us & 0xFFFFFFFF, 0, power, power, power, power, 900, 900, 900, 900, **rest
-    )
+    return packing.servo_output_raw(vehicle.boot_us & 0xFFFFFFFF, 0, *widths, 900, 900, 900, 900, **rest)
 
 
 def _vfr_hud(vehicle: Vehicle) -> Any:

@@ -28,6 +28,7 @@ from mavlink_sim.microservices import HANDLERS
 from mavlink_sim.parameters import Parameters
 from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
 from mavlink_sim.releases import NEWEST, release_named
+from mavlink_sim.shared_air import SharedAir
 from mavlink_sim.signing import Signing, Streams, timestamp_now
 from mavlink_sim.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
 from mavlink_sim.transmitter import Transmitter
@@ -53,7 +54,8 @@ class Vehicle:
 
     Args:
         system_id: its MAVLink system; the component is 1.
-        seed: of wind direction and gusts.
+        seed: of its own chances, and of wind direction and gusts unless they are shared.
+        air_seed: of the wind's direction and gusts, shared by all vehicles of this seed; None: its own.
         wind_mps: steady horizontal wind, from a direction that the seed chooses.
         gusts_mps: standard deviation of the gusts per axis; None for the usual amount.
         noise: whether sensors and estimates err as a real vehicle's do; False: they tell the truth.
@@ -77,6 +79,7 @@ class Vehicle:
         *,
         system_id: int = 1,
         seed: int = 0,
+        air_seed: int | None = None,
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
         noise: bool = True,
@@ -92,33 +95,39 @@ class Vehicle:
         self.parameters = Parameters(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
-            direction = random.Random(seed).uniform(0.0, math.tau)
+            direction = random.Random(seed if air_seed is None else air_seed).uniform(0.0, math.tau)
             self.parameters.set("SIH_WIND_N", wind_mps * math.cos(direction))
             self.parameters.set("SIH_WIND_E", wind_mps * math.sin(direction))
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
         self.airframe.on_touch = self._touched
+        self._air = None if air_seed is None else SharedAir(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
-        self.events = EventBuffer()
         self.files = vehicle_files(self.parameters)
         self._signing_streams: Streams = {}
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
-        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self._boot_us * 1000
+        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self.faults.elapsed_us * 1000
         self.start_ned_m = start_ned_m
         self._on_event = on_event or (lambda text: None)
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
-        self.autopilot = Autopilot(
-            self.estimate, self.parameters, ready_after_s=ready_after_s, on_event=self._on_event
-        )
+        self._leftover_s = 0.0
+        self._wind_revision = -1
+        self._boot()
         self.gimbal_manager = GimbalManager(self) if gimbal else None
+
+    def _boot(self) -> None:
+        """Everything that begins with power: whatever is set here does not survive a reboot."""
         self._boot_us = 0
         self._steps_to_control = 0
-        self._leftover_s = 0.0
+        self.autopilot = Autopilot(
+            self.estimate, self.parameters, ready_after_s=self.ready_after_s, on_event=self._on_event
+        )
+        self.autopilot.position_valid = self.estimate.position_valid
+        self.events = EventBuffer()
         self._ping_sequence = itertools.count()
-        self._wind_revision = -1
         self._companion_seen_s: float | None = None
         self._companion_lost = False
         self._origin_told = False
@@ -243,6 +252,7 @@ class Vehicle:
         while self._leftover_s >= STEP_S - 1e-9:
             self._leftover_s -= STEP_S
             self._step()
+        self.estimate.look()
 
     def after(self, delay_s: float, action: Callable[[], None]) -> None:
         """Do something in a later step."""
@@ -267,14 +277,23 @@ class Vehicle:
         elif down_mps > HARD_LANDING_MPS:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
-    def forget_boot(self) -> None:
-        """What does not survive a reboot, outside the autopilot."""
-        self._later.clear()
-        self._companion_seen_s, self._companion_lost, self._origin_told = None, False, False
-        self.events = EventBuffer()
-        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
+    def reboot(self) -> None:
+        """Power was lost for a moment: the motors are off, and time since boot begins anew.
+
+        What is stored stays: parameters, plans with the current mission item, signing keys. So does what is
+        no part of the autopilot: the airframe, the battery, the gimbal, what the pilot holds. `autopilot` is
+        another object afterwards.
+        """
+        before = self.autopilot
+        self.estimate.restart([one.number for one in self.faults.active])
+        self._boot()
+        self.autopilot.navigator.take_stored(before.navigator)
+        self.autopilot.supervision.keep_equipment(before.supervision)
         for link in self.links.values():
-            link.forget(self._boot_us)
+            link.forget()
+        if self.gimbal_manager is not None:
+            gimbal, self.gimbal_manager = self.gimbal_manager.gimbal, GimbalManager(self)
+            self.gimbal_manager.gimbal = gimbal
 
     def reload_wind(self, more: Iterable[Vector] = ()) -> None:
         """The wind of SIH_WIND_N and SIH_WIND_E, and what else blows."""
@@ -288,23 +307,32 @@ class Vehicle:
         self.airframe.wind = (north, east, 0.0)
 
     def _step(self) -> None:
-        if self.faults.step(STEP_S):
+        faults = self.faults
+        if not faults.known:
+            faults.elapsed_us += STEP_US
+        elif faults.step(STEP_S):
             return
         self._boot_us += STEP_US
-        while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
-            heapq.heappop(self._later)[2]()
+        estimate = self.estimate  # it looks at the truth when somebody is about to read it
+        if self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
+            estimate.look()
+            while self._later and self._later[0][0] <= self._boot_us / 1e6 + 1e-9:
+                heapq.heappop(self._later)[2]()
         if self._wind_revision != self.parameters.revision:
             self.reload_wind(self.faults.winds.values())
         self._steps_to_control -= 1
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
+            estimate.look()
             self.autopilot.update(CONTROL_STEP_S)
             mission_link.update(self)
             if self.gimbal_manager is not None:
                 self.gimbal_manager.step(CONTROL_STEP_S)
             self._watch_companion()
+        if self._air is not None:
+            self.airframe.blow(self._air.gust_at(self.faults.elapsed_us))
         self.airframe.advance(STEP_S)
-        self.estimate.update(STEP_S)
+        estimate.age(STEP_S)
         if not self._origin_told and self.autopilot.sensors_ready:
             self._origin_told = True  # GPS_GLOBAL_ORIGIN is sent when it changes, which is once
             for link in self.links.values():
@@ -313,11 +341,13 @@ class Vehicle:
             self._tell()
         for link in self.links.values():
             if link.streams.next_us <= self._boot_us:
+                estimate.look()
                 for name in link.streams.due(self._boot_us):
                     self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
-            file_transfer.continue_transfer(link, self.now_s)
+            if link.file_transfer is not None:
+                file_transfer.continue_transfer(link, self.now_s)
 
     def _watch_companion(self) -> None:
         seen = self._companion_seen_s

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 # Each room of `companion` and its floor; a room may import from lower floors alone.
 FLOORS = {
     "fence": 0,
+    "formation": 0,
     "points": 0,
     "systemd_notify": 0,
     "settings": 1,
@@ -26,6 +27,7 @@ FLOORS = {
     "operator": 4,
     "mission": 4,
     "views": 4,
+    "pose": 4,
     "service": 5,
     "rehearsal": 6,
     "demo": 7,

@@ -15,6 +15,7 @@ from vision.depth import range_of_boxes
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
+from vision.markers import Marker
 from vision.sources import Source
 from vision.tracking import CameraView, Tracker, TrackEvent
 
@@ -41,6 +42,7 @@ class PerceptionResult:
         left_out: reason → frames so far that were not looked at. `replaced`: a newer one came first;
             `unreadable`; `too_old`; and on purpose `every` and `rate`.
         track_events: what happened to tracks, the oldest first; all since the result before.
+        markers: those in the frame; None where none are looked for.
     """
 
     sequence: int
@@ -53,6 +55,7 @@ class PerceptionResult:
     dropped: int
     track_events: tuple[TrackEvent, ...] = ()
     left_out: Mapping[str, int] = field(default_factory=dict)
+    markers: tuple[Marker, ...] | None = None
 
 
 class Timing(Protocol):
@@ -98,6 +101,7 @@ class Pipeline:
         recorder: FrameRecorder | None = None,
         tracker: Tracker | None = None,
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
+        find_markers: Callable[[Frame], tuple[Marker, ...]] | None = None,
     ) -> None:
         """
         Args:
@@ -108,6 +112,7 @@ class Pipeline:
             tracker: is given the detections of every frame that is looked at.
             view_at: tells where the camera looked when it took a frame, None where that is not known. Asked
                 after the detection, when what the vehicle told of that moment has come.
+            find_markers: is given every frame that is looked at, beside the detector.
         """
         self._source = source
         self._detector = detector
@@ -115,6 +120,7 @@ class Pipeline:
         self._recorder = recorder
         self._tracker = tracker if detector is not None else None
         self._view_at = view_at
+        self._find_markers = find_markers
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self._missing = 0
@@ -194,8 +200,12 @@ class Pipeline:
         timing_ms["track"] = (tracked_ns - detected_ns) / 1e6
         if frame.depth_m is not None:
             detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
+        ranged_ns = time.perf_counter_ns()
+        timing_ms["range"] = (ranged_ns - tracked_ns) / 1e6
+        markers = None if self._find_markers is None else self._find_markers(frame)
         done_ns = time.perf_counter_ns()
-        timing_ms["range"] = (done_ns - tracked_ns) / 1e6
+        if markers is not None:
+            timing_ms["markers"] = (done_ns - ranged_ns) / 1e6
         timing_ms["total"] = (done_ns - started_ns) / 1e6
         return PerceptionResult(
             sequence=frame.sequence,
@@ -208,4 +218,5 @@ class Pipeline:
             dropped=self.dropped,
             track_events=events,
             left_out=self.left_out,
+            markers=markers,
         )

@@ -12,11 +12,12 @@ import json
 import logging
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import zenoh
 
-from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, command_key
+from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, command_key, everybodys_key
 from companion.settings import ZenohSection
 
 logger = logging.getLogger(__name__)
@@ -57,6 +58,7 @@ class Bus:
         on_event: called with (level, text) when the network is lost or found.
         on_command: answers a command's text with a JSON-able reply; called in the loop, one task each.
         views: names of the views that publish besides the first.
+        listeners: topics, each with what is called in the loop with its messages, of any vehicle.
 
     Attributes:
         published: path of a topic (`Topic.path`) → messages handed to zenoh.
@@ -71,6 +73,7 @@ class Bus:
         on_event: Callable[[str, str], None],
         on_command: CommandHandler,
         views: Sequence[str] = (),
+        listeners: Sequence[tuple[Topic, Callable[[bytes], None]]] = (),
     ) -> None:
         self._settings = settings
         self._vehicle = vehicle
@@ -85,6 +88,8 @@ class Bus:
         self._watching: asyncio.Task[None] | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._queryable: zenoh.Queryable[None] | None = None
+        self._listeners = tuple(listeners)
+        self._subscribers: list[zenoh.Subscriber[None]] = []
         self._streams: list[tuple[Topic, str | None]] = [(topic, None) for topic in TOPICS]
         self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
         self.published: dict[str, int] = {topic.path(view): 0 for topic, view in self._streams}
@@ -202,6 +207,14 @@ class Bus:
         # Presence for free: the token goes when we go, however we go.
         self._token = session.liveliness().declare_token(alive_key(self._vehicle))
         self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
+        self._subscribers = [
+            session.declare_subscriber(everybodys_key(topic), partial(self._heard_on_zenoh_thread, listener))
+            for topic, listener in self._listeners
+        ]
+
+    def _heard_on_zenoh_thread(self, listener: Callable[[bytes], None], sample: zenoh.Sample) -> None:
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes())
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
         if self._loop is not None and not self._loop.is_closed():

@@ -67,8 +67,12 @@ TRACKS: Final = Topic(
     False,
     "what happened to tracks at one frame: new, update, lost, end",
 )
+MARKERS: Final = Topic(
+    "markers", None, 0.5, _JSON, _REAL_TIME, True, "the markers in one frame, and where they are"
+)
 VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
 SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
+POSE: Final = Topic("pose", 10.0, 1.0, _JSON, _REAL_TIME, True, "where on earth it is, for other vehicles")
 STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
 EVENTS: Final = Topic(
     "events",
@@ -91,14 +95,19 @@ IMAGE: Final = Topic(
 )
 
 # What every view publishes of its own.
-VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE)
+VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, MARKERS, IMAGE)
 
-TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE, VEHICLE, SETPOINT, STATUS, EVENTS)
+TOPICS: Final = (DETECTIONS, LABELS, TRACKS, MARKERS, IMAGE, VEHICLE, SETPOINT, POSE, STATUS, EVENTS)
 
 # The last name of the queryable that takes a command and answers with its outcome.
 COMMAND: Final = "command"
 
 NO_OBJECTS = "no objects detected"
+
+
+def everybodys_key(topic: Topic) -> str:
+    """The key expression of one stream of all vehicles."""
+    return topic.key("*")
 
 
 def command_key(vehicle: str) -> str:

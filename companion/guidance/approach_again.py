@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from companion.guidance.approach import ApproachBehaviour
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
 from companion.guidance.motion import position_and_yaw, stay_at
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.sighting import Sightings
@@ -29,7 +29,7 @@ class PersistentApproach(Behaviour):
     """
 
     name = "approach"
-    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+    requirements = ApproachBehaviour.requirements
 
     def __init__(
         self, approach: Callable[[], ApproachBehaviour], class_name: str, *, retries: int, confidence: float

@@ -63,6 +63,14 @@ class FileName:
 
 
 @dataclass(frozen=True, slots=True)
+class Word:
+    """A word that is not one of a few, such as a vehicle's name."""
+
+    key: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
 class ClassNames:
     """The names of some object classes, parted by commas."""
 
@@ -70,7 +78,7 @@ class ClassNames:
     meaning: str
 
 
-Argument = Number | ClassName | Choice | Points | FileName | ClassNames
+Argument = Number | ClassName | Choice | Points | FileName | ClassNames | Word
 
 
 def names_in(text: str) -> tuple[str, ...]:
@@ -98,6 +106,9 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
         case Choice(key, words):
             if value not in words:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
+        case Word(key):
+            if not isinstance(value, str) or not re.fullmatch(r"[\w.-]+", value):
+                raise GrammarError(f"{word}: {key} must be a word, got {value!r}")
         case Points(key):
             try:
                 points = points_from(str(value))

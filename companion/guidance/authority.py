@@ -14,7 +14,7 @@ SHOW_DELAY_S = 2.0
 # PX4 ends a take-off inside NAV_MC_ALT_RAD (0.8 m); heights measured in two ways differ by some more. A hold
 # that appears lower than this below the wanted height was asked for by a pilot.
 TAKEOFF_SHORT_M = 1.3
-GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN)
+GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN, FlightMode.PRECISION_LAND)
 
 
 class Authority:

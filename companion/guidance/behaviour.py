@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.marker_target import NO_MARKERS, MarkerSight
+from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.target import Target
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 
@@ -19,6 +22,11 @@ class Requirement(StrEnum):
     IN_AIR = "in_air"
     ON_GROUND = "on_ground"
     PERCEPTION = "perception"  # a perception worker that delivers
+    BATTERY = "battery"  # more charge than guidance.min_battery_percent
+    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, or a class of known size
+    MARKER = "marker"  # perception that looks for markers
+    GIMBAL = "gimbal"  # one that answers
+    NEIGHBOURS = "neighbours"  # other vehicles whose poses are fresh
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +40,9 @@ class Situation:
         perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
         perception_fresh: that age is within the declared maximum.
         sent: what the envelope let through of the last setpoint; None before the first.
+        neighbourhood: the other vehicles; None: nobody listens for them.
+        min_separation_m: what is kept to each of them.
+        markers: what is seen of markers, or why none can be.
     """
 
     now_ns: int
@@ -40,6 +51,14 @@ class Situation:
     perception_age_s: float | None = None
     perception_fresh: bool = False
     sent: Setpoint | None = None
+    markers: MarkerSight = NO_MARKERS
+    neighbourhood: Neighbourhood | None = None
+    min_separation_m: float = 3.0
+
+    @property
+    def neighbours(self) -> tuple[Neighbour, ...]:
+        """The other vehicles that are known and placed."""
+        return () if self.neighbourhood is None else self.neighbourhood.vehicles
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +92,8 @@ class Behaviour(ABC):
     requirements: frozenset[Requirement] = frozenset()
     # Classes that perception must know for this behaviour to make sense.
     class_names: tuple[str, ...] = ()
+    # Vehicles whose poses must be fresh, where it requires NEIGHBOURS.
+    neighbour_names: tuple[str, ...] = ()
 
     def on_activate(self, situation: Situation) -> None:  # noqa: B027  (a hook that may be left out)
         """Called once, before the first update."""
@@ -91,6 +112,16 @@ class Behaviour(ABC):
     def take_notes(self) -> Sequence[str]:
         """What happened that people should know, since it was last asked for."""
         return ()
+
+    @property
+    def flown(self) -> Behaviour:
+        """What flies now: itself, or of several in turn the one whose turn it is."""
+        return self
+
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
+        return None
 
     @property
     def status(self) -> str:

@@ -7,6 +7,7 @@ import re
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
+from companion.formation import SHAPES
 from companion.guidance.arguments import (
     Argument,
     Choice,
@@ -16,6 +17,7 @@ from companion.guidance.arguments import (
     GrammarError,
     Number,
     Points,
+    Word,
     check,
     names_in,
 )
@@ -23,6 +25,8 @@ from companion.points import points_from
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0
+# More vehicles than have been flown, even on paper.
+MOST_SLOTS = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,6 +304,39 @@ class Approach(Command):
 
 
 @dataclass(frozen=True, slots=True)
+class Follow(Command):
+    word: ClassVar[str] = "follow"
+    meaning: ClassVar[str] = "keep a distance and a bearing to a moving object of the class"
+
+    class_name: Annotated[str, ClassName("class", "what to follow")]
+    distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
+    bearing: Annotated[
+        str,
+        Choice(
+            "bearing",
+            ("here", "compass", "course"),
+            "where to stay: as it is, or `angle` from north or course",
+        ),
+    ] = "here"
+    angle_deg: Annotated[
+        float,
+        Number("angle", "deg", -360.0, 360.0, "seen from the object, clockwise; of course, 180 is behind"),
+    ] = 180.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 5.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    occlusion_s: Annotated[
+        float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's expected way this long")
+    ] = 3.0
+    duration_s: Annotated[
+        float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
+    ] = 0.0
+
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Patrol(Command):
     word: ClassVar[str] = "patrol"
     meaning: ClassVar[str] = "fly a round of points again and again, and stop for what is seen on the way"
@@ -351,6 +388,74 @@ class Mission(Command):
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class Formation(Command):
+    word: ClassVar[str] = "formation"
+    meaning: ClassVar[str] = "hold a slot about a leader: another vehicle, or a virtual one on a path"
+
+    shape: Annotated[str, Choice("shape", SHAPES, "of the formation")]
+    leader: Annotated[str, Word("leader", 'vehicle.name of the leader, or "virtual"')]
+    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 5.0
+    slot: Annotated[str, Word("slot", "number of the slot to take, from 1, or auto")] = "auto"
+    points: Annotated[
+        str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long for a leader not heard")
+    ] = 5.0
+
+    @property
+    def endless(self) -> bool:
+        return self.points is None or self.laps == 0.0
+
+    @property
+    def slot_number(self) -> int | None:
+        """None: auto."""
+        return None if self.slot == "auto" else int(self.slot)
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point of the path, metres from home."""
+        return points_from(self.points or "")
+
+    def __post_init__(self) -> None:
+        super(Formation, self).__post_init__()
+        if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
+            raise GrammarError(f"formation: slot must be auto or 1 to {MOST_SLOTS}, got {self.slot!r}")
+        if (self.leader == "virtual") != (self.points is not None):
+            raise GrammarError(
+                "formation: leader=virtual and points=… belong together; one of them is missing"
+            )
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class LandOnMarker(Command):
+    word: ClassVar[str] = "land-on-marker"
+    meaning: ClassVar[str] = "find a marker below, descend onto it in a narrowing cone, land and disarm"
+
+    identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "of the marker whose pad to land on")]
+    method: Annotated[
+        str,
+        Choice("method", ("offboard", "autopilot"), "who flies: we, or the autopilot by LANDING_TARGET"),
+    ] = "offboard"
+    pad: Annotated[str, Choice("pad", ("still", "moving"), "whether the pad may move")] = "still"
+    attempts: Annotated[float, Number("attempts", "", 1.0, 10.0, "descents before giving up")] = 3.0
+    search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "how far around to look for it")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "over ground, at most")] = 1.5
+
+    def __post_init__(self) -> None:
+        super(LandOnMarker, self).__post_init__()
+        for key, value in (("id", self.identifier), ("attempts", self.attempts)):
+            if value != int(value):
+                raise GrammarError(f"land-on-marker: {key} must be a whole number, got {value:g}")
+        if self.method == "autopilot" and self.pad == "moving":
+            raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
+
+
 COMMANDS: dict[str, type[Command]] = {
     kind.word: kind
     for kind in (
@@ -365,7 +470,10 @@ COMMANDS: dict[str, type[Command]] = {
         Orbit,
         Seek,
         Approach,
+        Follow,
         Patrol,
         Mission,
+        Formation,
+        LandOnMarker,
     )
 }

@@ -7,10 +7,13 @@ over ground nor upwards or downwards; braking is never delayed. A setpoint insid
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 from companion.fence import Fence
+from companion.guidance.neighbours import Neighbour
+from companion.guidance.separation import BRAKING, Row, apart, level_rows, rows_at
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from vision.rotation import wrap_angle
@@ -41,6 +44,7 @@ class Limits:
         min_altitude_m, max_altitude_m: band above home.
         max_distance_m: horizontally from home.
         fence: polygons about home to stay inside and out of.
+        min_separation_m: to every other vehicle that tells where it is.
 
     Raises:
         ValueError: a limit is not finite and positive, or the band of altitudes is empty.
@@ -55,6 +59,7 @@ class Limits:
     max_altitude_m: float = 50.0
     max_distance_m: float = 200.0
     fence: Fence = NO_FENCE
+    min_separation_m: float = 3.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -83,12 +88,20 @@ class Envelope:
         self._velocity: Vector3 | None = None
         self._home: Vector3 | None = None
         self._yaw_rad: float | None = None
+        self._neighbours: Sequence[Neighbour] = ()
 
     def reset(self) -> None:
         """Forget the last setpoint: the next one starts from how the vehicle really moves."""
         self._velocity = self._yaw_rad = None
 
-    def apply(self, setpoint: Setpoint, state: VehicleState, now_ns: int, dt_s: float) -> Limited:
+    def apply(
+        self,
+        setpoint: Setpoint,
+        state: VehicleState,
+        now_ns: int,
+        dt_s: float,
+        neighbours: Sequence[Neighbour] = (),
+    ) -> Limited:
         """What may be sent of a setpoint.
 
         Args:
@@ -96,10 +109,12 @@ class Envelope:
             state: for where the vehicle is, how it moves, and where home is.
             now_ns: CLOCK_MONOTONIC nanoseconds.
             dt_s: since the last call; more than 0.2 s counts as that.
+            neighbours: other vehicles, to keep apart from.
 
         Without a known position a position setpoint cannot be judged: a brake takes its place.
         """
         dt_s = max(0.0, min(dt_s, LONGEST_STEP_S))
+        self._neighbours = neighbours
         reasons: list[str] = []
         if state.home_position_ned_m is not None:
             self._home = state.home_position_ned_m
@@ -150,6 +165,8 @@ class Envelope:
         limits, altitude_m = self.limits, state.altitude_m
         if state.position_ned_m is None or altitude_m is None:
             return velocity
+        rows = self._rows(state.position_ned_m)
+        velocity = self._keep_apart(velocity, rows, reasons)
         north, east, down = velocity
         if down < -self._towards_fence(limits.max_altitude_m - altitude_m):
             down = -self._towards_fence(limits.max_altitude_m - altitude_m)
@@ -167,12 +184,26 @@ class Envelope:
             circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
             if north * circle[0][0] + east * circle[0][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
+        circle += level_rows(rows, down)
         over_ground = limits.fence.slowed((north, east), away, self._towards_fence, also=circle)
         if math.dist(over_ground, (north, east)) > 1e-9:
             if not reasons or not reasons[-1].startswith("distance from home"):
                 reasons.append("slowed down at the fence")
             north, east = over_ground
         return (north, east, down)
+
+    def _rows(self, place: Vector3) -> list[Row]:
+        limits = self.limits
+        return rows_at(
+            place, self._neighbours, limits.min_separation_m, BRAKING * limits.max_acceleration_mps2
+        )
+
+    def _keep_apart(self, velocity: Vector3, rows: Sequence[Row], reasons: list[str]) -> Vector3:
+        """Take away what would carry the vehicle nearer to another than they may be."""
+        left, because_of = apart(velocity, rows)
+        if because_of:
+            reasons.append(f"kept {self.limits.min_separation_m:g} m from {', '.join(because_of)}")
+        return left
 
     def _towards_fence(self, left_m: float) -> float:
         """The speed from which the vehicle stops in so much way, which begins when it answers."""
@@ -230,6 +261,12 @@ class Envelope:
         elif place[2] > lowest:
             place = (place[0], place[1], lowest)
             reasons.append(f"descent limited to {limits.max_descend_mps:g} m/s")
+        # A place is flown to with a speed that goes with the way to it, so the same law holds for both.
+        north, east, down = (POSITION_GAIN_PER_S * (p - h) for p, h in zip(place, here, strict=True))
+        left = self._keep_apart((north, east, down), self._rows(here), reasons)
+        if left != (north, east, down):
+            north, east, down = (h + v / POSITION_GAIN_PER_S for h, v in zip(here, left, strict=True))
+            return (north, east, down)
         return place
 
     def _limit_yaw(

@@ -25,6 +25,7 @@ from companion.guidance.arguments import (
     GrammarError,
     Number,
     Points,
+    Word,
     known_class,
     names_in,
     nearest,
@@ -97,6 +98,7 @@ def describe() -> str:
                     | ClassNames(key, meaning)
                     | Points(key, meaning)
                     | FileName(key, meaning)
+                    | Word(key, meaning)
                 ):
                     lines.append(f"    {key}: {meaning}")
     return "\n".join(lines)
@@ -167,7 +169,7 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {text!r}") from None
         case Choice():
             return text.lower()
-        case Points() | FileName():
+        case Points() | FileName() | Word():
             return text
         case ClassNames():
             names = names_in(text)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from companion.guidance.authority import Authority
+from companion.guidance.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryWatch
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
 from companion.guidance.envelope import Envelope
 from companion.guidance.hold import HoldBehaviour
@@ -42,6 +43,7 @@ class PilotEventKind(StrEnum):
     ENDED = "ended"
     REFUSED = "refused"
     LOST = "lost"  # command was taken from us
+    BATTERY = "battery"  # too little charge to fly on, or none is told
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +90,13 @@ class Pilot:
         on_event: Callable[[PilotEvent], None],
         class_names: Callable[[], Sequence[str] | None] = lambda: None,
         lifetime_s: float = DEFAULT_LIFETIME_S,
+        battery: BatteryMinimum = NO_MINIMUM,
     ) -> None:
         self._lifetime_s = lifetime_s
         self._driver, self._streamer, self._envelope = driver, streamer, envelope
         self._on_event, self._class_names = on_event, class_names
         self._authority = Authority()
+        self._battery = BatteryWatch(battery)
         self._phase = _Phase.IDLE
         self._behaviour: Behaviour | None = None
         self._future: asyncio.Future[Outcome] | None = None
@@ -159,13 +163,14 @@ class Pilot:
             self._drop_request()
         elif self._phase is _Phase.DELEGATED:
             self._phase, self._requested = _Phase.READY, None
+        self._battery.reset()
         self._begin(behaviour, future)
         self._tell(PilotEventKind.STARTED, behaviour, "started")
         return future
 
     def refusal_of(self, behaviour: Behaviour) -> str | None:
         """Why this behaviour could not begin now; None: it could."""
-        return refusal(behaviour, self._situation, self._class_names())
+        return refusal(behaviour, self._situation, self._class_names(), self._battery.minimum)
 
     def update(self, situation: Situation) -> None:
         """One turn of the guidance loop. Never waits."""
@@ -182,6 +187,7 @@ class Pilot:
         if why is not None:
             self._lose(why)
             return
+        self._watch_battery(self._behaviour, situation)
         if self._task is not None and self._task.done():
             self._finish_request(self._task, situation)
         if self._phase is _Phase.ENGAGING and self._activated:
@@ -231,7 +237,7 @@ class Pilot:
                 deadline_ns = situation.now_ns + round(self._lifetime_s * 1e9)
                 self.asked = replace(step, deadline_ns=deadline_ns)
                 self.sent, self.limited_by = self._envelope.apply(
-                    self.asked, situation.state, situation.now_ns, dt_s
+                    self.asked, situation.state, situation.now_ns, dt_s, situation.neighbours
                 )
                 self._streamer.submit(self.sent)
             case Setpoint() if self._phase is not _Phase.ENGAGING:
@@ -249,6 +255,27 @@ class Pilot:
         self._begin(hold, None)
         if self._phase is _Phase.OFFBOARD:
             self._run(hold, situation)
+
+    def _watch_battery(self, behaviour: Behaviour, situation: Situation) -> None:
+        """Too little charge ends what flies; the vehicle brakes until what the operator chose begins."""
+        state, now_ns = situation.state, situation.now_ns
+        if (why := self._battery.unknown(behaviour, state, now_ns)) is not None:
+            self._tell(PilotEventKind.BATTERY, behaviour, why)
+        if (why := self._battery.ending(behaviour, state, now_ns)) is None:
+            return
+        ending = ENDINGS[self._battery.minimum.action]()
+        self._tell(PilotEventKind.BATTERY, behaviour, f"{why}: {behaviour.name} ends, {ending.name} follows")
+        self._end(Outcome(False, why))
+        if self._phase in (_Phase.REQUESTING, _Phase.DELEGATED):
+            self._drop_request()
+        ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+        # Nobody asked for it, so nobody else tells how it went.
+        ended.add_done_callback(
+            lambda done: self._tell(
+                PilotEventKind.BATTERY, ending, f"{ending.name} after low battery: {done.result().reason}"
+            )
+        )
+        self._begin(ending, ended)
 
     def _silent(self, paused_s: float) -> str | None:
         """Why our setpoints failed to go out, if they did.

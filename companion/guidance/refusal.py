@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.neighbours import missing_neighbours
 from companion.vehicle.state import LandedState
 
 PERCEPTION_GAP_S = 1.5
@@ -18,13 +20,17 @@ AIRBORNE = (LandedState.IN_AIR, LandedState.TAKING_OFF, LandedState.LANDING)
 
 
 def refusal(
-    behaviour: Behaviour, situation: Situation | None, class_names: Sequence[str] | None
+    behaviour: Behaviour,
+    situation: Situation | None,
+    class_names: Sequence[str] | None,
+    battery: BatteryMinimum = NO_MINIMUM,
 ) -> str | None:
     """Why this behaviour cannot begin now, in one line; None: it can.
 
     Args:
         situation: the newest; None before there is one.
         class_names: what the detector knows; None: not known, not checked.
+        battery: the least charge to begin with.
     """
     if situation is None:
         return "the vehicle's state is not known yet"
@@ -42,6 +48,12 @@ def refusal(
                 missing.append(f"to be on the ground ({_where(situation)})")
             case Requirement.PERCEPTION if not _perceiving(situation):
                 missing.append(f"perception ({_perception_age(situation)})")
+            case Requirement.NEIGHBOURS:
+                missing += missing_neighbours(situation.neighbourhood, behaviour.neighbour_names)
+            case Requirement.MARKER if (what := situation.markers.unavailable(PERCEPTION_GAP_S)) is not None:
+                missing.append(what)
+    if (charge := battery.missing(behaviour, state, now_ns)) is not None:
+        missing.append(charge)
     if class_names is not None:
         unknown = [name for name in behaviour.class_names if name not in class_names]
         if unknown:

@@ -9,10 +9,13 @@ from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.approach_again import PersistentApproach
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.figure_eight import FigureEightBehaviour
+from companion.guidance.follow import FollowBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.formation import FormationBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.search import SearchBehaviour
@@ -68,6 +71,8 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
             )
         case commands.Approach():
             return _approach(command)
+        case commands.Follow():
+            return _follow(command)
         case commands.Patrol():
             return PatrolBehaviour(
                 command.places,
@@ -79,6 +84,26 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 again_s=command.again_s,
                 apart_m=command.apart_m,
                 confidence=command.confidence,
+            )
+        case commands.Formation(shape, leader, spacing_m):
+            return FormationBehaviour(
+                shape,
+                leader,
+                spacing_m,
+                command.slot_number,
+                points=command.places,
+                speed_mps=command.speed_mps,
+                laps=command.laps,
+                lost_timeout_s=command.lost_timeout_s,
+            )
+        case commands.LandOnMarker(identifier, method, pad, attempts, search_m, speed_mps):
+            return LandOnMarkerBehaviour(
+                int(identifier),
+                by_autopilot=method == "autopilot",
+                moving=pad == "moving",
+                attempts=int(attempts),
+                search_m=search_m,
+                speed_mps=speed_mps,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
 
@@ -107,6 +132,19 @@ def _goto(command: commands.Goto) -> GotoBehaviour:
         altitude_m=command.altitude_m,
         speed_mps=command.speed_mps,
         heading_rad=None if heading is None else math.radians(heading),
+    )
+
+
+def _follow(command: commands.Follow) -> FollowBehaviour:
+    return FollowBehaviour(
+        command.class_name,
+        distance_m=command.distance_m,
+        bearing=command.bearing,
+        angle_rad=math.radians(command.angle_deg),
+        speed_mps=command.speed_mps,
+        confidence=command.confidence,
+        occlusion_s=command.occlusion_s,
+        duration_s=command.duration_s,
     )
 
 

@@ -55,7 +55,7 @@ def lawnmower(width_m: float, height_m: float, spacing_m: float) -> list[tuple[f
     """To and fro along the longer side of an area: `width_m` west to east, `height_m` south to north."""
     across_m, along_m = sorted((width_m, height_m))
     count = max(1, math.ceil(across_m / spacing_m - 1e-9))
-    points = []
+    points: list[tuple[float, float]] = []
     for strip in range(count):
         beside = across_m * ((strip + 0.5) / count - 0.5)
         ends = [(-along_m / 2.0, beside), (along_m / 2.0, beside)]

@@ -41,7 +41,7 @@ class ObjectTrack:
         self._class_name = target.class_name
         self._place = np.array(target.position_ned_m[:2], np.float64)
         self._down_m = target.position_ned_m[2]
-        self._covariance = _noise(target, self._place - vehicle[:2])
+        self._covariance = measurement_noise(target, self._place - vehicle[:2])
         self._captured_ns = target.captured_ns
         self._track_id = target.track_id
         self._others: set[int] = set()
@@ -132,10 +132,10 @@ class ObjectTrack:
             range_m = max(NEAREST_M, float(np.hypot(*(self._place - vehicle[:2]))))
             direction = np.array([math.cos(target.bearing_rad), math.sin(target.bearing_rad)])
             measured = np.array(vehicle[:2]) + direction * range_m
-        return measured - self._place, _noise(target, measured - vehicle[:2])
+        return measured - self._place, measurement_noise(target, measured - vehicle[:2])
 
 
-def _noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDArray[np.float64]:
+def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDArray[np.float64]:
     """(2, 2) covariance of a measured place, given the vector from the vehicle to it."""
     range_m = max(NEAREST_M, float(np.hypot(*line_of_sight)))
     along = line_of_sight / range_m

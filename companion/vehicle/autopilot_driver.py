@@ -19,8 +19,10 @@ from dataclasses import replace
 from typing import Any
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
+from companion.vehicle.clock_sync import ClockSync
 from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, pack_frame
+from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.px4_modes import request_of_mode
 from companion.vehicle.setpoint import Setpoint
@@ -75,7 +77,10 @@ _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
 # A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
 _SETBACKS_OF_TWO = 3
 _TWO_CLOCKS_S = 2.0
-_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE")
+_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION")
+_TIMESYNC_ID = 111
+_TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
+_TIMESYNC_PERIOD_S = 0.5
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 
 
@@ -106,13 +111,16 @@ class AutopilotDriver(ABC):
         self._boot_ms = 0
         self._setbacks_ns: deque[int] = deque(maxlen=_SETBACKS_OF_TWO)
         self._two_heard_ns = 0
+        self._asked_ns = 0
         self._restarted = asyncio.Event()
         self._heard = asyncio.Event()
+        self._clock = ClockSync()
         self._others: set[tuple[Any, ...]] = set()
         self._received_count: Counter[int] = Counter()
         self._mode_ns = 0
         self._sequence = 0
         self._keeper: asyncio.Task[None] | None = None
+        self._synchroniser: asyncio.Task[None] | None = None
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
 
@@ -129,7 +137,7 @@ class AutopilotDriver(ABC):
         """Decode frames of the chosen system; call `_handle` with what they say."""
 
     @abstractmethod
-    def _send_message(self, name: str, fields: dict[str, int | float]) -> None:
+    def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         """Put one message on the wire."""
 
     @abstractmethod
@@ -167,13 +175,15 @@ class AutopilotDriver(ABC):
             raise
         logger.info("%s: PX4, system %s, answers", self.url, self._system_id)
         self._keeper = asyncio.create_task(self._keep(), name=f"keeper of {self.url}")
+        self._synchroniser = asyncio.create_task(self._synchronise(), name=f"clock of {self.url}")
 
     async def close(self) -> None:
         """See Driver."""
-        keeper, self._keeper = self._keeper, None
-        if keeper is not None:
-            keeper.cancel()
-            await asyncio.gather(keeper, return_exceptions=True)
+        tasks = [task for task in (self._keeper, self._synchroniser) if task is not None]
+        self._keeper = self._synchroniser = None
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         try:
             await self._detach()
         finally:
@@ -226,6 +236,8 @@ class AutopilotDriver(ABC):
                 ours.append(frame)
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._received_count[frame.message_id] += 1
+                    if frame.message_id == _TIMESYNC_ID:
+                        self._time_from(frame)
         if ours and self._autopilot_kind == _AUTOPILOT_PX4:
             self._take_frames(ours)
 
@@ -255,6 +267,20 @@ class AutopilotDriver(ABC):
         self._handle("HEARTBEAT", fields)
         self._heard.set()
 
+    def _time_from(self, frame: Frame) -> None:
+        """An answer to `_synchronise`; the autopilot's own questions have no `tc1`."""
+        now_ns = time.monotonic_ns()
+        boot_ns, asked_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
+        # Older autopilots do not say whom they answer; our own stamp tells.
+        for_us = (system, component) in ((0, 0), (self._own_system_id, self._own_component_id))
+        if (
+            boot_ns > 0
+            and asked_ns == self._asked_ns
+            and for_us
+            and self._clock.answer(asked_ns, boot_ns, now_ns)
+        ):
+            self._state = replace(self._state, clock=self._clock.offset(now_ns))
+
     def _note_other(self, sender: tuple[Any, ...], text: str) -> None:
         if sender not in self._others:
             self._others.add(sender)
@@ -269,7 +295,8 @@ class AutopilotDriver(ABC):
             self._mode_ns = now_ns
         if name in _OF_ITS_PLACE and self._two_autopilots(now_ns):
             return  # Nobody can tell whose it is: what is known grows stale, and what needs it ends.
-        state = fold(self._state, name, fields, now_ns)
+        stamp_ns = self._clock.stamp(fields["time_boot_ms"], now_ns) if "time_boot_ms" in fields else now_ns
+        state = fold(self._state, name, fields, stamp_ns)
         changed, self._state = state is not self._state, state
         for watcher in list(self._watchers.values()):
             watcher(name, fields)
@@ -297,8 +324,13 @@ class AutopilotDriver(ABC):
             else:
                 self._restarted.set()
                 # What held before the restart is not known to hold now, home least of all.
+                self._clock.forget()
                 self._state = replace(
-                    self._state, ready_to_arm=False, home_altitude_amsl_m=None, home_position_ned_m=None
+                    self._state,
+                    ready_to_arm=False,
+                    home_altitude_amsl_m=None,
+                    home_position_ned_m=None,
+                    clock=None,
                 )
         self._boot_ms = boot_ms
 
@@ -386,6 +418,11 @@ class AutopilotDriver(ABC):
                 "yaw_rate": setpoint.yaw_rate_radps or 0.0,
             },
         )
+
+    def send_landing_target(self, target: LandingTarget) -> None:
+        """See Driver."""
+        if self._link is not None and self._system_id is not None:
+            self._send_message("LANDING_TARGET", landing_target_fields(target, self._autopilot_kind or 0))
 
     # --- commands -----------------------------------------------------------------------------------
 
@@ -497,6 +534,14 @@ class AutopilotDriver(ABC):
             )
             await self._until(lambda: self._state.connected(time.monotonic_ns()), None)
             logger.warning("%s: system %s is back", self.url, self._system_id)
+
+    async def _synchronise(self) -> None:
+        """Ask the autopilot for its time, for ever."""
+        while True:
+            self._asked_ns = time.monotonic_ns()
+            question = _TIMESYNC.pack(0, self._asked_ns, self._system_id or 0, AUTOPILOT_COMPONENT)
+            self._transmit_payload(_TIMESYNC_ID, question)
+            await asyncio.sleep(_TIMESYNC_PERIOD_S)
 
     async def _silence(self) -> bool:
         """Wait until the newest heartbeat is too old (True) or the autopilot's clock began anew (False)."""

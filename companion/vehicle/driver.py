@@ -10,6 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 
@@ -74,6 +75,9 @@ class Driver(Protocol):
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """Put one SET_POSITION_TARGET_LOCAL_NED on the wire, now. Never raises for a lost link."""
+
+    def send_landing_target(self, target: LandingTarget) -> None:
+        """Put one LANDING_TARGET on the wire, now, in the frame that this autopilot takes."""
 
     def send_heartbeat(self, status: SystemStatus) -> None:
         """Put one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER on the wire, now."""

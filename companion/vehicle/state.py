@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.vehicle.clock_sync import ClockOffset
+
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -49,6 +51,8 @@ class LandedState(StrEnum):
 class VehicleState:
     """A snapshot. Every group of values has the stamp of its newest message (CLOCK_MONOTONIC ns, 0: never).
 
+    The stamps are those of the measurements once the autopilot's clock is known, and of the arrival before.
+
     Attributes:
         position_ned_m: metres from the local origin, north, east, down.
         velocity_ned_mps: metres a second, north, east, down.
@@ -59,6 +63,7 @@ class VehicleState:
         battery_fraction: 0..1, None when unknown.
         ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
         failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
+        clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until it has told its time.
     """
 
     heartbeat_ns: int = 0
@@ -66,6 +71,7 @@ class VehicleState:
     position_ns: int = 0
     global_ns: int = 0
     landed_ns: int = 0
+    battery_ns: int = 0
     armed: bool = False
     mode: FlightMode = FlightMode.UNKNOWN
     landed: LandedState = LandedState.UNKNOWN
@@ -81,6 +87,7 @@ class VehicleState:
     home_altitude_amsl_m: float | None = None
     home_position_ned_m: Vector3 | None = None
     battery_fraction: float | None = None
+    clock: ClockOffset | None = None
 
     @property
     def yaw_rad(self) -> float | None:

@@ -98,11 +98,12 @@ def _sys_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleStat
     return _battery_status(replace(state, ready_to_arm=ready), fields, now_ns)
 
 
-def _battery_status(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     # Of several batteries the first speaks for the vehicle, as in SYS_STATUS.
     if fields.get("id", 0) != 0 or fields["battery_remaining"] < 0:
         return state
-    return replace(state, battery_fraction=min(fields["battery_remaining"] / 100.0, 1.0))
+    fraction = min(fields["battery_remaining"] / 100.0, 1.0)
+    return replace(state, battery_ns=now_ns, battery_fraction=fraction)
 
 
 def _number(value: float | None) -> float:

@@ -16,6 +16,7 @@ from companion.messages import (
     tracks_message,
     vehicle_message,
 )
+from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 from vision.detections import NO_TRACK, Detections
@@ -53,6 +54,8 @@ def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
         "captured_ns": 1_000,
         "inferred_ns": 2_000,
         "published_ns": 3_000,
+        "captured_boot_ns": None,
+        "captured_boot_error_ns": None,
         "width": 640,
         "height": 480,
         "timing_ms": {"inference": 20.12},
@@ -89,6 +92,14 @@ def test_a_tracked_detection_bears_its_identity_its_median_and_whether_it_counts
         for record in message["detections"]  # type: ignore[index]
     ]
     assert tracks == [(7, 0.81, "confirmed"), (8, 0.4, "tentative"), (None, None, "none")]
+
+
+def test_the_capture_is_told_by_the_autopilots_clock_too_once_that_is_known() -> None:
+    clock = ClockOffset(offset_ns=-400, error_ns=25)
+    message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000, clock=clock))
+    assert (message["captured_boot_ns"], message["captured_boot_error_ns"]) == (600, 25)
+    told = strictly(vehicle_message(VehicleState(clock=clock), 5_000))
+    assert (told["boot_offset_ns"], told["boot_error_ns"]) == (-400, 25)
 
 
 def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from mavlink_sim.geography import local
 from mavlink_sim.messages import dialect
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
@@ -103,8 +104,11 @@ def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(cockpit)
     begin(cockpit, "second_autopilot")
     cockpit.fly(0.5)
     assert cockpit.command(ARM, 1) == [0, 0]
-    norths = {round(message.y) for message in cockpit.received("LOCAL_POSITION_NED")}
-    assert {0, 25} <= norths
+    places = [
+        local(message.lat / 1e7, message.lon / 1e7, 0.0)
+        for message in cockpit.received("GLOBAL_POSITION_INT")
+    ]
+    assert {round(east) for _, east, _ in places} == {0, 25}
 
 
 def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(cockpit) -> None:

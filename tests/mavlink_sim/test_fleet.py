@@ -16,6 +16,7 @@ from mavlink_sim.fleet import instance_options, places
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.simulation import SimulationOptions
 from mavlink_sim.testing import free_udp_port_range, running_simulator
+from mavlink_sim.vehicle import Vehicle
 
 METRE_DEG = math.degrees(1.0 / 6371000.0)
 
@@ -158,3 +159,30 @@ def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.
     now_s += 6.0
     pace.tell()
     assert len(told) == 1  # nothing lost since
+
+
+def test_a_fleet_flies_in_one_wind_with_the_same_gusts() -> None:
+    fleet = instance_options(SimulationOptions(seed=7, wind_mps=5.0), 3, 5.0)
+    vehicles = [
+        Vehicle(seed=one.seed, air_seed=one.world_seed, wind_mps=one.wind_mps, ready_after_s=0.0)
+        for one in fleet
+    ]
+    gusts = []
+    for start_s, vehicle in enumerate(vehicles):  # none is in the air for as long as another
+        vehicle.step(1.0 + start_s)
+        vehicle.autopilot.arm()
+        vehicle.autopilot.takeoff(5.0)
+        vehicle.step(19.0 - start_s)
+        gusts.append((vehicle.airframe.wind, vehicle.airframe._gust))
+    assert gusts[0] == gusts[1] == gusts[2]
+    assert any(gusts[0][1])
+    other = instance_options(SimulationOptions(seed=8, wind_mps=5.0), 3, 5.0)[0]
+    stranger = Vehicle(seed=other.seed, air_seed=other.world_seed, wind_mps=5.0)
+    stranger.step(20.0)
+    assert (stranger.airframe.wind, stranger.airframe._gust) != gusts[0]
+    assert len({vehicle.estimate.drift for vehicle in vehicles}) == 3
+
+
+def test_a_fleet_sees_one_world() -> None:
+    assert {one.world_seed for one in instance_options(SimulationOptions(seed=7), 3, 5.0)} == {7}
+    assert instance_options(SimulationOptions(seed=7), 1, 5.0)[0].world_seed is None

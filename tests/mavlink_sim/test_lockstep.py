@@ -1,6 +1,7 @@
 """The vehicle in one's own process: stepped, spoken to, looked at."""
 
 import hashlib
+import itertools
 import math
 import subprocess
 import sys
@@ -11,7 +12,9 @@ import pytest
 
 import mavlink_sim
 from mavlink_sim import CommandRefusedError, LockstepVehicle, NotReachedError
-from mavlink_sim.messages import dialect
+from mavlink_sim.fault_grammar import FaultError
+from mavlink_sim.messages import dialect, parser
+from mavlink_sim.signing import Signing
 from mavlink_sim.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
 
@@ -173,3 +176,68 @@ def test_a_fall_is_a_hard_landing_and_a_landing_is_none() -> None:
     vehicle.command(400, 0.0, 21196.0)  # motors off in the air
     vehicle.run_until(lambda truth: truth.on_ground, 10.0)
     assert any(event.startswith(("hard landing at", "crashed at")) for event in vehicle.events)
+
+
+# ---- faults and signatures on its links
+
+
+def test_a_delayed_link_is_late_both_ways() -> None:
+    vehicle = LockstepVehicle({"onboard": {"HEARTBEAT": 1.0}}, seed=1)
+    vehicle.step(5.0)
+    vehicle.receive()
+    vehicle.vehicle.faults.begin("link_delay 0.2")
+    vehicle.send(dialect.MAVLink_timesync_message(0, 77))
+    vehicle.step(0.38)
+    assert [message for message in vehicle.receive() if message.get_type() == "TIMESYNC"] == []
+    vehicle.step(0.04)
+    answers = [message for message in vehicle.receive() if message.get_type() == "TIMESYNC"]
+    assert [(answer.ts1, answer.get_srcSystem()) for answer in answers] == [(77, 1)]
+    assert answers[0].tc1 == pytest.approx(5.2e9, abs=1e7)
+
+
+def test_a_lost_link_loses_and_bytes_stay_numbered_in_order() -> None:
+    vehicle = LockstepVehicle(seed=1)
+    vehicle.step(1.0)
+    vehicle.vehicle.faults.begin("packet_loss 0.5 way=out at=2 for=1")
+    vehicle.step(4.0)
+    numbers = [message.get_msgbuf()[4] for message in client_reads(vehicle.receive_bytes())]
+    gaps = [(after - before) % 256 for before, after in itertools.pairwise(numbers)]
+    assert max(gaps) > 1
+    assert max(gaps) < 40
+    assert gaps.count(1) > len(gaps) / 2
+
+
+def test_damaged_messages_are_not_taken_for_messages() -> None:
+    vehicle = LockstepVehicle(seed=1)
+    vehicle.vehicle.faults.begin("corrupt 1.0 way=out")
+    vehicle.step(3.0)
+    assert all(message.get_type() != "BAD_DATA" for message in vehicle.receive())
+    assert vehicle.vehicle.links["onboard"].sent > 500
+    vehicle.step(1.0)
+    assert vehicle.receive_bytes()
+
+
+def test_a_link_with_a_key_signs_and_refuses_what_is_unsigned() -> None:
+    vehicle = LockstepVehicle(seed=1, parameters={"MAV_SIGN_CFG": 2})
+    vehicle.vehicle.sign_everything(bytes(range(32)), timestamp=1_000_000)
+    vehicle.step(2.0)
+    frames = client_reads(vehicle.receive_bytes())
+    assert len(frames) > 500
+    assert all(message.get_msgbuf()[2] & 1 for message in frames)
+    heartbeat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    vehicle.send(heartbeat)
+    assert vehicle.vehicle.links["onboard"].received == 0
+    client = Signing(link_id=9)
+    client.set_up(bytes(range(32)), 2_000_000)
+    assert vehicle.send_bytes(client.signed(bytes(heartbeat.pack(parser(1, 191))))) == 1
+    assert vehicle.vehicle.links["onboard"].received == 1
+
+
+def test_a_vehicle_without_links_refuses_faults_of_links() -> None:
+    vehicle = LockstepVehicle({})
+    with pytest.raises(FaultError, match="no links"):
+        vehicle.vehicle.faults.begin("link_delay 0.2")
+
+
+def client_reads(data: bytes) -> list[Any]:
+    return [message for message in parser().parse_buffer(data) if message.get_type() != "BAD_DATA"]

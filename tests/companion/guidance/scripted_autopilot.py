@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from kinematic_vehicle import KinematicVehicle
 
+from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Outcome, Situation
 from companion.guidance.envelope import Envelope
 from companion.guidance.pilot import Pilot, PilotEvent
@@ -30,6 +31,9 @@ class ScriptedAutopilot:
         self.linked = True
         self.failsafe = False
         self.position_alive = True
+        self.battery_fraction: float | None = 0.9
+        self.battery_alive = True
+        self._battery_ns = vehicle.now_ns
         self.takeoff_short_m = 0.0
         self.requests: list[str] = []
         self.setpoints: list[Setpoint] = []
@@ -59,6 +63,8 @@ class ScriptedAutopilot:
             armed=armed,
             mode=mode,
             failsafe=self.failsafe,
+            battery_fraction=self.battery_fraction,
+            battery_ns=self._battery_ns,
         )
 
     def subscribe(self, callback: Callable[[VehicleState], None]) -> Callable[[], None]:
@@ -135,6 +141,8 @@ class ScriptedAutopilot:
             self._heartbeat_ns = vehicle.now_ns
             if self.position_alive:
                 self._position_ns = vehicle.now_ns
+            if self.battery_alive:
+                self._battery_ns = vehicle.now_ns
         for callback in list(self._callbacks):
             callback(self.state)
 
@@ -150,7 +158,11 @@ class Cockpit:
     """The service's loop in lockstep: autopilot, streamer, guidance, 50 times a second of a turned clock."""
 
     def __init__(
-        self, vehicle: KinematicVehicle, lag_s: float = 0.0, class_names: tuple[str, ...] | None = None
+        self,
+        vehicle: KinematicVehicle,
+        lag_s: float = 0.0,
+        class_names: tuple[str, ...] | None = None,
+        battery: BatteryMinimum = NO_MINIMUM,
     ) -> None:
         self.autopilot = ScriptedAutopilot(vehicle, lag_s)
         self.events: list[PilotEvent] = []
@@ -161,6 +173,7 @@ class Cockpit:
             Envelope(),
             on_event=self.events.append,
             class_names=lambda: class_names,
+            battery=battery,
         )
         self.vehicle = vehicle
         self.streaming = True

@@ -136,6 +136,23 @@ async def test_a_dead_link_is_told_of_and_its_return_too(kind: str, caplog) -> N
             await state_shows(driver, lambda s: s.position_fresh(time.monotonic_ns()))
 
 
+async def test_late_telemetry_bears_the_time_when_it_was_true(
+    kind: str,
+) -> None:
+    with simulated(speed=1.0) as simulator:
+        async with connected(kind, simulator) as driver:
+            await ready(driver)
+            await wait_until(lambda: driver.state.clock is not None, 5.0)
+            clock = driver.state.clock
+            assert clock is not None
+            assert 0 < clock.error_ns < 50_000_000
+            late = []
+            driver.subscribe(lambda state: late.append(time.monotonic_ns() - state.position_ns))
+            simulator.fault("link_delay 0.3 way=out")
+            # By its arrival it would look fresh for ever.
+            await wait_until(lambda: bool(late) and late[-1] > 200_000_000, 5.0)
+
+
 async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_is_stale(kind: str) -> None:
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:

@@ -1,0 +1,320 @@
+"""What a vehicle tells the others of itself, as it goes over the bus: `companion/<vehicle>/pose`.
+
+Places are latitude, longitude and height above sea level, so that vehicles with local origins of their own
+fit together. Stamps are of the sender's clock, which no receiver knows; see `neighbours.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from companion.formation import SHAPES
+from companion.vehicle.state import LandedState, Vector3, VehicleState
+
+# GLOBAL_POSITION_INT comes 5 to 50 times a second.
+GLOBAL_MAX_AGE_S = 0.5
+ROLES = ("alone", "leader", "follower", "virtual")
+
+
+class PoseError(ValueError):
+    """What came is no pose. The message is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Plan:
+    """What is flown. Of two plans the greater holds: whoever commands anew counts one on."""
+
+    version: int
+    author: str
+    shape: str
+    spacing_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Where a virtual structure is on its path.
+
+    Attributes:
+        place: latitude and longitude, degrees, and height above sea level, metres.
+        velocity_ned_mps, heading_rad: of its leader that is not there.
+        origin: where the path's points are measured from, written as `place`.
+        along_m: how far along the path it has come.
+        over: it stands at the end of its path, and all vehicles are in their slots.
+    """
+
+    place: Vector3
+    velocity_ned_mps: Vector3
+    heading_rad: float
+    origin: Vector3
+    along_m: float
+    over: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FormationNote:
+    """How a vehicle flies in a formation.
+
+    Attributes:
+        leader: whom it follows. plan: what it takes for the plan.
+        wish: the slot its operator asked for, from 1; None: any.
+        error_m: how far it is from its slot.
+        slots: who flies in which slot, from 1, as this vehicle has assigned them; of several that have, the
+            one whose name comes first counts.
+        count: how many slots there are.
+        heading_rad, turn_rate_radps: of the formation, which turns slower than a leader can.
+        structure: of a virtual structure, where it is.
+    """
+
+    leader: str
+    plan: Plan
+    wish: int | None = None
+    error_m: float = 0.0
+    slots: tuple[tuple[str, int], ...] = ()
+    count: int = 0
+    heading_rad: float = 0.0
+    turn_rate_radps: float = 0.0
+    structure: Structure | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """One message.
+
+    Attributes:
+        vehicle: its name. source: changes when its service starts anew.
+        published_ns: by the sender's CLOCK_MONOTONIC. age_s: of the position, when it was published.
+        altitude_m: above sea level. heading_rad: clockwise from north.
+        turn_rate_radps: of the heading, clockwise.
+        role: alone, leader, follower or virtual (a leader that is not there).
+        airborne: it flies.
+    """
+
+    vehicle: str
+    source: str
+    published_ns: int
+    age_s: float
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    velocity_ned_mps: Vector3
+    heading_rad: float
+    turn_rate_radps: float
+    role: str = "alone"
+    airborne: bool = True
+    formation: FormationNote | None = None
+
+
+def global_problem(state: VehicleState, now_ns: int) -> str | None:
+    """Why the vehicle does not know where on earth it is; None: it does."""
+    if not state.position_fresh(now_ns) or state.velocity_ned_mps is None:
+        return "its own position is not known"
+    if not all(map(math.isfinite, (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m))):
+        return "its own latitude and longitude are not known"
+    age_s = (now_ns - state.global_ns) / 1e9
+    return f"its own latitude and longitude are {age_s:.1f} s old" if age_s > GLOBAL_MAX_AGE_S else None
+
+
+def pose_of(
+    state: VehicleState,
+    now_ns: int,
+    *,
+    vehicle: str,
+    source: str,
+    role: str = "alone",
+    formation: FormationNote | None = None,
+) -> Pose | None:
+    """What to tell of a vehicle now; None while it does not know where on earth it is."""
+    yaw_rad = state.yaw_rad
+    if global_problem(state, now_ns) is not None or yaw_rad is None or state.velocity_ned_mps is None:
+        return None
+    return Pose(
+        vehicle,
+        source,
+        now_ns,
+        max(0.0, (now_ns - state.global_ns) / 1e9),
+        state.latitude_deg,
+        state.longitude_deg,
+        state.altitude_amsl_m,
+        state.velocity_ned_mps,
+        yaw_rad,
+        turn_rate(state),
+        role,
+        state.armed and state.landed is not LandedState.ON_GROUND,
+        formation,
+    )
+
+
+def turn_rate(state: VehicleState) -> float:
+    """How fast the heading turns, rad/s clockwise: body rates through roll and pitch."""
+    if state.attitude is None or state.angular_velocity_frd_radps is None:
+        return 0.0
+    w, x, y, z = state.attitude
+    _, pitch_rate, yaw_rate = state.angular_velocity_frd_radps
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    # Upright within reason: straight up there is no heading to turn.
+    return (math.sin(roll) * pitch_rate + math.cos(roll) * yaw_rate) / max(0.2, math.cos(pitch))
+
+
+def pose_message(pose: Pose) -> dict[str, Any]:
+    """As it is published, JSON-able."""
+    return {
+        "vehicle": pose.vehicle,
+        "source": pose.source,
+        "published_ns": pose.published_ns,
+        "age_s": round(pose.age_s, 4),
+        "latitude_deg": round(pose.latitude_deg, 8),
+        "longitude_deg": round(pose.longitude_deg, 8),
+        "altitude_amsl_m": round(pose.altitude_m, 3),
+        "velocity_ned_mps": [round(value, 3) for value in pose.velocity_ned_mps],
+        "heading_rad": round(pose.heading_rad, 4),
+        "turn_rate_radps": round(pose.turn_rate_radps, 4),
+        "role": pose.role,
+        "airborne": pose.airborne,
+        "formation": None if pose.formation is None else _note_message(pose.formation),
+    }
+
+
+def _note_message(note: FormationNote) -> dict[str, Any]:
+    structure = note.structure
+    return {
+        "leader": note.leader,
+        "plan": {
+            "version": note.plan.version,
+            "author": note.plan.author,
+            "shape": note.plan.shape,
+            "spacing_m": note.plan.spacing_m,
+        },
+        "wish": note.wish,
+        "error_m": round(note.error_m, 2),
+        "slots": dict(note.slots),
+        "count": note.count,
+        "heading_rad": round(note.heading_rad, 4),
+        "turn_rate_radps": round(note.turn_rate_radps, 4),
+        "structure": None
+        if structure is None
+        else {
+            "place": [
+                round(structure.place[0], 8),
+                round(structure.place[1], 8),
+                round(structure.place[2], 3),
+            ],
+            "velocity_ned_mps": [round(value, 3) for value in structure.velocity_ned_mps],
+            "heading_rad": round(structure.heading_rad, 4),
+            "origin": list(structure.origin),
+            "along_m": round(structure.along_m, 2),
+            "over": structure.over,
+        },
+    }
+
+
+def pose_from_message(message: Any) -> Pose:
+    """What was published. Raises PoseError for what is none: it came off the network."""
+    fields = _Fields(message, "pose")
+    role = fields.text("role")
+    if role not in ROLES:
+        raise PoseError(f"pose: role must be one of {', '.join(ROLES)}, got {role!r}")
+    formation = fields.value("formation")
+    return Pose(
+        fields.text("vehicle"),
+        fields.text("source"),
+        fields.whole("published_ns", 0),
+        fields.number("age_s", 0.0, 60.0),
+        fields.number("latitude_deg", -90.0, 90.0),
+        fields.number("longitude_deg", -180.0, 180.0),
+        fields.number("altitude_amsl_m", -1000.0, 100_000.0),
+        fields.vector("velocity_ned_mps", 200.0),
+        fields.number("heading_rad", -10.0, 10.0),
+        fields.number("turn_rate_radps", -50.0, 50.0),
+        role,
+        fields.value("airborne") is True,
+        None if formation is None else _note_from(formation),
+    )
+
+
+def _note_from(message: Any) -> FormationNote:
+    fields = _Fields(message, "pose.formation")
+    plan = _Fields(fields.value("plan"), "pose.formation.plan")
+    shape = plan.text("shape")
+    if shape not in SHAPES:
+        raise PoseError(f"pose.formation.plan: shape must be one of {', '.join(SHAPES)}, got {shape!r}")
+    slots = _Fields(fields.value("slots"), "pose.formation.slots")
+    wish, structure = fields.value("wish"), fields.value("structure")
+    return FormationNote(
+        fields.text("leader"),
+        Plan(plan.whole("version", 0), plan.text("author"), shape, plan.number("spacing_m", 0.1, 1000.0)),
+        None if wish is None else fields.whole("wish", 1),
+        fields.number("error_m", 0.0, 1e6),
+        tuple((name, slots.whole(name, 1)) for name in slots.names),
+        fields.whole("count", 0),
+        fields.number("heading_rad", -10.0, 10.0),
+        fields.number("turn_rate_radps", -50.0, 50.0),
+        None if structure is None else _structure_from(structure),
+    )
+
+
+def _structure_from(message: Any) -> Structure:
+    fields = _Fields(message, "pose.formation.structure")
+    return Structure(
+        fields.place("place"),
+        fields.vector("velocity_ned_mps", 200.0),
+        fields.number("heading_rad", -10.0, 10.0),
+        fields.place("origin"),
+        fields.number("along_m", 0.0, 1e9),
+        fields.value("over") is True,
+    )
+
+
+class _Fields:
+    """An object's fields, each checked as it is read."""
+
+    def __init__(self, message: Any, what: str) -> None:
+        if not isinstance(message, Mapping):
+            raise PoseError(f"{what} must be an object, got {type(message).__name__}")
+        self._message, self._what = message, what
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._message)
+
+    def value(self, key: str) -> Any:
+        if key not in self._message:
+            raise PoseError(f"{self._what}: {key} is missing")
+        return self._message[key]
+
+    def text(self, key: str) -> str:
+        value = self.value(key)
+        if not isinstance(value, str) or not 1 <= len(value) <= 100:
+            raise PoseError(f"{self._what}: {key} must be a text of 1 to 100 characters, got {value!r:.50}")
+        return value
+
+    def number(self, key: str, low: float, high: float) -> float:
+        return self._checked(key, self.value(key), low, high)
+
+    def whole(self, key: str, low: int) -> int:
+        value = self.value(key)
+        # As large as a nanosecond stamp may be in 64 bits.
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**63:
+            raise PoseError(f"{self._what}: {key} must be a whole number from {low}, got {value!r:.50}")
+        return value
+
+    def vector(self, key: str, limit: float) -> Vector3:
+        return self._three(key, ((-limit, limit),) * 3)
+
+    def place(self, key: str) -> Vector3:
+        return self._three(key, ((-90.0, 90.0), (-180.0, 180.0), (-1000.0, 100_000.0)))
+
+    def _three(self, key: str, ranges: tuple[tuple[float, float], ...]) -> Vector3:
+        value = self.value(key)
+        if not isinstance(value, list | tuple) or len(value) != 3:
+            raise PoseError(f"{self._what}: {key} must be three numbers, got {value!r:.50}")
+        x, y, z = (self._checked(key, part, *limits) for part, limits in zip(value, ranges, strict=True))
+        return (x, y, z)
+
+    def _checked(self, key: str, value: Any, low: float, high: float) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise PoseError(f"{self._what}: {key} must be {low:g} to {high:g}, got {value!r:.50}")
+        return float(value)

@@ -1,0 +1,71 @@
+"""LANDING_TARGET (MAVLink common, 149): where a target to land on is, as each autopilot takes it.
+
+PX4 takes a place in MAV_FRAME_LOCAL_NED with `position_valid`; angles it takes for an infrared beacon's, and
+any other frame it refuses. ArduPilot takes a vector in MAV_FRAME_BODY_FRD with `position_valid` and
+`distance`; releases that know no vector go by the two angles: `angle_x` to the right, `angle_y` to the back
+of straight down. Both are about the body as it was when the picture was taken.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from companion.vehicle.state import Vector3
+
+AUTOPILOT_ARDUPILOT = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
+FRAME_LOCAL_NED, FRAME_BODY_FRD = 1, 12  # MAV_FRAME
+TYPE_VISION_FIDUCIAL = 2  # LANDING_TARGET_TYPE
+LARGEST_NUMBER = 255
+
+
+@dataclass(frozen=True, slots=True)
+class LandingTarget:
+    """A target to land on, as one picture showed it.
+
+    Attributes:
+        captured_ns: CLOCK_MONOTONIC of the picture.
+        identifier: of the marker.
+        position_ned_m: of its centre, local NED.
+        offset_frd_m: from the autopilot to its centre, in the body frame of that moment.
+        size_m: side of the marker.
+    """
+
+    captured_ns: int
+    identifier: int
+    position_ned_m: Vector3
+    offset_frd_m: Vector3
+    size_m: float
+
+    def __post_init__(self) -> None:
+        values = (*self.position_ned_m, *self.offset_frd_m, self.size_m)
+        if not all(math.isfinite(value) for value in values):
+            raise ValueError(f"every value of a landing target must be finite, got {values}")
+
+
+def landing_target_fields(target: LandingTarget, autopilot: int) -> dict[str, int | float | list[float]]:
+    """The message's fields for an autopilot (MAV_AUTOPILOT); any but ArduPilot is told what PX4 takes."""
+    forward, right, down = target.offset_frd_m
+    distance_m = math.hypot(forward, right, down)
+    fields: dict[str, int | float | list[float]] = {
+        "time_usec": target.captured_ns // 1000,
+        "target_num": min(target.identifier, LARGEST_NUMBER),
+        "frame": FRAME_LOCAL_NED,
+        "angle_x": 0.0,
+        "angle_y": 0.0,
+        "distance": distance_m,
+        "size_x": 0.0,
+        "size_y": 0.0,
+        "q": [1.0, 0.0, 0.0, 0.0],
+        "type": TYPE_VISION_FIDUCIAL,
+        "position_valid": 1,
+    }
+    place = target.position_ned_m
+    if autopilot == AUTOPILOT_ARDUPILOT:
+        place = target.offset_frd_m
+        fields["frame"] = FRAME_BODY_FRD
+    if down > 0.0:
+        fields["angle_x"], fields["angle_y"] = math.atan2(right, down), math.atan2(-forward, down)
+        fields["size_x"] = fields["size_y"] = 2 * math.atan2(target.size_m / 2, distance_m)
+    fields["x"], fields["y"], fields["z"] = place
+    return fields

@@ -1,0 +1,221 @@
+"""Vehicles that fly in formation, each with its own companion, over a network that loses every tenth pose."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.bench_formation import Fleet, PointAirframe
+from companion.guidance.envelope import Limits
+from companion.guidance.figure_eight import FigureEightBehaviour
+from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.formation import FormationBehaviour
+from companion.guidance.goto import GotoBehaviour
+from companion.guidance.hold import HoldBehaviour
+
+GRID = [(0.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 6.0), (-12.0, 0.0), (-12.0, -6.0), (-12.0, 6.0)]
+
+
+def flying(count, seed=1, places=GRID):
+    """Vehicles a, b, c … hovering, every one known to all others."""
+    fleet = Fleet(seed)
+    for index in range(count):
+        name = chr(ord("a") + index)
+        fleet.add(
+            name, PointAirframe(seed * 100 + index, places[index], 6.0, 10**9 + seed * 10**12 * (index + 1))
+        )
+    fleet.run(1.0)
+    return fleet
+
+
+def follow(fleet, names, shape="wedge", **options):
+    for name in names:
+        assert fleet.command(name, FormationBehaviour(shape, "a", **options)) is None
+
+
+def settled(fleet, names, within_m=0.8):
+    errors = fleet.slot_errors()
+    return set(names) <= set(errors) and max(errors[name] for name in names) < within_m
+
+
+def apart(fleet):
+    return fleet.least_m >= Limits().min_separation_m
+
+
+def slots(fleet, name):
+    return dict(fleet.members[name].behaviour.note.slots)
+
+
+@pytest.mark.parametrize("shape", ["line", "column", "wedge", "circle"])
+def test_followers_take_their_slots_and_keep_them_through_turns(shape):
+    fleet = flying(4)
+    follow(fleet, "bcd", shape)
+    assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
+    fleet.command("a", FollowPathBehaviour(((15.0, 0.0), (15.0, 15.0), (30.0, 15.0)), 2.0))
+    worst = []
+    fleet.run(25.0, lambda: worst.append(max(fleet.slot_errors().values())))
+    assert fleet.run_until(lambda: fleet.members["a"].outcome is not None and settled(fleet, "bcd"), 30.0)
+    assert max(worst) < 3.0
+    assert apart(fleet)
+    # All agree on who assigned what: the one whose name comes first.
+    assert sorted(slots(fleet, "b").values()) == [1, 2, 3]
+    assert not slots(fleet, "c")
+
+
+def test_one_that_joins_gets_a_slot_and_nobody_comes_near_anybody():
+    fleet = flying(5)
+    follow(fleet, "bc", "line")
+    assert fleet.run_until(lambda: settled(fleet, "bc"), 30.0)
+    follow(fleet, "de", "line")
+    assert fleet.run_until(lambda: settled(fleet, "bcde"), 40.0)
+    assert sorted(slots(fleet, "b").values()) == [1, 2, 3, 4]
+    assert apart(fleet)
+
+
+def test_the_slot_of_a_silent_vehicle_stays_free_for_a_while_and_then_they_close_up():
+    fleet = flying(4)
+    follow(fleet, "bcd", "column")
+    assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
+    first = min(slots(fleet, "b"), key=slots(fleet, "b").get)
+    assert first in "bcd"
+    silent = next(name for name in "cd" if slots(fleet, "b")[name] < 3) if first == "b" else first
+    others = [name for name in "bcd" if name != silent]
+    fleet.members[silent].muted = True
+    fleet.run(3.0)
+    told = slots(fleet, others[0]) or slots(fleet, others[1])
+    assert silent in told
+    # It goes out of the way, and is an obstacle where it was last heard.
+    fleet.run(4.0)
+    told = slots(fleet, others[0]) or slots(fleet, others[1])
+    assert silent not in told
+    assert sorted(told.values()) == [1, 2]
+    assert apart(fleet)
+    assert all(fleet.members[name].outcome is None for name in others)
+
+
+def test_one_that_leaves_by_command_is_out_at_once_and_the_others_close_up():
+    fleet = flying(4)
+    follow(fleet, "bcd", "line")
+    assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
+    leaving = next(name for name, slot in slots(fleet, "b").items() if slot == 1)
+    rest = [name for name in "bcd" if name != leaving]
+    assert fleet.command(leaving, GotoBehaviour(from_home_m=(-20.0, 30.0))) is None
+    assert fleet.run_until(lambda: fleet.members[leaving].outcome is not None and settled(fleet, rest), 40.0)
+    assert apart(fleet)
+
+
+def test_without_their_leader_followers_brake_and_hold_and_go_on_when_it_is_back():
+    fleet = flying(3)
+    follow(fleet, "bc", lost_timeout_s=6.0)
+    assert fleet.run_until(lambda: settled(fleet, "bc"), 30.0)
+    fleet.command("a", FollowPathBehaviour(((80.0, 0.0),), 2.0))
+    fleet.run(6.0)
+    fleet.members["a"].muted = True
+    fleet.run(3.5)
+    for name in "bc":
+        member = fleet.members[name]
+        assert math.hypot(*member.airframe.state().velocity_ned_mps) < 0.5
+        assert "a, the leader, is not heard" in member.behaviour.status
+    fleet.members["a"].muted = False
+    assert fleet.run_until(lambda: settled(fleet, "bc", 1.2), 40.0)
+    fleet.members["a"].muted = True
+    fleet.run(8.5)
+    for name in "bc":
+        assert fleet.members[name].outcome.reason == "a, the leader, is not heard; waited for 6 s"
+        assert not fleet.members[name].outcome.success
+    assert apart(fleet)
+
+
+def test_when_the_one_who_assigns_is_lost_the_next_does_and_slots_stay():
+    fleet = flying(4)
+    follow(fleet, "bcd", "wedge")
+    assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
+    before = slots(fleet, "b")
+    fleet.members["b"].muted = True
+    fleet.run(3.0)
+    assert slots(fleet, "c") == before
+
+
+def test_a_command_to_one_changes_the_shape_for_all():
+    fleet = flying(4)
+    follow(fleet, "bcd", "wedge")
+    assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
+    follow(fleet, "d", "line", spacing_m=6.0)
+    fleet.run(1.0)
+    assert fleet.run_until(lambda: settled(fleet, "bcd"), 40.0)
+    for name in "bcd":
+        assert "line" in fleet.members[name].behaviour.status
+    assert apart(fleet)
+
+
+def test_a_slot_that_was_asked_for_is_given_once():
+    fleet = flying(4)
+    follow(fleet, "b", "line", slot=3)
+    follow(fleet, "c", "line")
+    assert fleet.run_until(lambda: settled(fleet, "bc"), 30.0)
+    assert slots(fleet, "b") == {"b": 3, "c": 1}
+    follow(fleet, "d", "line", slot=3)
+    fleet.run(2.0)
+    assert fleet.members["d"].outcome.reason == "slot 3 is b's: choose another, or slot=auto"
+
+
+def test_two_cannot_follow_each_other_nor_one_itself_nor_anybody_not_heard():
+    fleet = flying(2)
+    assert fleet.command("b", FormationBehaviour("line", "a")) is None
+    fleet.run(1.0)
+    assert fleet.command("a", FormationBehaviour("line", "b")) is None
+    fleet.run(1.0)
+    reasons = [member.outcome.reason for member in fleet.members.values() if member.outcome is not None]
+    assert any("two cannot follow each other" in reason for reason in reasons)
+    assert "another leader than itself" in fleet.command("a", FormationBehaviour("line", "a"))
+    assert "the pose of zeus (none came; heard are b)" in fleet.command(
+        "a", FormationBehaviour("line", "zeus")
+    )
+
+
+def test_a_virtual_structure_flies_its_path_waits_and_all_end_together():
+    fleet = flying(3)
+    points = ((0.0, 0.0), (20.0, 0.0), (20.0, 12.0, 8.0))
+    for name in "abc":
+        assert (
+            fleet.command(name, FormationBehaviour("line", "virtual", points=points, speed_mps=2.5)) is None
+        )
+    members = fleet.members.values()
+    assert fleet.run_until(lambda: all(member.outcome is not None for member in members), 90.0)
+    assert {member.outcome.reason for member in members} == {"the structure has flown its path"}
+    assert apart(fleet)
+    centre = [sum(member.airframe.place()[axis] for member in members) / 3 for axis in range(3)]
+    # Three abreast with one in the middle: their centre is the structure's.
+    assert centre == pytest.approx([20.0, 12.0, -8.0], abs=0.8)
+
+
+def test_when_the_one_who_moves_the_structure_falls_silent_the_next_goes_on():
+    fleet = flying(3)
+    points = ((0.0, 0.0), (40.0, 0.0))
+    for name in "abc":
+        fleet.command(name, FormationBehaviour("line", "virtual", points=points))
+    fleet.run(14.0)
+    fleet.members["a"].muted = fleet.members["a"].deaf = True
+    assert fleet.run_until(lambda: all(fleet.members[name].outcome for name in "bc"), 90.0)
+    assert all(fleet.members[name].outcome.success for name in "bc")
+    norths = [fleet.members[name].airframe.place()[0] for name in "bc"]
+    assert norths == pytest.approx([40.0, 40.0], abs=1.5)
+
+
+def test_a_vehicle_that_hovers_in_the_way_is_flown_around():
+    fleet = flying(3, places=[(0.0, 0.0), (0.0, -30.0), (0.0, -15.0)])
+    assert fleet.command("b", FormationBehaviour("line", "a", slot=2)) is None
+    assert isinstance(fleet.members["c"].behaviour, HoldBehaviour)
+    assert fleet.run_until(lambda: settled(fleet, "b"), 40.0)
+    assert apart(fleet)
+
+
+def test_a_figure_of_eight_in_a_circle_of_six_keeps_them_apart():
+    fleet = flying(7)
+    follow(fleet, "bcdefg", "circle")
+    fleet.run(15.0)
+    fleet.command("a", FigureEightBehaviour(12.0, 2.0, 1.0))
+    fleet.run(30.0)
+    assert apart(fleet)
+    assert all(fleet.members[name].outcome is None for name in "bcdefg")

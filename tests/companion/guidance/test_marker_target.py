@@ -1,0 +1,137 @@
+"""Markers become places in local NED, whatever the vehicle's attitude was."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.guidance.marker_target import MarkerSight, looks_down, marker_targets
+from companion.guidance.pad_filter import PadFilter
+from companion.guidance.targets import HistoryError, StateHistory
+from companion.vehicle.state import VehicleState
+from vision.camera_model import CameraModel, CameraMount
+from vision.markers import PadMarker, marker_from_corners, square
+from vision.rotation import matrix_from_quaternion, quaternion_from_euler, wrap_angle
+
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(75.0))
+DOWNWARD = CameraMount(forward_m=0.1, right_m=-0.05, down_m=0.08, pitch_rad=-math.pi / 2)
+
+
+def seen(position, roll, pitch, yaw, centre, heading, *, identifier=7, size_m=0.6, on_pads=None, noise=None):
+    """What a camera looking down makes of a marker lying at `centre` (north, east) on the ground."""
+    attitude = quaternion_from_euler(roll, pitch, yaw)
+    history = StateHistory()
+    history.add(
+        VehicleState(
+            attitude_ns=1000, position_ns=1000, attitude=attitude, position_ned_m=position,
+            home_position_ned_m=(0.0, 0.0, 0.0), velocity_ned_mps=(0.0, 0.0, 0.0),
+        )
+    )  # fmt: skip
+    ned_from_body = matrix_from_quaternion(attitude)
+    eye = np.array(position) + ned_from_body @ DOWNWARD.position_frd_m
+    cosine, sine = math.cos(heading), math.sin(heading)
+    ned_from_marker = np.array([[-sine, cosine, 0.0], [cosine, sine, 0.0], [0.0, 0.0, -1.0]])
+    corners = square(size_m) @ ned_from_marker.T + (*centre, 0.0)
+    pixels = CAMERA.project((corners - eye) @ (ned_from_body @ DOWNWARD.body_from_optical))
+    marker = marker_from_corners(identifier, pixels + (0.0 if noise is None else noise), size_m, CAMERA)
+    assert marker is not None
+    return marker_targets([marker], 1000, DOWNWARD, history, on_pads or {})[0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3), yaw=st.floats(-3.0, 3.0),
+    north=st.floats(-1.0, 1.0), east=st.floats(-1.0, 1.0), height=st.floats(2.0, 9.0),
+    heading=st.floats(-3.0, 3.0),
+)  # fmt: skip
+def test_a_banking_vehicle_does_not_swing_its_marker(roll, pitch, yaw, north, east, height, heading):
+    position = (12.0, -7.0, -height)
+    target = seen(position, roll, pitch, yaw, (12.0 + north, -7.0 + east), heading)
+    assert target.position_ned_m == pytest.approx((12.0 + north, -7.0 + east, 0.0), abs=0.02)
+    assert target.pad_ned_m == target.position_ned_m
+    assert target.range_m == pytest.approx(math.hypot(north, east), abs=0.02)
+    assert abs(wrap_angle(target.heading_rad - heading)) < 0.05
+    body = matrix_from_quaternion(quaternion_from_euler(roll, pitch, yaw)).T @ (north, east, height)
+    assert target.pad_offset_frd_m == pytest.approx(tuple(body), abs=0.03)
+
+
+@settings(max_examples=30, deadline=None)
+@given(heading=st.floats(-3.1, 3.1), seed=st.integers(0, 1000))
+def test_a_marker_beside_the_centre_tells_where_its_pad_is_in_spite_of_noise(heading, seed):
+    """The small one is seen nearly face on, where its turning is ambiguous."""
+    right, up = 0.3, 0.58
+    cosine, sine = math.cos(heading), math.sin(heading)
+    centre = (up * cosine - right * sine, up * sine + right * cosine)
+    noise = np.random.default_rng(seed).normal(0.0, 0.3, (4, 2))
+    on_pads = {21: PadMarker(21, 7, right, up)}
+    target = seen(
+        (0.0, 0.0, -2.0), 0.05, -0.1, 0.4, centre, heading,
+        identifier=21, size_m=0.2, on_pads=on_pads, noise=noise,
+    )  # fmt: skip
+    assert target.pad == 7
+    assert target.pad_ned_m[:2] == pytest.approx((0.0, 0.0), abs=0.06)
+
+
+def test_without_the_pose_of_that_moment_there_is_no_place():
+    marker = marker_from_corners(1, CAMERA.project(square(0.5) * (1, -1, 1) + (0, 0, 3.0)), 0.5, CAMERA)
+    with pytest.raises(HistoryError, match="no attitude"):
+        marker_targets([marker], 1000, DOWNWARD, StateHistory(), {})
+    assert marker_targets([], 1000, DOWNWARD, StateHistory(), {}) == ()
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "down"), [(-90, True), (-75, True), (-60, False), (-20, False), (0, False)]
+)
+def test_only_a_camera_with_the_ground_below_in_its_picture_looks_down(pitch_deg, down):
+    assert looks_down(CAMERA, CameraMount(pitch_rad=math.radians(pitch_deg))) is down
+
+
+def test_what_is_missing_is_named():
+    assert MarkerSight().unavailable(1.5) == (
+        "perception that looks for markers (markers.dictionary is not set)"
+    )
+    assert "nothing came from it yet" in MarkerSight(missing="").unavailable(1.5)
+    assert "is 2.0 s old" in MarkerSight((), 1, 2.0, False, "").unavailable(1.5)
+    assert MarkerSight((), 1, 0.1, True, "").unavailable(1.5) is None
+
+
+def sighting(north, stamp_s, distance=3.0):
+    target = seen((0.0, 0.0, -distance), 0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
+    place = (north, 0.0, 0.0)
+    from dataclasses import replace
+
+    return replace(target, captured_ns=round(stamp_s * 1e9), pad_ned_m=place, distance_m=distance)
+
+
+def test_a_single_wrong_sighting_does_not_move_the_pad_and_many_do():
+    pad = PadFilter(sighting(1.0, 1.0), moving=False)
+    for step in range(10):
+        assert pad.add(sighting(1.0, 1.1 + step * 0.05))
+    assert not pad.add(sighting(3.0, 1.7))
+    assert pad.at(2_000_000_000)[0] == pytest.approx(1.0, abs=0.01)
+    believed = [pad.add(sighting(3.0, 1.75 + step * 0.05)) for step in range(8)]
+    assert believed[-1]
+    assert pad.at(3_000_000_000)[0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_moving_pad_is_where_it_will_be_and_a_still_one_where_it_was():
+    rng = np.random.default_rng(4)
+    for moving in (True, False):
+        pad = PadFilter(sighting(0.0, 1.0), moving=moving)
+        for step in range(1, 80):
+            pad.add(sighting(0.5 * step * 0.05 + rng.normal(0.0, 0.03), 1.0 + step * 0.05))
+        if moving:
+            assert pad.velocity_mps[0] == pytest.approx(0.5, abs=0.12)
+            assert pad.at(round(5.45e9))[0] == pytest.approx(0.5 * 4.45, abs=0.15)
+        else:
+            assert pad.velocity_mps == (0.0, 0.0)
+
+
+def test_old_sightings_are_passed_over():
+    pad = PadFilter(sighting(1.0, 1.0), moving=False)
+    assert not pad.add(sighting(5.0, 0.9))
+    assert pad.count == 1

@@ -1,0 +1,146 @@
+"""How old a pose is, where its vehicle is now, and who counts as there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_pose import NOW_NS, STATE
+
+from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.neighbours import Anchor, Neighbours, missing_neighbours
+from companion.guidance.pose import Pose
+from companion.guidance.refusal import refusal
+
+SECOND = 10**9
+PLACE = Anchor(47.4, 8.5, 493.0, (0.0, 0.0, 0.0))
+
+
+def pose(published_ns, name="alpha", offset=(10.0, 0.0, 0.0), source="a", **more):
+    latitude, longitude, altitude = PLACE.globally(offset)
+    return Pose(
+        name, source, published_ns, 0.0, latitude, longitude, altitude, (2.0, 0.0, 0.0), 0.5, 0.1, **more
+    )
+
+
+def state_at(now_ns):
+    return replace(
+        STATE,
+        heartbeat_ns=now_ns,
+        attitude_ns=now_ns,
+        position_ns=now_ns,
+        global_ns=now_ns,
+        velocity_ned_mps=(0.0, 0.0, 0.0),
+    )
+
+
+@given(
+    st.floats(-80, 80), st.floats(-180, 180), st.tuples(*[st.floats(-3000, 3000)] * 2, st.floats(-100, 100))
+)
+def test_a_place_goes_round_the_globe_and_back(latitude, longitude, place):
+    anchor = Anchor(latitude, longitude, 100.0, (3.0, -4.0, 5.0))
+    assert anchor.local(*anchor.globally(place)) == pytest.approx(place, abs=0.01)
+
+
+def test_local_origins_that_differ_do_not_matter():
+    neighbours = Neighbours("beta", "b")
+    neighbours.hear(pose(0), NOW_NS)
+    # The own local origin is somewhere else: here stands at (1, 2, -5) of it.
+    alpha = neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha")
+    assert alpha.position_ned_m == pytest.approx((11.0, 2.0, -5.0), abs=0.02)
+
+
+def test_the_age_counts_a_delay_though_the_clocks_differ_by_hours():
+    neighbours, apart_ns = Neighbours("beta", "b"), 7_000 * SECOND
+    delays_s = [0.1, 0.03, 0.25]
+    for index, delay_s in enumerate(delays_s):
+        sent_ns = index * SECOND // 10
+        neighbours.hear(pose(sent_ns), NOW_NS + sent_ns + apart_ns + round(delay_s * 1e9))
+    now_ns = NOW_NS + apart_ns + 2 * SECOND // 10 + round(0.3e9)
+    # The last was sent 0.3 s ago; what is not known is the least delay of all.
+    assert neighbours.ages_s(now_ns)["alpha"] == pytest.approx(0.3 - 0.03, abs=0.002)
+
+
+def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_ever():
+    neighbours = Neighbours("beta", "b")
+    neighbours.hear(pose(0), NOW_NS)
+    for after_s, north, silent in ((0.5, 12.0, False), (3.0, 13.0, True)):
+        now_ns = NOW_NS + round(after_s * 1e9)
+        alpha = neighbours.around(state_at(now_ns), now_ns).named("alpha")
+        assert alpha.position_ned_m[0] == pytest.approx(north, abs=0.02)
+        assert alpha.silent is silent
+        assert alpha.velocity_ned_mps == ((0.0, 0.0, 0.0) if silent else (2.0, 0.0, 0.0))
+        assert alpha.heading_rad == pytest.approx(0.5 + 0.1 * min(after_s, 1.0))
+
+
+def test_who_is_silent_for_half_a_minute_is_forgotten():
+    neighbours = Neighbours("beta", "b")
+    neighbours.hear(pose(0), NOW_NS)
+    assert neighbours.around(state_at(NOW_NS + 29 * SECOND), NOW_NS + 29 * SECOND).vehicles
+    assert not neighbours.around(state_at(NOW_NS + 31 * SECOND), NOW_NS + 31 * SECOND).vehicles
+
+
+def test_what_comes_late_does_not_replace_what_is_newer():
+    neighbours = Neighbours("beta", "b")
+    neighbours.hear(pose(2 * SECOND), NOW_NS)
+    neighbours.hear(pose(1 * SECOND, offset=(50.0, 0.0, 0.0)), NOW_NS + 1)
+    assert neighbours.refused == 1
+    assert neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha").position_ned_m[0] < 12.0
+    # A service that has started anew has a clock of its own.
+    neighbours.hear(pose(5, offset=(50.0, 0.0, 0.0), source="anew"), NOW_NS + 2)
+    assert neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha").position_ned_m[0] > 50.0
+
+
+def test_the_own_message_is_nobody_and_a_namesake_is_somebody_else():
+    neighbours = Neighbours("beta", "b")
+    neighbours.hear(pose(1, "beta", source="b"), NOW_NS)
+    assert not neighbours.around(state_at(NOW_NS), NOW_NS).vehicles
+    neighbours.hear(pose(1, "beta", source="other"), NOW_NS)
+    around = neighbours.around(state_at(NOW_NS), NOW_NS)
+    assert [vehicle.name for vehicle in around.vehicles] == ["beta (other)"]
+    assert neighbours.namesakes == {"other"}
+    assert around.named("beta") is None
+
+
+def test_without_an_own_place_nobody_can_be_placed():
+    neighbours = Neighbours("beta", "b")
+    neighbours.hear(pose(1), NOW_NS)
+    around = neighbours.around(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
+    assert around.vehicles == ()
+    assert "latitude and longitude" in around.problem
+
+
+class Needy(Behaviour):
+    name = "needy"
+    requirements = frozenset({Requirement.NEIGHBOURS})
+    neighbour_names = ("alpha",)
+
+    def update(self, dt_s, situation):
+        raise NotImplementedError
+
+
+def test_a_behaviour_that_needs_a_neighbour_is_refused_with_its_name():
+    neighbours = Neighbours("beta", "b")
+
+    def words(now_ns):
+        state = state_at(now_ns)
+        return refusal(
+            Needy(), Situation(now_ns, state, neighbourhood=neighbours.around(state, now_ns)), None
+        )
+
+    assert words(NOW_NS) == "needy needs the pose of alpha (none came; nobody is heard)"
+    neighbours.hear(pose(1, "gamma"), NOW_NS)
+    assert words(NOW_NS) == "needy needs the pose of alpha (none came; heard are gamma)"
+    neighbours.hear(pose(1), NOW_NS)
+    assert words(NOW_NS) is None
+    assert words(NOW_NS + 2 * SECOND) == "needy needs the pose of alpha (it is 2.0 s old)"
+    assert missing_neighbours(None, ()) == ["neighbours (this service does not share poses)"]
+    lost = neighbours.around(replace(state_at(NOW_NS), global_ns=0), NOW_NS)
+    assert "s old" in missing_neighbours(lost, ())[0]
+    assert (
+        "another leader than itself"
+        in missing_neighbours(neighbours.around(state_at(NOW_NS), NOW_NS), ("beta",))[0]
+    )

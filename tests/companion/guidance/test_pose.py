@@ -1,0 +1,140 @@
+"""What vehicles tell each other of themselves, and what becomes of what is no pose."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.guidance.pose import (
+    FormationNote,
+    Plan,
+    Pose,
+    PoseError,
+    Structure,
+    pose_from_message,
+    pose_message,
+    pose_of,
+)
+from companion.vehicle.state import LandedState, VehicleState
+from vision.rotation import quaternion_from_euler
+
+STRUCTURE = Structure((47.4, 8.5, 490.0), (1.0, 0.0, 0.0), 0.1, (47.39, 8.5, 480.0), 12.25, True)
+NOTE = FormationNote(
+    "alpha", Plan(3, "beta", "wedge", 5.0), 2, 0.25, (("beta", 1), ("gamma", 2)), 2, 0.5, -0.1, STRUCTURE
+)
+POSE = Pose("beta", "ab12", 5_000, 0.02, 47.4, 8.5, 491.0, (1.0, -2.0, 0.5), 1.5, 0.2, "follower", True, NOTE)
+NOW_NS = 10**12
+STATE = VehicleState(
+    heartbeat_ns=NOW_NS,
+    attitude_ns=NOW_NS,
+    position_ns=NOW_NS,
+    global_ns=NOW_NS - 20_000_000,
+    armed=True,
+    landed=LandedState.IN_AIR,
+    position_ned_m=(1.0, 2.0, -5.0),
+    velocity_ned_mps=(1.0, 0.0, 0.0),
+    attitude=quaternion_from_euler(0.0, 0.0, 0.7),
+    angular_velocity_frd_radps=(0.0, 0.0, 0.3),
+    latitude_deg=47.4,
+    longitude_deg=8.5,
+    altitude_amsl_m=493.0,
+)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [POSE, replace(POSE, formation=None), replace(POSE, formation=replace(NOTE, wish=None, structure=None))],
+)
+def test_a_pose_comes_back_from_its_message_as_it_was(pose):
+    assert pose_from_message(json.loads(json.dumps(pose_message(pose)))) == pose
+
+
+def test_a_vehicle_tells_where_it_is_and_how_old_that_is():
+    pose = pose_of(STATE, NOW_NS, vehicle="beta", source="s")
+    assert pose is not None
+    assert (pose.age_s, pose.latitude_deg, pose.altitude_m) == (0.02, 47.4, 493.0)
+    assert pose.heading_rad == pytest.approx(0.7)
+    assert pose.turn_rate_radps == pytest.approx(0.3)
+    assert pose.airborne
+    assert not pose_of(replace(STATE, armed=False), NOW_NS, vehicle="b", source="s").airborne
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        replace(STATE, latitude_deg=math.nan),
+        replace(STATE, global_ns=NOW_NS - 10**9),
+        replace(STATE, position_ns=NOW_NS - 10**9),
+        replace(STATE, velocity_ned_mps=None),
+    ],
+)
+def test_a_vehicle_that_does_not_know_its_place_tells_nothing(state):
+    assert pose_of(state, NOW_NS, vehicle="beta", source="s") is None
+
+
+def test_the_heading_turns_by_the_body_rates_through_roll():
+    banked = replace(
+        STATE,
+        attitude=quaternion_from_euler(math.pi / 6, 0.0, 0.7),
+        angular_velocity_frd_radps=(0.0, 0.5 * math.sin(math.pi / 6), 0.5 * math.cos(math.pi / 6)),
+    )
+    assert pose_of(banked, NOW_NS, vehicle="b", source="s").turn_rate_radps == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("latitude_deg",), 91.0, "latitude_deg must be -90 to 90"),
+        (("latitude_deg",), math.nan, "latitude_deg must be"),
+        (("velocity_ned_mps",), [1.0, 2.0], "three numbers"),
+        (("velocity_ned_mps",), [1.0, 2.0, "x"], "velocity_ned_mps must be"),
+        (("published_ns",), True, "whole number"),
+        (("published_ns",), 2**70, "whole number"),
+        (("role",), "king", "role must be one of"),
+        (("vehicle",), "", "1 to 100 characters"),
+        (("formation", "plan", "shape"), "star", "shape must be one of"),
+        (("formation", "plan", "spacing_m"), 0.0, "spacing_m must be"),
+        (("formation", "slots"), {"beta": 0}, "beta must be a whole number from 1"),
+        (("formation", "slots"), [1], "must be an object"),
+        (("formation", "structure", "origin"), [0.0, 0.0, 1e9], "origin must be"),
+    ],
+)
+def test_a_message_that_is_no_pose_is_refused_by_name(path, value, words):
+    message = json.loads(json.dumps(pose_message(POSE)))
+    inner = message
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(PoseError, match=words):
+        pose_from_message(message)
+
+
+@pytest.mark.parametrize("key", list(pose_message(POSE)))
+def test_a_message_without_one_of_its_fields_is_refused(key):
+    message = pose_message(POSE)
+    del message[key]
+    with pytest.raises(PoseError, match=f"{key} is missing"):
+        pose_from_message(message)
+
+
+json_value = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(st.sampled_from(sorted(pose_message(POSE))), json_value)
+def test_whatever_stands_in_a_field_it_is_a_pose_or_refused(key, value):
+    message = pose_message(POSE)
+    message[key] = value
+    try:
+        pose = pose_from_message(message)
+    except PoseError:
+        return
+    assert math.isfinite(sum(pose.velocity_ned_mps) + pose.latitude_deg + pose.heading_rad)

@@ -1,0 +1,148 @@
+"""How near vehicles may be flown to each other."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kinematic_vehicle import KinematicVehicle
+
+from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.neighbours import Neighbour
+from companion.guidance.separation import Row, allowed_speed, apart, around, level_rows, pushed_apart, rows_at
+from companion.vehicle.setpoint import Setpoint
+
+speeds = st.floats(-5, 5)
+velocity = st.tuples(speeds, speeds, st.floats(-2, 2))
+
+
+def neighbour(place, moving=(0.0, 0.0, 0.0), *, name="alpha", age_s=0.1, role="alone"):
+    return Neighbour(name, place, moving, 0.0, 0.0, age_s, role)
+
+
+@given(st.floats(-5, 50), st.floats(-8, 8), st.floats(0, 1), st.floats(0.5, 5))
+def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(left, ahead, age, braking):
+    allowed = allowed_speed(left, ahead, age, braking)
+    assert allowed >= 0.0
+    assert allowed_speed(left - 0.5, ahead, age, braking) <= allowed
+    assert allowed_speed(left, ahead, age + 0.1, braking) <= allowed + 1e-9
+    assert allowed_speed(left, ahead - 0.5, age, braking) <= allowed + 1e-9
+
+
+@given(st.floats(0.1, 50), st.floats(0, 8), st.floats(0.5, 5))
+def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(left, ahead, braking):
+    speed = allowed_speed(left, ahead, 0.1, braking)
+    own_way = speed * 0.5 + speed**2 / 2 / braking
+    assert own_way <= left + ahead**2 / 2 / braking + 1e-6
+
+
+directions = st.floats(-math.pi, math.pi)
+rows = st.lists(
+    st.tuples(directions, st.floats(-1.5, 1.5), st.floats(0, 4)).map(
+        lambda row: Row(
+            math.cos(row[0]) * math.cos(row[1]),
+            math.sin(row[0]) * math.cos(row[1]),
+            math.sin(row[1]),
+            row[2],
+            "x",
+        )
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=200)
+@given(velocity, rows)
+def test_a_limit_takes_away_and_leaves_every_limit_kept(asked, limits):
+    left, names = apart(asked, limits)
+    assert math.hypot(*left) <= math.hypot(*asked) + 1e-6
+    for row in limits:
+        assert left[0] * row.north + left[1] * row.east + left[2] * row.down <= row.allowed_mps + 1e-5
+    assert (left == asked) or names
+
+
+def test_a_virtual_vehicle_is_no_obstacle():
+    assert rows_at((0, 0, 0), [neighbour((1.0, 0.0, 0.0), role="virtual")], 3.0, 2.0) == []
+
+
+def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not():
+    (row,) = rows_at((0.0, 0.0, -10.0), [neighbour((0.0, 0.0, -6.0))], 3.0, 2.0)
+    assert row.down == 1.0
+    assert level_rows([row], 0.0) == []
+    assert apart((3.0, 0.0, 1.0), [row])[0] == pytest.approx((3.0, 0.0, row.allowed_mps))
+
+
+def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right():
+    def side(east):
+        way, _ = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
+        assert math.hypot(*way) == pytest.approx(2.0)
+        return way[1]
+
+    assert side(0.0) > 0.5
+    assert side(3.0) < -0.3
+    assert side(-3.0) > 0.3
+    assert side(6.0) == 0.0
+    straight = ((2.0, 0.0), 1.0)
+    # Not as far as there; and far above.
+    assert around((2.0, 0.0), 4.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0) == straight
+    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, -9.0))], 4.0) == straight
+    # The side it turned to is kept while the other is not much better.
+    (_, east), side_now = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0, -1.0)
+    assert (east < 0.0, side_now) == (True, -1.0)
+    # Hemmed in on all sides it stays.
+    ring = [neighbour((3.0 * math.cos(a), 3.0 * math.sin(a), 0.0)) for a in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
+    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), ring, 4.0)[0] == (0.0, 0.0)
+
+
+def test_who_is_too_near_is_pushed_away_and_nobody_else():
+    assert pushed_apart((0, 0, 0), [neighbour((3.0, 0.0, 0.0)), neighbour((0.0, 9.0, 0.0))], 4.0) == (
+        -0.8,
+        0.0,
+    )
+    assert pushed_apart((0, 0, 0), [neighbour((0.5, 0.0, 0.0))], 9.0) == (-1.0, 0.0)
+    assert pushed_apart((0, 0, 0), [neighbour((0.5, 0.0, 0.0), role="virtual")], 9.0) == (0.0, 0.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.randoms(use_true_random=False), st.integers(2, 5), st.booleans())
+def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(random, count, by_position):
+    """Whatever behaviours ask: each asks for the same place, or for a velocity of its own, at full speed."""
+    fleet = [
+        (
+            KinematicVehicle([20.0 * math.cos(a), 20.0 * math.sin(a), -6.0 + random.uniform(-1, 1)]),
+            Envelope(Limits()),
+        )
+        for a in (math.tau * index / count + random.uniform(-0.3, 0.3) for index in range(count))
+    ]
+    for turn in range(240):
+        known = [
+            neighbour(tuple(vehicle.position), tuple(vehicle.velocity), name=str(index))
+            for index, (vehicle, _) in enumerate(fleet)
+        ]
+        for index, (vehicle, envelope) in enumerate(fleet):
+            others = [other for at, other in enumerate(known) if at != index]
+            now_ns = vehicle.now_ns
+            if by_position:
+                asked = Setpoint.position((0.0, 0.0, -6.0), now_ns)
+            else:
+                north, east, down = (-p for p in vehicle.position)
+                scale = 5.0 / max(0.1, math.hypot(north, east))
+                asked = Setpoint.velocity((north * scale, east * scale, -0.2 * (6.0 - down)), now_ns)
+            sent, _ = envelope.apply(asked, vehicle.state, now_ns, 0.05, others)
+            vehicle.fly(sent, 0.05)
+        for one, other in itertools.combinations(fleet, 2):
+            assert math.dist(one[0].position, other[0].position) >= 3.0, turn
+
+
+def test_the_envelope_says_from_whom_it_keeps_away():
+    vehicle = KinematicVehicle()
+    asked = Setpoint.velocity((1.0, 0.0, 0.0), vehicle.now_ns)
+    vehicle.velocity = [1.0, 0.0, 0.0]
+    sent, reasons = Envelope().apply(
+        asked, vehicle.state, vehicle.now_ns, 0.05, [neighbour((3.2, 0.0, -5.0))]
+    )
+    assert sent.velocity_ned_mps == pytest.approx((0.0, 0.0, 0.0))
+    assert reasons == ("kept 3 m from alpha",)

@@ -1,0 +1,96 @@
+"""The autopilot's clock, learnt from questions and answers."""
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.vehicle.clock_sync import KEPT_S, LONGEST_TRIP_NS, ClockOffset, ClockSync
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+def asked(sync: ClockSync, at_ns: int, there_ns: int, back_ns: int, offset_ns: int) -> bool:
+    """A question at `at_ns` of our clock that took so long there and back."""
+    return sync.answer(at_ns, at_ns + there_ns + offset_ns, at_ns + there_ns + back_ns)
+
+
+@given(
+    st.integers(-(10**15), 10**15),
+    st.lists(st.tuples(st.integers(0, 45 * MS), st.integers(0, 45 * MS)), min_size=1, max_size=18),
+    st.floats(-50e-6, 50e-6),
+)
+def test_the_truth_lies_within_the_error_that_is_told(offset_ns, trips, drift):
+    sync, at_ns = ClockSync(), SECOND
+    for there_ns, back_ns in trips:
+        true_ns = offset_ns + round(at_ns * drift)
+        assert asked(sync, at_ns, there_ns, back_ns, true_ns)
+        at_ns += SECOND // 2
+    known = sync.offset(at_ns)
+    assert known is not None
+    assert abs(known.offset_ns - (offset_ns + at_ns * drift)) <= known.error_ns + 1000
+    assert known.error_ns <= min(sum(trip) for trip in trips) / 2 + KEPT_S * 1e9 * 100e-6 + 1
+
+
+def test_the_shortest_trip_is_believed_and_the_long_ones_are_not():
+    sync = ClockSync()
+    asked(sync, SECOND, 200_000, 200_000, 7 * SECOND)
+    asked(sync, 2 * SECOND, 1 * MS, 80 * MS, 7 * SECOND)
+    known = sync.offset(2 * SECOND)
+    assert known is not None
+    assert known == ClockOffset(7 * SECOND, 200_000 + 99_960) or known.offset_ns == 7 * SECOND
+    assert not asked(sync, 3 * SECOND, 1 * MS, LONGEST_TRIP_NS, 7 * SECOND)
+    assert not sync.answer(5 * SECOND, 1, 4 * SECOND)
+
+
+def test_what_was_learnt_grows_old():
+    sync = ClockSync()
+    assert sync.offset(SECOND) is None
+    asked(sync, SECOND, MS, MS, 5)
+    young, old = sync.offset(2 * SECOND), sync.offset(9 * SECOND)
+    assert young is not None
+    assert old is not None
+    assert young.error_ns < old.error_ns
+    assert sync.offset(SECOND + round((KEPT_S + 1) * 1e9)) is None
+
+
+@pytest.mark.parametrize("jump_ns", [-3600 * SECOND, -200 * MS, 200 * MS, 3600 * SECOND])
+def test_a_jump_of_the_clock_is_believed_at_the_next_answer(jump_ns):
+    sync, at_ns = ClockSync(), 10_000 * SECOND
+    for step in range(5):
+        asked(sync, at_ns + step * SECOND, 2 * MS, 3 * MS, 4 * SECOND)
+    asked(sync, at_ns + 5 * SECOND, 2 * MS, 3 * MS, 4 * SECOND + jump_ns)
+    known = sync.offset(at_ns + 5 * SECOND)
+    assert known is not None
+    assert abs(known.offset_ns - 4 * SECOND - jump_ns) <= known.error_ns
+
+
+def test_a_stamp_is_that_of_the_measurement_and_without_a_clock_that_of_the_arrival():
+    sync, now_ns = ClockSync(), 50 * SECOND
+    assert sync.stamp(1_000, now_ns) == now_ns
+    asked(sync, now_ns, MS, MS, -40 * SECOND)  # booted at 40 s
+    late_ns = 30 * MS
+    boot_ms = (now_ns - 40 * SECOND) // MS
+    assert abs(sync.stamp(boot_ms, now_ns + late_ns) - now_ns) <= MS
+    # of the future: cut to the arrival as far as the error allows, and another clock beyond it
+    assert sync.stamp(boot_ms + 1, now_ns + MS) <= now_ns + MS
+    assert sync.stamp(boot_ms + 5_000, now_ns) == now_ns
+    assert sync.offset(now_ns) is None
+
+
+def test_messages_jittered_on_their_way_get_their_own_times_back():
+    rng, sync = random.Random(4), ClockSync()
+    offset_ns, worst_ns = -123 * SECOND - 456_789, 0
+    for step in range(400):
+        true_ns = 500 * SECOND + step * 20 * MS
+        if step % 25 == 0:
+            asked(sync, true_ns, rng.randrange(MS, 30 * MS), rng.randrange(MS, 30 * MS), offset_ns)
+        arrived_ns = true_ns + 35 * MS + rng.randrange(60 * MS)
+        stamp_ns = sync.stamp((true_ns + offset_ns) // MS, arrived_ns)
+        known = sync.offset(arrived_ns)
+        assert known is not None
+        assert abs(stamp_ns - true_ns) <= known.error_ns + MS
+        worst_ns = max(worst_ns, abs(stamp_ns - true_ns))
+    assert worst_ns < 35 * MS  # by their arrival they were off by up to 95 ms

@@ -1,0 +1,179 @@
+"""Markers: found by their pictures, and placed where they are."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink_sim.plates import Print
+from mavlink_sim.renderer import Renderer
+from mavlink_sim.world import Ground, World, WorldObject
+from vision.camera_model import CameraModel, CameraMount
+from vision.markers import (
+    DICTIONARIES,
+    MarkerDetector,
+    MarkerKind,
+    marker_from_corners,
+    marker_poses,
+    square,
+)
+from vision.rotation import matrix_from_euler
+
+PLAIN = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+BENT = CameraModel(640, 480, 455.0, 460.0, 321.0, 236.0, (-0.12, 0.03, 0.001, -0.0005))
+DOWN = matrix_from_euler(0.0, -math.pi / 2, 0.0)
+GROUND = Ground(("concrete",), 0, 256, 0.05)
+# A marker looked at straight on: its x to the right, its y up, its z towards the camera.
+FACING = np.diag([1.0, -1.0, -1.0])
+
+
+def picture(height_m: float, north_m: float, yaw: float, camera: CameraModel = PLAIN, **printed):
+    """A plate on the ground from above, its centre `north_m` ahead of straight down."""
+    print_ = Print(
+        printed.get("dictionary", "4X4_50"), printed.get("identifier", 7), printed.get("size", 0.5)
+    )
+    plate = WorldObject(0, "plate", (north_m, 0.0, 0.0), yaw, printed=print_)
+    renderer = Renderer(World((plate,), GROUND), camera, CameraMount())
+    return renderer.render((0.0, 0.0, -height_m), DOWN).image
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    camera=st.sampled_from([PLAIN, BENT]),
+    tilt=st.floats(-0.9, 0.9),
+    lean=st.floats(-0.9, 0.9),
+    turn=st.floats(-math.pi, math.pi),
+    right=st.floats(-0.3, 0.3),
+    down=st.floats(-0.3, 0.3),
+    forward=st.floats(0.6, 15.0),
+    size=st.floats(0.05, 1.0),
+)
+def test_exact_corners_give_the_exact_place_through_any_lens(
+    camera, tilt, lean, turn, right, down, forward, size
+):
+    forward = max(forward, 3.0 * size)
+    position = np.array([right * forward, down * forward, forward])
+    rotation = matrix_from_euler(tilt, lean, turn) @ FACING
+    if rotation[:, 2] @ position > -0.2 * forward:
+        return  # its back, or edge on
+    corners = camera.project(square(size) @ rotation.T + position)
+    marker = marker_from_corners(3, corners, size, camera)
+    assert marker is not None
+    assert np.linalg.norm(marker.position_camera_m - position) < 0.01 * forward
+    # The true turning is one of the two that fit.
+    poses = marker_poses(corners, size, camera)
+    angles = [math.acos(min(1.0, (np.trace(pose.rotation.T @ rotation) - 1) / 2)) for pose in poses]
+    assert min(angles) < 0.05
+    assert poses[0].reprojection_px < 0.05
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**31), forward=st.floats(1.0, 6.0), noise_px=st.floats(0.0, 0.4))
+def test_noise_on_the_corners_shows_as_reprojection_and_moves_the_place_by_little(seed, forward, noise_px):
+    rng = np.random.default_rng(seed)
+    position = np.array([0.1, -0.1, forward])
+    corners = PLAIN.project(square(0.5) @ FACING.T + position) + rng.normal(0.0, noise_px, (4, 2))
+    marker = marker_from_corners(0, corners, 0.5, PLAIN)
+    assert marker is not None
+    assert marker.reprojection_px <= 4 * noise_px + 0.05
+    side_px = 0.5 / forward * PLAIN.fx
+    assert np.linalg.norm(marker.position_camera_m - position) < forward * (0.002 + 6 * noise_px / side_px)
+
+
+def test_from_afar_both_poses_fit_and_both_are_kept():
+    rotation = matrix_from_euler(0.25, 0.0, 0.4) @ FACING
+    corners = PLAIN.project(square(0.3) @ rotation.T + np.array([0.0, 0.0, 8.0]))
+    marker = marker_from_corners(0, corners + np.array([[0.1, 0], [0, -0.1], [0.1, 0.1], [0, 0]]), 0.3, PLAIN)
+    assert marker is not None
+    assert marker.other is not None
+    assert 0.0 < marker.ambiguity <= 1.0
+    near = PLAIN.project(square(0.3) @ (matrix_from_euler(0.7, 0.0, 0.4) @ FACING).T + np.array([0, 0, 0.8]))
+    sure = marker_from_corners(0, near, 0.3, PLAIN)
+    assert sure is not None
+    assert sure.ambiguity < 0.05
+    assert np.linalg.norm(marker.other.position_camera_m - marker.position_camera_m) < 0.2
+
+
+@settings(max_examples=8, deadline=None)
+@given(yaw=st.floats(-math.pi, math.pi), height=st.floats(1.0, 6.0), north=st.floats(-0.6, 0.6))
+def test_a_drawn_plate_is_found_and_placed(yaw, height, north):
+    found = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(picture(height, north, yaw), PLAIN)
+    assert [marker.identifier for marker in found] == [7]
+    right, down, forward = found[0].position_camera_m
+    # Looking straight down with north to the top: north is up in the picture.
+    assert right == pytest.approx(0.0, abs=0.02 + 0.01 * height)
+    assert -down == pytest.approx(north, abs=0.02 + 0.01 * height)
+    assert forward == pytest.approx(height, rel=0.04)
+    assert found[0].reprojection_px < 1.0
+
+
+def test_a_drawn_plate_tells_which_way_its_upper_edge_points():
+    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(picture(1.5, 0.0, 0.6), PLAIN)[0]
+    upper = marker.rotation[:, 1]
+    assert math.atan2(upper[0], -upper[1]) == pytest.approx(0.6, abs=0.03)
+
+
+def test_every_dictionary_that_is_named_finds_its_markers():
+    for dictionary in ("4X4_50", "5X5_250", "6X6_1000", "ARUCO_ORIGINAL", "APRILTAG_16h5", "APRILTAG_36h11"):
+        image = picture(2.0, 0.0, 0.3, dictionary=dictionary, identifier=5, size=0.8)
+        found = MarkerDetector(MarkerKind(dictionary, 0.8)).detect(image, PLAIN)
+        assert 5 in [marker.identifier for marker in found], dictionary
+    assert "APRILTAG_36h11" in DICTIONARIES
+
+
+def test_single_ids_may_have_a_size_of_their_own():
+    kind = MarkerKind("4X4_50", 1.0, {7: 0.25})
+    marker = MarkerDetector(kind).detect(picture(2.0, 0.0, 0.0, size=0.25), PLAIN)[0]
+    assert marker.size_m == 0.25
+    assert marker.position_camera_m[2] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_lens_with_distortion_does_not_move_the_marker():
+    image = picture(2.0, 0.5, 0.2, camera=BENT)  # the renderer draws it bent
+    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(image, BENT)[0]
+    assert -marker.position_camera_m[1] == pytest.approx(0.5, abs=0.05)
+    assert marker.position_camera_m[2] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_picture_without_markers_shows_none():
+    detector = MarkerDetector(MarkerKind("4X4_50", 0.5))
+    assert detector.detect(np.zeros((480, 640, 3), np.uint8), PLAIN) == ()
+    noise = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    assert detector.detect(noise, PLAIN) == ()
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        np.zeros((4, 2)),
+        np.array([[0, 0], [1, 1], [2, 2], [3, 3]]),
+        np.full((4, 2), np.nan),
+        # Seen from behind: counter-clockwise.
+        np.array([[100, 100], [100, 200], [200, 200], [200, 100]]),
+    ],
+)
+def test_corners_that_are_no_marker_have_no_pose(corners):
+    assert marker_from_corners(0, corners, 0.5, PLAIN) is None
+
+
+def test_what_cannot_be_is_refused_by_name():
+    with pytest.raises(ValueError, match="unknown marker dictionary '4x4'; known are"):
+        MarkerKind("4x4", 0.5)
+    with pytest.raises(ValueError, match="marker 50 is not in dictionary 4X4_50, which has 0 to 49"):
+        MarkerKind("4X4_50", 0.5, {50: 0.1})
+    with pytest.raises(ValueError, match="above 0, got -1"):
+        MarkerKind("4X4_50", 0.5, {1: -1})
+    with pytest.raises(ValueError, match="camera model is of 640x480 pixels, the picture of 320x240"):
+        MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(np.zeros((240, 320, 3), np.uint8), PLAIN)
+
+
+def test_a_marker_crosses_a_pipe():
+    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(picture(2.0, 0.0, 0.0), PLAIN)[0]
+    data = pickle.dumps(marker)
+    assert len(data) < 2000
+    assert np.array_equal(pickle.loads(data).corners_px, marker.corners_px)

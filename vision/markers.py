@@ -1,0 +1,305 @@
+"""ArUco and AprilTag markers: found in a picture, and where they are before the camera.
+
+Markers after Garrido-Jurado et al. 2014 and Olson 2011, found by OpenCV. A square marker's pose follows from
+its four corners in closed form (IPPE: Collins and Bartoli, Infinitesimal Plane-based Pose Estimation, 2014).
+That gives two, and seen from far away or nearly face on both fit about equally well. Where the marker is
+hardly differs between them, how it is turned does; both are kept, so that whoever knows more (that a pad lies
+level) can choose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.camera_model import CameraModel
+
+# A square that is no marker, or corners torn apart by blur, fit no pose: RMS over its corners, as a share of
+# the marker's own side in the picture, and never less than this many pixels.
+WORST_FIT, WORST_FIT_PX = 0.05, 2.0
+# OpenCV spells some of them twice; the usual spelling is offered.
+DICTIONARIES = tuple(
+    sorted(
+        name.removeprefix("DICT_")
+        for name in dir(cv2.aruco)
+        if name.startswith("DICT_")
+        and not (name.startswith("DICT_APRILTAG") and "H" in name)
+        and not name.endswith("36H12")
+    )
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerKind:
+    """Which markers are looked for, and how large they are.
+
+    Attributes:
+        dictionary: one of DICTIONARIES: "4X4_50", "APRILTAG_36h11".
+        size_m: side of the black square, metres.
+        sizes_m: the same for single ids that are larger or smaller.
+
+    Raises:
+        ValueError: no such dictionary, an id that is not in it, or a size that is not positive.
+    """
+
+    dictionary: str
+    size_m: float
+    sizes_m: Mapping[int, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = markers_in(self.dictionary)
+        for identifier in self.sizes_m:
+            if not 0 <= identifier < count:
+                raise ValueError(
+                    f"marker {identifier} is not in dictionary {self.dictionary}, which has 0 to {count - 1}"
+                )
+        for size_m in (self.size_m, *self.sizes_m.values()):
+            if not (math.isfinite(size_m) and size_m > 0.0):
+                raise ValueError(f"a marker's side must be a number of metres above 0, got {size_m}")
+
+    def size_of(self, identifier: int) -> float:
+        """Side of that marker's black square, metres."""
+        return self.sizes_m.get(identifier, self.size_m)
+
+
+@dataclass(frozen=True, slots=True)
+class PadMarker:
+    """A marker on the pad of another: several sizes on one pad are seen from every height.
+
+    Attributes:
+        identifier: of this marker. pad: of the one whose centre is the pad's.
+        right_m, up_m: this marker's centre from the pad's, along the print's right and upper edge; both are
+            printed the same way up.
+    """
+
+    identifier: int
+    pad: int
+    right_m: float = 0.0
+    up_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPose:
+    """Where a marker is before the camera.
+
+    Attributes:
+        position_camera_m: (3,) its centre in the optical frame: right, down, forward.
+        rotation: (3, 3) `optical_from_marker`; x to the marker's right, y to its upper edge, z out of it.
+        reprojection_px: RMS distance of its four corners from where this pose puts them, pixels.
+    """
+
+    position_camera_m: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    reprojection_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """One marker in one picture. Small, and can be pickled.
+
+    Attributes:
+        identifier: in its dictionary.
+        size_m: side of the black square by which it was measured, metres.
+        corners_px: (4, 2) float64 pixels: its upper left corner, then clockwise as printed.
+        position_camera_m, rotation, reprojection_px: of the pose that fits better; see MarkerPose.
+        other: the second pose that the same corners allow; None where it cannot be.
+    """
+
+    identifier: int
+    size_m: float
+    corners_px: NDArray[np.float64]
+    position_camera_m: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    reprojection_px: float
+    other: MarkerPose | None = None
+
+    @property
+    def ambiguity(self) -> float:
+        """How well the second pose fits beside the first: 0 not at all, 1 just as well."""
+        if self.other is None or self.other.reprojection_px <= 0.0:
+            return 0.0
+        return self.reprojection_px / self.other.reprojection_px
+
+    @property
+    def side_px(self) -> float:
+        """Mean length of its sides in the picture, pixels."""
+        sides = self.corners_px - np.roll(self.corners_px, 1, axis=0)
+        return float(np.linalg.norm(sides, axis=1).mean())
+
+
+def markers_in(dictionary: str) -> int:
+    """How many markers a dictionary has. Raises ValueError, naming those that there are."""
+    return len(_dictionary(dictionary).bytesList)
+
+
+class MarkerDetector:
+    """Finds the markers of one dictionary in pictures."""
+
+    def __init__(self, kind: MarkerKind) -> None:
+        self.kind = kind
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        self._detector = cv2.aruco.ArucoDetector(_dictionary(kind.dictionary), parameters)
+
+    def detect(self, image_bgr: NDArray[np.uint8], camera: CameraModel) -> tuple[Marker, ...]:
+        """What is in the picture, by id.
+
+        Args:
+            image_bgr: (height, width, 3) uint8 BGR, or (height, width) uint8 grey.
+            camera: the model for pictures of this size.
+
+        Raises:
+            ValueError: the picture's size is not the camera model's.
+        """
+        if image_bgr.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"the camera model is of {camera.width}x{camera.height} pixels, the picture of "
+                f"{image_bgr.shape[1]}x{image_bgr.shape[0]}"
+            )
+        grey = image_bgr if image_bgr.ndim == 2 else cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
+        corners, identifiers, _ = self._detector.detectMarkers(grey)
+        if identifiers is None:
+            return ()
+        found = [
+            marker_from_corners(int(identifier), points, self.kind.size_of(int(identifier)), camera)
+            for identifier, points in zip(np.ravel(identifiers), corners, strict=True)
+        ]
+        return tuple(sorted((marker for marker in found if marker), key=lambda marker: marker.identifier))
+
+
+def marker_from_corners(
+    identifier: int, corners_px: NDArray[Any], size_m: float, camera: CameraModel
+) -> Marker | None:
+    """The marker whose corners are seen there; None where no pose before the camera explains them.
+
+    Args:
+        corners_px: (4, 2) pixels: its upper left corner, then clockwise as printed.
+        size_m: side of the black square, metres.
+    """
+    corners = np.asarray(corners_px, np.float64).reshape(4, 2)
+    poses = marker_poses(corners, size_m, camera)
+    if not poses:
+        return None
+    best = poses[0]
+    marker = Marker(
+        identifier,
+        size_m,
+        corners,
+        best.position_camera_m,
+        best.rotation,
+        best.reprojection_px,
+        poses[1] if len(poses) > 1 else None,
+    )
+    return marker if best.reprojection_px <= max(WORST_FIT_PX, WORST_FIT * marker.side_px) else None
+
+
+def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraModel) -> list[MarkerPose]:
+    """The poses that the corners allow, the better one first: two, one or none.
+
+    One behind the camera, or showing the marker's back, is left out.
+
+    Args:
+        corners_px: (4, 2) pixels, as `marker_from_corners`.
+    """
+    if not np.isfinite(corners_px).all():
+        return []
+    rays = camera.rays(corners_px)
+    plane = rays[:, :2] / rays[:, 2:]
+    model = square(size_m)
+    poses = []
+    for rotation in _rotations(model, plane):
+        position = _position(model @ rotation.T, plane)
+        if not (np.isfinite(position).all() and position[2] > 0.0 and rotation[:, 2] @ position < 0.0):
+            continue
+        off = camera.project(model @ rotation.T + position) - corners_px
+        error_px = float(np.sqrt((off**2).sum(axis=1).mean()))
+        if math.isfinite(error_px):
+            poses.append(MarkerPose(position, rotation, error_px))
+    return sorted(poses, key=lambda pose: pose.reprojection_px)
+
+
+def _rotations(model: NDArray[np.float64], plane: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """IPPE: the two rotations that agree with the homography at the marker's centre; none where it has none.
+
+    Not OpenCV's: its rotation vectors fail at half a turn, which is how a camera sees a marker face on
+    (found with OpenCV 5.0).
+
+    Args:
+        model: (4, 3) corners in the marker's plane. plane: (4, 2) where they are seen, at unit depth.
+    """
+    if len(np.unique(plane, axis=0)) < 4:
+        return ()
+    homography = _homography(model[:, :2], plane)
+    if not np.isfinite(homography).all():
+        return ()
+    centre = homography[:2, 2]
+    jacobian = homography[:2, :2] - np.outer(centre, homography[2, :2])
+    ahead = _turn_to(centre)
+    outward = np.array([[1.0, 0.0, -centre[0]], [0.0, 1.0, -centre[1]]]) @ ahead
+    scaled = np.linalg.solve(outward[:, :2], jacobian)
+    largest = float(np.linalg.svd(scaled, compute_uv=False)[0])
+    if largest < 1e-12:
+        return ()
+    upper = scaled / largest
+    gram = np.eye(2) - upper.T @ upper
+    lower = np.sqrt(np.maximum(np.diag(gram), 0.0)) * (1.0, -1.0 if gram[0, 1] < 0.0 else 1.0)
+    rotations = []
+    for sign in (1.0, -1.0):
+        first, second = np.vstack([upper, sign * lower]).T
+        turned = np.column_stack([first, second, np.cross(first, second)])
+        left, _, right = np.linalg.svd(ahead @ turned)
+        rotations.append(np.asarray(left @ right, np.float64))
+    return tuple(rotations)
+
+
+def _homography(model: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) that takes the four corners to where they are seen; its last element is 1. NaN if none does."""
+    rows = []
+    for (x, y), (u, v) in zip(model, plane, strict=True):
+        rows.append([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y])
+        rows.append([0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y])
+    try:
+        solution = np.linalg.solve(np.array(rows), plane.ravel())
+    except np.linalg.LinAlgError:
+        return np.full((3, 3), np.nan)
+    homography: NDArray[np.float64] = np.append(solution, 1.0).reshape(3, 3)
+    return homography
+
+
+def _turn_to(point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) the shortest rotation of the optical axis to the ray through (x, y, 1), after Rodrigues."""
+    ray = np.array([point[0], point[1], 1.0])
+    ray /= np.linalg.norm(ray)
+    x, y, cosine = ray
+    cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    turn: NDArray[np.float64] = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    return turn
+
+
+def _position(turned: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) where the marker's centre is, by least squares over the turned corners (4, 3)."""
+    count = len(plane)
+    system, wanted = np.zeros((2 * count, 3)), np.zeros(2 * count)
+    system[0::2, 0] = system[1::2, 1] = 1.0
+    system[0::2, 2], system[1::2, 2] = -plane[:, 0], -plane[:, 1]
+    wanted[0::2] = plane[:, 0] * turned[:, 2] - turned[:, 0]
+    wanted[1::2] = plane[:, 1] * turned[:, 2] - turned[:, 1]
+    return np.asarray(np.linalg.lstsq(system, wanted, rcond=None)[0], np.float64)
+
+
+def square(size_m: float) -> NDArray[np.float64]:
+    """(4, 3) corners of a marker of that side in its own frame, metres: upper left, then clockwise."""
+    half = size_m / 2
+    return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    if name not in DICTIONARIES:
+        raise ValueError(f"unknown marker dictionary {name!r}; known are {', '.join(DICTIONARIES)}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
