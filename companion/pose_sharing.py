@@ -65,7 +65,8 @@ class PoseSharing:
 
     def pose(self, state: VehicleState, behaviour: Behaviour | None, now_ns: int) -> Pose | None:
         """What to tell of this vehicle; None while it does not know where on earth it is."""
-        note = behaviour.note if isinstance(behaviour, FormationBehaviour) else None
+        flown = None if behaviour is None else behaviour.flown
+        note = flown.note if isinstance(flown, FormationBehaviour) else None
         role = "follower" if note is not None else "alone"
         if note is None and self._neighbours.leads():
             role = "leader"

@@ -47,6 +47,9 @@ class ApproachBehaviour(Behaviour):
 
     It begins with the object of the class nearest to the nose, among the true ones, and stays with it.
     Lost, it brakes and looks for `lost_timeout_s` before it gives up.
+
+    Attributes:
+        lost_at: where the object was last known to be, if losing it ended the approach.
     """
 
     name = "approach"
@@ -62,6 +65,7 @@ class ApproachBehaviour(Behaviour):
         lost_timeout_s: float = 5.0,
     ) -> None:
         self.class_names = (class_name,)
+        self.lost_at: Vector3 | None = None
         self._class_name = class_name
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._confidence = confidence
@@ -85,6 +89,7 @@ class ApproachBehaviour(Behaviour):
         self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
         self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
         self._doubted = False
+        self.lost_at = None
         self._arrived_since_ns = [None] * len(ARRIVALS)
         self._range_m = math.nan
 
@@ -213,6 +218,7 @@ class ApproachBehaviour(Behaviour):
                 why = "it was never seen with a known range"
             else:
                 why = f"last seen {self._range_m:.1f} m away"
+                self.lost_at = self._track.position_ned_m
             return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
         if self._wait_place is None and ground_speed(situation.state) < STANDING_MPS:
             self._wait_place = (position[0], position[1], self._down_m)

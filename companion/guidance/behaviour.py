@@ -114,6 +114,11 @@ class Behaviour(ABC):
         return ()
 
     @property
+    def flown(self) -> Behaviour:
+        """What flies now: itself, or of several in turn the one whose turn it is."""
+        return self
+
+    @property
     def landing_target(self) -> LandingTarget | None:
         """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
         return None

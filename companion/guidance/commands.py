@@ -292,6 +292,15 @@ class Approach(Command):
     lost_timeout_s: Annotated[
         float, Number("lost_timeout", "s", 0.5, 60.0, "wait for a lost object this long")
     ] = 5.0
+    retries: Annotated[
+        float,
+        Number("retries", "", 0.0, 20.0, "how often a lost object is looked for, where it was and around"),
+    ] = 2.0
+
+    def __post_init__(self) -> None:
+        super(Approach, self).__post_init__()
+        if self.retries != int(self.retries):
+            raise GrammarError(f"approach: retries must be a whole number, got {self.retries:g}")
 
 
 @dataclass(frozen=True, slots=True)

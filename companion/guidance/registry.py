@@ -6,6 +6,7 @@ import math
 
 from companion.guidance import commands
 from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.approach_again import PersistentApproach
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.follow import FollowBehaviour
@@ -68,14 +69,8 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 confidence=confidence,
                 clockwise=direction == "clockwise",
             )
-        case commands.Approach(class_name, distance_m, speed_mps, confidence, lost_timeout_s):
-            return ApproachBehaviour(
-                class_name,
-                distance_m=distance_m,
-                speed_mps=speed_mps,
-                confidence=confidence,
-                lost_timeout_s=lost_timeout_s,
-            )
+        case commands.Approach():
+            return _approach(command)
         case commands.Follow():
             return _follow(command)
         case commands.Patrol():
@@ -111,6 +106,21 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 speed_mps=speed_mps,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
+
+
+def _approach(command: commands.Approach) -> PersistentApproach:
+    return PersistentApproach(
+        lambda: ApproachBehaviour(
+            command.class_name,
+            distance_m=command.distance_m,
+            speed_mps=command.speed_mps,
+            confidence=command.confidence,
+            lost_timeout_s=command.lost_timeout_s,
+        ),
+        command.class_name,
+        retries=int(command.retries),
+        confidence=command.confidence,
+    )
 
 
 def _goto(command: commands.Goto) -> GotoBehaviour:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.vehicle.landing_target import LandingTarget
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +94,9 @@ class SequenceBehaviour(Behaviour):
         self._at = 0
         self._flown: Behaviour | None = None
         # The first one, made at once, tells what the mission needs to begin.
-        self._first: Behaviour | None = plan.steps[0].make()
+        first = plan.steps[0].make()
+        self._first: Behaviour | None = first
+        self.neighbour_names = first.neighbour_names
         self._activated = False
         self._visits: Counter[int] = Counter()
         self._repeats = 0
@@ -144,6 +147,14 @@ class SequenceBehaviour(Behaviour):
             return False
         self._request_failure = why
         return True
+
+    @property
+    def flown(self) -> Behaviour:
+        return self if self._flown is None else self._flown.flown
+
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        return None if self._flown is None else self._flown.landing_target
 
     def on_activate(self, situation: Situation) -> None:
         self._started_ns = situation.now_ns

@@ -12,7 +12,9 @@ from companion.guidance.commands import (
     Command,
     Hold,
     Land,
+    Mission,
     Orbit,
+    Patrol,
     Rtl,
     Seek,
     Stop,
@@ -139,10 +141,34 @@ commands = st.one_of(
     orbits,
     st.builds(Seek, class_names, number(0.25, 20), number(0.05, 1), number(0.05, 1), directions),
     st.builds(Approach, class_names, number(1, 100), number(0.2, 10), number(0.05, 1), number(0.5, 60)),
+    st.builds(
+        Seek, class_names, pattern=st.just("square"), radius_m=number(1, 500), speed_mps=number(0.2, 20)
+    ),
+    st.builds(
+        Seek,
+        class_names,
+        pattern=st.just("lawnmower"),
+        width_m=number(1, 1000),
+        height_m=number(1, 1000),
+        spacing_m=st.none() | number(1, 200),
+    ),
+)
+several_names = st.lists(
+    class_names.map(lambda name: name.strip()).filter(lambda name: "," not in name), min_size=1
+)
+without_class_name = st.one_of(
+    st.builds(Mission, class_names),
+    st.builds(
+        Patrol,
+        st.sampled_from(["0,0 10,0", "0,0,5 9,9,8 -3,2"]),
+        several_names.map(",".join),
+        st.sampled_from(["hold", "approach"]),
+        number(1, 100),
+    ),
 )
 
 
-@given(commands)
+@given(commands | without_class_name)
 def test_what_is_written_is_read_back(command: Command):
     assert parse(str(command)) == command
 

@@ -306,3 +306,22 @@ async def test_what_goes_wrong_in_a_step_is_its_failure_and_the_plan_goes_on():
     assert outcome.success
     assert behaviour.records[0].reason == "broken failed: ZeroDivisionError: no such luck"
     assert broken.left
+
+
+class Telling(HoldBehaviour):
+    landing_target = "what the autopilot is to land on"
+
+
+async def test_what_a_step_tells_and_needs_is_told_and_needed_by_the_mission():
+    cockpit, telling = Cockpit(flying()), Telling(1.0)
+    plan = Plan(
+        "test", (PlannedStep("tell", "hold", lambda: telling),), way_down=lambda word: HoldBehaviour()
+    )
+    behaviour = SequenceBehaviour(plan, cockpit.pilot.refusal_of)
+    assert behaviour.landing_target is None
+    future = await begun(cockpit, behaviour)
+    await cockpit.until(lambda: cockpit.pilot.phase == "offboard")
+    assert behaviour.landing_target == "what the autopilot is to land on"
+    assert behaviour.flown is telling
+    assert behaviour.requirements == telling.requirements
+    await cockpit.outcome(future)

@@ -1,0 +1,123 @@
+"""An approach that does not give up at once: what it has lost is looked for where it was, then all around."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.motion import position_and_yaw, stay_at
+from companion.guidance.seek import SeekBehaviour
+from companion.guidance.sighting import Sightings
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+
+# So long the nose is on the place where the object was last known to be, once it points there.
+LOOK_BACK_S = 3.0
+# Half a turn at the envelope's slowest useful rate.
+LOOK_BACK_LIMIT_S = 12.0
+POINTED_RAD = math.radians(6.0)
+
+
+class PersistentApproach(Behaviour):
+    """Approaches; having lost the object (the approach has waited for it), looks back, then turns once.
+
+    Args:
+        approach: makes a new approach. retries: how often it is looked for again.
+        confidence: least that counts, of what is looked for.
+    """
+
+    name = "approach"
+    requirements = ApproachBehaviour.requirements
+
+    def __init__(
+        self, approach: Callable[[], ApproachBehaviour], class_name: str, *, retries: int, confidence: float
+    ) -> None:
+        self.class_names = (class_name,)
+        self._make, self._class_name = approach, class_name
+        self._retries, self._confidence = retries, confidence
+        self._approach: ApproachBehaviour | None = approach()
+        self._seek: SeekBehaviour | None = None
+        self._sightings = Sightings((class_name,), confidence)
+        self._lost_at: Vector3 | None = None
+        self._place: Vector3 = (0.0, 0.0, 0.0)
+        self._looked_since_ns: int | None = None
+        self._begun_ns = 0
+        self._tried = 0
+        self._why = ""
+        self._notes: list[str] = []
+
+    def on_activate(self, situation: Situation) -> None:
+        self._tried, self._why, self._seek = 0, "", None
+        self._approach = self._make()
+        self._approach.on_activate(situation)
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        if self._approach is not None:
+            step = self._approach.update(dt_s, situation)
+            lost_at = self._approach.lost_at
+            if not isinstance(step, Outcome) or step.success or lost_at is None:
+                return step
+            self._why, self._lost_at, self._approach = step.reason, lost_at, None
+            return self._look_again(situation)
+        if self._seek is None:
+            return self._look_back(situation)
+        step = self._seek.update(dt_s, situation)
+        if not isinstance(step, Outcome):
+            return step
+        self._seek = None
+        if step.success:
+            return self._go_there(situation, step.reason)
+        if not situation.perception_fresh:
+            return Outcome(False, f"{self._why}; {step.reason}")
+        return self._look_again(situation)
+
+    def take_notes(self) -> tuple[str, ...]:
+        notes, self._notes = tuple(self._notes), []
+        return notes
+
+    @property
+    def status(self) -> str:
+        if self._approach is not None:
+            return self._approach.status
+        doing = "where it was" if self._seek is None else "all around"
+        return f"lost the {self._class_name}, looking {doing} ({self._tried} of {self._retries})"
+
+    def _look_again(self, situation: Situation) -> Step:
+        """Begin once more where it was; the end, if that was done often enough."""
+        if self._tried >= self._retries:
+            times = "once" if self._tried == 1 else f"{self._tried} times"
+            return Outcome(False, self._why + (f"; looked for it again {times}" if self._tried else ""))
+        self._tried += 1
+        self._notes.append(f"approach: {self._why}; looking for it, {self._tried} of {self._retries}")
+        self._sightings.reset(situation.now_ns)
+        self._place, _ = position_and_yaw(situation.state)
+        self._looked_since_ns, self._begun_ns = None, situation.now_ns
+        return self._look_back(situation)
+
+    def _look_back(self, situation: Situation) -> Step:
+        """Stand, nose to where it was; then turn."""
+        assert self._lost_at is not None
+        now_ns = situation.now_ns
+        position, yaw_rad = position_and_yaw(situation.state)
+        if (found := self._sightings.look(situation)) is not None:
+            return self._go_there(situation, f"found the {found.class_name} where it was")
+        bearing_rad = math.atan2(self._lost_at[1] - position[1], self._lost_at[0] - position[0])
+        if (
+            self._looked_since_ns is None
+            and abs(math.remainder(bearing_rad - yaw_rad, math.tau)) < POINTED_RAD
+        ):
+            self._looked_since_ns = now_ns
+        looked_ns = now_ns - (now_ns if self._looked_since_ns is None else self._looked_since_ns)
+        if looked_ns > LOOK_BACK_S * 1e9 or now_ns - self._begun_ns > LOOK_BACK_LIMIT_S * 1e9:
+            self._seek = SeekBehaviour(self._class_name, laps=1.0, confidence=self._confidence)
+            self._seek.on_activate(situation)
+            return self._seek.update(0.0, situation)
+        return Setpoint.velocity(stay_at(self._place, position), now_ns, yaw_rad=bearing_rad)
+
+    def _go_there(self, situation: Situation, told: str) -> Step:
+        self._notes.append(f"approach: {told}")
+        self._approach = self._make()
+        self._approach.on_activate(situation)
+        return self._approach.update(0.0, situation)

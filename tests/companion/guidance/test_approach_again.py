@@ -1,0 +1,90 @@
+import math
+
+import pytest
+from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+
+from companion.guidance.grammar import parse
+from companion.guidance.registry import behaviour_for
+
+
+def flown(text, car, each, seconds=300.0):
+    behaviour, notes = behaviour_for(parse(text)), []
+    vehicle = KinematicVehicle()
+    flight = Flight(behaviour, vehicle, [car])
+
+    def listen(at, vehicle):
+        notes.extend(behaviour.take_notes())
+        each(at, flight)
+
+    outcome = flight.run(seconds, listen)
+    assert outcome is not None
+    return outcome, [*notes, *behaviour.take_notes()], flight
+
+
+def test_what_comes_back_where_it_was_is_approached_on():
+    car = SeenObject("car", 30.0, 0.0)
+
+    def each(seconds, flight):
+        car.visible = not 5.0 < seconds < 11.0
+
+    outcome, notes, flight = flown("approach car", car, each)
+    assert outcome.success, outcome.reason
+    assert [note.split(";")[-1].strip() for note in notes] == [
+        "looking for it, 1 of 2",
+        "approach: found the car where it was",
+    ]
+    assert math.dist(flight.vehicle.position[:2], (30.0, 0.0)) == pytest.approx(5.0, abs=0.4)
+
+
+def test_what_went_elsewhere_is_found_by_turning_and_approached():
+    car = SeenObject("car", 25.0, 0.0, track_id=1)
+
+    def each(seconds, flight):
+        car.visible = not 5.0 < seconds < 12.0
+        if seconds > 6.0:
+            car.north, car.east, car.track_id = -8.0, 14.0, 2
+
+    outcome, notes, flight = flown("approach car", car, each)
+    assert outcome.success, outcome.reason
+    assert notes[-1].startswith("approach: found a car: bearing")
+    assert math.dist(flight.vehicle.position[:2], (-8.0, 14.0)) == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("retries", "said"), [(0, ""), (1, "; looked for it again once"), (2, "again 2 times")]
+)
+def test_what_is_gone_for_good_is_looked_for_so_often_and_the_vehicle_stands(retries, said):
+    car = SeenObject("car", 30.0, 0.0)
+    places = []
+
+    def each(seconds, flight):
+        car.visible = seconds < 5.0
+        if seconds > 9.0:
+            places.append(tuple(flight.vehicle.position))
+
+    outcome, notes, _ = flown(f"approach car retries={retries}", car, each)
+    assert not outcome.success
+    assert outcome.reason.startswith("lost the car for 5.0 s: last seen ")
+    assert outcome.reason.endswith(said)
+    assert len(notes) == retries
+    assert max(math.dist(places[0], place) for place in places) < 0.5
+
+
+def test_what_was_never_seen_is_not_sought():
+    outcome, notes, _ = flown("approach car", SeenObject("car", -20.0, 0.0), lambda seconds, flight: None)
+    assert "never seen" in outcome.reason
+    assert notes == []
+
+
+def test_a_silent_detector_is_no_lost_object():
+    def each(seconds, flight):
+        flight.perception_alive = seconds < 4.0
+
+    outcome, notes, _ = flown("approach car", SeenObject("car", 40.0, 0.0), each)
+    assert "nothing comes from the detector" in outcome.reason
+    assert notes == []
+
+
+def test_retries_are_whole():
+    with pytest.raises(ValueError, match="whole number"):
+        parse("approach car retries=1.5")
