@@ -23,11 +23,17 @@ from companion.vehicle.state import FlightMode, LandedState, Vector3
 SIGHTINGS_NEEDED, SIGHT_FRESH_S = 3, 0.6
 # Unseen for so long, the descent waits; for so long, it is given up.
 WAIT_AFTER_S, LOST_AFTER_S = 0.4, 1.5
+# From higher up than this there is time: the place is remembered, and flown to, for longer.
+LOW_M, LOST_HIGH_AFTER_S = 3.5, 5.0
 # The cone: allowed distance beside the pad's centre, metres, at the ground and for each metre of height.
 CONE_M, CONE_PER_M = 0.10, 0.20
 # The answer to a distance beside the pad, 1/s: stiffer than the autopilot's own, see `pressed`.
 GAIN_PER_S = 1.2
 DESCENT_MPS, SLOWEST_DESCENT_MPS, DESCENT_PER_M = 0.8, 0.2, 0.3
+# Unseen, it rises a little: from higher up more is in the picture. So slowly, m/s.
+RISE_MPS = 0.3
+# Gusts move it up and down too: the wanted height is held by so much for each metre, 1/s, but no further off.
+HEIGHT_GAIN_PER_S, HEIGHT_LEASH_M = 1.2, 0.5
 # Blind from here on: a marker of a pad's size no longer fits into the picture.
 FINAL_M = 0.7
 # What may be off when the blind part begins: the distance, and what the speed will make of it.
@@ -92,6 +98,7 @@ class LandOnMarkerBehaviour(Behaviour):
         self._blind_since_ns: int | None = None
         self._waiting_s = self._blocked_s = 0.0
         self._asked_down_mps = 0.0
+        self._wanted_down_m = 0.0
         self._until_ns: float = math.inf
         self._touching = False
         self._height_m = math.nan
@@ -192,6 +199,7 @@ class LandOnMarkerBehaviour(Behaviour):
                 return ModeRequest(FlightMode.PRECISION_LAND)
             height_m = max(self._height_m, 0.0)
             self._enter(_Phase.DESCEND, now_ns, BASE_TIMEOUT_S + 6.0 * height_m)
+            self._wanted_down_m = position[2]
             return self._descending(dt_s, situation, position)
         if self._blind_since_ns is not None:
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
@@ -209,7 +217,7 @@ class LandOnMarkerBehaviour(Behaviour):
         now_ns, pad = situation.now_ns, self._pad
         assert pad is not None
         unseen_s = pad.unseen_s(now_ns)
-        if unseen_s > LOST_AFTER_S:
+        if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
             return self._climb(f"lost {self._height_m:.1f} m above it", situation, position)
         place, drift = pad.at(now_ns), pad.velocity_mps
         error_m = math.dist(place[:2], position[:2])
@@ -223,10 +231,19 @@ class LandOnMarkerBehaviour(Behaviour):
         allowed_m = CONE_M + CONE_PER_M * max(self._height_m, 0.0)
         inside = max(0.0, min(1.0, 2.0 * (allowed_m - error_m) / allowed_m))
         rate = min(DESCENT_MPS, SLOWEST_DESCENT_MPS + DESCENT_PER_M * max(self._height_m, 0.0)) * inside
-        if unseen_s > WAIT_AFTER_S or self._height_m <= FINAL_M:
+        if unseen_s > WAIT_AFTER_S:
+            rate = -RISE_MPS if self._height_m < LOW_M else 0.0
+        elif self._height_m <= FINAL_M:
             rate = 0.0
         self._asked_down_mps = rate
-        return self._to(place, situation, position, drift, rate)
+        return self._to(place, situation, position, drift, self._held(rate, dt_s, position))
+
+    def _held(self, rate_mps: float, dt_s: float, position: Vector3) -> float:
+        """The velocity down that keeps to a height which changes at a rate."""
+        wanted_m = self._wanted_down_m + rate_mps * dt_s
+        wanted_m = max(position[2] - HEIGHT_LEASH_M, min(position[2] + HEIGHT_LEASH_M, wanted_m))
+        self._wanted_down_m = wanted_m
+        return max(-CLIMB_MPS, min(DESCENT_MPS, rate_mps + HEIGHT_GAIN_PER_S * (wanted_m - position[2])))
 
     def _notice_floor(self, dt_s: float, situation: Situation) -> None:
         """Count how long the envelope has let through less than half of the descent."""
@@ -264,7 +281,8 @@ class LandOnMarkerBehaviour(Behaviour):
 
     def _climb(self, why: str, situation: Situation, position: Vector3) -> Step:
         self._failures.append(why)
-        self._goal_down_m = min(position[2] - CLIMB_M, max(self._started_down_m, position[2] - 2 * CLIMB_M))
+        # Higher than where it began, the marker may be too small to be seen.
+        self._goal_down_m = min(position[2], max(self._started_down_m, position[2] - 2 * CLIMB_M))
         self._enter(_Phase.CLIMB, situation.now_ns, BASE_TIMEOUT_S)
         return self._climbing(0.0, situation, position)
 
