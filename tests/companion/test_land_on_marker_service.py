@@ -86,7 +86,8 @@ def test_the_service_lands_on_the_marker_that_it_is_told(tmp_path: Path, method:
     middle = sorted(math.dist(marker["pad_ned_m"][:2], PAD) for marker in placed)[len(placed) // 2]
     assert middle < 0.8  # with all that the vehicle's own estimate is off
     last = json.loads(truth.read_text().splitlines()[-1])
-    assert math.dist(last["position_ned_m"][:2], PAD) < 0.4
+    # In gusts; how near the autopilot comes by itself is a matter of its own position hold.
+    assert math.dist(last["position_ned_m"][:2], PAD) < (0.5 if method == "offboard" else 1.0)
 
 
 def iter_queue(messages: queue.Queue[dict]) -> list[dict]:
