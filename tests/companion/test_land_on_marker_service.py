@@ -1,0 +1,113 @@
+"""The whole service lands on a printed plate: simulator, pictures, OpenCV, zenoh, MAVLink."""
+
+from __future__ import annotations
+
+import json
+import math
+import queue
+import uuid
+from pathlib import Path
+
+import pytest
+from service_process import running_service
+
+from mavlink_sim.testing import running_simulator
+
+SCENE = """
+name = "pad"
+[ground]
+kinds = ["concrete"]
+tile_texels = 256
+texel_m = 0.05
+[[plates]]
+dictionary = "4X4_50"
+id = 7
+size_m = 0.5
+place_m = [0.8, -0.5]
+yaw_deg = 30
+[[plates]]
+dictionary = "4X4_50"
+id = 17
+size_m = 0.12
+place_m = [1.163, -0.29]
+yaw_deg = 30
+[camera]
+width = 320
+height = 240
+horizontal_fov_deg = 80
+rate_hz = 10
+[camera.mount]
+pitch_deg = -90
+"""
+PAD = (0.8, -0.5)
+
+
+def flags(camera: str, *more: str) -> list[str]:
+    return [
+        "--source-uri", f"shm://{camera}", "--detector-enabled", "false",
+        "--camera-horizontal-fov-deg", "80", "--markers-size-m", "0.5",
+        "--guidance-perception-max-age-s", "1.0", *more,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["offboard", "autopilot"])
+def test_the_service_lands_on_the_marker_that_it_is_told(tmp_path: Path, method: str) -> None:
+    scene, truth = tmp_path / "pad.toml", tmp_path / "truth.jsonl"
+    scene.write_text(SCENE)
+    camera = f"pad-{uuid.uuid4().hex[:8]}"
+    wanted = flags(
+        camera, "--markers-dictionary", "4X4_50", "--markers-others", "17:0.12@7:0:0.42",
+        "--camera-mount-pitch-deg", "-90",
+    )  # fmt: skip
+    driver = "pymavlink" if method == "offboard" else "mavsdk"
+    with (
+        running_simulator(scene=scene, camera=camera, truth=truth, seed=3) as simulator,
+        running_service(
+            simulator.onboard_port, [*wanted, "--vehicle-driver", driver], cwd=tmp_path
+        ) as service,
+        service.client() as session,
+    ):
+        messages: queue.Queue[dict] = queue.Queue()
+        session.declare_subscriber(
+            "companion/vehicle1/markers",
+            lambda sample: messages.put(json.loads(sample.payload.to_string())),
+        )
+        lifted = service.command("takeoff 4", timeout_s=60.0)
+        assert lifted["success"], lifted
+        landed = service.command(f"land-on-marker 7 method={method}", timeout_s=150.0)
+        assert landed["success"], (landed, service.lines[-10:])
+        assert "landed and disarmed" in landed["reason"]
+
+    seen = [message for message in iter_queue(messages) if message["markers"]]
+    assert seen
+    placed = [marker for message in seen for marker in message["markers"] if marker["pad_ned_m"]]
+    assert {marker["pad"] for marker in placed} == {7}
+    assert all(message["captured_ns"] <= message["published_ns"] for message in seen)
+    middle = sorted(math.dist(marker["pad_ned_m"][:2], PAD) for marker in placed)[len(placed) // 2]
+    assert middle < 0.8  # with all that the vehicle's own estimate is off
+    last = json.loads(truth.read_text().splitlines()[-1])
+    # In gusts; how near the autopilot comes by itself is a matter of its own position hold.
+    assert math.dist(last["position_ned_m"][:2], PAD) < (0.5 if method == "offboard" else 1.0)
+
+
+def iter_queue(messages: queue.Queue[dict]) -> list[dict]:
+    found = []
+    while not messages.empty():
+        found.append(messages.get())
+    return found
+
+
+def test_a_camera_that_looks_ahead_and_a_service_without_markers_refuse_by_name(tmp_path: Path) -> None:
+    scene = tmp_path / "pad.toml"
+    scene.write_text(SCENE)
+    camera = f"pad-{uuid.uuid4().hex[:8]}"
+    with running_simulator(scene=scene, camera=camera) as simulator:
+        with running_service(simulator.onboard_port, flags(camera), cwd=tmp_path) as service:
+            refused = service.command("land-on-marker 7")
+            assert not refused["success"]
+            assert "perception that looks for markers (markers.dictionary is not set)" in refused["reason"]
+        ahead = flags(camera, "--markers-dictionary", "4X4_50", "--camera-mount-pitch-deg", "-20")
+        with running_service(simulator.onboard_port, ahead, cwd=tmp_path) as service:
+            refused = service.command("land-on-marker 7")
+            assert not refused["success"]
+            assert "camera that sees straight down (camera.mount_pitch_deg is -20)" in refused["reason"]
