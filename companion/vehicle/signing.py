@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
 
 logger = logging.getLogger(__name__)
@@ -28,7 +29,7 @@ _TELEMETRY_RADIO = 68  # MAV_COMP_ID_TELEMETRY_RADIO
 _LINK_ID = 0
 
 
-class SigningKeyError(ValueError):
+class SigningKeyError(LinkError, ValueError):
     """The key file cannot be used. The message never holds what is in it."""
 
 
@@ -45,16 +46,16 @@ def read_key(path: str | Path) -> bytes:
     try:
         with path.open("rb") as file:
             status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise SigningKeyError(f"signing key {path}: expected a regular file")
-            if status.st_mode & 0o077:
-                mode = stat.S_IMODE(status.st_mode)
-                raise SigningKeyError(f"signing key {path}: others can read it ({mode:o}); chmod 600 {path}")
-            if status.st_uid not in (os.geteuid(), 0):
-                raise SigningKeyError(f"signing key {path}: it belongs to another user; make it your own")
-            content = file.read(MAX_KEY_FILE_BYTES + 1)
+            content = file.read(MAX_KEY_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
     except OSError as error:
         raise SigningKeyError(f"signing key {path}: cannot be read: {error.strerror}") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise SigningKeyError(f"signing key {path}: expected a regular file")
+    if status.st_mode & 0o077:
+        mode = stat.S_IMODE(status.st_mode)
+        raise SigningKeyError(f"signing key {path}: others can read it (mode {mode:o}): chmod 600 {path}")
+    if status.st_uid not in (os.geteuid(), 0):
+        raise SigningKeyError(f"signing key {path}: it belongs to another user; make it your own")
     if len(content) == KEY_LENGTH:
         return content
     if len(content) > MAX_KEY_FILE_BYTES:

@@ -1,0 +1,57 @@
+"""Pilot, pymavlink driver and a Copter in its own process: a whole flight, and whose vehicle it is."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import pytest
+from test_flight_with_the_simulator import pilots_station, running_service
+
+from companion.guidance.grammar import parse
+from companion.guidance.registry import behaviour_for
+from companion.vehicle.state import FlightMode
+from mavlink_sim.testing import running_simulator
+
+LOITER, GUIDED = 5, 4
+
+
+async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot() -> None:
+    options = {"autopilot": "ardupilot", "ready_after": 0.0, "speed": 2.0, "seed": 3}
+    with running_simulator(**options) as simulator, pilots_station(simulator.gcs_port) as station:
+        async with running_service("pymavlink", simulator.onboard_port) as service:
+            driver, pilot = service.driver, service.pilot
+            await service.until(lambda: driver.state.ready_to_arm and driver.state.home_position_ned_m)
+
+            outcome = await service.fly("takeoff 3")
+            assert outcome.success, outcome.reason
+            assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
+
+            orbit = pilot.command(behaviour_for(parse("orbit radius=6 speed=2")))
+            await service.until(lambda: pilot.phase == "offboard")
+            await service.until(lambda: math.hypot(*driver.state.velocity_ned_mps[:2]) > 1.5)
+            assert driver.state.mode is FlightMode.OFFBOARD
+            assert not orbit.done()
+
+            # The station has to have heard the vehicle to know where to send.
+            station.mav.heartbeat_send(6, 8, 0, 0, 4)
+            assert station.wait_heartbeat(timeout=10)
+            station.set_mode(LOITER)
+            await service.until(orbit.done, 10.0)
+            assert orbit.result().reason == "the pilot took over: position mode"
+
+            # GUIDED again, but not by us: nothing is sent, and nothing of ours is flown.
+            sent = service.streamer.sent_count
+            station.set_mode(GUIDED)
+            await service.until(lambda: driver.state.mode is FlightMode.OFFBOARD)
+            watched_until = time.monotonic() + 1.0
+            await service.until(lambda: time.monotonic() > watched_until)
+            assert service.streamer.sent_count == sent
+            assert not pilot.in_command
+
+            stopped = await service.fly("stop")
+            assert stopped.success, stopped.reason
+            assert "mode BRAKE" in simulator.events
+            landed = await service.fly("land")
+            assert landed.success, landed.reason
+            assert not driver.state.armed

@@ -1,0 +1,153 @@
+"""The pymavlink driver and an ArduPilot: the built-in Copter, flown by the driver's contract."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+from fake_autopilot import FakeAutopilot, free_port, state_shows, wait_until
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.ardupilot_manners import ArduPilotManners
+from companion.vehicle.ardupilot_modes import custom_mode_of_mode, mode_of_custom_mode
+from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.drivers import open_driver
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from mavlink_sim.testing import RunningSimulator, running_simulator
+
+SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
+
+
+@asynccontextmanager
+async def copter(speed: float = 4.0) -> AsyncIterator[tuple[Driver, RunningSimulator]]:
+    """A Copter in its own process, and a driver connected to it that knows its home."""
+    with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=speed, seed=3) as simulator:
+        driver = open_driver("pymavlink", f"udpin://127.0.0.1:{simulator.onboard_port}")
+        await driver.connect(20.0)
+        try:
+            await state_shows(driver, lambda state: state.ready_to_arm and known(state))
+            yield driver, simulator
+        finally:
+            await driver.close()
+
+
+def known(state: VehicleState) -> bool:
+    return (
+        state.position_fresh(time.monotonic_ns())
+        and state.landed is not LandedState.UNKNOWN
+        and state.home_position_ned_m is not None
+        and state.battery_fraction is not None
+        and math.isfinite(state.latitude_deg)
+    )
+
+
+async def test_streams_parameters_and_modes_on_the_ground() -> None:
+    async with copter() as (driver, _):
+        assert driver.state.mode is FlightMode.STABILIZED
+        assert driver.state.altitude_m == pytest.approx(0.0, abs=0.5)
+        assert await driver.get_parameter("RTL_ALT") == 1500.0  # an INT32, sent as a number
+        await driver.set_parameter("RTL_ALT", 900)
+        await driver.set_parameter("GUID_TIMEOUT", 1.5)
+        assert await driver.get_parameter("RTL_ALT") == 900.0
+        assert await driver.get_parameter("GUID_TIMEOUT") == 1.5
+        with pytest.raises(CommandRefusedError, match="RTL_ALT is an integer"):
+            await driver.set_parameter("RTL_ALT", 900.5)
+        with pytest.raises(CommandRefusedError, match="arm it first"):
+            await driver.takeoff(3.0)
+        await driver.set_mode(FlightMode.RETURN)
+        with pytest.raises(CommandRefusedError, match=r"refused to arm .failed"):
+            await driver.arm()
+        await driver.set_mode(FlightMode.HOLD)  # GUIDED: a Copter cannot be armed in BRAKE
+        await driver.arm()
+        await driver.disarm()
+
+
+async def test_a_flight_by_setpoints_brakes_on_silence_but_stays_in_guided() -> None:
+    async with copter() as (driver, simulator):
+        modes: list[FlightMode] = []
+        driver.subscribe(lambda s: modes.append(s.mode) if modes[-1:] != [s.mode] else None)
+        await driver.set_mode(FlightMode.HOLD)
+        await driver.arm()
+        await driver.takeoff(4.0)
+        assert driver.state.mode is FlightMode.TAKEOFF
+        await state_shows(driver, lambda s: s.mode is FlightMode.HOLD and s.landed is LandedState.IN_AIR)
+        assert driver.state.altitude_m == pytest.approx(4.0, abs=1.0)
+        await driver.set_mode(FlightMode.OFFBOARD)
+
+        async def fly() -> None:
+            while True:
+                driver.send_setpoint(Setpoint.velocity((2.0, 0.0, 0.0), time.monotonic_ns()))
+                await asyncio.sleep(0.05)
+
+        sending = asyncio.create_task(fly())
+        await state_shows(driver, lambda s: (s.velocity_ned_mps or (0.0,))[0] > 1.5)
+        sending.cancel()
+        # GUID_TIMEOUT's 3 s of simulated time, and the braking
+        await state_shows(driver, lambda s: math.hypot(*(s.velocity_ned_mps or (9.0,))) < 0.7)
+        assert driver.state.mode is FlightMode.OFFBOARD
+        assert abs(driver.state.yaw_rad or 0.0) < 0.3  # without a yaw asked for it keeps its heading
+
+        await driver.set_mode(FlightMode.HOLD)
+        assert simulator.wait_for_event("mode BRAKE")
+        await driver.set_mode(FlightMode.LAND)
+        await state_shows(driver, lambda s: not s.armed, 30.0)
+        assert [str(mode) for mode in modes][-6:] == ["hold", "takeoff", "hold", "offboard", "hold", "land"]
+
+
+async def test_a_pilots_mode_is_seen_and_guided_by_somebody_else_shows_as_offboard() -> None:
+    async with copter() as (driver, simulator):
+        await driver.set_mode(FlightMode.HOLD)
+        await driver.arm()
+        await driver.takeoff(3.0)
+        await state_shows(driver, lambda s: s.mode is FlightMode.HOLD)
+        simulator.fault("pilot_takeover mode=POSCTL")
+        await state_shows(driver, lambda s: s.mode is FlightMode.POSITION)  # LOITER
+    manners = ArduPilotManners()
+    state = VehicleState(armed=True, landed=LandedState.IN_AIR)
+    manners.mode_request(FlightMode.HOLD, VehicleState())
+    told = [manners.heard("HEARTBEAT", {"custom_mode": mode}, state) for mode in (0, 4, 5, 4)]
+    assert [fields["flight_mode"] for ((_, fields),) in told] == [
+        FlightMode.STABILIZED,  # the request has not shown yet
+        FlightMode.HOLD,
+        FlightMode.POSITION,
+        FlightMode.OFFBOARD,  # not ours any more
+    ]
+
+
+def test_modes_go_by_what_they_do_and_what_is_not_there_cannot_be_asked_for() -> None:
+    assert mode_of_custom_mode(4) is FlightMode.OFFBOARD
+    assert mode_of_custom_mode(21) is FlightMode.RETURN
+    assert mode_of_custom_mode(99) is FlightMode.UNKNOWN
+    assert custom_mode_of_mode(FlightMode.POSITION) == 5
+    with pytest.raises(ValueError, match="has no mode takeoff"):
+        custom_mode_of_mode(FlightMode.TAKEOFF)
+
+
+async def test_what_goes_on_the_wire_to_an_ardupilot() -> None:
+    port = free_port()
+    autopilot = FakeAutopilot(port, autopilot=3)
+    autopilot.custom_mode, autopilot.base_mode = 4, 217
+    autopilot.start()
+    driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}")
+    try:
+        await driver.connect(10.0)
+        driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
+        (message,) = await autopilot.hears(SETPOINT)
+        assert message.type_mask == 0b0101_1100_0111  # a yaw rate of zero: the heading is kept
+        assert message.yaw_rate == 0.0
+        autopilot.say(mavlink.MAVLink_gps_global_origin_message(474000000, 85000000, 480_000))
+        home = (474000900, 85000000, 485_000)
+        autopilot.say(mavlink.MAVLink_home_position_message(*home, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0))
+        await wait_until(lambda: driver.state.home_position_ned_m is not None, 5.0)
+        assert driver.state.home_position_ned_m == pytest.approx((10.007, 0.0, -5.0), abs=0.01)
+        await driver.set_mode(FlightMode.OFFBOARD)
+        asked = [m for m in await autopilot.hears("COMMAND_LONG") if m.command == 176]
+        assert (asked[-1].param1, asked[-1].param2) == (1.0, 4.0)
+    finally:
+        await driver.close()
+        await autopilot.stop()

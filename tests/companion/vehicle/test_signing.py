@@ -1,0 +1,161 @@
+"""MAVLink signing on our side: the key file, what is signed, what is refused; against two other makers."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from pathlib import Path
+
+import pytest
+from fake_autopilot import state_shows
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.config import load_settings, to_toml
+from companion.vehicle.driver import CommandRefusedError, LinkError
+from companion.vehicle.drivers import open_driver
+from companion.vehicle.framing import Framer
+from companion.vehicle.signing import FrameSigner, SigningKeyError, read_key
+from mavlink_sim.testing import running_simulator
+
+KEY = bytes(range(32))
+
+
+def key_file(folder: Path, content: bytes, mode: int = 0o600) -> Path:
+    path = folder / "signing.key"
+    path.write_bytes(content)
+    path.chmod(mode)
+    return path
+
+
+def frames(data: bytes) -> list:
+    return Framer().feed(data, datagram=True)
+
+
+def heartbeat(system: int = 1, component: int = 1, *, key: bytes | None = None, timestamp: int = 0) -> bytes:
+    """One frame as pymavlink packs it, signed by pymavlink if there is a key."""
+    codec = mavlink.MAVLink(None, system, component)
+    if key is not None:
+        codec.signing.secret_key = key
+        codec.signing.sign_outgoing = True
+        codec.signing.link_id = 3
+        codec.signing.timestamp = timestamp
+    return bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
+
+
+def now() -> int:
+    signer = FrameSigner(KEY)
+    return int.from_bytes(signer.signed(heartbeat())[-12:-6], "little")
+
+
+def test_a_key_is_32_bytes_as_they_are_or_a_passphrases_hash(tmp_path: Path) -> None:
+    assert read_key(key_file(tmp_path, KEY)) == KEY
+    assert read_key(key_file(tmp_path, b"correct horse\n")) == hashlib.sha256(b"correct horse").digest()
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "reason"),
+    [
+        (KEY, 0o640, "others can read it"),
+        (KEY, 0o604, "others can read it"),
+        (b"", 0o600, "neither"),
+        (b" \n", 0o600, "neither"),
+        (b"\xff" * 31, 0o600, "neither"),
+        (b"x" * 5000, 0o600, "no passphrase"),
+    ],
+    ids=["group", "others", "empty", "blank", "bytes", "long"],
+)
+def test_a_key_file_that_cannot_be_used_says_why_and_not_what_is_in_it(
+    tmp_path: Path, content: bytes, mode: int, reason: str
+) -> None:
+    path = key_file(tmp_path, content, mode)
+    with pytest.raises(SigningKeyError, match=reason) as caught:
+        read_key(path)
+    assert str(path) in str(caught.value)
+    with pytest.raises(SigningKeyError, match="No such file"):
+        read_key(tmp_path / "missing")
+
+
+@given(st.binary(min_size=0, max_size=40))
+def test_what_we_sign_is_what_pymavlink_accepts(text: bytes) -> None:
+    codec = mavlink.MAVLink(None, 1, 191)
+    plain = mavlink.MAVLink_statustext_message(6, text).pack(codec)
+    reader = mavlink.MAVLink(None, 1, 1)
+    reader.signing.secret_key = KEY
+    reader.signing.allow_unsigned_callback = lambda *_: False
+    signed = FrameSigner(KEY).signed(bytes(plain))
+    message = reader.decode(bytearray(signed))
+    assert message.get_signed()
+    assert message.get_type() == "STATUSTEXT"
+    assert FrameSigner(KEY).signed(signed) == signed  # what is signed stays as it is
+
+
+def test_what_pymavlink_signs_is_accepted_once() -> None:
+    signer = FrameSigner(KEY)
+    (frame,) = frames(heartbeat(key=KEY, timestamp=now()))
+    assert signer.accepts(frame)
+    assert not signer.accepts(frame)
+    assert signer.refused == {"replayed": 1}
+
+
+def test_unsigned_foreign_and_old_frames_are_refused_and_a_radios_are_not() -> None:
+    signer = FrameSigner(KEY)
+    (unsigned,) = frames(heartbeat())
+    (foreign,) = frames(heartbeat(key=bytes(32), timestamp=now()))
+    (old,) = frames(heartbeat(key=KEY, timestamp=now() - 7_000_000))
+    assert [signer.accepts(frame) for frame in (unsigned, foreign, old)] == [False] * 3
+    assert signer.refused == {"unsigned": 1, "wrong signature": 1, "old timestamp": 1}
+    (radio,) = frames(heartbeat(component=68))
+    codec = mavlink.MAVLink(None, 51, 68)
+    (status,) = frames(bytes(mavlink.MAVLink_radio_status_message(1, 1, 100, 1, 1, 0, 0).pack(codec)))
+    assert signer.accepts(radio)
+    assert signer.accepts(status)
+
+
+def test_timestamps_only_grow() -> None:
+    signer = FrameSigner(KEY)
+    stamps = [int.from_bytes(signer.signed(heartbeat())[-12:-6], "little") for _ in range(200)]
+    assert stamps == sorted(set(stamps))
+
+
+def test_neither_the_settings_nor_a_log_show_the_key(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    path = key_file(tmp_path, b"open sesame")
+    settings = load_settings(None, {"vehicle.signing_key_file": str(path)}, {})
+    shown = to_toml(settings)
+    assert str(path) in shown
+    signer = FrameSigner(read_key(path))
+    signer.accepts(frames(heartbeat())[0])
+    told = shown + repr(signer) + caplog.text
+    assert "sesame" not in told
+    assert read_key(path).hex() not in told
+
+
+async def test_a_signed_link_is_flown_and_another_key_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "simulator.key"
+    path.write_bytes(KEY)
+    with running_simulator(signing_key=path, ready_after=0.0, speed=4.0) as simulator:
+        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+        other = open_driver("pymavlink", url, signing_key=os.urandom(32))
+        with pytest.raises(LinkError, match=r"refused by signing .*wrong signature.*the same key"):
+            await other.connect(2.0)
+        driver = open_driver("pymavlink", url, signing_key=KEY)
+        await driver.connect(20.0)
+        try:
+            await state_shows(driver, lambda state: state.ready_to_arm)
+            assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
+            await driver.arm()
+            await driver.disarm()
+        finally:
+            await driver.close()
+        unsigned = open_driver("pymavlink", url)
+        await unsigned.connect(20.0)
+        try:
+            with pytest.raises(CommandRefusedError, match="does not answer"):
+                await unsigned.arm()
+        finally:
+            await unsigned.close()

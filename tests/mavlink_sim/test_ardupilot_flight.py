@@ -1,0 +1,369 @@
+"""A Copter's decisions: arming, GUIDED and what it is told, the ways down, the failsafes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from mavlink_sim import LockstepVehicle
+from mavlink_sim.lockstep import CommandRefusedError
+from mavlink_sim.messages import dialect
+from mavlink_sim.quaternions import inverse, product
+
+ARM, TAKEOFF, SET_MODE = 400, 22, 176
+POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111
+KEEP_HEADING = 0b010000000000  # clears the ignore bit of the yaw rate, which is zero
+
+
+@pytest.fixture
+def copter() -> LockstepVehicle:
+    """Ready to be armed, in STABILIZE, with a companion that is heard."""
+    vehicle = LockstepVehicle(autopilot="ardupilot", seed=4, ready_after_s=0.0)
+    vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    vehicle.step(0.1)
+    return vehicle
+
+
+@pytest.fixture
+def flying(copter: LockstepVehicle) -> LockstepVehicle:
+    copter.take_off(6.0)
+    copter.step(3.0)
+    return copter
+
+
+def texts(vehicle: LockstepVehicle) -> list[tuple[int, str]]:
+    return [(m.severity, m.text) for m in vehicle.receive() if m.get_type() == "STATUSTEXT"]
+
+
+def target(mask: int, values: tuple[float, ...], frame: int = 1, yaw: float = 0.0, rate: float = 0.0) -> Any:
+    """SET_POSITION_TARGET_LOCAL_NED with its values put where the mask says that they count."""
+    groups = [(0.0,) * 3] * 3
+    groups[(POSITION, VELOCITY, ACCELERATION).index(mask | 0b110000000000)] = values
+    flat = [value for group in groups for value in group]
+    return dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, mask, *flat, yaw, rate)
+
+
+def guided(vehicle: LockstepVehicle, mask: int, *values: float, **options: Any) -> None:
+    vehicle.send(target(mask, values, **options))
+
+
+def away(vehicle: LockstepVehicle, place: tuple[float, float, float]) -> float:
+    return math.dist(vehicle.truth.position_ned_m, place)
+
+
+def test_it_boots_in_stabilize_and_can_be_armed_there(copter: LockstepVehicle) -> None:
+    assert copter.truth.mode == "STABILIZE"
+    assert copter.command(ARM, 1) == "ACCEPTED"
+    assert copter.command(ARM, 1) == "ACCEPTED"
+    assert texts(copter) == [(6, "Arming motors")]
+
+
+@pytest.mark.parametrize("mode", [6, 9, 17, 3])
+def test_modes_that_cannot_be_armed_in_are_taken_while_disarmed_and_refuse_arming(
+    copter: LockstepVehicle, mode: int
+) -> None:
+    assert copter.command(SET_MODE, 1, mode) == "ACCEPTED"
+    assert copter.command(ARM, 1) == "FAILED"
+    name = {6: "RTL", 9: "LAND", 17: "BRAKE", 3: "AUTO"}[mode]
+    assert texts(copter) == [(2, f"Arm: {name} mode not armable")]
+    assert copter.command(ARM, 1, 2989) == "ACCEPTED"  # the magic number arms anyhow
+
+
+def test_guided_needs_a_position_estimate_to_be_armed_and_stabilize_does_not() -> None:
+    vehicle = LockstepVehicle(autopilot="ardupilot", parameters={"ARMING_CHECK": 0})
+    vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    vehicle.set_mode("GUIDED")
+    assert vehicle.command(ARM, 1) == "FAILED"
+    assert texts(vehicle) == [(2, "Arm: Need Position Estimate")]
+    vehicle.set_mode("STABILIZE")
+    assert vehicle.command(ARM, 1) == "ACCEPTED"
+
+
+def test_a_take_off_needs_guided_and_arming_and_its_height_is_above_home(copter: LockstepVehicle) -> None:
+    copter.arm()
+    assert copter.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == "FAILED"
+    copter.command(ARM, 0)
+    copter.set_mode("GUIDED")
+    assert copter.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == "FAILED"
+    copter.arm()
+    assert copter.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == "ACCEPTED"
+    states: list[int] = []
+    for _ in range(150):
+        copter.step(0.1)
+        states.append(int(copter.vehicle.autopilot.landed_state))
+    assert [state for at, state in enumerate(states) if at == 0 or state != states[at - 1]] == [1, 3, 2]
+    assert copter.truth.height_m == pytest.approx(5.0, abs=0.5)
+    assert copter.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 9) == "FAILED"  # it flies already
+    assert copter.truth.mode == "GUIDED"
+
+
+def test_setpoints_lift_no_vehicle_off_the_ground_and_it_disarms_after_disarm_delay(
+    copter: LockstepVehicle,
+) -> None:
+    copter.set_mode("GUIDED")
+    copter.arm()
+    armed_s = copter.now_s
+    sent = copter.repeat(target(VELOCITY, (0.0, 0.0, -1.0)), 10.0)
+    copter.run_until(lambda truth: not truth.armed, 20.0)
+    sent.stop()
+    assert copter.now_s - armed_s == pytest.approx(10.0, abs=0.2)
+    assert copter.truth.on_ground
+
+
+@pytest.mark.parametrize(
+    ("frame", "asked", "turns"), [(1, (8.0, 3.0, -6.0), 0), (7, (8.0, 3.0, 0.0), 0), (8, (3.0, -8.0, 0.0), 1),
+                                  (9, (3.0, -8.0, 0.0), 1)],
+)  # fmt: skip
+def test_a_position_counts_from_origin_vehicle_or_heading(
+    flying: LockstepVehicle, frame: int, asked: tuple[float, float, float], turns: int
+) -> None:
+    if turns:  # the nose to the east
+        guided(flying, VELOCITY & ~1024, 0.0, 0.0, 0.0, yaw=math.pi / 2)
+        flying.step(3.0)
+        assert flying.truth.yaw_rad == pytest.approx(math.pi / 2, abs=0.1)
+    north, east, down = flying.truth.position_ned_m
+    place = asked if frame == 1 else (north + 8.0, east + 3.0, down)
+    guided(flying, POSITION, *asked, frame=frame)
+    flying.step(15.0)
+    assert away(flying, place) < 1.0
+
+
+def test_a_velocity_that_is_not_renewed_stops_after_guid_timeout_and_the_mode_stays(
+    flying: LockstepVehicle,
+) -> None:
+    guided(flying, VELOCITY & ~2048, 2.0, 0.0, 0.0)
+    flying.step(2.8)
+    assert flying.truth.velocity_ned_mps[0] == pytest.approx(2.0, abs=0.7)
+    flying.step(2.7)
+    stopped = flying.truth.position_ned_m
+    flying.step(10.0)
+    assert away(flying, stopped) < 1.2
+    assert flying.truth.mode == "GUIDED"
+    assert flying.truth.armed
+
+
+def test_a_position_is_kept_however_old_it_is(flying: LockstepVehicle) -> None:
+    guided(flying, POSITION, 30.0, 0.0, -6.0)
+    flying.step(25.0)
+    assert away(flying, (30.0, 0.0, -6.0)) < 1.0
+
+
+def test_without_any_yaw_the_nose_follows_the_flight_and_with_a_rate_of_zero_it_stays(
+    flying: LockstepVehicle,
+) -> None:
+    sent = flying.repeat(target(VELOCITY & ~2048, (0.0, 3.0, 0.0)), 10.0)
+    flying.step(5.0)
+    assert abs(flying.truth.yaw_rad) < 0.2
+    sent.message = target(VELOCITY, (0.0, 3.0, 0.0))
+    flying.step(5.0)
+    assert flying.truth.yaw_rad == pytest.approx(math.pi / 2, abs=0.25)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        target(VELOCITY, (2.0, 0.0, 0.0), frame=12),
+        target(VELOCITY, (math.nan, 0.0, 0.0)),
+        target(VELOCITY, (2000.0, 0.0, 0.0)),
+        dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 0b110111111111, *([1.0] * 11)),
+    ],
+    ids=["frame", "no number", "too fast", "nothing given"],
+)
+def test_what_makes_no_sense_stops_the_vehicle(flying: LockstepVehicle, message: Any) -> None:
+    sent = flying.repeat(target(VELOCITY, (3.0, 0.0, 0.0)), 10.0)
+    flying.step(3.0)
+    sent.stop()
+    flying.send(message)
+    flying.step(2.5)
+    assert math.hypot(*flying.truth.velocity_ned_mps) < 0.8
+
+
+def test_an_acceleration_speeds_up_until_the_timeout(flying: LockstepVehicle) -> None:
+    guided(flying, ACCELERATION, 1.0, 0.0, 0.0)
+    flying.step(2.5)
+    assert flying.truth.velocity_ned_mps[0] == pytest.approx(2.0, abs=0.8)
+    flying.step(4.0)
+    assert math.hypot(*flying.truth.velocity_ned_mps) < 0.8
+
+
+def test_a_place_on_the_globe_above_home_is_flown_to(flying: LockstepVehicle) -> None:
+    scale = math.radians(1.0) * 6371000.0
+    latitude = round((47.397743225 + 10.0 / scale) * 1e7)
+    flying.send(
+        dialect.MAVLink_set_position_target_global_int_message(
+            0, 1, 1, 6, POSITION, latitude, round(8.545594215e7), 9.0, *([0.0] * 8)
+        )
+    )
+    flying.step(15.0)
+    assert away(flying, (10.0, 0.0, -9.0)) < 1.0
+
+
+def test_an_attitude_is_flown_with_a_climb_rate_and_levelled_out_after_the_timeout(
+    flying: LockstepVehicle,
+) -> None:
+    tilt = math.radians(-8.0)
+    attitude = dialect.MAVLink_set_attitude_target_message(
+        0, 1, 1, 0b111, [math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0], 0.0, 0.0, 0.0, 0.75
+    )
+    flying.send(attitude)
+    flying.step(2.5)
+    assert flying.truth.pitch_rad == pytest.approx(tilt, abs=0.05)
+    assert flying.truth.velocity_ned_mps[2] == pytest.approx(-1.25, abs=0.4)
+    flying.step(2.0)
+    assert flying.truth.pitch_rad == pytest.approx(0.0, abs=0.05)
+
+
+def test_outside_guided_setpoints_are_passed_over(flying: LockstepVehicle) -> None:
+    flying.set_mode("BRAKE")
+    flying.step(2.0)
+    before = flying.truth.position_ned_m
+    sent = flying.repeat(target(VELOCITY, (3.0, 0.0, 0.0)), 10.0)
+    flying.step(4.0)
+    sent.stop()
+    assert away(flying, before) < 1.2
+    assert texts(flying)[-1] == (6, "Arming motors")
+
+
+def test_condition_yaw_turns_and_change_speed_slows_down(flying: LockstepVehicle) -> None:
+    assert flying.command(115, 90.0, 30.0, 1.0, 0.0) == "ACCEPTED"
+    flying.step(4.0)
+    assert flying.truth.yaw_rad == pytest.approx(math.pi / 2, abs=0.1)
+    assert flying.command(115, 30.0, 0.0, -1.0, 1.0) == "ACCEPTED"
+    flying.step(3.0)
+    assert flying.truth.yaw_rad == pytest.approx(math.pi / 3, abs=0.1)
+    assert flying.command(115, 400.0) == "FAILED"
+    assert flying.command(178, 1.0, 1.0) == "ACCEPTED"
+    guided(flying, POSITION, 20.0, 0.0, -6.0)
+    flying.step(5.0)
+    assert math.hypot(*flying.truth.velocity_ned_mps) == pytest.approx(1.0, abs=0.6)
+    assert flying.command(178, 1.0, 0.0) == "DENIED"
+
+
+def test_land_comes_down_disarms_at_once_and_the_mode_stays_land(flying: LockstepVehicle) -> None:
+    flying.land()
+    assert flying.truth.on_ground
+    assert flying.truth.mode == "LAND"
+    assert flying.events[-2:] == ["landed", "disarmed (after landing)"]
+    assert not flying.truth.crashed
+
+
+def test_rtl_climbs_returns_waits_and_lands_at_home() -> None:
+    vehicle = LockstepVehicle(
+        autopilot="ardupilot", seed=2, ready_after_s=0.0, parameters={"RTL_ALT": 1200, "RTL_LOIT_TIME": 2000}
+    )
+    vehicle.take_off(6.0)
+    guided(vehicle, POSITION, 15.0, -5.0, -6.0)
+    vehicle.step(12.0)
+    vehicle.set_mode("RTL")
+    highest = 0.0
+    for _ in range(600):
+        vehicle.step(0.1)
+        highest = max(highest, vehicle.truth.height_m)
+        if not vehicle.truth.armed:
+            break
+    assert highest == pytest.approx(12.0, abs=1.0)
+    assert away(vehicle, (0.0, 0.0, 0.0)) < 1.0
+    assert vehicle.truth.mode == "RTL"
+
+
+def test_disarming_in_the_air_needs_the_magic_number(flying: LockstepVehicle) -> None:
+    assert flying.command(ARM, 0) == "FAILED"
+    assert flying.command(ARM, 0, 21196) == "ACCEPTED"
+
+
+def test_auto_without_a_mission_and_modes_that_are_not_there_are_refused(flying: LockstepVehicle) -> None:
+    texts(flying)
+    assert flying.command(SET_MODE, 1, 3) == "FAILED"
+    assert flying.command(SET_MODE, 1, 99) == "FAILED"
+    assert flying.command(SET_MODE, 0, 5) == "DENIED"
+    assert texts(flying) == [(4, "Mode change to AUTO failed: init failed"), (4, "No such mode 99")]
+    with pytest.raises(CommandRefusedError):
+        flying.set_mode("FLIP")
+    with pytest.raises(ValueError, match="GUIDED"):
+        flying.set_mode("OFFBOARD")
+
+
+def test_a_silent_ground_station_sends_it_home_if_fs_gcs_enable_says_so(flying: LockstepVehicle) -> None:
+    flying.vehicle.parameters.set("FS_GCS_ENABLE", 1)
+    beat = flying.repeat(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 1.0, source=(255, 190))
+    flying.step(8.0)
+    assert flying.truth.mode == "GUIDED"
+    beat.stop()
+    flying.step(6.5)
+    assert flying.truth.mode == "RTL"
+    assert (4, "GCS Failsafe") in texts(flying)
+    flying.set_mode("BRAKE")  # somebody who asks for a mode has it
+    flying.step(2.0)
+    assert flying.truth.mode == "BRAKE"
+
+
+def test_a_lost_position_leads_to_land(flying: LockstepVehicle) -> None:
+    flying.vehicle.faults.begin("gps_loss for=30")
+    flying.run_until(lambda truth: truth.mode == "LAND", 30.0)
+    assert (2, "EKF Failsafe: changed to LAND Mode") in texts(flying)
+    assert flying.command(SET_MODE, 1, 4) in ("FAILED", "TEMPORARILY_REJECTED")
+
+
+def test_the_fence_is_watched(flying: LockstepVehicle) -> None:
+    for name, value in (("FENCE_ENABLE", 1), ("FENCE_RADIUS", 12), ("RTL_ALT", 600)):
+        flying.vehicle.parameters.set(name, value)
+    guided(flying, POSITION, 40.0, 0.0, -6.0)
+    flying.run_until(lambda truth: truth.mode == "RTL", 20.0)
+    assert flying.truth.position_ned_m[0] == pytest.approx(12.0, abs=0.5)
+    assert (2, "Circle fence breached") in texts(flying)
+
+
+def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame: int, valid: int) -> Any:
+    """What a camera fixed to the body, looking down, reports of a plate on the ground."""
+    truth = vehicle.truth
+    x, y, z = (place - here for place, here in zip((north, east, 0.3), truth.position_ned_m, strict=True))
+    body = product(product(inverse(truth.quaternion), (0.0, x, y, z)), truth.quaternion)[1:]
+    angle_x, angle_y = math.atan2(body[1], body[2]), math.atan2(-body[0], body[2])
+    return dialect.MAVLink_landing_target_message(
+        0, 0, frame, angle_x, angle_y, math.hypot(*body), 0.0, 0.0, *body, [1, 0, 0, 0], 2, valid
+    )
+
+
+@pytest.mark.parametrize(
+    ("frame", "valid", "enabled", "hits"),
+    [(12, 0, 1, True), (12, 1, 1, True), (1, 1, 1, False), (12, 0, 0, False)],
+    ids=["angles", "body position", "PX4's frame", "disabled"],
+)
+def test_land_aims_at_a_landing_target_in_its_own_forms(
+    flying: LockstepVehicle, frame: int, valid: int, enabled: int, hits: bool
+) -> None:
+    flying.vehicle.parameters.set("PLND_ENABLED", enabled)
+    flying.vehicle.parameters.set("PLND_TYPE", 1)
+    north, east = 1.6, -1.2
+    flying.set_mode("LAND")
+    while flying.truth.armed:
+        flying.send(landing_target(north, east, flying, frame=frame, valid=valid))
+        flying.step(0.1)
+        assert flying.now_s < 120.0
+    missed = math.dist(flying.truth.position_ned_m[:2], (north, east))
+    assert (missed < 0.8) is hits, missed  # in gusts that move a held position by 0.3 m
+    told = [text for _, text in texts(flying)]
+    assert told.count("Plnd: Frame not supported ") == (frame == 1)
+
+
+def test_a_pilot_takes_over_in_loiter_and_a_reboot_begins_anew(flying: LockstepVehicle) -> None:
+    flying.vehicle.faults.begin("pilot_takeover mode=POSCTL")
+    flying.step(0.5)
+    assert flying.truth.mode == "LOITER"
+    flying.vehicle.faults.begin("reboot seconds=1")
+    flying.step(8.0)
+    assert not flying.truth.armed
+    assert flying.truth.mode == "STABILIZE"
+
+
+def test_the_same_seed_is_the_same_flight() -> None:
+    places = []
+    for _ in range(2):
+        vehicle = LockstepVehicle(autopilot="ardupilot", seed=9, wind_mps=3.0, ready_after_s=0.0)
+        vehicle.take_off(3.0)
+        guided(vehicle, VELOCITY, 1.0, 1.0, 0.0)
+        vehicle.step(5.0)
+        places.append(vehicle.truth.position_ned_m)
+    assert places[0] == places[1]

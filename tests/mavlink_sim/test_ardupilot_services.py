@@ -1,0 +1,205 @@
+"""What a Copter's links say: heartbeats, streams, parameters, texts; and a whole flight by mavutil."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+
+from mavlink_sim import LockstepVehicle
+from mavlink_sim.messages import dialect
+from mavlink_sim.testing import running_simulator
+
+GCS = (255, 190)
+
+
+@pytest.fixture
+def copter() -> LockstepVehicle:
+    vehicle = LockstepVehicle(autopilot="ardupilot", seed=1, ready_after_s=0.0)
+    vehicle.step(0.1)
+    vehicle.receive()
+    return vehicle
+
+
+def kinds(vehicle: LockstepVehicle, seconds: float) -> dict[str, int]:
+    vehicle.receive()
+    vehicle.step(seconds)
+    counted: dict[str, int] = {}
+    for message in vehicle.receive():
+        counted[message.get_type()] = counted.get(message.get_type(), 0) + 1
+    return counted
+
+
+def read(vehicle: LockstepVehicle, name: str) -> Any:
+    vehicle.receive()
+    vehicle.send(dialect.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+    vehicle.step(0.1)
+    found = [m for m in vehicle.receive() if m.get_type() == "PARAM_VALUE"]
+    return found[-1] if found else None
+
+
+def test_the_heartbeat_is_an_ardupilots_and_follows_a_change_of_mode_at_once(
+    copter: LockstepVehicle,
+) -> None:
+    copter.step(1.0)
+    beat = copter.newest["onboard"]["HEARTBEAT"]
+    assert (beat.autopilot, beat.type, beat.custom_mode, beat.base_mode, beat.system_status) == (
+        3,
+        2,
+        0,
+        81,
+        3,
+    )
+    copter.receive()
+    assert copter.command(176, 1, 4) == "ACCEPTED"
+    copter.step(0.02)
+    told = copter.receive()
+    assert [m.custom_mode for m in told if m.get_type() == "HEARTBEAT"] == [4]
+    acknowledged = [m for m in told if m.get_type() == "COMMAND_ACK"]
+    assert [(m.command, m.result) for m in acknowledged] == [(176, 0)]  # one, and the real one
+    copter.command(400, 1)
+    copter.step(1.1)
+    assert copter.newest["onboard"]["HEARTBEAT"].base_mode == 217
+    assert copter.newest["onboard"]["HEARTBEAT"].system_status == 3  # landed is STANDBY, armed or not
+
+
+def test_set_mode_is_acknowledged_by_its_own_number(copter: LockstepVehicle) -> None:
+    copter.send(dialect.MAVLink_set_mode_message(1, 1, 5))
+    copter.step(0.02)
+    (answer,) = [m for m in copter.receive() if m.get_type() == "COMMAND_ACK"]
+    assert (answer.command, answer.result) == (11, 0)
+    assert copter.truth.mode == "LOITER"
+
+
+def test_next_to_nothing_comes_unasked_and_streams_come_by_group_or_one_by_one(
+    copter: LockstepVehicle,
+) -> None:
+    assert set(kinds(copter, 12.0)) == {"HEARTBEAT", "TIMESYNC"}
+    copter.send(dialect.MAVLink_request_data_stream_message(1, 1, 6, 5, 1))
+    counted = kinds(copter, 4.0)
+    assert counted["GLOBAL_POSITION_INT"] == counted["LOCAL_POSITION_NED"] == 20
+    assert "ATTITUDE" not in counted
+    assert read(copter, "SR1_POSITION").param_value == 5.0
+    assert copter.command(511, 32, 50_000) == "ACCEPTED"
+    assert copter.command(511, 245, 200_000) == "ACCEPTED"
+    counted = kinds(copter, 4.0)
+    assert (counted["LOCAL_POSITION_NED"], counted["EXTENDED_SYS_STATE"]) == (80, 20)
+    assert counted["GLOBAL_POSITION_INT"] == 20
+    assert copter.command(511, 32, 0) == "ACCEPTED"  # back to the group's rate
+    assert copter.command(511, 410, 100_000) == "FAILED"
+    copter.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 2, 1))
+    counted = kinds(copter, 4.0)
+    assert counted["LOCAL_POSITION_NED"] == counted["ATTITUDE"] == counted["EKF_STATUS_REPORT"] == 8
+    copter.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 2, 0))
+    assert set(kinds(copter, 3.0)) <= {"HEARTBEAT", "TIMESYNC", "EXTENDED_SYS_STATE"}
+
+
+def test_parameters_travel_as_numbers_in_the_order_of_the_list_without_a_hash(
+    copter: LockstepVehicle,
+) -> None:
+    copter.send(dialect.MAVLink_param_request_list_message(1, 1))
+    copter.step(1.0)
+    listed = [m for m in copter.receive() if m.get_type() == "PARAM_VALUE"]
+    assert [m.param_index for m in listed] == list(range(listed[0].param_count))
+    values = {m.param_id: (m.param_type, m.param_value) for m in listed}
+    assert values["RTL_ALT"] == (6, 1500.0)
+    assert values["DISARM_DELAY"] == (2, 10.0)
+    assert values["GUID_TIMEOUT"] == (9, 3.0)
+    assert "MPC_XY_CRUISE" not in values
+
+
+def test_a_set_is_rounded_cut_and_told_and_what_is_unknown_is_met_with_silence(
+    copter: LockstepVehicle,
+) -> None:
+    for value, kept in ((42.4, 42.0), (1000.0, 127.0)):
+        copter.send(dialect.MAVLink_param_set_message(1, 1, b"DISARM_DELAY", value, 9))
+        copter.step(0.02)
+        (echo,) = [m for m in copter.receive() if m.get_type() == "PARAM_VALUE"]
+        assert (echo.param_value, echo.param_type, echo.param_index) == (kept, 2, 65535)
+    copter.send(dialect.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 1.0, 9))
+    assert read(copter, "COM_OF_LOSS_T") is None
+
+
+def test_a_message_asked_for_follows_its_acknowledgement(copter: LockstepVehicle) -> None:
+    assert copter.command(512, 148) == "ACCEPTED"
+    copter.step(0.02)
+    names = [m.get_type() for m in copter.receive()]
+    assert names.index("COMMAND_ACK") < names.index("AUTOPILOT_VERSION")
+    version = copter.newest["onboard"]["AUTOPILOT_VERSION"]
+    assert version.capabilities & 131072  # PARAM_ENCODE_C_CAST
+    assert not version.capabilities & 16  # PARAM_ENCODE_BYTEWISE
+    assert version.flight_sw_version >> 24 == 4
+    assert copter.command(512, 410) == "FAILED"
+    assert copter.command(2000) == "UNSUPPORTED"
+
+
+def test_home_is_where_it_was_armed_and_its_local_position_is_always_zero(copter: LockstepVehicle) -> None:
+    copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
+    copter.step(0.1)
+    copter.command(400, 1)
+    copter.step(0.02)
+    home = copter.newest["onboard"]["HOME_POSITION"]
+    assert home.latitude - 473977432 == pytest.approx(360, abs=40)
+    assert (home.x, home.y, home.z) == (0.0, 0.0, 0.0)
+
+
+def test_texts_have_no_tab_and_go_to_everyone_who_speaks(copter: LockstepVehicle) -> None:
+    copter.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    copter.command(400, 1)
+    copter.step(0.02)
+    assert [m.text for m in copter.receive() if m.get_type() == "STATUSTEXT"] == ["Arming motors"]
+
+
+def test_missions_are_refused(copter: LockstepVehicle) -> None:
+    copter.send(dialect.MAVLink_mission_count_message(1, 1, 3))
+    copter.send(dialect.MAVLink_mission_request_list_message(1, 1))
+    copter.step(0.02)
+    told = copter.receive()
+    assert [m.type for m in told if m.get_type() == "MISSION_ACK"] == [3]
+    assert [m.count for m in told if m.get_type() == "MISSION_COUNT"] == [0]
+
+
+def test_a_gimbal_and_a_parameter_of_px4s_are_refused_in_words() -> None:
+    with pytest.raises(ValueError, match="no gimbal"):
+        LockstepVehicle(autopilot="ardupilot", gimbal=True)
+    with pytest.raises(KeyError, match="COM_OF_LOSS_T"):
+        LockstepVehicle(autopilot="ardupilot", parameters={"COM_OF_LOSS_T": 1.0})
+    with pytest.raises(ValueError, match="expected one of px4, ardupilot"):
+        LockstepVehicle(autopilot="betaflight")
+
+
+def test_a_whole_flight_by_mavutil(tmp_path: Path) -> None:
+    """As the tutorials for ArduPilot fly: modes by name, arm, take off, go, come home."""
+    with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=6.0) as simulator:
+        link = mavutil.mavlink_connection(simulator.pymavlink_device, source_system=255)
+        link.wait_heartbeat(timeout=20)
+        assert link.mode_mapping()["GUIDED"] == 4
+
+        def until(name: str, condition: Any = lambda message: True) -> Any:
+            deadline = time.monotonic() + 40.0
+            while time.monotonic() < deadline:
+                message = link.recv_match(type=name, blocking=True, timeout=1.0)
+                if message is not None and condition(message):
+                    return message
+            raise TimeoutError(name)
+
+        link.mav.request_data_stream_send(1, 1, 0, 10, 1)
+        until("EKF_STATUS_REPORT", lambda m: m.flags & 16)
+        link.set_mode("GUIDED")
+        until("HEARTBEAT", lambda m: m.custom_mode == 4)
+        link.arducopter_arm()
+        link.motors_armed_wait()
+        link.mav.command_long_send(1, 1, 22, 0, 0, 0, 0, 0, 0, 0, 5)
+        until("GLOBAL_POSITION_INT", lambda m: m.relative_alt > 4500)
+        link.mav.set_position_target_local_ned_send(0, 1, 1, 1, 0b110111111000, 8, 0, -5, *([0] * 8))
+        until("LOCAL_POSITION_NED", lambda m: m.x > 7.0)
+        link.param_set_send("RTL_ALT", 300)
+        link.param_set_send("RTL_LOIT_TIME", 0)
+        link.set_mode("RTL")
+        link.motors_disarmed_wait()
+        assert abs(until("LOCAL_POSITION_NED").x) < 1.5
+        assert "disarmed (after landing)" in simulator.wait_for_event("disarmed")
+        link.close()
