@@ -40,6 +40,7 @@ from companion.perception_preview import PreviewEncoder
 from companion.settings import Settings
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
@@ -67,7 +68,7 @@ class Orders:
     Attributes:
         stop: end now.
         hud: for the recorded video's next frames.
-        attitudes: of the vehicle, the last few seconds.
+        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
         watched: whether anybody wants pictures.
     """
 
@@ -76,6 +77,7 @@ class Orders:
         self.hud = Hud((), None)
         self.watched = False
         self.attitudes = AttitudeHistory()
+        self.height_m: float | None = None
         self._connection = connection
         self._finished = threading.Event()
         threading.Thread(target=self._take, name="inbox", daemon=True).start()
@@ -90,6 +92,7 @@ class Orders:
                 self.hud = message
             elif isinstance(message, Attitude):
                 self.attitudes.add(message.stamp_ns, message.wxyz)
+                self.height_m = message.height_m
             elif isinstance(message, Watched):
                 self.watched = message.watched
             elif isinstance(message, Stop):
@@ -173,6 +176,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             recorder=perception,
             tracker=_tracker(begin),
             view_at=_view_at(settings, orders.attitudes),
+            obstacles_in=_obstacles_in(settings, orders),
         )
         try:
             _run(pipeline, perception, orders, outbox)
@@ -268,6 +272,8 @@ def _tracker(begin: Begin) -> Tracker | None:
 
 def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame], CameraView | None]:
     """Where the camera looked when it took a frame; None without the vehicle's attitude of that moment."""
+    if not settings.tracker.camera_motion:
+        return lambda _: None
     body_from_optical = settings.camera.mount().body_from_optical
 
     def view_at(frame: Frame) -> CameraView | None:
@@ -277,6 +283,22 @@ def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame]
         return CameraView(settings.camera.model(frame.width, frame.height), ned_from_body @ body_from_optical)
 
     return view_at
+
+
+def _obstacles_in(settings: Settings, orders: Orders) -> Callable[[Frame], ObstacleSectors | None]:
+    """How far obstacles are in a frame with depth; None without the vehicle's attitude of that moment."""
+    mount = settings.camera.mount()
+
+    def obstacles_in(frame: Frame) -> ObstacleSectors | None:
+        ned_from_body = orders.attitudes.at(frame.captured_ns)
+        if settings.guidance.obstacles == "off" or frame.depth_m is None or ned_from_body is None:
+            return None
+        camera = settings.camera.model(frame.width, frame.height)
+        return obstacle_sectors(
+            frame.depth_m, frame.captured_ns, camera, mount, ned_from_body, orders.height_m
+        )
+
+    return obstacles_in
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

@@ -22,6 +22,7 @@ from companion.guidance.battery import BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.commands import Command
 from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.obstacles import ObstacleRules, obstacles_message
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
 from companion.guidance.targets import StateHistory
@@ -43,6 +44,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 from companion.views import View, open_views
+from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -100,7 +102,11 @@ class Service:
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
             battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
+            obstacles=ObstacleRules(
+                guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps
+            ),
         )
+        self._obstacles: ObstacleSectors | None = None
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
         self.bus = Bus(
@@ -359,6 +365,7 @@ class Service:
             self.steering.targets if fresh else (),
             age_s,
             fresh,
+            self._obstacles,
             self.streamer.last_sent,
         )
 
@@ -379,7 +386,7 @@ class Service:
         self._history.add(state)
         if state.attitude is not None:
             for view in self.views:
-                view.keeper.send_attitude(state.attitude_ns, state.attitude)
+                view.keeper.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
 
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Publish what a view saw; work out where it is, if that view steers."""
@@ -390,6 +397,9 @@ class Service:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
         if view is self.steering:
             view.place(result, self._history)
+            if result.obstacles is not None:
+                self._obstacles = result.obstacles
+                self.bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
             self._seen.set()
 
     def _show(self, view: View, preview: Preview) -> None:

@@ -15,6 +15,7 @@ from vision.depth import range_of_boxes
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
+from vision.obstacle_sectors import ObstacleSectors
 from vision.sources import Source
 from vision.tracking import CameraView, Tracker, TrackEvent
 
@@ -41,6 +42,7 @@ class PerceptionResult:
         left_out: reason → frames so far that were not looked at. `replaced`: a newer one came first;
             `unreadable`; `too_old`; and on purpose `every` and `rate`.
         track_events: what happened to tracks, the oldest first; all since the result before.
+        obstacles: how far the nearest is in each direction; None without depth or attitude.
     """
 
     sequence: int
@@ -53,6 +55,7 @@ class PerceptionResult:
     dropped: int
     track_events: tuple[TrackEvent, ...] = ()
     left_out: Mapping[str, int] = field(default_factory=dict)
+    obstacles: ObstacleSectors | None = None
 
 
 class Timing(Protocol):
@@ -98,6 +101,7 @@ class Pipeline:
         recorder: FrameRecorder | None = None,
         tracker: Tracker | None = None,
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
+        obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
     ) -> None:
         """
         Args:
@@ -108,6 +112,7 @@ class Pipeline:
             tracker: is given the detections of every frame that is looked at.
             view_at: tells where the camera looked when it took a frame, None where that is not known. Asked
                 after the detection, when what the vehicle told of that moment has come.
+            obstacles_in: finds them in a frame with depth.
         """
         self._source = source
         self._detector = detector
@@ -115,6 +120,7 @@ class Pipeline:
         self._recorder = recorder
         self._tracker = tracker if detector is not None else None
         self._view_at = view_at
+        self._obstacles_in = obstacles_in
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self._missing = 0
@@ -192,7 +198,9 @@ class Pipeline:
             detections, events = tracked.detections, tracked.events
         tracked_ns = time.perf_counter_ns()
         timing_ms["track"] = (tracked_ns - detected_ns) / 1e6
+        obstacles = None
         if frame.depth_m is not None:
+            obstacles = self._obstacles_in(frame)
             detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
         done_ns = time.perf_counter_ns()
         timing_ms["range"] = (done_ns - tracked_ns) / 1e6
@@ -208,4 +216,5 @@ class Pipeline:
             dropped=self.dropped,
             track_events=events,
             left_out=self.left_out,
+            obstacles=obstacles,
         )

@@ -69,6 +69,9 @@ TRACKS: Final = Topic(
 )
 VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
 SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
+OBSTACLES: Final = Topic(
+    "obstacles", None, 0.5, _JSON, _REAL_TIME, True, "distance of the nearest obstacle in 72 directions"
+)
 STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
 EVENTS: Final = Topic(
     "events",
@@ -93,7 +96,7 @@ IMAGE: Final = Topic(
 # What every view publishes of its own.
 VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE)
 
-TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE, VEHICLE, SETPOINT, STATUS, EVENTS)
+TOPICS: Final = (DETECTIONS, LABELS, TRACKS, IMAGE, VEHICLE, SETPOINT, OBSTACLES, STATUS, EVENTS)
 
 # The last name of the queryable that takes a command and answers with its outcome.
 COMMAND: Final = "command"

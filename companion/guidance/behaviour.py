@@ -9,6 +9,7 @@ from enum import StrEnum
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
+from vision.obstacle_sectors import ObstacleSectors
 
 
 class Requirement(StrEnum):
@@ -35,6 +36,7 @@ class Situation:
         targets: what is seen now, in the level world frame; empty when nothing is or when it is too old.
         perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
         perception_fresh: that age is within the declared maximum.
+        obstacles: what the newest depth image says, however old; None: none came.
         sent: what the envelope let through of the last setpoint; None before the first.
     """
 
@@ -43,6 +45,7 @@ class Situation:
     targets: tuple[Target, ...] = ()
     perception_age_s: float | None = None
     perception_fresh: bool = False
+    obstacles: ObstacleSectors | None = None
     sent: Setpoint | None = None
 
 

@@ -22,7 +22,7 @@ class Choice:
         """The choice, once it is made: its newest detection. None: not yet.
 
         Args:
-            trusted: of the newest frame, those that may be chosen. Without identities the first frame decides.
+            trusted: of the newest frame, those that may be chosen. Without identities one frame decides.
             yaw_rad: of the nose.
         """
         if trusted and any(target.track_id is None for target in trusted):

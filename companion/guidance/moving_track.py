@@ -31,7 +31,7 @@ REACH_M, REACH_MPS = 1.5, 1.0
 # Of two strangers where it is expected, neither is taken unless one fits so much better.
 CLEARLY_NEARER = 3.0
 # χ² with two degrees of freedom: 99 % of the object's own detections are inside, and the picture's tracker is
-# believed without question where 90 % are. Two cars that pass each other are a gate apart, and identities leap.
+# believed without question where 90 % are: where two cars pass each other identities leap.
 GATE, SURE_GATE = 9.2, 4.6
 # Two boxes in one direction may both be the object.
 SAME_BEARING_RAD = 0.03
