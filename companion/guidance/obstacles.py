@@ -3,7 +3,7 @@
 Each sector that a depth camera saw something in bounds the speed in its direction. With an answer that comes
 after L seconds and a deceleration a, v may be flown towards what is d away where v·L + v²/(2a) + margin <= d.
 The bounds join the fence's in one projection (`Fence.slowed`): a wall shortens what leads into it and leaves
-what leads along it, and nothing is ever pushed back.
+what leads along it. Inside the margin the vehicle backs out, at half a metre a second at most.
 
 What the camera cannot see is unknown, not free. By default its speed is not limited all the same: a camera
 that looks forward sees a fifth of the circle, and a vehicle that could not fly aside or follow its path round
@@ -23,9 +23,15 @@ from companion.guidance.behaviour import Behaviour, Situation
 from vision.obstacle_sectors import SECTOR_RAD, SECTORS, ObstacleSectors
 
 ObstacleUse = Literal["off", "auto", "required"]
-# How late a multirotor's velocity follows and what is kept for stopping: as for a fence (`envelope`).
-LATENCY_S = 0.4
-DECELERATION_MPS2 = 1.0
+# How late a multirotor's velocity follows and how it stops, below what the built-in vehicle does: PX4 has
+# gathered against drag on the way (MPC_XY_VEL_I_ACC), and goes on with that for a second when it should stop.
+LATENCY_S = 0.6
+DECELERATION_MPS2 = 0.7
+# Against the nearest obstacle it is braked by asking for less than nothing, and what drifts into the margin
+# is backed out of it, slowly: a zero alone is left with the wind and what was gathered.
+BRAKING_GAIN, MOST_BRAKING_MPS, MOST_RETREAT_MPS = 1.0, 1.5, 0.5
+# So the last metres are flown with no more speed than this for each of them.
+GAIN_PER_S = 0.4
 MAX_AGE_S = 0.5
 # A few seconds: what is remembered for longer than a person needs to step aside is not there any more.
 REMEMBERED_S = 8.0
@@ -84,7 +90,23 @@ class ObstacleRules:
                 rows.append((north, east, speed_towards(distance_m - self.margin_m, late_s)))
             elif math.isnan(distance_m) and self.unknown_speed_mps is not None:
                 rows.append((north, east, self.unknown_speed_mps))
+        nearest_m = min((value for value in seen.distance_m if math.isfinite(value)), default=math.inf)
+        if math.isfinite(nearest_m):
+            north, east = DIRECTIONS[seen.distance_m.index(nearest_m)]
+            rows.insert(0, (north, east, self._braking(nearest_m, (north, east), late_s, situation)))
         return tuple(rows)
+
+    def _braking(
+        self, distance_m: float, direction: tuple[float, float], late_s: float, situation: Situation
+    ) -> float:
+        """The speed allowed towards the nearest: below zero where the vehicle is too fast or too near."""
+        left_m = distance_m - self.margin_m
+        allowed = speed_towards(left_m, late_s)
+        north_mps, east_mps, _ = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        excess = north_mps * direction[0] + east_mps * direction[1] - allowed
+        if excess > 0.0:
+            allowed -= min(MOST_BRAKING_MPS, BRAKING_GAIN * excess)
+        return min(allowed, max(-MOST_RETREAT_MPS, left_m)) if left_m < 0.0 else allowed
 
 
 NO_RULES = ObstacleRules()
@@ -129,7 +151,8 @@ class ObstacleMemory:
 def speed_towards(left_m: float, late_s: float, deceleration_mps2: float = DECELERATION_MPS2) -> float:
     """The speed from which the vehicle stops in so much way, which begins when it answers; 0 or more."""
     late = deceleration_mps2 * late_s
-    return math.sqrt(late**2 + 2.0 * deceleration_mps2 * max(0.0, left_m)) - late
+    left_m = max(0.0, left_m)
+    return min(math.sqrt(late**2 + 2.0 * deceleration_mps2 * left_m) - late, GAIN_PER_S * left_m)
 
 
 def fresh(situation: Situation) -> bool:
