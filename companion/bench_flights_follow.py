@@ -27,10 +27,10 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
-MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
+MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-15.0))
 SIZES_M = {"car": (4.2, 1.8, 1.5), "person": (0.5, 0.6, 1.7)}
 SPEED_MPS = 3.0
-DISTANCE_M, HEIGHT_M = 8.0, 2.5
+DISTANCE_M, HEIGHT_M = 8.0, 4.0
 SETTLING_S, FLIGHT_S = 8.0, 60.0
 RANGE_TOLERANCE_M, PICTURE_TOLERANCE_RAD = 1.5, math.radians(10.0)
 LEAST_TIME_ON_TARGET = 0.95

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
-from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.envelope import Envelope, Limited, Limits
+from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
 from companion.vehicle.setpoint import Setpoint
@@ -167,19 +168,19 @@ class LockstepFlight:
         limit_s: float,
         each: Callable[[Moment], None] | None = None,
         situated: Callable[[Situation], Situation] = lambda situation: situation,
-        limiting: Callable[[Setpoint, Situation, float], tuple[Setpoint, tuple[str, ...]]] | None = None,
+        rules: ObstacleRules = NO_RULES,
     ) -> FlightLog:
         """Fly it until it ends or the time is over.
 
         Args:
             each: called with every turn of guidance.
             situated: adds what the service would to what the behaviour sees.
-            limiting: between the behaviour and the envelope; what it takes away, and why.
+            rules: for the obstacles that `situated` tells of.
 
         Raises:
             TypeError: the behaviour asks for a mode of the autopilot's own.
         """
-        log, envelope = FlightLog(), Envelope(self.limits)
+        log, envelope, memory = FlightLog(), Envelope(self.limits), ObstacleMemory()
         self._watch(WARM_UP_S)
         self.begun_s = self.vehicle.now_s
         sent, activated, stepped_ns, ticks = None, False, self.now_ns, 0
@@ -200,10 +201,14 @@ class LockstepFlight:
                     raise TypeError(
                         f"{behaviour.name} asks for {step.mode.value}: only setpoints are flown here"
                     )
-                wanted, why = (step, ()) if limiting is None else limiting(step, situation, dt_s)
-                sent, reasons = envelope.apply(wanted, situation.state, now_ns, dt_s)
+                envelope.near = rules.rows(memory.filled(situation))
+                if (blind := rules.blind(situation)) is not None:
+                    envelope.reset()
+                    sent, reasons = Limited(Setpoint.brake(now_ns), (blind,))
+                else:
+                    sent, reasons = envelope.apply(step, situation.state, now_ns, dt_s)
                 self._stream.message = self._message(sent)
-                moment = Moment(self.seconds, self.vehicle.truth, situation, step, sent, (*why, *reasons))
+                moment = Moment(self.seconds, self.vehicle.truth, situation, step, sent, reasons)
                 log.moments.append(moment)
                 self._judge(moment, log)
                 if each is not None:

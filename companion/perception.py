@@ -184,15 +184,17 @@ class PerceptionKeeper:
             if self._process is not None:
                 self._process.watch(watched)
 
-    def send_attitude(self, stamp_ns: int, attitude: Quaternion) -> None:
-        """Where the vehicle was turned to, for the tracker. At most 50 a second are sent on; never waits.
+    def send_attitude(self, stamp_ns: int, attitude: Quaternion, height_m: float | None = None) -> None:
+        """Where the vehicle was turned to, for tracker and obstacles. At most 50 a second go on; never waits.
 
         Args:
             stamp_ns: CLOCK_MONOTONIC nanoseconds.
             attitude: (w, x, y, z), body FRD to NED.
+            height_m: above home, None where unknown.
         """
         tracker = self._settings.tracker
         wanted = tracker.enabled and tracker.camera_motion and self._settings.detector.enabled
+        wanted = wanted or self._settings.guidance.obstacles != "off"
         early_ns = self._attitude_due_ns - stamp_ns
         if not wanted or self._process is None or early_ns > ATTITUDE_JITTER_S * 1e9:
             return
@@ -200,7 +202,7 @@ class PerceptionKeeper:
             self._attitude_due_ns + round(ATTITUDE_PERIOD_S * 1e9),
             stamp_ns + round(2 * ATTITUDE_JITTER_S * 1e9),
         )
-        self._process.turn(Attitude(stamp_ns, attitude))
+        self._process.turn(Attitude(stamp_ns, attitude, height_m))
 
     @property
     def state(self) -> PerceptionState:

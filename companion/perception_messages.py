@@ -44,10 +44,11 @@ class Hud:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The vehicle's attitude (w, x, y, z), body FRD to NED, at a CLOCK_MONOTONIC stamp."""
+    """The vehicle's attitude (w, x, y, z), body FRD to NED, at a CLOCK_MONOTONIC stamp; its known height."""
 
     stamp_ns: int
     wxyz: Quaternion
+    height_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,6 +41,7 @@ from companion.settings import Settings
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.markers import Marker, MarkerDetector
+from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
@@ -68,7 +69,7 @@ class Orders:
     Attributes:
         stop: end now.
         hud: for the recorded video's next frames.
-        attitudes: of the vehicle, the last few seconds.
+        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
         watched: whether anybody wants pictures.
     """
 
@@ -77,6 +78,7 @@ class Orders:
         self.hud = Hud((), None)
         self.watched = False
         self.attitudes = AttitudeHistory()
+        self.height_m: float | None = None
         self._connection = connection
         self._finished = threading.Event()
         threading.Thread(target=self._take, name="inbox", daemon=True).start()
@@ -91,6 +93,7 @@ class Orders:
                 self.hud = message
             elif isinstance(message, Attitude):
                 self.attitudes.add(message.stamp_ns, message.wxyz)
+                self.height_m = message.height_m
             elif isinstance(message, Watched):
                 self.watched = message.watched
             elif isinstance(message, Stop):
@@ -175,6 +178,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             tracker=_tracker(begin),
             view_at=_view_at(settings, orders.attitudes),
             find_markers=_find_markers(settings),
+            obstacles_in=_obstacles_in(settings, orders),
         )
         try:
             _run(pipeline, perception, orders, outbox)
@@ -270,6 +274,8 @@ def _tracker(begin: Begin) -> Tracker | None:
 
 def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame], CameraView | None]:
     """Where the camera looked when it took a frame; None without the vehicle's attitude of that moment."""
+    if not settings.tracker.camera_motion:
+        return lambda _: None
     body_from_optical = settings.camera.mount().body_from_optical
 
     def view_at(frame: Frame) -> CameraView | None:
@@ -288,6 +294,22 @@ def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] |
         return None
     detector = MarkerDetector(kind)
     return lambda frame: detector.detect(frame.image, settings.camera.model(frame.width, frame.height))
+
+
+def _obstacles_in(settings: Settings, orders: Orders) -> Callable[[Frame], ObstacleSectors | None]:
+    """How far obstacles are in a frame with depth; None without the vehicle's attitude of that moment."""
+    mount = settings.camera.mount()
+
+    def obstacles_in(frame: Frame) -> ObstacleSectors | None:
+        ned_from_body = orders.attitudes.at(frame.captured_ns)
+        if settings.guidance.obstacles == "off" or frame.depth_m is None or ned_from_body is None:
+            return None
+        camera = settings.camera.model(frame.width, frame.height)
+        return obstacle_sectors(
+            frame.depth_m, frame.captured_ns, camera, mount, ned_from_body, orders.height_m
+        )
+
+    return obstacles_in
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

@@ -23,6 +23,7 @@ from companion.guidance.battery import BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.commands import Command, Mission
 from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.obstacles import ObstacleRules, obstacles_message
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search_pattern import Footprint
@@ -50,6 +51,7 @@ from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 from companion.views import View, open_views
 from companion.views_markers import MarkerWatch
+from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -110,7 +112,11 @@ class Service:
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
             battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
+            obstacles=ObstacleRules(
+                guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps
+            ),
         )
+        self._obstacles: ObstacleSectors | None = None
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
         self.poses = PoseSharing(settings.vehicle.name, self._event)
@@ -394,6 +400,7 @@ class Service:
             self.steering.targets if fresh else (),
             age_s,
             fresh,
+            self._obstacles,
             self.streamer.last_sent,
             neighbourhood=self.poses.around(self.driver.state, now_ns),
             min_separation_m=self.settings.guidance.min_separation_m,
@@ -425,7 +432,7 @@ class Service:
         self._history.add(state)
         if state.attitude is not None:
             for view in self.views:
-                view.keeper.send_attitude(state.attitude_ns, state.attitude)
+                view.keeper.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
 
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Publish what a view saw; work out where it is, if that view steers."""
@@ -442,6 +449,9 @@ class Service:
             self._seen.set()
         if view is self.steering:
             view.place(result, self._history)
+            if result.obstacles is not None:
+                self._obstacles = result.obstacles
+                self.bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
             self._seen.set()
 
     def _show(self, view: View, preview: Preview) -> None:

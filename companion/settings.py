@@ -361,6 +361,12 @@ class GuidanceSection(Section):
     """no flight begins with less charge than this, and one ends below it; percent, 0: not watched"""
     low_battery: Literal["rtl", "land", "hold"] = "rtl"
     """what follows a flight that ended for its battery: return, land here, or hold under our command"""
+    obstacles: Literal["off", "auto", "required"] = "auto"
+    """depth slows flight towards obstacles: where it comes (auto), or nothing flies without it (required)"""
+    obstacle_margin_m: Annotated[float, Field(gt=0, le=50)] = 2.0
+    """distance kept from obstacles, from the vehicle's middle, metres"""
+    unknown_speed_mps: Annotated[float | None, Field(gt=0, le=30)] = None
+    """largest speed towards what the depth camera does not see; unset: not limited, metres a second"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """detections older than this do not steer, seconds from capture"""
     view: Annotated[str | None, _VIEW_NAME] = None

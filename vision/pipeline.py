@@ -16,6 +16,7 @@ from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
 from vision.markers import Marker
+from vision.obstacle_sectors import ObstacleSectors
 from vision.sources import Source
 from vision.tracking import CameraView, Tracker, TrackEvent
 
@@ -43,6 +44,7 @@ class PerceptionResult:
             `unreadable`; `too_old`; and on purpose `every` and `rate`.
         track_events: what happened to tracks, the oldest first; all since the result before.
         markers: those in the frame; None where none are looked for.
+        obstacles: how far the nearest is in each direction; None without depth or attitude.
     """
 
     sequence: int
@@ -56,6 +58,7 @@ class PerceptionResult:
     track_events: tuple[TrackEvent, ...] = ()
     left_out: Mapping[str, int] = field(default_factory=dict)
     markers: tuple[Marker, ...] | None = None
+    obstacles: ObstacleSectors | None = None
 
 
 class Timing(Protocol):
@@ -102,6 +105,7 @@ class Pipeline:
         tracker: Tracker | None = None,
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
         find_markers: Callable[[Frame], tuple[Marker, ...]] | None = None,
+        obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
     ) -> None:
         """
         Args:
@@ -113,6 +117,7 @@ class Pipeline:
             view_at: tells where the camera looked when it took a frame, None where that is not known. Asked
                 after the detection, when what the vehicle told of that moment has come.
             find_markers: is given every frame that is looked at, beside the detector.
+            obstacles_in: finds them in a frame with depth.
         """
         self._source = source
         self._detector = detector
@@ -121,6 +126,7 @@ class Pipeline:
         self._tracker = tracker if detector is not None else None
         self._view_at = view_at
         self._find_markers = find_markers
+        self._obstacles_in = obstacles_in
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self._missing = 0
@@ -198,7 +204,9 @@ class Pipeline:
             detections, events = tracked.detections, tracked.events
         tracked_ns = time.perf_counter_ns()
         timing_ms["track"] = (tracked_ns - detected_ns) / 1e6
+        obstacles = None
         if frame.depth_m is not None:
+            obstacles = self._obstacles_in(frame)
             detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
         ranged_ns = time.perf_counter_ns()
         timing_ms["range"] = (ranged_ns - tracked_ns) / 1e6
@@ -219,4 +227,5 @@ class Pipeline:
             track_events=events,
             left_out=self.left_out,
             markers=markers,
+            obstacles=obstacles,
         )

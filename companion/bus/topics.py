@@ -73,6 +73,9 @@ MARKERS: Final = Topic(
 VEHICLE: Final = Topic("vehicle", 10.0, 0.5, _JSON, _DATA, True, "state of the vehicle")
 SETPOINT: Final = Topic("setpoint", 10.0, 0.5, _JSON, _DATA, True, "the setpoint asked for and the one sent")
 POSE: Final = Topic("pose", 10.0, 1.0, _JSON, _REAL_TIME, True, "where on earth it is, for other vehicles")
+OBSTACLES: Final = Topic(
+    "obstacles", None, 0.5, _JSON, _REAL_TIME, True, "distance of the nearest obstacle in 72 directions"
+)
 STATUS: Final = Topic("status", 1.0, 3.0, _JSON, _DATA, False, "how every part of the service is")
 EVENTS: Final = Topic(
     "events",
@@ -97,7 +100,19 @@ IMAGE: Final = Topic(
 # What every view publishes of its own.
 VIEW_TOPICS: Final = (DETECTIONS, LABELS, TRACKS, MARKERS, IMAGE)
 
-TOPICS: Final = (DETECTIONS, LABELS, TRACKS, MARKERS, IMAGE, VEHICLE, SETPOINT, POSE, STATUS, EVENTS)
+TOPICS: Final = (
+    DETECTIONS,
+    LABELS,
+    TRACKS,
+    MARKERS,
+    IMAGE,
+    VEHICLE,
+    SETPOINT,
+    OBSTACLES,
+    POSE,
+    STATUS,
+    EVENTS,
+)
 
 # The last name of the queryable that takes a command and answers with its outcome.
 COMMAND: Final = "command"

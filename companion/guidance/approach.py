@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.choosing import Choice
 from companion.guidance.motion import (
     correction,
     ground_speed,
@@ -71,6 +72,7 @@ class ApproachBehaviour(Behaviour):
         self._confidence = confidence
         self._lost_timeout_s = lost_timeout_s
         self._track: ObjectTrack | None = None
+        self._choice = Choice()
         self._doubted = False
         self._down_m = 0.0
         self._seen_ns = 0
@@ -88,6 +90,7 @@ class ApproachBehaviour(Behaviour):
         self._started_ns = self._seen_ns = situation.now_ns
         self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
         self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
+        self._choice = Choice()
         self._doubted = False
         self.lost_at = None
         self._arrived_since_ns = [None] * len(ARRIVALS)
@@ -152,9 +155,9 @@ class ApproachBehaviour(Behaviour):
         trusted = [target for target in fitting if target.trusted]
         if fitting:
             self._doubted = not trusted
-        if not trusted:
+        chosen = self._choice.take(trusted, yaw_rad, situation.now_ns)
+        if chosen is None:
             return
-        chosen = min(trusted, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._bearing_rad = chosen.bearing_rad

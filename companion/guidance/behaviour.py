@@ -13,6 +13,7 @@ from companion.guidance.target import Target
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
+from vision.obstacle_sectors import ObstacleSectors
 
 
 class Requirement(StrEnum):
@@ -39,6 +40,7 @@ class Situation:
         targets: what is seen now, in the level world frame; empty when nothing is or when it is too old.
         perception_age_s: age of the newest detection message by its capture stamp; None: none ever came.
         perception_fresh: that age is within the declared maximum.
+        obstacles: what the newest depth image says, however old; None: none came.
         sent: what the envelope let through of the last setpoint; None before the first.
         neighbourhood: the other vehicles; None: nobody listens for them.
         min_separation_m: what is kept to each of them.
@@ -50,6 +52,7 @@ class Situation:
     targets: tuple[Target, ...] = ()
     perception_age_s: float | None = None
     perception_fresh: bool = False
+    obstacles: ObstacleSectors | None = None
     sent: Setpoint | None = None
     markers: MarkerSight = NO_MARKERS
     neighbourhood: Neighbourhood | None = None

@@ -81,7 +81,11 @@ class Limited(NamedTuple):
 
 
 class Envelope:
-    """Applies `limits` to a stream of setpoints. It remembers the last one, for acceleration and yaw rate."""
+    """Applies `limits` to a stream of setpoints. It remembers the last one, for acceleration and yaw rate.
+
+    Attributes:
+        near: what obstacles allow: (north, east) unit direction, and the speed in it.
+    """
 
     def __init__(self, limits: Limits | None = None) -> None:
         self.limits = limits or Limits()
@@ -89,6 +93,7 @@ class Envelope:
         self._home: Vector3 | None = None
         self._yaw_rad: float | None = None
         self._neighbours: Sequence[Neighbour] = ()
+        self.near: tuple[tuple[float, float, float], ...] = ()
 
     def reset(self) -> None:
         """Forget the last setpoint: the next one starts from how the vehicle really moves."""
@@ -178,17 +183,17 @@ class Envelope:
         away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
         distance_m = math.hypot(*away)
         # The circle is one more edge, so that what one takes away another cannot give back.
-        circle: list[tuple[float, float, float]] = []
+        circle: list[tuple[float, float, float]] = list(self.near)
         if distance_m > 0.0:
             allowed_mps = self._towards_fence(limits.max_distance_m - distance_m)
             circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
-            if north * circle[0][0] + east * circle[0][1] > allowed_mps + 1e-9:
+            if north * circle[-1][0] + east * circle[-1][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
         circle += level_rows(rows, down)
         over_ground = limits.fence.slowed((north, east), away, self._towards_fence, also=circle)
         if math.dist(over_ground, (north, east)) > 1e-9:
             if not reasons or not reasons[-1].startswith("distance from home"):
-                reasons.append("slowed down at the fence")
+                reasons.append(self._what_slows((north, east)))
             north, east = over_ground
         return (north, east, down)
 
@@ -204,6 +209,10 @@ class Envelope:
         if because_of:
             reasons.append(f"kept {self.limits.min_separation_m:g} m from {', '.join(because_of)}")
         return left
+
+    def _what_slows(self, velocity: tuple[float, float]) -> str:
+        near = any(velocity[0] * row[0] + velocity[1] * row[1] > row[2] + 1e-9 for row in self.near)
+        return "slowed down before an obstacle" if near else "slowed down at the fence"
 
     def _towards_fence(self, left_m: float) -> float:
         """The speed from which the vehicle stops in so much way, which begins when it answers."""
@@ -248,6 +257,13 @@ class Envelope:
         if inside != goal:
             place = (home[0] + inside[0], home[1] + inside[1], down)
             reasons.append("kept inside the fence")
+        way = (place[0] - here[0], place[1] - here[1])
+        flown = (way[0] * POSITION_GAIN_PER_S, way[1] * POSITION_GAIN_PER_S)
+        freed = NO_FENCE.slowed(flown, here[:2], abs, self.near)
+        if math.dist(freed, flown) > 1e-9:
+            reach_s = 1.0 / POSITION_GAIN_PER_S
+            place = (here[0] + freed[0] * reach_s, here[1] + freed[1] * reach_s, place[2])
+            reasons.append("slowed down before an obstacle")
         offset = (place[0] - here[0], place[1] - here[1], 0.0)
         carrot = _shorten(offset, limits.max_horizontal_speed_mps / POSITION_GAIN_PER_S)
         if carrot != offset:

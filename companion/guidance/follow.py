@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.choosing import Choice
 from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
 from companion.guidance.moving_track import MovingTrack
 from companion.guidance.target import DOUBTED
@@ -67,6 +68,7 @@ class FollowBehaviour(Behaviour):
 
     def _forget(self, now_ns: int, down_m: float) -> None:
         self._track: MovingTrack | None = None
+        self._choice = Choice()
         self._started_ns = self._seen_ns = now_ns
         self._down_m = down_m
         self._doubted = False
@@ -160,9 +162,9 @@ class FollowBehaviour(Behaviour):
         trusted = [target for target in fitting if target.trusted]
         if fitting:
             self._doubted = not trusted
-        if not trusted:
+        chosen = self._choice.take(trusted, yaw_rad, situation.now_ns)
+        if chosen is None:
             return
-        chosen = min(trusted, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._yaw_rad = chosen.bearing_rad

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.guidance.target import Target
-from companion.guidance.track import GATE, NEAREST_M, measurement_noise
+from companion.guidance.track import NEAREST_M, measurement_noise
 from companion.vehicle.state import Vector3
 from vision.rotation import wrap_angle
 
@@ -30,6 +30,9 @@ FASTEST_MPS = 15.0
 REACH_M, REACH_MPS = 1.5, 1.0
 # Of two strangers where it is expected, neither is taken unless one fits so much better.
 CLEARLY_NEARER = 3.0
+# χ² with two degrees of freedom: 99 % of the object's own detections are inside, and the picture's tracker is
+# believed without question where 90 % are: where two cars pass each other identities leap.
+GATE, SURE_GATE = 9.2, 4.6
 # Two boxes in one direction may both be the object.
 SAME_BEARING_RAD = 0.03
 
@@ -113,8 +116,8 @@ class MovingTrack:
         # The picture's own tracker knows best, unless its identity has leapt to where the object cannot be.
         own = self._track_id
         fits = [fit for fit in fitting if own is not None and fit.target.track_id == own]
-        if not fits:
-            fits = self._strangers(fitting, state, elapsed_s)
+        if not fits or fits[0].squared > SURE_GATE:
+            fits += self._strangers(fitting, state, elapsed_s)
         fits.sort(key=lambda fit: fit.squared)
         if not fits or (len(fits) > 1 and fits[1].squared < CLEARLY_NEARER * max(fits[0].squared, 0.3)):
             return False
@@ -142,7 +145,9 @@ class MovingTrack:
         near = []
         for fit in fitting:
             target = fit.target
-            if not target.trusted or target.track_id in self._others or target.position_ned_m is None:
+            if not target.trusted or target.position_ned_m is None:
+                continue
+            if target.track_id is not None and target.track_id in {self._track_id, *self._others}:
                 continue
             north, east, _ = target.position_ned_m
             if math.hypot(north - state[0], east - state[1]) <= reach_m:

@@ -19,6 +19,7 @@ from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requir
 from companion.guidance.envelope import Envelope
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.mode_request import perform
+from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.refusal import refusal
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
@@ -91,12 +92,14 @@ class Pilot:
         class_names: Callable[[], Sequence[str] | None] = lambda: None,
         lifetime_s: float = DEFAULT_LIFETIME_S,
         battery: BatteryMinimum = NO_MINIMUM,
+        obstacles: ObstacleRules = NO_RULES,
     ) -> None:
         self._lifetime_s = lifetime_s
         self._driver, self._streamer, self._envelope = driver, streamer, envelope
         self._on_event, self._class_names = on_event, class_names
         self._authority = Authority()
         self._battery = BatteryWatch(battery)
+        self._obstacles, self._memory = obstacles, ObstacleMemory()
         self._phase = _Phase.IDLE
         self._behaviour: Behaviour | None = None
         self._future: asyncio.Future[Outcome] | None = None
@@ -170,7 +173,9 @@ class Pilot:
 
     def refusal_of(self, behaviour: Behaviour) -> str | None:
         """Why this behaviour could not begin now; None: it could."""
-        return refusal(behaviour, self._situation, self._class_names(), self._battery.minimum)
+        return refusal(
+            behaviour, self._situation, self._class_names(), self._battery.minimum, self._obstacles
+        )
 
     def update(self, situation: Situation) -> None:
         """One turn of the guidance loop. Never waits."""
@@ -235,6 +240,11 @@ class Pilot:
             case Setpoint() if self._phase is _Phase.OFFBOARD:
                 # How long a setpoint counts is the operator's setting, whatever its behaviour wrote.
                 deadline_ns = situation.now_ns + round(self._lifetime_s * 1e9)
+                if (blind := self._obstacles.blind(situation)) is not None:
+                    self._brake(situation)
+                    self.asked, self.limited_by = replace(step, deadline_ns=deadline_ns), (blind,)
+                    return
+                self._envelope.near = self._obstacles.rows(self._memory.filled(situation))
                 self.asked = replace(step, deadline_ns=deadline_ns)
                 self.sent, self.limited_by = self._envelope.apply(
                     self.asked, situation.state, situation.now_ns, dt_s, situation.neighbours

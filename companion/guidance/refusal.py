@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
 from companion.guidance.neighbours import missing_neighbours
+from companion.guidance.obstacles import NO_RULES, ObstacleRules
 from companion.vehicle.state import LandedState
 
 PERCEPTION_GAP_S = 1.5
@@ -24,13 +25,14 @@ def refusal(
     situation: Situation | None,
     class_names: Sequence[str] | None,
     battery: BatteryMinimum = NO_MINIMUM,
+    obstacles: ObstacleRules = NO_RULES,
 ) -> str | None:
     """Why this behaviour cannot begin now, in one line; None: it can.
 
     Args:
         situation: the newest; None before there is one.
         class_names: what the detector knows; None: not known, not checked.
-        battery: the least charge to begin with.
+        battery: the least charge to begin with. obstacles: whether depth is needed.
     """
     if situation is None:
         return "the vehicle's state is not known yet"
@@ -54,6 +56,8 @@ def refusal(
                 missing.append(what)
     if (charge := battery.missing(behaviour, state, now_ns)) is not None:
         missing.append(charge)
+    if (depth := obstacles.missing(behaviour, situation)) is not None:
+        missing.append(depth)
     if class_names is not None:
         unknown = [name for name in behaviour.class_names if name not in class_names]
         if unknown:

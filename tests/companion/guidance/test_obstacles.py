@@ -1,0 +1,138 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kinematic_vehicle import KinematicVehicle
+from scripted_autopilot import Cockpit
+
+from companion.bench_flights_obstacles import ALLOWED_M, MARGIN_M, run
+from companion.guidance.behaviour import Situation
+from companion.guidance.envelope import Envelope
+from companion.guidance.goto import GotoBehaviour
+from companion.guidance.land import LandBehaviour
+from companion.guidance.obstacles import (
+    MAX_AGE_S,
+    ObstacleMemory,
+    ObstacleRules,
+    obstacles_message,
+    speed_towards,
+)
+from companion.guidance.refusal import refusal
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode
+from vision.obstacle_sectors import SECTORS, ObstacleSectors
+
+NAN, INF = math.nan, math.inf
+
+
+def sectors(captured_ns, near=None, *, rest=INF):
+    distances = [rest] * SECTORS
+    for index, value in (near or {}).items():
+        distances[index % SECTORS] = value
+    return ObstacleSectors(captured_ns, tuple(distances))
+
+
+def situation(obstacles, *, age_s=0.0, vehicle=None):
+    vehicle = vehicle or KinematicVehicle()
+    return Situation(vehicle.now_ns + round(age_s * 1e9), vehicle.state, obstacles=obstacles)
+
+
+@given(left_m=st.floats(0.0, 50.0), late_s=st.floats(0.1, 2.0))
+def test_the_speed_allowed_always_stops_in_the_way_that_is_left(left_m, late_s):
+    speed = speed_towards(left_m, late_s, 0.7)
+    assert speed >= 0.0
+    assert speed * late_s + speed**2 / (2 * 0.7) <= left_m + 1e-6
+
+
+def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it():
+    vehicle = KinematicVehicle(velocity=[0.0, 1.0, 0.0])
+    now_ns = vehicle.now_ns
+    # A wall 2 m north, at right angles.
+    near = {i: 2.0 / math.cos(math.radians(5 * i)) for i in range(-14, 15)}
+    envelope = Envelope()
+    envelope.near = ObstacleRules("auto", 2.0).rows(situation(sectors(now_ns, near), vehicle=vehicle))
+    asked = Setpoint.velocity((2.0, 2.0, 0.0), now_ns)
+    sent = envelope.apply(asked, vehicle.state, now_ns, 0.05)
+    assert sent.sent.velocity_ned_mps[0] == pytest.approx(0.0, abs=0.02)
+    assert sent.sent.velocity_ned_mps[1] > 0.1
+    assert "slowed down before an obstacle" in sent.reasons
+    away = envelope.apply(Setpoint.velocity((-0.1, 0.0, 0.0), now_ns), vehicle.state, now_ns, 0.05)
+    assert away.sent.velocity_ned_mps[0] == pytest.approx(-0.1)
+
+
+def test_a_place_behind_an_obstacle_is_not_flown_to():
+    vehicle = KinematicVehicle()
+    envelope = Envelope()
+    near = sectors(vehicle.now_ns, {0: 3.0, 1: 3.0, -1: 3.0})
+    envelope.near = ObstacleRules("auto", 2.0).rows(situation(near, vehicle=vehicle))
+    sent = envelope.apply(
+        Setpoint.position((10.0, 0.0, -5.0), vehicle.now_ns), vehicle.state, vehicle.now_ns, 0.05
+    )
+    assert sent.sent.position_ned_m[0] < 1.0
+
+
+def test_unknown_is_not_limited_unless_the_operator_says_so():
+    seen = sectors(KinematicVehicle().now_ns, rest=NAN)
+    assert ObstacleRules("auto").rows(situation(seen)) == ()
+    rows = ObstacleRules("auto", unknown_speed_mps=1.0).rows(situation(seen))
+    assert len(rows) == SECTORS
+    assert {row[2] for row in rows} == {1.0}
+
+
+def test_depth_that_stops_coming_is_named_and_brakes():
+    vehicle = KinematicVehicle()
+    seen = sectors(vehicle.now_ns)
+    rules = ObstacleRules("auto")
+    assert rules.blind(situation(seen, age_s=MAX_AGE_S - 0.1)) is None
+    assert rules.blind(situation(seen, age_s=0.7)) == "no depth to fly by: the newest is 0.7 s old"
+    assert rules.blind(situation(None)) is None
+    assert ObstacleRules("required").blind(situation(None)) == "no depth to fly by: none came yet"
+    assert ObstacleRules("off").blind(situation(seen, age_s=9.0)) is None
+
+
+def test_required_depth_that_is_missing_is_a_refusal_that_names_it():
+    goto = GotoBehaviour(from_here_m=(5.0, 0.0))
+    rules = ObstacleRules("required")
+    assert "needs depth (none came yet" in refusal(goto, situation(None), None, obstacles=rules)
+    assert refusal(LandBehaviour(), situation(None), None, obstacles=rules) is None
+    assert refusal(goto, situation(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
+
+
+async def test_the_pilot_sends_a_brake_while_depth_is_missing():
+    cockpit = Cockpit(KinematicVehicle(mode=FlightMode.HOLD))
+    await cockpit.turn(0.1)
+    cockpit.pilot.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
+    await cockpit.until(lambda: cockpit.pilot.phase == "offboard", 5.0)
+    await cockpit.turn(1.0)
+    assert math.hypot(*cockpit.pilot.sent.velocity_ned_mps) > 1.0
+    cockpit.pilot._obstacles = ObstacleRules("required")
+    await cockpit.turn(0.1)
+    assert cockpit.pilot.sent.velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert cockpit.pilot.limited_by == ("no depth to fly by: none came yet",)
+
+
+def test_what_has_left_the_picture_is_remembered_where_it_stands():
+    memory, vehicle = ObstacleMemory(), KinematicVehicle()
+    memory.filled(situation(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
+    vehicle.position[0] += 1.0
+    vehicle.now_ns += 10**9
+    later = memory.filled(situation(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle))
+    assert later.obstacles.distance_m[0] == pytest.approx(3.0)
+    vehicle.now_ns += 10**10
+    assert math.isnan(
+        memory.filled(situation(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles.distance_m[0]
+    )
+
+
+def test_the_message_tells_unknown_from_free():
+    message = obstacles_message(sectors(5, {0: 1.234, 1: NAN}), "v")
+    assert message["distance_m"][:3] == [1.23, None, None]
+    assert message["known"][:3] == [True, False, True]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_goto_stops_before_what_stands_in_its_way(seed):
+    result = run(seed)
+    assert result.success, result.reason
+    assert result.values["nearest_m"] >= MARGIN_M - ALLOWED_M

@@ -1,0 +1,129 @@
+"""How far the nearest obstacle is, in each of 72 directions about the vehicle, from one depth image.
+
+The layout is that of MAVLink's OBSTACLE_DISTANCE (common, 330): sectors of 5°, here level and from north, so
+that a vehicle that turns or banks after the capture does not turn its obstacles. Only what lies in a band of
+heights about the vehicle counts; the ground is below it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.camera_model import CameraModel, CameraMount
+
+SECTORS = 72
+SECTOR_RAD = math.tau / SECTORS
+# Of the vehicle's own height: what is in this band can be flown into (metres above and below).
+ABOVE_M, BELOW_M = 0.7, 0.8
+# The band ends so far above the ground; a degree of attitude raises it by 0.2 m, 10 m away.
+GROUND_GAP_M = 0.35
+# The near end of what is seen in a sector, against single wrong pixels that are too near.
+NEAR_PERCENTILE = 5.0
+LEAST_POINTS = 5
+# With depth in fewer of its pixels, nothing can be said of a sector: a dark lens is not a free sky.
+LEAST_KNOWN_SHARE = 0.1
+# Rows and columns that are looked at, at most.
+GRID_ROWS, GRID_COLUMNS = 120, 160
+
+
+@dataclass(frozen=True, slots=True)
+class ObstacleSectors:
+    """What one depth image says of the surroundings.
+
+    Attributes:
+        captured_ns: CLOCK_MONOTONIC stamp of the image.
+        distance_m: 72 horizontal distances from the vehicle, metres. Sector i is centred i · 5° clockwise
+            from north. Infinite: seen, and nothing is there. NaN: not seen, or without depth.
+    """
+
+    captured_ns: int
+    distance_m: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.distance_m) != SECTORS:
+            raise ValueError(f"distance_m must have {SECTORS} values, got {len(self.distance_m)}")
+
+
+def obstacle_sectors(
+    depth_m: NDArray[np.float32],
+    captured_ns: int,
+    camera: CameraModel,
+    mount: CameraMount,
+    ned_from_body: NDArray[np.float64],
+    height_m: float | None = None,
+) -> ObstacleSectors:
+    """The nearest obstacle of each sector.
+
+    Args:
+        depth_m: (H, W) float32, metres along the optical axis; NaN, infinite or not above zero where unknown.
+        camera: of that size.
+        ned_from_body: (3, 3) float64, the attitude at the capture, body FRD to NED.
+        height_m: of the vehicle above the ground, which then lies below the band; None: not known, and the
+            vehicle must be higher than 0.8 m.
+
+    Raises:
+        ValueError: the image is not of the camera's size.
+    """
+    if depth_m.shape != (camera.height, camera.width):
+        raise ValueError(
+            f"depth must have the camera's size ({camera.height}, {camera.width}), got {depth_m.shape}"
+        )
+    rows = slice(None, None, max(1, math.ceil(camera.height / GRID_ROWS)))
+    columns = slice(None, None, max(1, math.ceil(camera.width / GRID_COLUMNS)))
+    depth = depth_m[rows, columns].ravel()
+    rays = _rays(camera, rows.step, columns.step)
+    turn = (ned_from_body @ mount.body_from_optical).astype(np.float32)
+    eye = (ned_from_body @ mount.position_frd_m).astype(np.float32)
+
+    level = rays @ turn.T
+    looked = _sector(level[:, 0], level[:, 1])
+    known = np.isfinite(depth) & (depth > 0.0)
+    counted = np.bincount(looked, minlength=SECTORS)
+    with_depth = np.bincount(looked[known], minlength=SECTORS)
+    seen = (counted >= LEAST_POINTS) & (with_depth >= LEAST_KNOWN_SHARE * counted)
+
+    points = level[known] * depth[known, None] + eye
+    below_m = BELOW_M if height_m is None else min(BELOW_M, height_m - GROUND_GAP_M)
+    in_band = (points[:, 2] > -ABOVE_M) & (points[:, 2] < below_m)
+    north, east = points[in_band, 0], points[in_band, 1]
+    distance = np.full(SECTORS, np.nan)
+    distance[seen] = np.inf
+    _nearest_of_each(_sector(north, east), np.hypot(north, east), distance)
+    return ObstacleSectors(captured_ns, tuple(float(value) for value in distance))
+
+
+def _nearest_of_each(
+    sector: NDArray[np.int64], range_m: NDArray[np.float32], distance: NDArray[np.float64]
+) -> None:
+    """Write each sector's low percentile where it has points enough."""
+    order = np.lexsort((range_m, sector))
+    ordered = range_m[order]
+    counts = np.bincount(sector, minlength=SECTORS)
+    firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    enough = counts >= LEAST_POINTS
+    places = firsts + (counts * (NEAR_PERCENTILE / 100.0)).astype(np.int64)
+    distance[enough] = ordered[places[enough]]
+
+
+def _sector(north: NDArray[np.float32], east: NDArray[np.float32]) -> NDArray[np.int64]:
+    return np.rint(np.arctan2(east, north) / SECTOR_RAD).astype(np.int64) % SECTORS
+
+
+_cached: dict[tuple[CameraModel, int, int], NDArray[np.float32]] = {}
+
+
+def _rays(camera: CameraModel, row_step: int, column_step: int) -> NDArray[np.float32]:
+    """(N, 3) float32 rays of the looked-at pixels with z = 1; the last camera's are kept."""
+    key = (camera, row_step, column_step)
+    if key not in _cached:
+        across, down = np.meshgrid(
+            np.arange(0, camera.width, column_step), np.arange(0, camera.height, row_step)
+        )
+        rays = camera.rays(np.column_stack([across.ravel(), down.ravel()]))
+        _cached.clear()
+        _cached[key] = (rays / rays[:, 2:]).astype(np.float32)
+    return _cached[key]
