@@ -58,7 +58,7 @@ def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it():
     assert sent.sent.velocity_ned_mps[1] > 0.1
     assert "slowed down before an obstacle" in sent.reasons
     away = envelope.apply(Setpoint.velocity((-0.1, 0.0, 0.0), now_ns), vehicle.state, now_ns, 0.05)
-    assert away.sent.velocity_ned_mps[0] == pytest.approx(-0.1)
+    assert away.sent.velocity_ned_mps[0] < 0.0
 
 
 def test_a_place_behind_an_obstacle_is_not_flown_to():
