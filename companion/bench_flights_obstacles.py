@@ -1,8 +1,8 @@
 """Flights of `goto` through a wall or a pillar, seen by the built-in vehicle's rendered depth camera.
 
 The place to go to lies behind a wall (even seeds) or a pillar of 2 m (odd ones), 12 to 18 m away, at up to
-4 m/s, in up to 3 m/s of wind. Depth comes ten times a second with a stereo camera's noise, 80 ms late. It
-succeeds when the vehicle's middle never comes nearer to the obstacle than the margin less a metre, and
+4 m/s, in up to 3 m/s of wind. Depth comes ten times a second with a stereo camera's noise, 80 ms late. A
+flight succeeds when the vehicle's middle never comes nearer to the obstacle than the margin less a metre, and
 the wall (nobody gets round it) has stopped it.
 """
 

@@ -1,0 +1,63 @@
+import math
+
+import pytest
+from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+
+from companion.bench_flights import UnknownFlightError, flight_named, flights, summary
+from companion.bench_flights_follow import run
+from companion.guidance.follow import FollowBehaviour
+from companion.guidance.grammar import parse
+from companion.guidance.registry import behaviour_for
+
+
+def moving(thing, speed_mps, *, hidden=(1e9, 1e9)):
+    def each(seconds, _vehicle):
+        thing.north = 12.0 + speed_mps * seconds
+        thing.visible = not hidden[0] <= seconds < hidden[1]
+
+    return each
+
+
+@pytest.mark.parametrize("bearing", ["here", "course"])
+def test_follow_keeps_its_distance_to_what_moves_and_survives_a_while_without_seeing_it(bearing):
+    car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
+    vehicle = KinematicVehicle()
+    flight = Flight(FollowBehaviour("car", distance_m=8.0, bearing=bearing), vehicle, [car])
+    assert flight.run(30.0, moving(car, 3.0, hidden=(18.0, 19.5))) is None
+    assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(8.0, abs=0.8)
+
+
+def test_follow_ends_with_the_reason_when_what_it_follows_is_gone():
+    car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
+    outcome = Flight(FollowBehaviour("car", occlusion_s=2.0), objects=[car]).run(
+        30.0, moving(car, 3.0, hidden=(10, 99))
+    )
+    assert not outcome.success
+    assert outcome.reason.startswith("lost the car for 2.0 s: last expected ")
+
+
+def test_follow_does_not_take_another_of_the_class_for_its_own():
+    car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
+    other = SeenObject("car", 20.0, 4.0, track_id=2, track_score=0.9)
+    outcome = Flight(FollowBehaviour("car"), objects=[car, other]).run(30.0, moving(car, 0.5, hidden=(6, 99)))
+    assert outcome is not None
+    assert "lost the car" in outcome.reason
+
+
+def test_the_command_makes_the_behaviour():
+    assert isinstance(behaviour_for(parse("follow car distance=6 bearing=course angle=180")), FollowBehaviour)
+    assert parse("follow car").endless
+    assert not parse("follow car duration=10").endless
+
+
+def test_a_minute_behind_a_person_in_lockstep():
+    result = run(4)
+    assert result.success, result.reason
+
+
+def test_flights_are_found_by_their_names():
+    assert {"approach", "approach-depth", "follow", "obstacles"} <= set(flights())
+    with pytest.raises(UnknownFlightError, match="there are: "):
+        flight_named("nix")
+    with pytest.raises(ValueError, match="no flights"):
+        summary("follow", [])
