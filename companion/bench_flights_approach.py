@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
+from companion.bench_drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench_flights import FlightResult
-from companion.drawn_detector import DrawnDetector, Pose, Thing
+from companion.bench_lockstep_flight import LockstepFlight, Sight
 from companion.guidance.approach import ApproachBehaviour
-from companion.lockstep_flight import LockstepFlight, Sight
 from vision.camera_model import CameraModel, CameraMount
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))

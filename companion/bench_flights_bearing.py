@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.bench_drawn_detector import DrawnDetector, Faults, Pose, Thing
 from companion.bench_flights import FlightResult
-from companion.drawn_detector import DrawnDetector, Faults, Pose, Thing
+from companion.bench_lockstep_flight import LockstepFlight, Moment, Sight
 from companion.guidance.orbit import OrbitBehaviour
-from companion.lockstep_flight import LockstepFlight, Moment, Sight
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections

@@ -2,7 +2,7 @@
 
 A person or a car goes its winding way for a minute, with up to 1 m/s² sideways. Twice it is hidden, for 1 to
 2 s. Another of its class stands 3.5 m beside its way, a second one comes towards it and passes as near. The
-wind is up to 3 m/s with its gusts; the detector's faults are those of `drawn_detector`, its results 80 ms
+wind is up to 3 m/s with its gusts; the detector's faults are those of `bench_drawn_detector`, its results 80 ms
 late. Range comes from the ground plane.
 
 Time on target is the share of guidance's turns, from 8 s after the beginning until the minute is over (a
@@ -19,10 +19,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from companion.bench_drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench_flights import FlightResult
-from companion.drawn_detector import DrawnDetector, Pose, Thing
+from companion.bench_lockstep_flight import LockstepFlight, Moment, Sight
 from companion.guidance.follow import FollowBehaviour
-from companion.lockstep_flight import LockstepFlight, Moment, Sight
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 

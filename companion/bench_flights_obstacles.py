@@ -14,10 +14,10 @@ from collections import deque
 import numpy as np
 
 from companion.bench_flights import FlightResult
+from companion.bench_lockstep_flight import LockstepFlight
 from companion.guidance.behaviour import Situation
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.obstacles import ObstacleRules
-from companion.lockstep_flight import LockstepFlight
 from mavlink_sim.depth_camera import DepthSensor, measured_depth
 from mavlink_sim.renderer import Renderer
 from mavlink_sim.world import World, WorldObject, range_to

@@ -83,7 +83,7 @@ class _Outline:
 
 
 class DrawnDetector:
-    """Callable as `lockstep_flight.Sight.detect`. The same seed and calls give the same detections.
+    """Callable as `bench_lockstep_flight.Sight.detect`. The same seed and calls give the same detections.
 
     Args:
         with_depth: detections have a range, as with a depth camera.

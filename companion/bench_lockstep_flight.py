@@ -2,7 +2,7 @@
 
 What a flight in the service has is here too, with the service's own parts: telemetry as messages, folded into
 the state; targets from boxes through the history of poses; the envelope; setpoints at 50 Hz. In place of the
-network stands a detector made of the truth (`drawn_detector`), whose results come late and pass a tracker.
+network stands a detector made of the truth (`bench_drawn_detector`), whose results come late and pass a tracker.
 """
 
 from __future__ import annotations
