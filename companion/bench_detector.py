@@ -172,7 +172,7 @@ def in_turn(measured: Sequence[Measured], frames: int) -> None:
 
 def draw_pictures(path: Path, width: int, height: int) -> Path:
     """A few pictures of the built-in world, (N, height, width, 3) uint8 BGR, as a numpy file."""
-    from mavlink_sim.training_scenes import random_scene
+    from mavlink_sim.datasets.training_scenes import random_scene
 
     rng = np.random.default_rng(0)
     np.save(path, np.stack([random_scene(rng, width, height)[0] for _ in range(_PICTURES)]))

@@ -2,8 +2,8 @@
 
 A person or a car goes its winding way for a minute, with up to 1 m/s² sideways. Twice it is hidden, for 1 to
 2 s. Another of its class stands 3.5 m beside its way, a second one comes towards it and passes as near. The
-wind is up to 3 m/s with its gusts; the detector's faults are those of `bench_drawn_detector`, its results 80 ms
-late. Range comes from the ground plane.
+wind is up to 3 m/s with its gusts; the detector's faults are those of `bench_drawn_detector`, its results
+80 ms late. Range comes from the ground plane.
 
 Time on target is the share of guidance's turns, from 8 s after the beginning until the minute is over (a
 flight that ends before counts the rest as off target), at which by the truth both hold: the distance to the

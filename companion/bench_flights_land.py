@@ -21,10 +21,10 @@ from companion.bench_flights import FlightResult
 from companion.bench_marker_flight import RATES_HZ, LandingFlight, beside_m
 from companion.guidance.envelope import Limits
 from companion.guidance.land_on_marker import LandOnMarkerBehaviour
+from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.lockstep import LockstepVehicle, Truth
-from mavlink_sim.plates import Print
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.world import Ground, World, WorldObject
+from mavlink_sim.world.plates import Print
+from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import Marker, MarkerDetector, MarkerKind, PadMarker, marker_from_corners, square
 from vision.rotation import matrix_from_quaternion

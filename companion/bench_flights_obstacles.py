@@ -18,9 +18,9 @@ from companion.bench_lockstep_flight import LockstepFlight
 from companion.guidance.behaviour import Situation
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.obstacles import ObstacleRules
-from mavlink_sim.depth_camera import DepthSensor, measured_depth
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.world import World, WorldObject, range_to
+from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.world.world import World, WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.rotation import matrix_from_quaternion

@@ -26,8 +26,8 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 from mavlink_sim import LockstepVehicle
-from mavlink_sim.messages import dialect
 from mavlink_sim.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
+from mavlink_sim.wire.messages import dialect
 from vision.rotation import quaternion_from_euler, wrap_angle
 
 GUIDANCE_HZ = 20.0

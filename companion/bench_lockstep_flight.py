@@ -2,7 +2,8 @@
 
 What a flight in the service has is here too, with the service's own parts: telemetry as messages, folded into
 the state; targets from boxes through the history of poses; the envelope; setpoints at 50 Hz. In place of the
-network stands a detector made of the truth (`bench_drawn_detector`), whose results come late and pass a tracker.
+network stands a detector made of the truth (`bench_drawn_detector`), whose results come late and pass a
+tracker.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 from mavlink_sim.lockstep import LockstepVehicle, Truth
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
 from vision.rotation import Quaternion

@@ -20,7 +20,7 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 from mavlink_sim.lockstep import LockstepVehicle, Truth
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 from vision.camera_model import CameraMount
 from vision.markers import Marker, PadMarker
 

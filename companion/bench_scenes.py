@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mavlink_sim.ground_view import Buffers
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.world import Ground, World, WorldObject
+from mavlink_sim.camera.ground_view import Buffers
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
 from vision.rotation import Quaternion, matrix_from_quaternion, quaternion_from_euler

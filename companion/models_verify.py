@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mavlink_sim.training_scenes import random_scene
+from mavlink_sim.datasets.training_scenes import random_scene
 from vision.evaluation.dataset import image_files, read_image
 from vision.letterbox import fit
 from vision.runtimes.contract import Precision, Runtime, RuntimeUnusableError

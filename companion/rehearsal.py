@@ -118,7 +118,7 @@ def rehearsal_settings(
     port: int, camera: str, *, video: Path | None = None, driver: str = "mavsdk"
 ) -> Settings:
     """Settings for the built-in vehicle and its camera, whatever is configured on this machine."""
-    from mavlink_sim.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
+    from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
 
     fov_deg = math.degrees(2 * math.atan(DEFAULT_CAMERA.width / 2 / DEFAULT_CAMERA.fx))
     overrides = {

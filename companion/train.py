@@ -1,7 +1,7 @@
 """`companion train`: the bundled detector, made again from nothing but this repository.
 
-The recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.training_scenes`) decide the weights; nothing
-is downloaded.
+The recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.datasets.training_scenes`) decide the weights;
+nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mavlink_sim.shapes import CLASS_NAMES
-from mavlink_sim.training_scenes import random_scene
+from mavlink_sim.datasets.training_scenes import random_scene
+from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.yolo.checkpoint import save_checkpoint
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX
 from vision.yolo.evaluation import evaluate
@@ -78,7 +78,7 @@ def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettin
     score = evaluate(trained.model, random_scene, HELD_OUT_SEED, held_out, width, height)
     metadata = {
         "licence": LICENCE,
-        "trained_on": "scenes drawn by mavlink_sim.training_scenes",
+        "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",
         "steps_done": trained.steps_done,
         "score": {
             "map50": round(score.map50, 4),

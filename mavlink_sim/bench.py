@@ -13,9 +13,9 @@ from typing import Annotated
 import typer
 
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.messages import dialect
-from mavlink_sim.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 from mavlink_sim.testing import free_udp_ports
+from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -14,14 +14,14 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from mavlink_sim.endpoint import PortInUseError
+from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.fleet import Fleet, instance_options
-from mavlink_sim.parameters import UnknownParameterError
 from mavlink_sim.personality import AUTOPILOTS, PX4
+from mavlink_sim.px4.parameters import UnknownParameterError
 from mavlink_sim.releases import NEWEST
-from mavlink_sim.signing import ALWAYS, key_of
 from mavlink_sim.simulation import SimulationOptions
-from mavlink_sim.video_outputs import STANDARD_OUTPUT
+from mavlink_sim.wire.endpoint import PortInUseError
+from mavlink_sim.wire.signing import ALWAYS, key_of
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
 MAX_WIND_MPS = 8.0
@@ -248,7 +248,7 @@ def main() -> None:
     """The console script's entry: what cannot be is said in one line, with exit code 2."""
     try:
         if sys.argv[1:2] == ["dataset"]:
-            from mavlink_sim.dataset_cli import app as dataset_app
+            from mavlink_sim.datasets.cli import app as dataset_app
 
             code = dataset_app(sys.argv[2:], prog_name="mavlink-sim dataset", standalone_mode=False)
         elif sys.argv[1:2] == ["bench"]:

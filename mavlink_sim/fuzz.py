@@ -21,10 +21,10 @@ from pathlib import Path
 
 from pymavlink.generator.mavcrc import x25crc
 
-from mavlink_sim.messages import dialect, parser
-from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.wire.messages import dialect, parser
 
 SOURCES = ((1, 191), (245, 190), (1, 1), (0, 0), (255, 255), (7, 1))
 SPECIAL_FLOATS = (float("nan"), float("inf"), float("-inf"), 0.0, -0.0, 1e38, -1e38, 1e-45, 1.0, 21196.0)

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavlink_sim.lockstep_wire import LockstepWire
-from mavlink_sim.messages import Outgoing, dialect
 from mavlink_sim.personality import PX4, vehicle_class
-from mavlink_sim.streams import ONBOARD_RATES_HZ
 from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.wire.messages import Outgoing, dialect
+from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 
 COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
 ANSWER_LIMIT_S = 1.0

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.messages import parser
+from mavlink_sim.wire.messages import parser
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle

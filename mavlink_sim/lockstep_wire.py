@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.messages import Outgoing, parser
+from mavlink_sim.wire.messages import Outgoing, parser
 
 if TYPE_CHECKING:
-    from mavlink_sim.links import Link
+    from mavlink_sim.services.links import Link
     from mavlink_sim.vehicle import Vehicle
 
 

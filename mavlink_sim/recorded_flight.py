@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink import mavutil
 
-from mavlink_sim.messages import parser
-from mavlink_sim.telemetry import PREARM_CHECK
+from mavlink_sim.services.telemetry import PREARM_CHECK
 from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.wire.messages import parser
 
 RATE_TOLERANCE = 0.05  # of the number of messages of a kind, besides two of them
 TIME_TOLERANCE_S = 1.0

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import random
 
-from mavlink_sim.normal_numbers import BITS, NORMAL
-from mavlink_sim.physics import GUST_STEP_S, GUST_TIME_CONSTANT_S, Vector
+from mavlink_sim.physics.airframe import GUST_STEP_S, GUST_TIME_CONSTANT_S, Vector
+from mavlink_sim.physics.normal_numbers import BITS, NORMAL
 
 STEP_US = round(GUST_STEP_S * 1e6)
 _KEEP = 1.0 - GUST_STEP_S / GUST_TIME_CONSTANT_S

@@ -15,21 +15,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from mavlink_sim.endpoint import UdpEndpoint
-from mavlink_sim.fault_room import fault_room
+from mavlink_sim.faults.room import fault_room
 from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.releases import NEWEST
-from mavlink_sim.streams import GCS_RATES_HZ
-from mavlink_sim.traffic_log import recording
 from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.wire.endpoint import UdpEndpoint
+from mavlink_sim.wire.streams import GCS_RATES_HZ
+from mavlink_sim.wire.traffic_log import recording
 from vision.rotation import euler_from_quaternion
 from vision.shared_frame import segment_path
 
 if TYPE_CHECKING:
-    from mavlink_sim.camera_process import CameraProcess
-    from mavlink_sim.physics import Vector
-    from mavlink_sim.scene import Scene
-    from mavlink_sim.world import World
+    from mavlink_sim.camera.process import CameraProcess
+    from mavlink_sim.camera.scene import Scene
+    from mavlink_sim.physics.airframe import Vector
+    from mavlink_sim.world.world import World
 
 logger = logging.getLogger(__name__)
 
@@ -177,7 +177,7 @@ class Simulation:
 
     def _open_world(self) -> None:
         # imported here: a vehicle without camera or truth needs neither the renderer nor its start-up time
-        from mavlink_sim.scene_file import scene_or_demo
+        from mavlink_sim.camera.scene_file import scene_or_demo
 
         options = self.options
         self._scene = scene_or_demo(
@@ -185,7 +185,7 @@ class Simulation:
         )
         if not options.shows_world:
             return
-        from mavlink_sim.camera_process import CameraProcess
+        from mavlink_sim.camera.process import CameraProcess
 
         if options.camera is not None:
             segment_path(options.camera)  # raises for a name that cannot be
@@ -332,7 +332,7 @@ class Simulation:
 
 
 def _object_truth(world: World, position_ned_m: Vector) -> list[dict[str, Any]]:
-    from mavlink_sim.world import range_to
+    from mavlink_sim.world.world import range_to
 
     return [
         {

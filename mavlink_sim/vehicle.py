@@ -14,27 +14,27 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from typing import Any
 
-from mavlink_sim import file_transfer, mission_link, parameter_protocol, telemetry
-from mavlink_sim.announcements import CRITICAL, INFO, Text
-from mavlink_sim.autopilot import Autopilot
-from mavlink_sim.estimate_errors import FallibleEstimate
-from mavlink_sim.event_protocol import EventBuffer
-from mavlink_sim.faults import Faults
-from mavlink_sim.geography import geographic, start_of_vehicle
-from mavlink_sim.gimbal import Gimbal
-from mavlink_sim.gimbal_protocol import GimbalManager
-from mavlink_sim.links import AUTOPILOT_COMPONENT, Link, forward, target_of
-from mavlink_sim.messages import Outgoing, dialect, link_node_status
-from mavlink_sim.microservices import HANDLERS
-from mavlink_sim.modes import Mode
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import HARD_LANDING_MPS, Multirotor, Vector
+from mavlink_sim.autopilot.commander import Autopilot
+from mavlink_sim.faults.schedule import Faults
+from mavlink_sim.flight.transmitter import Transmitter
+from mavlink_sim.physics.airframe import HARD_LANDING_MPS, Multirotor, Vector
+from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.geography import geographic, start_of_vehicle
+from mavlink_sim.physics.gimbal import Gimbal
+from mavlink_sim.px4.modes import Mode
+from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.releases import NEWEST, release_named
+from mavlink_sim.services import file_transfer, mission_link, parameter_protocol, telemetry
+from mavlink_sim.services.event_protocol import EventBuffer
+from mavlink_sim.services.gimbal_protocol import GimbalManager
+from mavlink_sim.services.links import AUTOPILOT_COMPONENT, Link, forward, target_of
+from mavlink_sim.services.microservices import HANDLERS
+from mavlink_sim.services.vehicle_files import vehicle_files
 from mavlink_sim.shared_air import SharedAir
-from mavlink_sim.signing import Signing, Streams, timestamp_now
-from mavlink_sim.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
-from mavlink_sim.transmitter import Transmitter
-from mavlink_sim.vehicle_files import vehicle_files
+from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
+from mavlink_sim.wire.messages import Outgoing, dialect, link_node_status
+from mavlink_sim.wire.signing import Signing, Streams, timestamp_now
+from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
 BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12

@@ -38,6 +38,21 @@ FLOORS = {
     "bench": 7,
     "cli": 8,
 }
+# The same for `mavlink_sim`; its modules at the top, and the ArduPilot made of them, stand above every room.
+SIMULATOR_FLOORS = {
+    "px4": 0,
+    "wire": 0,
+    "world": 0,
+    "physics": 1,
+    "camera": 1,
+    "flight": 2,
+    "datasets": 2,
+    "missions": 3,
+    "autopilot": 4,
+    "services": 5,
+    "faults": 6,
+}
+SIMULATOR_TOP = 7
 SIMULATOR_MAY_IMPORT = {
     "vision.camera_model",
     "vision.frame",
@@ -114,6 +129,20 @@ def test_rooms_of_the_companion_import_downwards_only() -> None:
             if not other.startswith("companion.") or room(other) == here:
                 continue
             assert FLOORS[room(other)] < FLOORS[here], f"{name} imports upwards: {other}"
+
+
+def test_rooms_of_the_simulator_import_downwards_only() -> None:
+    def floor(module: str) -> int:
+        return SIMULATOR_FLOORS.get(module.split(".")[1], SIMULATOR_TOP)
+
+    for name, path in modules().items():
+        if not name.startswith("mavlink_sim."):
+            continue
+        for other in imports_of(name, path, only_top=True):
+            if not other.startswith("mavlink_sim.") or other.split(".")[1] == name.split(".")[1]:
+                continue
+            if floor(name) < SIMULATOR_TOP:
+                assert floor(other) < floor(name), f"{name} imports upwards: {other}"
 
 
 def test_no_module_imports_itself_in_a_circle() -> None:

@@ -14,7 +14,7 @@ from companion.cli import app as companion_app
 from companion.guidance import grammar
 from companion.guidance.commands import COMMANDS
 from mavlink_sim.cli import app as simulator_app
-from mavlink_sim.dataset_cli import app as dataset_app
+from mavlink_sim.datasets.cli import app as dataset_app
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [

@@ -10,8 +10,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink_sim import flight, manual_flight
-from mavlink_sim.announcements import CRITICAL, INFO
 from mavlink_sim.ardupilot.guided import Guided
 from mavlink_sim.ardupilot.landing import Land
 from mavlink_sim.ardupilot.modes import (
@@ -23,9 +21,13 @@ from mavlink_sim.ardupilot.modes import (
 )
 from mavlink_sim.ardupilot.return_to_launch import ReturnToLaunch
 from mavlink_sim.ardupilot.watch import FailsafeWatch
-from mavlink_sim.autopilot import ACCEPTED, IDLE_THRUST_MPS2, TAKEOFF_DETECTION_HEIGHT_M, Autopilot
-from mavlink_sim.control import TrajectorySetpoint
-from mavlink_sim.modes import (
+from mavlink_sim.autopilot.commander import ACCEPTED, IDLE_THRUST_MPS2, TAKEOFF_DETECTION_HEIGHT_M, Autopilot
+from mavlink_sim.autopilot.position_failsafe import Descend
+from mavlink_sim.flight import manual_flight
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.position_control import TrajectorySetpoint
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.px4.modes import (
     CUSTOM_MODE_ENABLED,
     GUIDED_ENABLED,
     MANUAL_INPUT_ENABLED,
@@ -35,9 +37,8 @@ from mavlink_sim.modes import (
     Mode,
     SystemState,
 )
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import GRAVITY_MPS2, Multirotor, Vector
-from mavlink_sim.position_failsafe import Descend
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import CRITICAL, INFO
 
 FAILED = 4  # MAV_RESULT
 WARNING = 4  # MAV_SEVERITY_WARNING

@@ -13,8 +13,12 @@ from mavlink_sim.ardupilot import streams
 from mavlink_sim.ardupilot.autopilot import FAILED
 from mavlink_sim.ardupilot.modes import CopterMode, mode_of
 from mavlink_sim.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
-from mavlink_sim.autopilot import ACCEPTED, TEMPORARILY_REJECTED
-from mavlink_sim.commands import (
+from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
+from mavlink_sim.flight.setpoints import GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT_INT
+from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, local
+from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED
+from mavlink_sim.services.commands import (
     ARM_DISARM,
     DENIED,
     DO_CHANGE_SPEED,
@@ -31,15 +35,11 @@ from mavlink_sim.commands import (
     Command,
     command_of,
 )
-from mavlink_sim.geography import HOME_ALTITUDE_M, local
-from mavlink_sim.messages import dialect
-from mavlink_sim.modes import CUSTOM_MODE_ENABLED
-from mavlink_sim.physics import Vector
-from mavlink_sim.setpoints import GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT_INT
+from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.links import Link
+    from mavlink_sim.services.links import Link
 
 FORCE_ARM = 2989.0
 NAV_LOITER_UNLIM = 17

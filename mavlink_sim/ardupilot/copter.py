@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-from mavlink_sim.announcements import Text
 from mavlink_sim.ardupilot import services, streams, telemetry
 from mavlink_sim.ardupilot.autopilot import CopterAutopilot
 from mavlink_sim.ardupilot.modes import CopterMode
 from mavlink_sim.ardupilot.parameters import CopterParameters
-from mavlink_sim.links import Link
+from mavlink_sim.services.links import Link
 from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.wire.announcements import Text
 
 
 class CopterVehicle(Vehicle):

@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink_sim import flight
-from mavlink_sim.control import NAN, NOTHING, TrajectorySetpoint
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor, Vector
-from mavlink_sim.precision_landing import LandingTarget
-from mavlink_sim.quaternions import inverse, product
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
+from mavlink_sim.flight.precision_landing import LandingTarget
+from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.quaternions import inverse, product
+from mavlink_sim.px4.parameters import Parameters
 from vision.rotation import Quaternion
 
 BODY_FRD = 12  # MAV_FRAME_BODY_FRD

@@ -11,12 +11,12 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.ardupilot import streams
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import Parameter
+from mavlink_sim.px4.parameters import Parameter
+from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.links import Link
+    from mavlink_sim.services.links import Link
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
-from mavlink_sim.parameters import REAL32, Parameter, Parameters
+from mavlink_sim.px4.parameters import REAL32, Parameter, Parameters
 
 INT8, INT16, INT32 = 2, 4, 6  # MAV_PARAM_TYPE
 _RANGES = {INT8: (-(2**7), 2**7 - 1), INT16: (-(2**15), 2**15 - 1), INT32: (-(2**31), 2**31 - 1)}

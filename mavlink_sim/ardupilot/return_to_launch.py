@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from mavlink_sim import flight
-from mavlink_sim.control import NAN, TrajectorySetpoint
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor, Vector
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.position_control import NAN, TrajectorySetpoint
+from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.px4.parameters import Parameters
 
 ALTITUDE_REACHED_M = 0.5
 LOWEST_RETURN_M = 2.0  # RTL_ALT_MIN: the cone allows no lower

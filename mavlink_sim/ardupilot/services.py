@@ -6,23 +6,23 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim import microservices, pilot_link
-from mavlink_sim.announcements import INFO
 from mavlink_sim.ardupilot import commands, landing, parameter_service, streams, targets
 from mavlink_sim.ardupilot.guided import THRUST_AS_THRUST, Attitude
-from mavlink_sim.messages import dialect
-from mavlink_sim.precision_landing import LandingTarget
-from mavlink_sim.setpoints import (
+from mavlink_sim.flight.precision_landing import LandingTarget
+from mavlink_sim.flight.setpoints import (
     ATTITUDE_IGNORE,
     BODY_YAW_RATE_IGNORE,
     PITCH_RATE_IGNORE,
     ROLL_RATE_IGNORE,
     THROTTLE_IGNORE,
 )
+from mavlink_sim.services import microservices, pilot_link
+from mavlink_sim.wire.announcements import INFO
+from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle
-    from mavlink_sim.links import Link
+    from mavlink_sim.services.links import Link
 
 RATES_IGNORE = ROLL_RATE_IGNORE | PITCH_RATE_IGNORE | BODY_YAW_RATE_IGNORE
 MISSION_UNSUPPORTED = 3  # MAV_MISSION_UNSUPPORTED

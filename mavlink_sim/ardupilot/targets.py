@@ -11,9 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from mavlink_sim.geography import HOME_ALTITUDE_M, local
-from mavlink_sim.physics import Vector
-from mavlink_sim.setpoints import (
+from mavlink_sim.flight.setpoints import (
     ACCELERATION_IGNORE,
     BODY_NED,
     FORCE,
@@ -26,6 +24,8 @@ from mavlink_sim.setpoints import (
     YAW_IGNORE,
     YAW_RATE_IGNORE,
 )
+from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, local
 
 NAN = math.nan
 LOCAL_OFFSET_NED = 7  # MAV_FRAME_LOCAL_OFFSET_NED

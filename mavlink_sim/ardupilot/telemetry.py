@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from mavlink_sim import telemetry
-from mavlink_sim.geography import geographic
-from mavlink_sim.messages import dialect
+from mavlink_sim.physics.geography import geographic
+from mavlink_sim.services import telemetry
+from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.copter import CopterVehicle

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from mavlink_sim.announcements import CRITICAL, Text
 from mavlink_sim.ardupilot.modes import WITHOUT_POSITION, CopterMode
-from mavlink_sim.parameters import Parameters
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import CRITICAL, Text
 
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.autopilot import CopterAutopilot

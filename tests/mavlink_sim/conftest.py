@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect
-from mavlink_sim.streams import GCS_RATES_HZ
 from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.streams import GCS_RATES_HZ
 
 NAN = math.nan
 COMPANION = (1, 191)

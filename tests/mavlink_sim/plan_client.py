@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mavlink_sim.geography import geographic
-from mavlink_sim.messages import dialect
+from mavlink_sim.physics.geography import geographic
+from mavlink_sim.wire.messages import dialect
 
 NAN = math.nan
 COMPANION = (1, 191)

@@ -6,8 +6,8 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.messages import dialect, parser
-from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.services.microservices import HANDLERS
+from mavlink_sim.wire.messages import dialect, parser
 
 HANDLED = {m.id: m for m in dialect.mavlink_map.values() if m.msgname in HANDLERS}
 OTHERS = {m.id: m for m in dialect.mavlink_map.values() if m.msgname not in HANDLERS}

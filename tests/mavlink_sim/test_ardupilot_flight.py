@@ -9,8 +9,8 @@ import pytest
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.lockstep import CommandRefusedError
-from mavlink_sim.messages import dialect
-from mavlink_sim.quaternions import inverse, product
+from mavlink_sim.physics.quaternions import inverse, product
+from mavlink_sim.wire.messages import dialect
 
 ARM, TAKEOFF, SET_MODE = 400, 22, 176
 POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111

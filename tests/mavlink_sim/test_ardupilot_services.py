@@ -10,8 +10,8 @@ import pytest
 from pymavlink import mavutil
 
 from mavlink_sim import LockstepVehicle
-from mavlink_sim.messages import dialect
 from mavlink_sim.testing import running_simulator
+from mavlink_sim.wire.messages import dialect
 
 GCS = (255, 190)
 

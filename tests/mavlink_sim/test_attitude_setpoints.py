@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.attitude_control import AttitudeController, AttitudeSetpoint, RatesSetpoint
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2
-from mavlink_sim.quaternions import inverse, product, third_axis, unit
-from mavlink_sim.setpoints import attitude_setpoint
+from mavlink_sim.flight.attitude_control import AttitudeController, AttitudeSetpoint, RatesSetpoint
+from mavlink_sim.flight.setpoints import attitude_setpoint
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2
+from mavlink_sim.physics.quaternions import inverse, product, third_axis, unit
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.messages import dialect
 from vision.rotation import euler_from_quaternion, matrix_from_quaternion, quaternion_from_euler
 
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2

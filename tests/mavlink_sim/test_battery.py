@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.battery import Battery, BatteryWarning
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
+from mavlink_sim.physics.battery import Battery, BatteryWarning
+from mavlink_sim.px4.parameters import Parameters
 
 GROUND_STATION = (245, 190)
 CHECKED = {"CBRK_SUPPLY_CHK": 0, "SIM_BAT_MIN_PCT": 0}

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.camera_lens import CameraMotion, Lens, Shutter
-from mavlink_sim.plates import Print
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.world import Ground, World, WorldObject
+from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.world.plates import Print
+from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_euler
 

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from mavlink_sim.camera_process import CameraProcess
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.world import Ground, World, WorldObject
+from mavlink_sim.camera.process import CameraProcess
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.rotation import quaternion_from_euler
@@ -122,8 +122,8 @@ def test_poses_to_a_dead_or_hung_camera_do_not_block(camera: CameraProcess) -> N
 
 PARENT = """
 import sys, time
-from mavlink_sim.camera_process import CameraProcess
-from mavlink_sim.world import Ground, World
+from mavlink_sim.camera.process import CameraProcess
+from mavlink_sim.world.world import Ground, World
 from vision.camera_model import CameraModel, CameraMount
 if __name__ == "__main__":
     world = World((), Ground(("concrete",), 0, 256, 0.05))

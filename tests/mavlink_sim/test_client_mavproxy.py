@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, vehicle
 
 pytestmark = pytest.mark.skipif(

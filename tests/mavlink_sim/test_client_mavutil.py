@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pymavlink import mavparm, mavutil
 
-from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.testing import RunningSimulator, vehicle
 
 SPEED = 4.0

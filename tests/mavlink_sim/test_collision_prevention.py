@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_client import listen
 
-from mavlink_sim.collision_prevention import (
+from mavlink_sim.flight.collision_prevention import (
     FRAME_BODY_FRD,
     FRAME_LOCAL_NED,
     SECTORS,
@@ -18,9 +18,9 @@ from mavlink_sim.collision_prevention import (
     ObstacleMap,
     limited_acceleration,
 )
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.messages import dialect
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
 STILL = (0.0, 0.0)

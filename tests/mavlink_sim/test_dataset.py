@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import yaml
 
-from mavlink_sim.dataset import DatasetError, DatasetOptions, make_dataset
-from mavlink_sim.depth_camera import DepthSensor
-from mavlink_sim.scene import CameraSettings, Scene
-from mavlink_sim.shapes import CLASS_NAMES
-from mavlink_sim.world import Ground, World, WorldObject
+from mavlink_sim.camera.depth_camera import DepthSensor
+from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.datasets.dataset import DatasetError, DatasetOptions, make_dataset
+from mavlink_sim.world.shapes import CLASS_NAMES
+from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel
 
 SCENE = Scene(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.depth_camera import DepthSensor, measured_depth
+from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 
 FOCAL_PX = 400.0
 QUIET = DepthSensor(noise_px=0.0, dropout=0.0, minimum_m=0.1, maximum_m=100.0)

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from mavlink_sim import LockstepVehicle
-from mavlink_sim.estimator import Estimate
-from mavlink_sim.messages import dialect
-from mavlink_sim.physics import GRAVITY_MPS2, Multirotor
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor
+from mavlink_sim.physics.estimator import Estimate
+from mavlink_sim.wire.messages import dialect
 
 TOLD = {"LOCAL_POSITION_NED": 20.0, "GPS_RAW_INT": 8.0, "ATTITUDE": 50.0, "HIGHRES_IMU": 50.0}
 HERE = dialect.MAVLink_set_position_target_local_ned_message(

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.announcements import Text, event_identifier
-from mavlink_sim.battery import BatteryWarning
-from mavlink_sim.failsafe_actions import Action
-from mavlink_sim.failsafes import Conditions, FailsafeMachine
-from mavlink_sim.messages import dialect
-from mavlink_sim.modes import Mode
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.transmitter import CALIBRATION, Sticks
+from mavlink_sim.autopilot.failsafe_actions import Action
+from mavlink_sim.autopilot.failsafes import Conditions, FailsafeMachine
+from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.physics.battery import BatteryWarning
+from mavlink_sim.px4.modes import Mode
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import Text, event_identifier
+from mavlink_sim.wire.messages import dialect
 
 GROUND_STATION = (245, 190)
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mavlink_sim.fault_console import FaultConsole
+from mavlink_sim.faults.console import FaultConsole
 from mavlink_sim.vehicle import Vehicle
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.geography import local
-from mavlink_sim.messages import dialect
+from mavlink_sim.physics.geography import local
+from mavlink_sim.wire.messages import dialect
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
 GPS_ID, ESTIMATOR_ID = 24, 230
@@ -171,8 +171,8 @@ def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(cockpit, p
 
 
 def test_offboard_by_attitude_needs_no_position() -> None:
-    from mavlink_sim.control import TrajectorySetpoint
-    from mavlink_sim.position_failsafe import asks_for_position
+    from mavlink_sim.autopilot.position_failsafe import asks_for_position
+    from mavlink_sim.flight.position_control import TrajectorySetpoint
 
     assert asks_for_position(TrajectorySetpoint(velocity=(1.0, 0.0, 0.0)))
     assert not asks_for_position(TrajectorySetpoint(acceleration=(0.0, 0.0, 0.0)))

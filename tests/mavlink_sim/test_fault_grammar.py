@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.fault_grammar import FaultError, parse_fault
-from mavlink_sim.fault_kinds import EFFECTS, KINDS
+from mavlink_sim.faults.grammar import FaultError, parse_fault
+from mavlink_sim.faults.kinds import EFFECTS, KINDS
 
 
 @pytest.mark.parametrize(

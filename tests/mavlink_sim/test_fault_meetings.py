@@ -9,9 +9,9 @@ import pytest
 from plan_client import land, takeoff, upload, waypoint
 
 from mavlink_sim import LockstepVehicle
-from mavlink_sim.geography import local, start_of_vehicle
-from mavlink_sim.messages import dialect
-from mavlink_sim.mission_items import MissionItem
+from mavlink_sim.missions.items import MissionItem
+from mavlink_sim.physics.geography import local, start_of_vehicle
+from mavlink_sim.wire.messages import dialect
 
 ORBIT, CHANGE_ALTITUDE, SET_HOME = 34, 186, 179
 RETURN_ACTION, TERMINATE_ACTION = 3, 4  # GF_ACTION

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.fault_grammar import FaultError
+from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.lockstep_link import LockstepLink
-from mavlink_sim.messages import dialect, parser
 from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.wire.messages import dialect, parser
 
 
 def fly(cockpit: Any, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:

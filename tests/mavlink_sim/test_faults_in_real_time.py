@@ -11,12 +11,12 @@ import time
 import pytest
 import zenoh
 
-from mavlink_sim.fault_control import ControlError, FaultControl
-from mavlink_sim.faulty_socket import FaultySocket
-from mavlink_sim.link_faults import Delay, LinkStage, Loss
-from mavlink_sim.messages import dialect, parser
+from mavlink_sim.faults.zenoh_door import ControlError, FaultControl
 from mavlink_sim.testing import running_simulator
 from mavlink_sim.vehicle import Vehicle
+from mavlink_sim.wire.faulty_socket import FaultySocket
+from mavlink_sim.wire.link_faults import Delay, LinkStage, Loss
+from mavlink_sim.wire.messages import dialect, parser
 
 
 def bound() -> socket.socket:

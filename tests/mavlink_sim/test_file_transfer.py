@@ -20,12 +20,12 @@ from mavsdk.asyncio.plugins.ftp import FtpAsync, FtpError
 from mavsdk.plugins.component_metadata import MetadataType
 from pymavlink import mavftp, mavutil
 
-from mavlink_sim.file_system import FileSystem, resolve
-from mavlink_sim.file_transfer import DATA_BYTES, Failure, Opcode, Packet, Server
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import INT32, Parameters
+from mavlink_sim.px4.parameters import INT32, Parameters
+from mavlink_sim.services.file_system import FileSystem, resolve
+from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Packet, Server
+from mavlink_sim.services.vehicle_files import bson, offer_packed_parameters, packed_parameters
 from mavlink_sim.testing import RunningSimulator, running_simulator
-from mavlink_sim.vehicle_files import bson, offer_packed_parameters, packed_parameters
+from mavlink_sim.wire.messages import dialect
 
 
 class Client:

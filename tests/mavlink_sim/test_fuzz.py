@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 from mavlink_sim.fuzz import Fuzzer, fuzz_in_lockstep, fuzz_over_sockets
-from mavlink_sim.messages import parser
-from mavlink_sim.microservices import HANDLERS
+from mavlink_sim.services.microservices import HANDLERS
+from mavlink_sim.wire.messages import parser
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.geography import geographic
-from mavlink_sim.gimbal import Aim, Gimbal, Target
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import Parameters
+from mavlink_sim.physics.geography import geographic
+from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
+from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.simulation import Simulation, SimulationOptions
+from mavlink_sim.wire.messages import dialect
 from vision.rotation import matrix_from_quaternion, quaternion_from_euler
 
 NAN = math.nan

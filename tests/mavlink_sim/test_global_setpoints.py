@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
-from mavlink_sim.messages import dialect
-from mavlink_sim.physics import LINEAR_DRAG_PER_S
-from mavlink_sim.setpoints import (
+from mavlink_sim.flight.setpoints import (
     SetpointRejectedError,
     flyable,
     global_trajectory_setpoint,
     trajectory_setpoint,
 )
+from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.wire.messages import dialect
 
 NAMES = ("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
 POSITION_ALONE = 0xDF8

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.link_faults import (
+from mavlink_sim.wire.link_faults import (
     Channel,
     Corruption,
     Delay,

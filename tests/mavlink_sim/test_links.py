@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from mavlink_sim.announcements import INFO, Text
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.announcements import INFO, Text
+from mavlink_sim.wire.messages import dialect
 
 GCS = 6
 ONBOARD_CONTROLLER = 18

@@ -12,10 +12,10 @@ import pytest
 
 import mavlink_sim
 from mavlink_sim import CommandRefusedError, LockstepVehicle, NotReachedError
-from mavlink_sim.fault_grammar import FaultError
-from mavlink_sim.messages import dialect, parser
-from mavlink_sim.signing import Signing
-from mavlink_sim.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
+from mavlink_sim.faults.grammar import FaultError
+from mavlink_sim.wire.messages import dialect, parser
+from mavlink_sim.wire.signing import Signing
+from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
 
 def flight(seed: int, links: dict[str, dict[str, float]] | None = None) -> tuple[str, Any]:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.manual_flight import (
+from mavlink_sim.flight.manual_flight import (
     HeightByStick,
     Position,
     expo,
@@ -18,10 +18,10 @@ from mavlink_sim.manual_flight import (
     throttle_curve,
     with_dead_zone,
 )
-from mavlink_sim.modes import Mode
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor
-from mavlink_sim.transmitter import CALIBRATION, Sticks
+from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor
+from mavlink_sim.px4.modes import Mode
+from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.vehicle import Vehicle
 
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0}

@@ -20,7 +20,7 @@ from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
 from plan_client import item, land, polygon, rally, takeoff, waypoint
 
-from mavlink_sim.geography import geographic
+from mavlink_sim.physics.geography import geographic
 from mavlink_sim.testing import RunningSimulator, running_simulator
 
 SPEED = 6.0

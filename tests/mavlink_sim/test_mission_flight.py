@@ -20,7 +20,7 @@ from plan_client import (
     waypoint,
 )
 
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 
 SHORT = [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]
 

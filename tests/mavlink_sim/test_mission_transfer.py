@@ -26,9 +26,9 @@ from plan_client import (
     waypoint,
 )
 
-from mavlink_sim.messages import dialect, parser
-from mavlink_sim.mission_items import ItemRejectedError, PlanType, item_of, message_of
-from mavlink_sim.mission_messages import MissionCurrent
+from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
+from mavlink_sim.services.mission_messages import MissionCurrent
+from mavlink_sim.wire.messages import dialect, parser
 
 NAN = math.nan
 SQUARE = [(-50.0, -50.0), (-50.0, 50.0), (50.0, 50.0), (50.0, -50.0)]

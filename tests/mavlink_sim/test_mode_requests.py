@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 
 ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavlink_sim.modes import Mode, base_mode, mode_of
+from mavlink_sim.px4.modes import Mode, base_mode, mode_of
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.messages import dialect
-from mavlink_sim.setpoints import SetpointRejectedError, trajectory_setpoint
+from mavlink_sim.flight.setpoints import SetpointRejectedError, trajectory_setpoint
+from mavlink_sim.wire.messages import dialect
 
 
 def target(frame: int = 1, mask: int = 0, **fields: float) -> Any:

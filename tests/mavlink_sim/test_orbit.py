@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
-from mavlink_sim.messages import dialect
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.wire.messages import dialect
 
 NAN = math.nan
 CENTRE = (12.0, 5.0, 0.0)

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.generator.mavcrc import x25crc
 
-from mavlink_sim import packing
-from mavlink_sim.messages import dialect, parser
-from mavlink_sim.packing import Packed, checksum, packer
+from mavlink_sim.wire import packing
+from mavlink_sim.wire.messages import dialect, parser
+from mavlink_sim.wire.packing import Packed, checksum, packer
 
 HOT = {
     name: getattr(dialect, f"MAVLink_{name}_message")

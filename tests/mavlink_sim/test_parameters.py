@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import (
+from mavlink_sim.px4.parameters import (
     INT32,
     REAL32,
     Parameter,
@@ -16,6 +15,7 @@ from mavlink_sim.parameters import (
     UnknownParameterError,
     decode_wire_value,
 )
+from mavlink_sim.wire.messages import dialect
 
 
 def bytewise(value: int) -> float:

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.control import PositionController, TrajectorySetpoint
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor, rotation_matrix
-from mavlink_sim.rate_loop import mixed_thrusts
+from mavlink_sim.flight.position_control import PositionController, TrajectorySetpoint
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor, rotation_matrix
+from mavlink_sim.physics.rate_loop import mixed_thrusts
+from mavlink_sim.px4.parameters import Parameters
 
 STEP_S = 0.004
 

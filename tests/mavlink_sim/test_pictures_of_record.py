@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mavlink_sim.image_effects import MILD_EFFECTS
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.training_scenes import random_scene
-from mavlink_sim.world import demo_world
+from mavlink_sim.camera.image_effects import MILD_EFFECTS
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.datasets.training_scenes import random_scene
+from mavlink_sim.world.world import demo_world
 from vision.rotation import matrix_from_euler
 
 RECORD = Path(__file__).with_name("pictures_of_record.json")

@@ -16,8 +16,8 @@ from mavsdk.asyncio.plugins.manual_control import ManualControlAsync
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
+from mavlink_sim.flight.transmitter import CALIBRATION
 from mavlink_sim.testing import RunningSimulator, running_simulator
-from mavlink_sim.transmitter import CALIBRATION
 
 LIMIT_S = 60.0
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.plates import DICTIONARIES, Print, marker_cells
-from mavlink_sim.renderer import Renderer
-from mavlink_sim.world import Ground, Light, World, WorldObject
+from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.world.plates import DICTIONARIES, Print, marker_cells
+from mavlink_sim.world.world import Ground, Light, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_euler
 

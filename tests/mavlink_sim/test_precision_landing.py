@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from plan_client import land, listen, takeoff, upload
 
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 
 TARGET = (2.0, -1.5)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 
 PREARM_CHECK = 0x10000000
 NAN = float("nan")

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect, parser
-from mavlink_sim.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
+from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
+from mavlink_sim.wire.messages import dialect, parser
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 PARAMETERS = DATA / "px4" / "parameters.txt"

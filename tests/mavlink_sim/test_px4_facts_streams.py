@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common
 
-from mavlink_sim.messages import dialect, parser
+from mavlink_sim.wire.messages import dialect, parser
 
 GCS = 6
 ONBOARD_CONTROLLER = 18

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 
 INFO, CRITICAL = 6, 2
 GROUND_STATION = (245, 190)

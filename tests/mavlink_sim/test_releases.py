@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from mavlink_sim.messages import dialect
 from mavlink_sim.releases import RELEASES, release_named
+from mavlink_sim.wire.messages import dialect
 
 
 @pytest.mark.parametrize("release", ["1.14", "1.15"])

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.ground_view import Buffers
-from mavlink_sim.image_effects import ImageEffects
-from mavlink_sim.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered, Renderer, VisibleObject
-from mavlink_sim.shapes import CLASS_NAMES
-from mavlink_sim.world import Ground, Light, Sky, World, WorldObject, demo_world
+from mavlink_sim.camera.ground_view import Buffers
+from mavlink_sim.camera.image_effects import ImageEffects
+from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered, Renderer, VisibleObject
+from mavlink_sim.world.shapes import CLASS_NAMES
+from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject, demo_world
 from vision.camera_model import CameraModel, CameraMount
 from vision.geolocation import point_at_depth, point_on_ground
 from vision.rotation import matrix_from_euler

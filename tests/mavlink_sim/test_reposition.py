@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.geography import HOME_ALTITUDE_M, geographic
-from mavlink_sim.messages import dialect
-from mavlink_sim.parameters import Parameters
-from mavlink_sim.physics import Multirotor
-from mavlink_sim.reposition import reposition_goal
+from mavlink_sim.flight.reposition import reposition_goal
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.messages import dialect
 
 NAN = math.nan
 CHANGE_MODE = 1.0

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.scene import Path, Scene
-from mavlink_sim.scene_file import SceneError, example_scenes, load_scene, parse_scene, scene_or_demo
-from mavlink_sim.world import World, WorldObject, demo_world
+from mavlink_sim.camera.scene import Path, Scene
+from mavlink_sim.camera.scene_file import SceneError, example_scenes, load_scene, parse_scene, scene_or_demo
+from mavlink_sim.world.world import World, WorldObject, demo_world
 
 FULL = """
 name = "everything"

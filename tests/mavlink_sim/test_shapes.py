@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.painting_order import clip_polygon, painting_tree
-from mavlink_sim.palettes import palette_of
-from mavlink_sim.shapes import BUILDERS, CLASS_NAMES, VARIANTS, shape_of, variant_of
-from mavlink_sim.solids import Body, ground_shadow
+from mavlink_sim.world.painting_order import clip_polygon, painting_tree
+from mavlink_sim.world.palettes import palette_of
+from mavlink_sim.world.shapes import BUILDERS, CLASS_NAMES, VARIANTS, shape_of, variant_of
+from mavlink_sim.world.solids import Body, ground_shadow
 
 SIZES_M = {
     "person": ((0.25, 1.7), (0.4, 2.1), (1.4, 2.2)),

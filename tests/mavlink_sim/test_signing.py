@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink import mavutil
 
-from mavlink_sim.endpoint import UdpEndpoint
-from mavlink_sim.messages import Outgoing, component_metadata, dialect, parser
-from mavlink_sim.signing import ALWAYS, EXCEPT_USB, OPTIONAL, Signing, key_of, timestamp_now
 from mavlink_sim.testing import running_simulator
+from mavlink_sim.wire.endpoint import UdpEndpoint
+from mavlink_sim.wire.messages import Outgoing, component_metadata, dialect, parser
+from mavlink_sim.wire.signing import ALWAYS, EXCEPT_USB, OPTIONAL, Signing, key_of, timestamp_now
 
 KEY = bytes(range(32))
 OTHER_KEY = bytes(32 * [7])

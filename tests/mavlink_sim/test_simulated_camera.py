@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavlink_sim.camera_lens import Shutter
-from mavlink_sim.depth_camera import DepthSensor
-from mavlink_sim.plates import Print
-from mavlink_sim.scene import CameraSettings, Path, Scene
-from mavlink_sim.simulated_camera import SimulatedCamera, _motion_between, frame_truth, truth_line
-from mavlink_sim.world import Ground, World, WorldObject
+from mavlink_sim.camera.depth_camera import DepthSensor
+from mavlink_sim.camera.lens import Shutter
+from mavlink_sim.camera.scene import CameraSettings, Path, Scene
+from mavlink_sim.camera.simulated_camera import SimulatedCamera, _motion_between, frame_truth, truth_line
+from mavlink_sim.world.plates import Print
+from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_euler
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.messages import dialect
+from mavlink_sim.wire.messages import dialect
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ import pytest
 from pymavlink import mavutil
 
 from mavlink_sim.cli import main
-from mavlink_sim.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
-from mavlink_sim.messages import Outgoing, dialect, parser
 from mavlink_sim.testing import free_udp_ports, running_simulator
+from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
+from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SharedFrameReader
 
 
@@ -200,7 +200,7 @@ def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent
     peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
     clock = [100.0]
-    monkeypatch.setattr("mavlink_sim.endpoint.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("mavlink_sim.wire.endpoint.time.monotonic", lambda: clock[0])
     try:
         for peer in peers:
             peer.bind(("127.0.0.1", 0))

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.messages import dialect
-from mavlink_sim.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ, Streams
+from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ, Streams
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"

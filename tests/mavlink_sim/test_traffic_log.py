@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.endpoint import UdpEndpoint
-from mavlink_sim.messages import Outgoing, dialect, parser
-from mavlink_sim.traffic_log import TrafficLog, recording
+from mavlink_sim.wire.endpoint import UdpEndpoint
+from mavlink_sim.wire.messages import Outgoing, dialect, parser
+from mavlink_sim.wire.traffic_log import TrafficLog, recording
 
 
 def read(path: Path) -> list[Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mavlink_sim.training_scenes import (
+from mavlink_sim.datasets.training_scenes import (
     CLASS_NAMES,
     MIN_AREA_PX,
     MIN_SIDE_PX,

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mavlink_sim.mjpeg_output import MAX_CLIENTS, MjpegOutput
-from mavlink_sim.video_outputs import FrameOutput, NewestFrame, PipeOutput, check_output, open_output
+from mavlink_sim.camera.mjpeg_output import MAX_CLIENTS, MjpegOutput
+from mavlink_sim.camera.video_outputs import FrameOutput, NewestFrame, PipeOutput, check_output, open_output
 from vision.frame import Frame
 from vision.sources import open_source
 from vision.sources.source import SourceSettings
@@ -140,7 +140,7 @@ def test_a_path_that_is_no_fifo_is_refused_and_left_alone(tmp_path: Path) -> Non
 
 STDOUT_WRITER = """
 import sys, numpy as np
-from mavlink_sim.video_outputs import open_output
+from mavlink_sim.camera.video_outputs import open_output
 from vision.frame import Frame
 output = open_output("pipe:-", 64, 48, 30.0)
 for number in range(100000):

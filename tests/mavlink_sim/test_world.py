@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavlink_sim.shapes import CLASS_NAMES
-from mavlink_sim.world import World, WorldObject, demo_world, range_to
+from mavlink_sim.world.shapes import CLASS_NAMES
+from mavlink_sim.world.world import World, WorldObject, demo_world, range_to
 
 SEEDS = range(12)
 

@@ -1,0 +1,552 @@
+"""PX4's Commander in small: arming checks, modes, the offboard-loss failsafe, landed states, auto-disarming.
+
+`update` runs once a control step. Whatever PX4 would tell a ground station is queued in `texts`.
+Times are seconds since boot. Names in capitals are PX4's parameters.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
+
+from mavlink_sim.autopilot import position_failsafe
+from mavlink_sim.autopilot.supervision import REASONS, Supervision
+from mavlink_sim.flight import manual_flight, reposition
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.attitude_control import AttitudeController, RatesSetpoint
+from mavlink_sim.flight.orbit import Orbit, OrbitRequest
+from mavlink_sim.flight.position_control import Demand, PositionController, TrajectorySetpoint
+from mavlink_sim.flight.precision_landing import Precision
+from mavlink_sim.missions.navigator import Navigator
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.px4.modes import (
+    MANUAL_MODES,
+    MODES_PREVENTING_ARMING,
+    LandedState,
+    Mode,
+    SystemState,
+    base_mode,
+)
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import (
+    ARMED_EVENT,
+    ARMING_DENIED_EVENT,
+    CRITICAL,
+    DEFAULT_ALTITUDE_EVENT,
+    DISARMED_EVENT,
+    GIMBAL_COMMANDS,
+    INFO,
+    LANDED_EVENT,
+    LANDING_EVENT,
+    TAKEOFF_EVENT,
+    GimbalCommand,
+    Text,
+)
+
+ACCEPTED = 0  # MAV_RESULT
+TEMPORARILY_REJECTED = 1
+
+# Measured: a vehicle that does not take off is disarmed 11.2 s after arming with COM_DISARM_PRFLT = 10.
+PREFLIGHT_DISARM_MARGIN_S = 1.2
+# Measured with COM_OF_LOSS_T = 1: OFFBOARD is left 1.05-1.15 s after the last setpoint; a stream of 0.9 Hz is
+# lost for 50 ms at a time.
+OFFBOARD_LOSS_MARGIN_S = 0.06
+# PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
+LAND_DETECTION_S = 1.5
+TAKEOFF_DETECTION_HEIGHT_M = 0.12
+# As recorded: the vehicle creeps up while the ramp is still raising the thrust to hover, then climbs.
+RAMP_THRUST_SHARE = 0.9
+RAMP_CREEP_MPS = 0.2
+IDLE_THRUST_MPS2 = 0.6
+
+
+class Autopilot:
+    """The decisions of one vehicle. `now_s` is the time since boot, advanced by `update`."""
+
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        *,
+        ready_after_s: float,
+        on_event: Callable[[str], None],
+    ) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._ready_after_s = ready_after_s
+        self._on_event = on_event
+        self.controller = PositionController(parameters)
+        self.controller.reset(airframe.yaw_rad)
+        self.attitude = AttitudeController(parameters)
+        self.cruise_mps = math.nan  # of DO_CHANGE_SPEED; it ends with the mode
+        self.now_s = 0.0
+        self.armed = False
+        self.mode = Mode.HOLD
+        self.intended_mode = Mode.HOLD
+        self.failsafe = False
+        self.landed = airframe.on_ground  # it may boot while it falls
+        self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
+        self.home: Vector = airframe.position
+        self.texts: deque[Text] = deque()
+        self.supervision = Supervision(self, parameters)
+        self.gimbal_commands: deque[GimbalCommand] = deque()
+        self.demand = Demand(0.0, 0.0, 0.0, 0.0)
+        self._gimbal_schedule: deque[tuple[float, GimbalCommand]] = deque()
+        self._takeoff_height_m: float | None = None
+        self.task: flight.Task | None = None
+        self._mode_after_disarming = Mode.HOLD
+        self._last_setpoint_s = -math.inf
+        self._setpoint_needs_position = False
+        self._rates_alone = False  # the newest offboard setpoint was of body rates
+        self._armed_since_s = 0.0
+        self._landed_since_s = 0.0
+        self._contact_since_s: float | None = None
+        self._lifting_since_s: float | None = None
+        self._has_flown = False
+        self.navigator = Navigator(self, airframe, parameters, on_event)
+        # collision prevention: it may reduce what the sticks ask for in Position mode
+        self.stick_guard: manual_flight.AccelerationGuard | None = self.navigator.guard_sticks
+
+    # ---- what others read -------------------------------------------------------------------------------
+
+    @property
+    def has_setpoints(self) -> bool:
+        """The offboard stream is alive (COM_OF_LOSS_T)."""
+        if self._setpoint_needs_position and not self.position_valid:
+            return False
+        limit = self._parameters.number("COM_OF_LOSS_T") + OFFBOARD_LOSS_MARGIN_S
+        return self.now_s - self._last_setpoint_s <= limit
+
+    @property
+    def pilot_has_sticks(self) -> bool:
+        """A remote control or a joystick counts, so POSCTL and the like can be flown."""
+        return self.supervision.pilot_has_sticks
+
+    @pilot_has_sticks.setter
+    def pilot_has_sticks(self, attached: bool) -> None:
+        self.supervision.pilot_attached = attached
+
+    @property
+    def terminated(self) -> bool:
+        """The motors stand still for good; it takes a reboot."""
+        return self.supervision.terminated
+
+    @property
+    def sensors_ready(self) -> bool:
+        return self.now_s >= self._ready_after_s
+
+    @property
+    def can_arm(self) -> bool:
+        """PX4's prearm check of the current mode (SYS_STATUS' bit MAV_SYS_STATUS_PREARM_CHECK)."""
+        return (
+            self.sensors_ready
+            and not self.terminated
+            and (self.position_valid or not position_failsafe.needs_position(self.mode))
+            and (self.armed or self.mode not in MODES_PREVENTING_ARMING)  # no matter once it is
+            and (self.mode is not Mode.MISSION or self.navigator.mission.valid)
+            and not self.navigator.is_breached
+            and (self.mode is not Mode.OFFBOARD or self.has_setpoints)
+            and (self.mode not in MANUAL_MODES or self.pilot_has_sticks)
+            and self.supervision.allows_arming
+        )
+
+    @property
+    def system_status(self) -> SystemState:
+        if self.terminated:
+            return SystemState.FLIGHT_TERMINATION
+        if self.failsafe and self.armed:
+            return SystemState.CRITICAL
+        if self.armed:
+            return SystemState.ACTIVE
+        return SystemState.STANDBY if self.can_arm else SystemState.UNINIT
+
+    @property
+    def base_mode(self) -> int:
+        # PX4 goes by the newest setpoint, however old
+        ever_heard = math.isfinite(self._last_setpoint_s)
+        return base_mode(self.mode, self.armed, ever_heard and not self._rates_alone)
+
+    @property
+    def landed_state(self) -> LandedState:
+        if self.landed:
+            return LandedState.ON_GROUND
+        if self.mode is Mode.TAKEOFF or (self.task is not None and self.task.taking_off):
+            return LandedState.TAKEOFF
+        if self.task is not None and self.task.landing:
+            return LandedState.LANDING
+        return LandedState.IN_AIR
+
+    # ---- what a client asks for -------------------------------------------------------------------------
+
+    def arm(self, by: str = "external command") -> int:
+        """MAV_RESULT of an arming request. `by`: PX4's name of who asks, a key of `supervision.REASONS`."""
+        if self.armed:
+            return ACCEPTED
+        refusal = self.supervision.refuses_arming(by)
+        if refusal is not None:
+            self.texts.append(refusal)
+            return TEMPORARILY_REJECTED
+        if not self.can_arm:
+            if not self.sensors_ready:
+                self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
+            self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
+            return TEMPORARILY_REJECTED
+        self.armed = True
+        self._has_flown = False
+        self._armed_since_s = self.now_s
+        self._lifting_since_s = None
+        self.home = self._airframe.position
+        self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
+        self._on_event("armed")
+        self._start_task()
+        return ACCEPTED
+
+    def disarm(self, force: bool = False, by: str = "external command") -> int:
+        """MAV_RESULT of a disarming request; `force` stops the motors in the air too."""
+        if not self.armed:
+            return ACCEPTED
+        if not self.landed and not force and not self.supervision.may_disarm_in_the_air(by):
+            if by != "stick gesture":
+                self._say(CRITICAL, "Disarming denied: not landed\t")
+            return TEMPORARILY_REJECTED
+        self._disarm(f"Disarmed by {by}\t", "by command" if by == "external command" else f"by {by}")
+        return ACCEPTED
+
+    def set_mode(self, mode: Mode, tell: bool = False) -> int:
+        """MAV_RESULT of a request for a mode; with `tell`, a refusal is also a text."""
+        if self.armed and not self.can_run(mode):
+            if tell:
+                self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
+            return TEMPORARILY_REJECTED
+        self._intend(mode)
+        return ACCEPTED
+
+    def can_run(self, mode: Mode) -> bool:
+        """Whether an armed vehicle may fly in this mode now."""
+        if not self.position_valid and position_failsafe.needs_position(mode):
+            return False
+        if mode is Mode.OFFBOARD:
+            return self.has_setpoints
+        if mode in MANUAL_MODES:
+            return self.pilot_has_sticks
+        return mode is not Mode.MISSION or self.navigator.mission.valid
+
+    def takeoff(self, altitude_m: float | None) -> int:
+        """Mode TAKEOFF to a height above home (None: MIS_TAKEOFF_ALT). It never arms."""
+        if altitude_m is None:
+            altitude_m = self._parameters.number("MIS_TAKEOFF_ALT")
+            self._say(
+                INFO,
+                f"Using default takeoff altitude: {altitude_m:.1f} m\t",
+                (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
+            )
+        elif altitude_m < self.home[2] - self._airframe.position[2]:
+            # what becomes of a height above ground in a field that is above the sea; it does not descend
+            self._say(CRITICAL, "Already higher than takeoff altitude\t")
+        self._takeoff_height_m = altitude_m
+        self._intend(Mode.TAKEOFF)
+        return ACCEPTED
+
+    def land(self) -> int:
+        self._say(INFO, "Landing at current position\t", LANDING_EVENT)
+        self._intend(Mode.LAND)
+        return ACCEPTED
+
+    def return_home(self) -> int:
+        self._say(INFO, "Returning to launch\t")
+        self._intend(Mode.RTL)
+        return ACCEPTED
+
+    def reposition(self, goal: Vector, yaw_rad: float, speed_mps: float = math.nan) -> int:
+        """Fly to a local NED position and hold there; NaN components as in `reposition_goal`."""
+        airframe, parameters = self._airframe, self._parameters
+        former = None if self.task is None else self.task.goal
+        self._intend(Mode.HOLD)
+        if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
+            goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+            if not self.navigator.allows_goal(goal):
+                self._say(CRITICAL, "Reposition is outside geofence\t")
+                return ACCEPTED
+            self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
+            self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
+        return ACCEPTED
+
+    def change_speed(self, speed_mps: float, at_once: bool) -> None:
+        """Another cruise speed for auto modes until the mode ends; zero or less: MPC_XY_CRUISE again.
+
+        `at_once`: for the goal that is being flown to as well, else from the next one on.
+        """
+        self.cruise_mps = speed_mps if speed_mps > 0.0 else math.nan
+        if at_once and speed_mps > 0.0 and self.task is not None:
+            self.task.cruise_at(speed_mps)
+
+    def orbit(self, request: OrbitRequest) -> int:
+        """Mode ORBIT; a radius that cannot be is accepted too, and then the vehicle hovers in that mode."""
+        if self.mode is not Mode.ORBIT or not isinstance(self.task, Orbit):
+            self._intend(Mode.ORBIT)
+        if isinstance(self.task, Orbit) and not self.task.apply(request):
+            self._say(CRITICAL, "Orbit radius limit exceeded\t")
+        return ACCEPTED
+
+    def pilot_takes_over(self, mode: Mode = Mode.POSCTL) -> int:
+        """A pilot with a remote control switches the mode, taking the vehicle from a companion."""
+        self.pilot_has_sticks = True
+        return self.set_mode(mode)
+
+    def hold_at(self, place: Vector) -> None:
+        """Change to HOLD, and stay at a local NED position rather than where braking ends."""
+        self._intend(Mode.HOLD)
+        if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
+            self.task = flight.Hold(self._airframe, self._parameters, place)
+
+    def restart_task(self) -> None:
+        """Begin the current mode's task anew."""
+        self._start_task()
+
+    def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
+        """A valid setpoint arrived. Outside OFFBOARD it only counts as "signal present"."""
+        self._last_setpoint_s = self.now_s
+        self._setpoint_needs_position = position_failsafe.asks_for_position(setpoint)
+        self._rates_alone = isinstance(setpoint, RatesSetpoint)
+        if self.mode is Mode.OFFBOARD and isinstance(self.task, flight.Offboard):
+            self.task.setpoint = setpoint
+
+    # ---- one step ---------------------------------------------------------------------------------------
+
+    def update(self, dt_s: float) -> None:
+        """Check failsafes and detectors, run the flight task, move the airframe."""
+        self.now_s += dt_s
+        self.navigator.update()
+        self.supervision.update(dt_s, self._airframe.thrust_mps2)
+        position_failsafe.keep_landing(self)
+        while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
+            self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
+        airframe = self._airframe
+        if not self.armed or self.terminated:
+            self._idle(dt_s, 0.0)
+            if not self.landed and airframe.on_ground:
+                self._has_landed()
+            if self.armed:
+                self._disarm_automatically()
+            return
+        task = self.task
+        assert task is not None
+        was_landing = task.landing
+        setpoint = task.update(dt_s)
+        if task.landing and not was_landing and self.mode is Mode.RTL:
+            self._say(INFO, "RTL: land at destination\t")
+        if self.supervision.motors_stopped:
+            self._idle(dt_s, 0.0)
+        elif isinstance(task, manual_flight.Stabilized):
+            self._fly_directly(dt_s, task.demand)
+        elif isinstance(task, manual_flight.Acro) and self._spooling():
+            self._idle(dt_s, IDLE_THRUST_MPS2)
+        elif not isinstance(setpoint, TrajectorySetpoint):
+            self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
+        elif self._on_ground_and_idle(setpoint):
+            self._idle(dt_s, IDLE_THRUST_MPS2)
+        else:
+            self.attitude.release()
+            demand = self.demand = self.controller.update(
+                dt_s,
+                setpoint,
+                airframe.position,
+                airframe.velocity,
+                airframe.acceleration,
+                airframe.yaw_rad,
+                self._climb_limit(),
+            )
+            airframe.step(dt_s, demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, demand.yaw_rate_radps)
+        self._detect_landing(setpoint)
+        self._disarm_automatically()
+        if self.armed and task is self.task and task.finished and self.mode is Mode.TAKEOFF:
+            goal = task.goal
+            assert goal is not None
+            self.hold_at(goal)
+
+    def _idle(self, dt_s: float, thrust_mps2: float) -> None:
+        airframe = self._airframe
+        self.attitude.release()
+        self.controller.reset(airframe.yaw_rad)
+        self.demand = Demand(thrust_mps2, 0.0, 0.0, 0.0)
+        airframe.step(dt_s, thrust_mps2, 0.0, 0.0, 0.0)
+
+    def _fly_directly(self, dt_s: float, demand: Demand) -> None:
+        """Tilt and thrust by the pilot's sticks, without position control."""
+        self.attitude.release()
+        self.controller.reset(self._airframe.yaw_rad)
+        if self._spooling():
+            demand = Demand(IDLE_THRUST_MPS2, 0.0, 0.0, 0.0)
+        self.demand = demand
+        self._airframe.step(
+            dt_s, demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, demand.yaw_rate_radps
+        )
+
+    def _spooling(self) -> bool:
+        spool = self._parameters.number("COM_SPOOLUP_TIME")
+        return self.now_s - self._armed_since_s < spool
+
+    def _on_ground_and_idle(self, setpoint: TrajectorySetpoint) -> bool:
+        """Landed with a setpoint that does not ask to climb. Also starts the take-off ramp's clock."""
+        if not self.landed:
+            return False
+        airframe = self._airframe
+        rise = setpoint.velocity[2] < -0.05
+        if setpoint.position[2] == setpoint.position[2]:
+            rise = rise or setpoint.position[2] < airframe.position[2] - 0.1
+        if setpoint.acceleration[2] == setpoint.acceleration[2]:
+            rise = rise or setpoint.acceleration[2] < -0.3
+        if isinstance(self.task, flight.Takeoff):
+            rise = True
+        elif isinstance(self.task, flight.Hold | flight.Land | flight.Return):
+            rise = False
+        if not rise or self._spooling():
+            self._lifting_since_s = None
+            return True
+        if self._lifting_since_s is None:
+            self._lifting_since_s = self.now_s
+        return False
+
+    def _climb_limit(self) -> float:
+        """PX4's take-off ramp: hardly any climb while thrust builds up, up to MPC_TKO_SPEED, then free."""
+        if self._lifting_since_s is None:
+            return math.inf
+        ramp = max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)
+        progress = (self.now_s - self._lifting_since_s) / ramp
+        if progress >= 1.0 and not self.landed:
+            self._lifting_since_s = None
+            return math.inf
+        speed = self._parameters.number("MPC_TKO_SPEED")
+        rise = (progress - RAMP_THRUST_SHARE) / (1.0 - RAMP_THRUST_SHARE)
+        return min(max(speed * rise, RAMP_CREEP_MPS), speed)
+
+    def _detect_landing(self, setpoint: flight.Setpoint) -> None:
+        airframe = self._airframe
+        if self.landed:
+            if -airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
+                self.landed = False
+                self._has_flown = True
+                self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
+                self._on_event("takeoff")
+            return
+        sinking = self.controller.velocity[2] > 0.05 or airframe.thrust_mps2 < 0.5 * GRAVITY_MPS2
+        if not airframe.on_ground or not sinking:
+            self._contact_since_s = None
+            return
+        if self._contact_since_s is None:
+            self._contact_since_s = self.now_s
+        elif self.now_s - self._contact_since_s >= LAND_DETECTION_S:
+            self._has_landed()
+
+    def _has_landed(self) -> None:
+        self._contact_since_s = None
+        self.landed = True
+        if not self.armed:  # it fell
+            self.home = self._airframe.position
+        self._landed_since_s = self.now_s
+        self._say(INFO, "Landing detected\t", LANDED_EVENT)
+        self._on_event("landed")
+
+    def _disarm_automatically(self) -> None:
+        if not self.landed:
+            return
+        if self._has_flown and self.navigator.in_progress and not self.terminated:
+            return
+        if self._has_flown:
+            delay = self._parameters.number("COM_DISARM_LAND")
+            if delay >= 0.0 and self.now_s - self._landed_since_s >= delay:
+                self._disarm("Disarmed by landing\t", "after landing")
+        else:
+            delay = self._parameters.number("COM_DISARM_PRFLT")
+            if delay > 0.0 and self.now_s - self._armed_since_s >= delay + PREFLIGHT_DISARM_MARGIN_S:
+                self._disarm("Disarmed by auto preflight disarming\t", "no takeoff")
+
+    # ---- transitions ------------------------------------------------------------------------------------
+
+    def _intend(self, mode: Mode) -> None:
+        self.adopt_intention(mode)
+        self.supervision.mode_was_requested()
+        self._enter(self.supervision.run_failsafes())
+
+    # Several want a say in the mode: the user, the geofence, lost setpoints, links, the battery, a lost
+    # position. None of them sets it: all report to `supervision.conditions` or are asked by `can_run`, and
+    # the failsafe machine picks the worst answer. `_enter` gets its choice alone, so no two of them ever
+    # fight over the vehicle.
+
+    def adopt_intention(self, mode: Mode) -> None:
+        """This is what the user wants now; the failsafes decide whether it is flown."""
+        self.intended_mode = mode
+        if mode not in MODES_PREVENTING_ARMING:
+            self._mode_after_disarming = mode
+
+    def follow_failsafes(self, mode: Mode) -> None:
+        """Fly the mode that the failsafes have decided on."""
+        if mode is not self.mode and self.landed and isinstance(self.task, position_failsafe.Descend):
+            self.adopt_intention(Mode.LAND)  # it came down blindly: a position is no reason to rise again
+            mode = self.supervision.run_failsafes()
+        if mode is not self.mode:
+            self._enter(mode)
+
+    def announce(self, line: str) -> None:
+        """Tell whoever watches the simulation."""
+        self._on_event(line)
+
+    def _enter(self, mode: Mode) -> None:
+        if mode is not self.mode:
+            self._on_event(f"mode {mode.name}")
+            self.cruise_mps = math.nan
+        self.mode = mode
+        if not self.armed:
+            return
+        self._start_task()
+        self._gimbal_schedule.clear()
+        if mode in (Mode.LAND, Mode.RTL) and not self.landed:
+            self._gimbal_schedule.extend((self.now_s + delay, command) for delay, command in GIMBAL_COMMANDS)
+
+    def _start_task(self) -> None:
+        airframe, parameters = self._airframe, self._parameters
+        self.attitude.release()
+        if self.mode is Mode.OFFBOARD:
+            if not isinstance(self.task, flight.Offboard):
+                self.task = flight.Offboard()
+        elif self.mode is Mode.ORBIT:
+            self.task = Orbit(airframe, parameters)
+        elif self.mode in MANUAL_MODES:
+            self.task = manual_flight.task_of(
+                self.mode, airframe, parameters, lambda: self.supervision.sticks, self.stick_guard
+            )
+        elif self.mode is Mode.TAKEOFF:
+            self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
+        elif self.mode is Mode.MISSION:
+            self.task = self.navigator.mission_task()
+        elif self.mode is Mode.PRECLAND:
+            self.task = self.navigator.precision_landing(Precision.REQUIRED)
+        elif self.mode is Mode.LAND:
+            self.task = position_failsafe.landing_task(self)
+        elif self.mode is Mode.RTL:
+            self.task = self.navigator.return_task()
+        else:
+            self.task = flight.Hold(airframe, parameters)
+
+    def _takeoff_height(self) -> float:
+        height = self._takeoff_height_m
+        return self._parameters.number("MIS_TAKEOFF_ALT") if height is None else height
+
+    def _disarm(self, text: str, reason: str) -> None:
+        self.armed = False
+        self.failsafe = False
+        self.task = None
+        self._takeoff_height_m = None
+        if self.landed:
+            self.home = self._airframe.position
+        code = REASONS.get(reason.removeprefix("by "), 6 if reason == "after landing" else 4)
+        self._say(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
+        self.supervision.disarmed()
+        self._on_event(f"disarmed ({reason})")
+        self.intended_mode = self._mode_after_disarming
+        self._enter(self.intended_mode)
+
+    def _say(self, severity: int, text: str, event: tuple[int, int, bytes] | None = None) -> None:
+        self.texts.append(Text(severity, text, event))

@@ -1,0 +1,70 @@
+"""What PX4 does when the horizontal position is no longer valid (its mode requirements and mode fallback).
+
+A mode that needs a position is refused, and left if it is flown: Position falls to Altitude where a pilot has
+sticks, every other mode to Descend, because Return and Land need a position too. Descend is shown as LAND
+(that is how PX4 encodes it in HEARTBEAT): level, sinking with MPC_LAND_SPEED, drifting with the wind.
+OFFBOARD is left only if its setpoints ask for a position or a velocity; then it counts as lost setpoints.
+When the position comes back in the air, the mode that was wanted is flown again; a vehicle that came down
+blindly stays down. Which mode that makes is the choice of `failsafes`; here is what it has to know, and how
+to come down.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
+from mavlink_sim.flight.tasks import Land, Task
+from mavlink_sim.px4.modes import Mode
+from mavlink_sim.px4.parameters import Parameters
+
+if TYPE_CHECKING:
+    from mavlink_sim.autopilot.commander import Autopilot
+
+# ALTCTL, STABILIZED, ACRO and MANUAL are flown without; OFFBOARD depends on its setpoints.
+WITHOUT_POSITION = frozenset({Mode.ALTCTL, Mode.STABILIZED, Mode.ACRO, Mode.MANUAL, Mode.OFFBOARD})
+
+
+class Descend(Task):
+    """Sink without knowing where: level, with MPC_LAND_SPEED, at the heading it had."""
+
+    landing = True
+
+    def __init__(self, parameters: Parameters, yaw_rad: float) -> None:
+        self._parameters = parameters
+        self._yaw_rad = yaw_rad
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        speed = self._parameters.number("MPC_LAND_SPEED")
+        return TrajectorySetpoint(
+            velocity=(NAN, NAN, speed), acceleration=(0.0, 0.0, NAN), yaw_rad=self._yaw_rad
+        )
+
+
+def needs_position(mode: Mode) -> bool:
+    """Whether PX4 refuses the mode without a valid horizontal position."""
+    return mode not in WITHOUT_POSITION
+
+
+def asks_for_position(setpoint: object) -> bool:
+    """Whether an offboard setpoint needs the horizontal position or velocity (attitude setpoints do not)."""
+    for x, y, z in (getattr(setpoint, "position", NOTHING), getattr(setpoint, "velocity", NOTHING)):
+        if x == x or y == y or z == z:
+            return True
+    return False
+
+
+def landing_task(autopilot: Autopilot) -> Task:
+    """How mode LAND is flown: at one place, or blindly down where there is no position."""
+    if autopilot.position_valid:
+        return Land(autopilot._airframe, autopilot._parameters)
+    return Descend(autopilot._parameters, autopilot._airframe.yaw_rad)
+
+
+def keep_landing(autopilot: Autopilot) -> None:
+    """A landing goes on blindly when the position is lost, and at one place when it is back."""
+    descending = isinstance(autopilot.task, Descend)
+    if descending and autopilot.landed:
+        return  # it is down
+    if autopilot.armed and autopilot.mode is Mode.LAND and descending is autopilot.position_valid:
+        autopilot.task = landing_task(autopilot)

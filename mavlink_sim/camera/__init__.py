@@ -1,0 +1,1 @@
+"""Scenes and the camera in them: drawing, lens, sensor, depth, and where the frames go."""

@@ -1,0 +1,92 @@
+"""What a lens and a sensor do to a picture: blur, exposure, colour cast, contrast, noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.world.textures import Image
+
+
+@dataclass(frozen=True, slots=True)
+class ImageEffects:
+    """Effects in the order in which they are applied.
+
+    Attributes:
+        blur_sigma_px: of a Gaussian, 0 for none.
+        motion_px, motion_rad: length and direction of a straight smear.
+        exposure: multiplies brightness.
+        white_balance: multiplies blue, green, red.
+        contrast: 1 leaves it; pivots on mid grey.
+        gamma: 1 leaves it; above 1 darkens the middle.
+        grey: 0 colour … 1 monochrome.
+        noise_sigma: standard deviation of the sensor's noise in grey levels.
+    """
+
+    blur_sigma_px: float = 0.0
+    motion_px: float = 0.0
+    motion_rad: float = 0.0
+    exposure: float = 1.0
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    contrast: float = 1.0
+    gamma: float = 1.0
+    grey: float = 0.0
+    noise_sigma: float = 0.0
+
+
+MILD_EFFECTS = ImageEffects(noise_sigma=2.0)
+"""A good camera on a good day."""
+
+
+@lru_cache(maxsize=1)
+def _noise_bank() -> NDArray[np.int16]:
+    """(1200, 1600, 3) noise of standard deviation 64, partly common to the channels."""
+    rng = np.random.default_rng(99)
+    common = rng.standard_normal((1200, 1600, 1), dtype=np.float32)
+    own = rng.standard_normal((1200, 1600, 3), dtype=np.float32)
+    return np.asarray(np.rint(64.0 * (0.8 * common + 0.6 * own)), np.int16)
+
+
+def apply_effects(image: Image, effects: ImageEffects, rng: np.random.Generator) -> Image:
+    """A new picture (H, W, 3) uint8 with the effects; `rng` chooses the noise."""
+    if effects.blur_sigma_px > 0.05:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), effects.blur_sigma_px), np.uint8)
+    if effects.motion_px > 1.0:
+        image = np.asarray(cv2.filter2D(image, -1, _smear(effects.motion_px, effects.motion_rad)), np.uint8)
+    if effects.grey > 0.0:
+        grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+        image = np.asarray(cv2.addWeighted(image, 1.0 - effects.grey, grey, effects.grey, 0.0), np.uint8)
+    gains = effects.exposure * np.array(effects.white_balance)
+    if effects.contrast != 1.0 or effects.gamma != 1.0 or bool(np.any(gains != 1.0)):
+        level = (np.arange(256, dtype=np.float64)[:, None] / 255.0 * gains).clip(0.0, 1.0) ** effects.gamma
+        level = (level - 0.5) * effects.contrast + 0.5
+        table = np.clip(np.rint(level * 255.0), 0, 255).astype(np.uint8)
+        image = np.asarray(cv2.LUT(image, table[None]), np.uint8)
+    if effects.noise_sigma > 0.0:
+        height, width = image.shape[:2]
+        bank = _noise_bank()
+        rows, columns = -(-height // bank.shape[0]), -(-width // bank.shape[1])
+        if rows > 1 or columns > 1:
+            bank = np.tile(bank, (rows, columns, 1))
+        top = int(rng.integers(bank.shape[0] - height + 1))
+        left = int(rng.integers(bank.shape[1] - width + 1))
+        noise = bank[top : top + height, left : left + width]
+        scaled = cv2.addWeighted(noise, effects.noise_sigma / 64.0, noise, 0.0, 0.0)
+        image = np.asarray(cv2.add(image, scaled, dtype=cv2.CV_8U), np.uint8)
+    return image
+
+
+def _smear(length_px: float, direction_rad: float) -> NDArray[np.float32]:
+    side = math.ceil(length_px) | 1
+    kernel = np.zeros((side, side), np.float32)
+    middle, half = side // 2, length_px / 2
+    reach = np.array([math.cos(direction_rad), math.sin(direction_rad)]) * half
+    start, end = np.rint(middle - reach).astype(int), np.rint(middle + reach).astype(int)
+    cv2.line(kernel, start.tolist(), end.tolist(), 1.0)
+    smear: NDArray[np.float32] = kernel / kernel.sum()
+    return smear

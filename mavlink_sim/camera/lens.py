@@ -1,0 +1,211 @@
+"""From the pinhole picture that is drawn to what a real camera takes: distortion, rolling shutter, blur.
+
+The pinhole picture is drawn a little larger than the camera's; every pixel of the camera then looks up where
+its ray, bent by the lens and turned by the camera's motion until that row was read out, meets it. For the
+rotation this is exact (Forssén and Ringaby 2010, "Rectifying rolling shutter video"); for the translation it
+is exact within a surface, as the depth is taken from the pixel's place in the middle of the readout:
+outlines of near things before far ones lean with the rotation, but not with the translation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.world.textures import Image, Plane
+from vision.camera_model import CameraModel
+
+MARGIN_SHARE = 0.1
+"""Of the width, on every side, drawn beyond the picture where a moving camera's rows look."""
+MAX_GROWTH = 2.5
+MOST_EXPOSURES = 8
+_ROUND_TRIP_PX = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """How a picture is taken over time.
+
+    Attributes:
+        exposure_s: how long each row gathers light; motion during it blurs.
+        readout_s: from the first row's exposure to the last row's, 0 for a global shutter.
+    """
+
+    exposure_s: float = 0.0
+    readout_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("exposure_s", self.exposure_s), ("readout_s", self.readout_s)):
+            if not 0.0 <= value <= 0.5:
+                raise ValueError(f"a shutter's {name} must be 0 to 0.5 s, got {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraMotion:
+    """How the camera moves at the middle of the exposure, in its own optical frame (x right, y down).
+
+    Attributes:
+        velocity_mps: of the optical centre.
+        angular_velocity_radps: turning of the camera.
+    """
+
+    velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    angular_velocity_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def still(self) -> bool:
+        """Whether nothing moves."""
+        return not any(self.velocity_mps) and not any(self.angular_velocity_radps)
+
+
+class Lens:
+    """What one camera makes of pinhole pictures.
+
+    Attributes:
+        drawn: the pinhole camera whose pictures `expose` takes.
+
+    Raises (when made):
+        ValueError: the distortion cannot be undone over the whole picture, or only by a far larger one.
+    """
+
+    def __init__(self, camera: CameraModel, shutter: Shutter | None = None) -> None:
+        self.camera, self.shutter = camera, shutter or Shutter()
+        columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+        plane = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        if camera.distortion:
+            plane = _undistorted(camera, pixels)
+        shape = (camera.height, camera.width)
+        self._x = plane[:, 0].reshape(shape).astype(np.float32)
+        self._y = plane[:, 1].reshape(shape).astype(np.float32)
+        moving = self.shutter.exposure_s > 0.0 or self.shutter.readout_s > 0.0
+        margin = math.ceil(MARGIN_SHARE * camera.width) if moving else 1
+        # Whole pixels more on each side, so that where nothing bends or moves no pixel is interpolated.
+        left = math.ceil(-float(self._x.min()) * camera.fx - camera.cx) + margin
+        right = math.ceil(float(self._x.max()) * camera.fx + camera.cx) + 1 - camera.width + margin
+        top = math.ceil(-float(self._y.min()) * camera.fy - camera.cy) + margin
+        bottom = math.ceil(float(self._y.max()) * camera.fy + camera.cy) + 1 - camera.height + margin
+        width, height = left + camera.width + right, top + camera.height + bottom
+        if width > MAX_GROWTH * camera.width or height > MAX_GROWTH * camera.height:
+            raise ValueError(
+                f"the distortion {camera.distortion} bends the picture's edges out to a pinhole picture of "
+                f"{width}x{height}, more than {MAX_GROWTH} times {camera.width}x{camera.height}; "
+                "use weaker coefficients or a longer focal length"
+            )
+        self.drawn = CameraModel(width, height, camera.fx, camera.fy, camera.cx + left, camera.cy + top)
+        self._still_map = (
+            self._x * np.float32(camera.fx) + np.float32(self.drawn.cx),
+            self._y * np.float32(camera.fy) + np.float32(self.drawn.cy),
+        )
+        self._still_index = self._nearest(*self._still_map)
+
+    def expose(
+        self, image: Image, inverse_depth: Plane, labels: NDArray[np.int32], motion: CameraMotion
+    ) -> tuple[Image, Plane, NDArray[np.int32], NDArray[np.bool_]]:
+        """The camera's picture of a pinhole picture of the size `drawn`.
+
+        Returns:
+            The image (H, W, 3); the reciprocal depth and the labels (H, W) at the middle of each row's
+            exposure, of the nearest pixel; and which pixels of the pinhole picture were seen.
+        """
+        shutter = self.shutter
+        index, (map_x, map_y) = self._still_index, self._still_map
+        times = [0.0]
+        if not motion.still:
+            still_inverse = inverse_depth.reshape(-1).take(index)
+            if shutter.readout_s > 0.0:
+                map_x, map_y = self._moved(motion, 0.0, still_inverse)
+                index = self._nearest(map_x, map_y)
+            if shutter.exposure_s > 0.0:
+                times = self._exposures(motion, still_inverse)
+        if len(times) == 1:
+            exposed = _look_up(image, map_x, map_y)
+        else:
+            total = np.zeros((*self._x.shape, 3), np.float32)
+            for time_s in times:
+                cv2.accumulate(_look_up(image, *self._moved(motion, time_s, still_inverse)), total)
+            exposed = np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / len(times)), np.uint8)
+        seen = np.zeros(image.shape[0] * image.shape[1], np.uint8)
+        seen[index] = 1
+        # A pixel of the camera may cover several of the pinhole picture.
+        spread = cv2.dilate(seen.reshape(image.shape[:2]), np.ones((3, 3), np.uint8))
+        return (
+            exposed,
+            inverse_depth.reshape(-1).take(index),
+            labels.reshape(-1).take(index),
+            np.asarray(spread, np.bool_),
+        )
+
+    def _nearest(self, map_x: Plane, map_y: Plane) -> NDArray[np.intp]:
+        """(H, W) flat indices of the nearest pixels of the pinhole picture, at its rim if beyond it."""
+        columns = np.clip(np.rint(map_x), 0, self.drawn.width - 1).astype(np.intp)
+        rows = np.clip(np.rint(map_y), 0, self.drawn.height - 1).astype(np.intp)
+        return rows * self.drawn.width + columns
+
+    def _moved(self, motion: CameraMotion, time_s: float, inverse_depth: Plane) -> tuple[Plane, Plane]:
+        """Where in the pinhole picture each pixel looks, `time_s` after the middle of its row's exposure."""
+        camera = self.camera
+        height = camera.height
+        row_times = time_s + self.shutter.readout_s * ((np.arange(height) + 0.5) / height - 0.5)
+        turned = _rotations(np.array(motion.angular_velocity_radps), row_times).astype(np.float32)
+        shift = np.multiply.outer(row_times, np.array(motion.velocity_mps)).astype(np.float32)
+        x, y = self._x, self._y
+        rays = [
+            turned[:, axis, 0, None] * x
+            + turned[:, axis, 1, None] * y
+            + turned[:, axis, 2, None]
+            + shift[:, axis, None] * inverse_depth
+            for axis in range(3)
+        ]
+        ahead = np.maximum(rays[2], np.float32(1e-3))
+        map_x = rays[0] / ahead * np.float32(self.drawn.fx) + np.float32(self.drawn.cx)
+        map_y = rays[1] / ahead * np.float32(self.drawn.fy) + np.float32(self.drawn.cy)
+        return map_x, map_y
+
+    def _exposures(self, motion: CameraMotion, inverse_depth: Plane) -> list[float]:
+        """Moments within the exposure, no farther apart than about a pixel and a half of motion."""
+        half = self.shutter.exposure_s / 2
+        first, last = self._moved(motion, -half, inverse_depth), self._moved(motion, half, inverse_depth)
+        step = (slice(None, None, 16), slice(None, None, 16))
+        travel = np.hypot(last[0][step] - first[0][step], last[1][step] - first[1][step])
+        count = min(MOST_EXPOSURES, math.ceil(float(np.percentile(travel, 90)) / 1.5))
+        if count <= 1:
+            return [0.0]
+        return [half * (2 * (number + 0.5) / count - 1.0) for number in range(count)]
+
+
+def _look_up(image: Image, map_x: Plane, map_y: Plane) -> Image:
+    looked = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(looked, np.uint8)
+
+
+def _rotations(rate_radps: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3, 3) rotations by `rate` · time (Rodrigues' formula)."""
+    rate = float(np.linalg.norm(rate_radps))
+    if rate < 1e-12:
+        return np.tile(np.eye(3), (len(times_s), 1, 1))
+    x, y, z = rate_radps / rate
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = (rate * times_s)[:, None, None]
+    turned: NDArray[np.float64] = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return turned
+
+
+def _undistorted(camera: CameraModel, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) pixels → (N, 2) on the plane at depth 1 that the lens bends there."""
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-9)
+    plane = cv2.undistortPoints(
+        pixels.reshape(-1, 1, 2), camera.matrix, np.array(camera.distortion), criteria=criteria
+    ).reshape(-1, 2)
+    again = camera.project(np.column_stack([plane, np.ones(len(plane))]))
+    worst = float(np.abs(again - pixels).max()) if np.isfinite(again).all() else math.inf
+    if not worst < _ROUND_TRIP_PX:
+        raise ValueError(
+            f"the distortion {camera.distortion} folds the picture over itself within "
+            f"{camera.width}x{camera.height}: a pixel came back {worst:.1f} px away; use weaker coefficients"
+        )
+    return np.asarray(plane, np.float64)

@@ -1,0 +1,246 @@
+"""One object as a camera sees it: which face covers each pixel, how far it is, how bright.
+
+Faces are painted as numbers, far to near, into a small image; colour and depth then come from tables by that
+number. The reciprocal of a plane's depth is linear in the pixel, so depth is exact at every pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.camera.ground_view import Matrix, View
+from mavlink_sim.world.painting_order import clip_polygon
+from mavlink_sim.world.palettes import palette_of
+from mavlink_sim.world.plates import printed_side, reflectance
+from mavlink_sim.world.shapes import Shape
+from mavlink_sim.world.textures import Plane, fractal_noise
+from mavlink_sim.world.world import Light, Sky, WorldObject
+
+NEAR_M = 0.05
+FAR_PX = 30000.0
+"""Corners farther outside the image than this are pulled in: drawing needs bounded integers."""
+SUBPIXEL_BITS = 4
+FACE_BITS = 10
+"""A label is (object number + 1) << FACE_BITS | face number."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Pixels that an object covers when nothing stands before it.
+
+    Attributes:
+        left, top, right, bottom: the part of the image it touches; right and bottom are past the end.
+        pixels: (N,) int64, flat indices into the image.
+        faces: (N,) the face covering each.
+        inverse_depth: (N,) float32.
+        colours: (N, 3) float32 BGR.
+        inside_share: 0..1, share of its outline that lies inside the image.
+    """
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    pixels: NDArray[np.int64]
+    faces: NDArray[np.int64]
+    inverse_depth: Plane
+    colours: Plane
+    inside_share: float
+
+
+@lru_cache(maxsize=1)
+def _mottle() -> Plane:
+    """(65536,) brightness factors around 1: dirt and cloth, a 256 × 256 tile laid flat."""
+    rng = np.random.default_rng(12)
+    tile = 1.0 + 0.03 * fractal_noise(rng, 256, 8, 5, 0.8)
+    return tile.astype(np.float32).ravel()
+
+
+class PlacedObject:
+    """A world object prepared for drawing under one light."""
+
+    def __init__(self, item: WorldObject, light: Light, sky: Sky) -> None:
+        self.item = item
+        self.sky, self.light = sky, light
+        self.shape: Shape = item.shape
+        if len(self.shape.normals) >= 1 << FACE_BITS:
+            raise ValueError(f"a {item.class_name} has {len(self.shape.normals)} faces, too many to draw")
+        c, s = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
+        self.ned_from_object = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        self.origin = np.array(item.position_ned_m, np.float64)
+        low, high = self.shape.low, self.shape.high
+        self.middle = self.origin + self.ned_from_object @ ((low + high) / 2) * item.scale
+        self.radius_m = float(np.linalg.norm(high - low)) / 2 * item.scale
+        self.sun = np.array(light.towards_sun_ned)
+        self.normals_ned = self.shape.normals @ self.ned_from_object.T
+        self.lit = self._lit()
+        self._shadow: tuple[NDArray[np.float64], list[int]] | None = None
+
+    def _lit(self) -> Plane:
+        """(F, 3) faces' colours under sun and sky, without mirroring."""
+        shape = self.shape
+        palette = np.array(palette_of(self.item.class_name, shape.slots, self.item.appearance))
+        albedo = palette[shape.slot_of] * shape.shade[:, None]
+        upwards = 0.5 - 0.5 * self.normals_ned[:, 2:]
+        sunlit = np.maximum(self.normals_ned @ self.sun, 0.0)[:, None]
+        light = self.light
+        strength = light.ambient * (0.5 + 0.5 * upwards) + light.sun * sunlit * np.array(light.tint)
+        return np.asarray(albedo * strength, np.float32)
+
+    @property
+    def shadow(self) -> tuple[NDArray[np.float64], list[int]]:
+        """Outlines of the solids' shadows on the ground: (P, 3) NED corners, where each begins."""
+        if self._shadow is None:
+            outlines = self.shape.shadow(self.sun @ self.ned_from_object)
+            flat = np.concatenate(outlines).astype(np.float64)
+            turned = flat @ self.ned_from_object[:2, :2].T * self.item.scale + self.origin[:2]
+            if self.origin[2] < 0.0:  # in the air: its shadow falls farther from the sun
+                turned += self.sun[:2] * (self.origin[2] / max(-float(self.sun[2]), 0.05))
+            first = np.cumsum([0] + [len(outline) for outline in outlines]).tolist()
+            self._shadow = (np.column_stack([turned, np.zeros(len(turned))]), first)
+        return self._shadow
+
+    def draw(self, view: View) -> Sighting | None:
+        """What is seen of it from `view` with nothing before it, or None."""
+        shape, scale = self.shape, self.item.scale
+        eye = (view.eye - self.origin) @ self.ned_from_object / scale
+        turn = view.pixel_from_ned @ self.ned_from_object * scale
+        start = view.pixel_from_ned @ (self.origin - view.eye)
+        corners = shape.corners @ turn.T + start
+        depth = corners[:, 2]
+        nearest, farthest = float(depth.min()), float(depth.max())
+        if farthest < NEAR_M:
+            return None
+        height = shape.normals @ eye - shape.offsets
+        facing = height > 1e-6
+        if nearest >= NEAR_M:
+            points = corners[:, :2] / depth[:, None]
+            first: list[int] = shape.first.tolist()
+        else:
+            points, first, facing = _clipped(corners, shape, facing)
+            if not len(points):
+                return None
+        low, high = points.min(axis=0), points.max(axis=0)
+        left, top = max(0, math.floor(low[0])), max(0, math.floor(low[1]))
+        right, bottom = min(view.width, math.ceil(high[0]) + 1), min(view.height, math.ceil(high[1]) + 1)
+        if right <= left or bottom <= top:
+            return None
+        numbers = np.zeros((bottom - top, right - left), np.uint16)
+        bounded = np.clip(points - (left, top), -FAR_PX, FAR_PX)
+        fixed = np.rint(bounded * (1 << SUBPIXEL_BITS)).astype(np.int32)
+        seen = facing.tolist()
+        for solid in shape.tree.back_to_front(eye):
+            for face in shape.faces_of[solid]:
+                if seen[face]:
+                    polygon = fixed[first[face] : first[face + 1]]
+                    cv2.fillConvexPoly(numbers, polygon, face + 1, cv2.LINE_8, SUBPIXEL_BITS)
+        painted = np.flatnonzero(numbers)
+        if not len(painted):
+            return None
+        faces = numbers.ravel()[painted].astype(np.int64) - 1
+        rows, columns = np.divmod(painted, right - left)
+        rows += top
+        columns += left
+
+        rays = self.ned_from_object.T @ view.ned_from_pixel / scale
+        with np.errstate(divide="ignore", invalid="ignore"):
+            planes = np.where(facing[:, None], shape.normals @ rays / -height[:, None], 0.0)
+        slopes = planes.astype(np.float32)
+        x, y = columns.astype(np.float32), rows.astype(np.float32)
+        inverse: Plane = slopes[:, 0].take(faces) * x
+        inverse += slopes[:, 1].take(faces) * y
+        inverse += slopes[:, 2].take(faces)
+        np.clip(inverse, 1.0 / farthest, 1.0 / max(nearest, NEAR_M), out=inverse)
+        colours = self._view_colours(view, facing).take(faces, axis=0)
+        colours *= self._texture(view, x, y, inverse)[:, None]
+        if self.item.printed is not None:
+            front = np.flatnonzero((self.shape.normals @ printed_side(self.item.printed)).take(faces) > 0.9)
+            seen_on = reflectance(self.item.printed, eye, rays, x[front], y[front])
+            colours[front] *= seen_on[:, None]
+        pixels = rows * view.width + columns
+        at_rim = left == 0 or top == 0 or right == view.width or bottom == view.height
+        share = _inside_share(points, view) if at_rim else 1.0
+        return Sighting(left, top, right, bottom, pixels, faces, inverse, colours, share)
+
+    def _texture(self, view: View, x: Plane, y: Plane, inverse: Plane) -> Plane:
+        """Brightness of each pixel: darker near the ground, a little mottled, fixed to the object."""
+        rows = view.ned_from_pixel.astype(np.float32)
+        depth = 1.0 / inverse
+        above = -(view.eye[2] + depth * (rows[2, 0] * x + rows[2, 1] * y + rows[2, 2]))
+        north = view.eye[0] - self.origin[0] + depth * (rows[0, 0] * x + rows[0, 1] * y + rows[0, 2])
+        east = view.eye[1] - self.origin[1] + depth * (rows[1, 0] * x + rows[1, 1] * y + rows[1, 2])
+        texels = 90.0 / self.item.scale
+        across = ((north + 0.37 * above) * texels).astype(np.int32) & 255
+        along = ((east + 0.71 * above) * texels).astype(np.int32) & 255
+        brightness = _mottle().take((along << 8) + across)
+        brightness *= 0.76 + 0.24 * np.clip(above * (1.6 / self.item.scale), 0.0, 1.0)
+        return np.asarray(brightness, np.float32)
+
+    def _view_colours(self, view: View, facing: NDArray[np.bool_]) -> Plane:
+        """(F, 3) faces' colours with what glossy ones mirror of the sky and the sun."""
+        glossy = np.flatnonzero(facing & (self.shape.gloss > 0.0))
+        if not len(glossy):
+            return self.lit
+        shape, normals = self.shape, self.normals_ned[glossy]
+        middles = shape.corners[shape.first[glossy]] * self.item.scale @ self.ned_from_object.T + self.origin
+        look = middles - view.eye
+        look /= np.linalg.norm(look, axis=1, keepdims=True)
+        against = (look * normals).sum(axis=1, keepdims=True)
+        mirrored = look - 2 * against * normals
+        gloss = shape.gloss[glossy][:, None]
+        share = gloss * (0.12 + 0.88 * (1.0 + np.clip(against, -1, 0)) ** 3)
+        rise = -mirrored[:, 2:]
+        sky = np.array(self.sky.horizon) + (1 - np.exp(-4 * np.maximum(rise, 0))) * np.subtract(
+            self.sky.zenith, self.sky.horizon
+        )
+        bright = self.light.ambient + 0.35 * self.light.sun
+        scene = np.where(rise > 0, sky * min(1.0, bright * 1.4), np.array((58.0, 70.0, 72.0)) * bright)
+        glint = np.maximum(mirrored @ self.sun, 0.0)[:, None] ** 40 * gloss * 190 * self.light.sun
+        colours = self.lit.copy()
+        colours[glossy] += ((scene - colours[glossy]) * share + glint).astype(np.float32)
+        return colours
+
+
+def _clipped(
+    corners: Matrix, shape: Shape, facing: NDArray[np.bool_]
+) -> tuple[Matrix, list[int], NDArray[np.bool_]]:
+    """Projected corners of the faces turned to the eye, cut off at the near plane."""
+    forward = np.array([0.0, 0.0, 1.0])
+    pieces: list[Matrix] = []
+    first = [0]
+    kept = facing.copy()
+    for face in range(len(shape.normals)):
+        piece = np.zeros((0, 3))
+        if facing[face]:
+            piece = clip_polygon(corners[shape.first[face] : shape.first[face + 1]], forward, NEAR_M)
+        kept[face] = len(piece) >= 3
+        if kept[face]:
+            pieces.append(piece)
+        first.append(first[-1] + (len(piece) if kept[face] else 0))
+    if not pieces:
+        return np.zeros((0, 2)), first, kept
+    joined = np.concatenate(pieces)
+    return joined[:, :2] / joined[:, 2:], first, kept
+
+
+def _inside_share(points: Matrix, view: View) -> float:
+    """Share of the area of the points' convex outline that lies inside the image."""
+    bounded = np.clip(points, -FAR_PX, FAR_PX).astype(np.float32)
+    outline = cv2.convexHull(bounded).reshape(-1, 2)
+    whole = float(cv2.contourArea(outline))
+    if whole < 1.0:
+        return 1.0
+    cut = outline.astype(np.float64)
+    edges = (((1, 0), 0.0), ((-1, 0), 1.0 - view.width), ((0, 1), 0.0), ((0, -1), 1.0 - view.height))
+    for normal, offset in edges:
+        if len(cut) >= 3:
+            cut = clip_polygon(cut, np.array(normal, np.float64), offset)
+    if len(cut) < 3:
+        return 0.0
+    return min(1.0, float(cv2.contourArea(cut.astype(np.float32))) / whole)

@@ -1,0 +1,234 @@
+"""The rendered camera in a process of its own: poses go in by a pipe, frames come out at its outputs.
+
+The newest pose wins. The process ends when its pipe closes, so it never outlives the one that started it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import multiprocessing
+import os
+import signal
+import struct
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
+from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, truth_line
+from mavlink_sim.camera.video_outputs import check_output, open_output
+from mavlink_sim.world.world import World
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import matrix_from_quaternion
+
+logger = logging.getLogger(__name__)
+
+POSE = struct.Struct("=3d4dqd3d")
+"""Position NED in metres, quaternion (w, x, y, z) of `ned_from_body`, CLOCK_MONOTONIC nanoseconds, the
+scene's time in seconds, and the camera's roll, pitch, yaw on the body (not numbers: as it is mounted)."""
+EARLY_SHARE = 0.3
+"""A pose that comes this share of a period early is drawn at once: the poses' own rhythm jitters."""
+
+
+def run_camera(
+    scene: Scene,
+    rate_hz: float,
+    outputs: Sequence[str],
+    truth: Path | None,
+    poses: Connection,
+    ready: Event,
+) -> None:
+    """Draw a frame for the newest pose, at most `rate_hz` times a second, until `poses` closes.
+
+    The frames' `captured_ns` is the stamp of the pose that they were drawn from. The outputs open when the
+    ground has been painted and the first frame can be drawn without delay.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
+    cv2.setNumThreads(1)
+    model, mount = scene.camera.model, scene.camera.mount
+    SimulatedCamera(scene).capture((0.0, 0.0, -2.0), np.eye(3), 0)
+    camera = SimulatedCamera(scene)
+    with ExitStack() as resources:
+        sinks = [open_output(address, model.width, model.height, rate_hz) for address in outputs]
+        for sink in sinks:
+            resources.callback(sink.close)
+        lines = None
+        if truth is not None:
+            lines = resources.enter_context(truth.open("w", encoding="utf-8", buffering=1))
+        ready.set()
+        period_s = 1.0 / rate_hz
+        due_s = time.monotonic()
+        on_the_way: deque[Captured] = deque()
+
+        def deliver() -> float | None:
+            """Hand on what has arrived; seconds until the next arrival, None if nothing is on the way."""
+            while on_the_way and on_the_way[0].arrives_ns <= time.monotonic_ns():
+                captured = on_the_way.popleft()
+                for sink in sinks:
+                    sink.write(captured.frame)
+                if lines is not None:
+                    lines.write(truth_line(captured))
+            return max(on_the_way[0].arrives_ns - time.monotonic_ns(), 0) / 1e9 if on_the_way else None
+
+        while True:
+            try:
+                latest = _newest(poses, deliver())
+            except EOFError:
+                return
+            if latest is None:
+                continue
+            due_now_s = due_s - EARLY_SHARE * period_s
+            if time.monotonic() < due_now_s:
+                while (wait_s := due_now_s - time.monotonic()) > 0.0:
+                    arrival_s = deliver()
+                    time.sleep(wait_s if arrival_s is None else min(wait_s, arrival_s))
+                if poses.poll(0.0):
+                    continue
+            due_s = max(due_s + period_s, time.monotonic())
+            *values, stamp_ns, time_s, roll, pitch, yaw = POSE.unpack(latest)
+            turned = mount
+            if not math.isnan(roll):
+                turned = replace(mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
+            attitude = matrix_from_quaternion((values[3], values[4], values[5], values[6]))
+            taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned)
+            if taken is not None:
+                on_the_way.append(taken)
+
+
+def _newest(poses: Connection, timeout_s: float | None) -> bytes | None:
+    """The newest pose, waiting for one; None if none came in time. Raises EOFError when the pipe closed."""
+    newest: bytes | None = None
+    try:
+        if not poses.poll(timeout_s):
+            return None
+        while newest is None or poses.poll(0.0):
+            newest = poses.recv_bytes(POSE.size)
+    except ConnectionResetError as error:
+        raise EOFError from error
+    return newest
+
+
+class CameraProcess:
+    """Starts, feeds and stops the camera's process.
+
+    Args:
+        world: what is seen; a scene brings its own camera, and `camera` and `mount` are not looked at.
+        rate_hz: frames a second at most.
+        shared_name: of the shared memory for colour and depth; None for none.
+        outputs: further addresses of `video_outputs`.
+        truth: a file for what is really in each frame, a line of JSON each.
+
+    Raises:
+        ValueError: a rate or an address that cannot be, or no output at all.
+    """
+
+    def __init__(
+        self,
+        world: World | Scene,
+        camera: CameraModel = DEFAULT_CAMERA,
+        mount: CameraMount = DEFAULT_MOUNT,
+        rate_hz: float = 30.0,
+        shared_name: str | None = "mavlink-sim-camera",
+        outputs: Sequence[str] = (),
+        truth: Path | None = None,
+    ) -> None:
+        if not rate_hz > 0.0:
+            raise ValueError(f"the camera's rate must be positive, got {rate_hz} Hz")
+        scene = world if isinstance(world, Scene) else Scene(world, camera=CameraSettings(camera, mount))
+        addresses = ([f"shm://{shared_name}"] if shared_name is not None else []) + list(outputs)
+        if not addresses and truth is None:
+            raise ValueError("the camera has no output; give a shared memory's name or an address")
+        for address in addresses:
+            check_output(address)
+        context = multiprocessing.get_context("spawn")
+        self._receiving, self._sending = context.Pipe(duplex=False)
+        # A camera that hangs must not hang the vehicle: a full pipe drops the pose instead.
+        os.set_blocking(self._sending.fileno(), False)
+        self._ready = context.Event()
+        self._process = context.Process(
+            target=run_camera,
+            args=(scene, rate_hz, addresses, truth, self._receiving, self._ready),
+            name="mavlink-sim camera",
+            daemon=True,
+        )
+        self.name = ", ".join([shared_name] if shared_name is not None else []) or ", ".join(addresses)
+        self.shared_name = shared_name
+        self.dropped_poses = 0
+
+    def start(self) -> None:
+        """Start the process; returns at once. Its first frame comes when the ground is painted (seconds)."""
+        self._process.start()
+        self._receiving.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.is_alive()
+
+    @property
+    def ready(self) -> bool:
+        """Whether its outputs are open and the first frame can be drawn without delay."""
+        return self._ready.is_set()
+
+    @property
+    def pid(self) -> int | None:
+        """The process number, None before `start`."""
+        return self._process.pid
+
+    def send_pose(
+        self,
+        position_ned_m: Sequence[float],
+        quaternion: tuple[float, float, float, float],
+        stamp_ns: int,
+        time_s: float | None = None,
+        camera_rpy_rad: tuple[float, float, float] | None = None,
+    ) -> None:
+        """Hand over the vehicle's pose; never blocks.
+
+        Args:
+            quaternion: (w, x, y, z) of `ned_from_body`.
+            stamp_ns: CLOCK_MONOTONIC when the vehicle was there.
+            time_s: the scene's time, which moves its objects; by default the stamp in seconds.
+            camera_rpy_rad: a gimbal's roll, pitch, yaw from the body; None leaves the camera as mounted.
+        """
+        pose = POSE.pack(
+            *(float(value) for value in position_ned_m),
+            *quaternion,
+            stamp_ns,
+            stamp_ns / 1e9 if time_s is None else time_s,
+            *(camera_rpy_rad or (math.nan,) * 3),
+        )
+        try:
+            self._sending.send_bytes(pose)
+        except BlockingIOError:
+            self.dropped_poses += 1
+            if self.dropped_poses == 1:
+                logger.warning("the camera process takes no poses; dropping them")
+        except OSError:
+            self.dropped_poses += 1
+            if self.dropped_poses == 1:
+                logger.error("the camera process is gone (exit code %s)", self._process.exitcode)
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Close the pipe and wait for the process to end; kill it if it does not."""
+        for connection in (self._sending, self._receiving):
+            with contextlib.suppress(OSError):
+                connection.close()
+        if self._process.pid is None:
+            return
+        self._process.join(timeout_s)
+        if self._process.is_alive():
+            logger.warning("the camera process did not end in %.1f s; killing it", timeout_s)
+            self._process.kill()
+            self._process.join()

@@ -1,0 +1,354 @@
+"""The camera's picture of a world, drawn in software: colour, depth, and what is seen of each object.
+
+Ground, then shadows, then objects against a depth buffer, then sky and haze. One call is one frame; nothing
+is kept between frames, so any pose can be drawn at any time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.camera.ground_view import Buffers, View, add_haze, draw_ground, draw_sky
+from mavlink_sim.camera.image_effects import ImageEffects, apply_effects
+from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
+from mavlink_sim.camera.object_view import FACE_BITS, FAR_PX, NEAR_M, SUBPIXEL_BITS, PlacedObject, Sighting
+from mavlink_sim.world.painting_order import clip_polygon
+from mavlink_sim.world.textures import Image, Plane
+from mavlink_sim.world.world import World, WorldObject, range_to
+from vision.camera_model import CameraModel, CameraMount
+
+DEFAULT_CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+DEFAULT_MOUNT = CameraMount(forward_m=0.12, pitch_rad=math.radians(-20.0))
+
+LOWEST_EYE_M = 0.05
+"""A landed vehicle's camera would touch the ground; the picture is taken from no lower than this."""
+MAX_SHADOW_SOLIDS_AT_PX = 14.0
+"""A shadow smaller than this is drawn as one outline, not one for each solid."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VisibleObject:
+    """What is seen of one object.
+
+    Attributes:
+        world_object: the object.
+        xyxy: edges of the box around its visible pixels: left, top, and right, bottom past the last pixel.
+        visible_fraction: visible pixels against all that it would cover if nothing stood before it and the
+            image were larger, 0..1.
+        pixel_count: number of visible pixels.
+        range_m: horizontal metres from the camera to its footprint.
+    """
+
+    world_object: WorldObject
+    xyxy: tuple[float, float, float, float]
+    visible_fraction: float
+    pixel_count: int
+    range_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendered:
+    """One frame.
+
+    Attributes:
+        image: (H, W, 3) uint8 BGR.
+        depth_m: (H, W) float32 along the optical axis, NaN in the sky and beyond 10 km.
+        objects: those of which at least one pixel is seen, in the world's order.
+        eye_ned_m: (3,) the optical centre, NED.
+    """
+
+    image: Image
+    depth_m: Plane
+    objects: list[VisibleObject]
+    eye_ned_m: NDArray[np.float64]
+
+
+_STILL = CameraMotion()
+
+
+class Renderer:
+    """Draws one world through one camera; `rng` draws the sensor's noise if there are effects.
+
+    A camera with lens distortion or a shutter is drawn through `camera_lens`, which costs more; others are
+    drawn straight away.
+
+    Raises ValueError for a distortion that cannot be drawn, and for buffers of another size.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        camera: CameraModel = DEFAULT_CAMERA,
+        mount: CameraMount = DEFAULT_MOUNT,
+        effects: ImageEffects | None = None,
+        buffers: Buffers | None = None,
+        rng: np.random.Generator | None = None,
+        shutter: Shutter | None = None,
+    ) -> None:
+        self.world, self.camera, self.mount, self.effects = world, camera, mount, effects
+        self._lens = Lens(camera, shutter) if any(camera.distortion) or shutter is not None else None
+        self._drawn = camera if self._lens is None else self._lens.drawn
+        self._buffers = buffers or Buffers(self._drawn.width, self._drawn.height)
+        if self._buffers.work.shape != (self._drawn.height, self._drawn.width):
+            raise ValueError(
+                f"buffers must have the drawn picture's size {self._drawn.width}x{self._drawn.height}, "
+                f"got {self._buffers.work.shape[1]}x{self._buffers.work.shape[0]}"
+            )
+        self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
+        self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
+        self._radii = np.array([placed.radius_m for placed in self._placed])
+        self._shadow_middles: NDArray[np.float64] | None = None
+        self._shadow_radii: NDArray[np.float64] | None = None
+        self._rng = rng or np.random.default_rng(0)
+
+    def place(self, objects: Sequence[WorldObject]) -> None:
+        """Show these objects from now on; those that are the same values as before cost nothing."""
+        known = {placed.item: placed for placed in self._placed}
+        light, sky = self.world.light, self.world.sky
+        if all(placed.item is item for placed, item in zip(self._placed, objects, strict=False)) and len(
+            objects
+        ) == len(self._placed):
+            return
+        self.world = replace(self.world, objects=tuple(objects))
+        self._placed = [known.get(item) or PlacedObject(item, light, sky) for item in objects]
+        self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
+        self._radii = np.array([placed.radius_m for placed in self._placed])
+        self._shadow_middles = self._shadow_radii = None
+
+    def render(
+        self,
+        position_ned_m: Sequence[float],
+        ned_from_body: NDArray[np.float64],
+        mount: CameraMount | None = None,
+        motion: CameraMotion = _STILL,
+    ) -> Rendered:
+        """The frame seen when the body is at `position_ned_m` (3,) with attitude `ned_from_body` (3, 3).
+
+        Args:
+            mount: where the camera looks now if it is on a gimbal; by default the renderer's own mount.
+            motion: of the camera; only a camera with a shutter shows it.
+        """
+        view = self.view(position_ned_m, ned_from_body, mount)
+        buffers, world = self._buffers, self.world
+        inverse_depth = np.empty((view.height, view.width), np.float32)
+        image = draw_ground(world, view, buffers, inverse_depth)
+        self._cast_shadows(view, image)
+        labels = np.zeros((view.height, view.width), np.int32)
+        seen = _within_view(self._placed, self._middles, self._radii, view)
+        sightings = self._draw_objects(seen, view, image, inverse_depth, labels)
+        add_haze(world.sky, inverse_depth, buffers, image)
+        draw_sky(world.sky, world.light, view, inverse_depth, image)
+        _soften_edges(image, labels, sightings)
+        objects: list[VisibleObject | None]
+        if self._lens is None:
+            objects = [
+                _visible(placed, sighting, number, labels, view) for placed, sighting, number in sightings
+            ]
+        else:
+            image, inverse_depth, exposed, inside = self._lens.expose(image, inverse_depth, labels, motion)
+            objects = [
+                _visible_through_lens(placed, sighting, number, labels, exposed, inside, view)
+                for placed, sighting, number in sightings
+            ]
+        if self.effects is not None:
+            image = apply_effects(image, self.effects, self._rng)
+        with np.errstate(divide="ignore"):
+            depth_m = np.divide(np.float32(1.0), inverse_depth, out=inverse_depth)
+        np.copyto(depth_m, np.nan, where=np.isinf(depth_m))
+        return Rendered(image, depth_m, [item for item in objects if item is not None], view.eye)
+
+    def view(
+        self,
+        position_ned_m: Sequence[float],
+        ned_from_body: NDArray[np.float64],
+        mount: CameraMount | None = None,
+    ) -> View:
+        """The camera's pose for a body's pose, with matrices between the drawn picture's pixels and NED."""
+        mount = mount or self.mount
+        ned_from_optical = ned_from_body @ mount.body_from_optical
+        eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ mount.position_frd_m
+        eye[2] = min(eye[2], -LOWEST_EYE_M)
+        matrix = self._drawn.matrix
+        return View(
+            eye=eye,
+            ned_from_pixel=ned_from_optical @ np.linalg.inv(matrix),
+            pixel_from_ned=matrix @ ned_from_optical.T,
+            focal_px=(self._drawn.fx + self._drawn.fy) / 2,
+            width=self._drawn.width,
+            height=self._drawn.height,
+        )
+
+    def _cast_shadows(self, view: View, image: Image) -> None:
+        """Darken the ground where an object keeps the sun off."""
+        darkness = self.world.light.shadow
+        if darkness <= 0.0:
+            return
+        if self._shadow_middles is None or self._shadow_radii is None:
+            spans = [(placed.shadow[0].min(axis=0), placed.shadow[0].max(axis=0)) for placed in self._placed]
+            self._shadow_middles = np.array([(low + high) / 2 for low, high in spans]).reshape(-1, 3)
+            self._shadow_radii = np.array([float(np.linalg.norm(high - low)) / 2 for low, high in spans])
+        mask: Image | None = None
+        left, top, right, bottom = view.width, view.height, 0, 0
+        for placed in _within_view(self._placed, self._shadow_middles, self._shadow_radii, view):
+            outlines = _shadows_in_view(placed, view)
+            if not outlines:
+                continue
+            if mask is None:
+                mask = np.zeros((view.height, view.width), np.uint8)
+            for outline in outlines:
+                low, high = outline.min(axis=0), outline.max(axis=0)
+                if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
+                    continue
+                left, top = min(left, int(low[0])), min(top, int(low[1]))
+                right, bottom = max(right, int(high[0])), max(bottom, int(high[1]))
+                fixed = np.rint(np.clip(outline, -FAR_PX, FAR_PX) * (1 << SUBPIXEL_BITS)).astype(np.int32)
+                cv2.fillConvexPoly(mask, fixed, 255, cv2.LINE_8, SUBPIXEL_BITS)
+        left, top = max(left - 4, 0), max(top - 4, 0)
+        right, bottom = min(right + 5, view.width), min(bottom + 5, view.height)
+        if mask is None or right <= left or bottom <= top:
+            return
+        soft = cv2.blur(mask[top:bottom, left:right], (5, 5))
+        factor = cv2.cvtColor(255 - cv2.convertScaleAbs(soft, alpha=darkness), cv2.COLOR_GRAY2BGR)
+        part = image[top:bottom, left:right]
+        cv2.multiply(part, factor, dst=part, scale=1 / 255)
+
+    @staticmethod
+    def _draw_objects(
+        seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane, labels: NDArray[np.int32]
+    ) -> list[tuple[PlacedObject, Sighting, int]]:
+        sightings: list[tuple[PlacedObject, Sighting, int]] = []
+        flat_depth, flat_labels, flat_image = (
+            inverse_depth.reshape(-1),
+            labels.reshape(-1),
+            image.reshape(-1, 3),
+        )
+        for placed in seen:
+            sighting = placed.draw(view)
+            if sighting is None:
+                continue
+            number = len(sightings) + 1
+            nearer = sighting.inverse_depth > flat_depth.take(sighting.pixels)
+            pixels = sighting.pixels[nearer]
+            flat_depth[pixels] = sighting.inverse_depth[nearer]
+            flat_labels[pixels] = sighting.faces[nearer] + (number << FACE_BITS)
+            flat_image[pixels] = np.clip(sighting.colours[nearer], 0, 255).astype(np.uint8)
+            sightings.append((placed, sighting, number))
+        return sightings
+
+
+def _within_view(
+    placed: list[PlacedObject], middles: NDArray[np.float64], radii: NDArray[np.float64], view: View
+) -> list[PlacedObject]:
+    """Those whose bounding sphere is not certainly outside the image."""
+    if not placed:
+        return []
+    seen = (middles - view.eye) @ view.pixel_from_ned.T
+    depth = seen[:, 2]
+    near = np.maximum(depth - radii, 1e-3)
+    reach = 2.0 * view.focal_px * radii / near
+    safe = np.maximum(depth, 1e-3)
+    across = np.abs(seen[:, 0] / safe - view.width / 2) < view.width / 2 + reach
+    along = np.abs(seen[:, 1] / safe - view.height / 2) < view.height / 2 + reach
+    kept = (depth > NEAR_M - radii) & ((depth <= 1.5 * radii) | (across & along))
+    return [placed[index] for index in np.flatnonzero(kept)]
+
+
+def _shadows_in_view(placed: PlacedObject, view: View) -> list[NDArray[np.float64]]:
+    """Projected shadow outlines (K, 2), cut at the near plane; one for all where it is small anyway."""
+    corners, first = placed.shadow
+    projected = (corners - view.eye) @ view.pixel_from_ned.T
+    depth = projected[:, 2]
+    if float(depth.max()) < NEAR_M:
+        return []
+    whole = float(depth.min()) >= NEAR_M
+    if whole:
+        points = projected[:, :2] / projected[:, 2:]
+        low, high = points.min(axis=0), points.max(axis=0)
+        if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
+            return []
+        if float((high - low).max()) < MAX_SHADOW_SOLIDS_AT_PX:
+            return [cv2.convexHull(points.astype(np.float32)).reshape(-1, 2).astype(np.float64)]
+        return [points[start:end] for start, end in pairwise(first)]
+    forward = np.array([0.0, 0.0, 1.0])
+    cut: list[NDArray[np.float64]] = []
+    for start, end in pairwise(first):
+        piece = projected[start:end]
+        nearest = float(piece[:, 2].min())
+        kept = piece if nearest >= NEAR_M else clip_polygon(piece, forward, NEAR_M)
+        if len(kept) >= 3:
+            cut.append(kept[:, :2] / kept[:, 2:])
+    return cut
+
+
+def _soften_edges(
+    image: Image, labels: NDArray[np.int32], sightings: list[tuple[PlacedObject, Sighting, int]]
+) -> None:
+    """Blend pixels along the edges of faces with their neighbours, so that edges are not jagged."""
+    if not sightings:
+        return
+    left = max(min(sighting.left for _, sighting, _ in sightings) - 2, 0)
+    top = max(min(sighting.top for _, sighting, _ in sightings) - 2, 0)
+    right = max(sighting.right for _, sighting, _ in sightings) + 2
+    bottom = max(sighting.bottom for _, sighting, _ in sightings) + 2
+    part, label = image[top:bottom, left:right], labels[top:bottom, left:right]
+    across = label[:, 1:] != label[:, :-1]
+    along = label[1:] != label[:-1]
+    edge = np.zeros(label.shape, np.bool_)
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= along
+    edge[:-1] |= along
+    blurred = cv2.GaussianBlur(part, (3, 3), 0.6)
+    cv2.copyTo(blurred, edge.view(np.uint8), part)
+
+
+def _visible(
+    placed: PlacedObject, sighting: Sighting, number: int, labels: NDArray[np.int32], view: View
+) -> VisibleObject | None:
+    box = labels[sighting.top : sighting.bottom, sighting.left : sighting.right]
+    own = (box >> FACE_BITS) == number
+    columns, rows = np.flatnonzero(own.any(axis=0)), np.flatnonzero(own.any(axis=1))
+    if not len(columns):
+        return None
+    count = int(np.count_nonzero(own))
+    xyxy = (
+        float(sighting.left + columns[0]),
+        float(sighting.top + rows[0]),
+        float(sighting.left + columns[-1] + 1),
+        float(sighting.top + rows[-1] + 1),
+    )
+    fraction = count / len(sighting.pixels) * sighting.inside_share
+    return VisibleObject(
+        placed.item, xyxy, min(1.0, fraction), count, range_to(placed.item, (view.eye[0], view.eye[1]))
+    )
+
+
+def _visible_through_lens(
+    placed: PlacedObject,
+    sighting: Sighting,
+    number: int,
+    labels: NDArray[np.int32],
+    exposed: NDArray[np.int32],
+    inside: NDArray[np.bool_],
+    view: View,
+) -> VisibleObject | None:
+    """The box in the exposed picture; the fraction in the drawn one, where a pixel is a pixel everywhere."""
+    own = (exposed >> FACE_BITS) == number
+    rows = np.flatnonzero(own.any(axis=1))
+    if not len(rows):
+        return None
+    columns = np.flatnonzero(own[rows[0] : rows[-1] + 1].any(axis=0))
+    edges = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+    xyxy = (float(edges[0]), float(edges[1]), float(edges[2]), float(edges[3]))
+    drawn = (slice(sighting.top, sighting.bottom), slice(sighting.left, sighting.right))
+    seen = ((labels[drawn] >> FACE_BITS) == number) & inside[drawn]
+    fraction = float(np.count_nonzero(seen)) / len(sighting.pixels) * sighting.inside_share
+    range_m = range_to(placed.item, (view.eye[0], view.eye[1]))
+    return VisibleObject(placed.item, xyxy, min(1.0, fraction), int(np.count_nonzero(own)), range_m)

@@ -1,0 +1,351 @@
+"""Labelled pictures to train the detector with: random places, cameras, light, and things on the ground.
+
+Every draw comes from one generator, so that a seed gives the same pictures again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavlink_sim.camera.ground_view import Buffers, View
+from mavlink_sim.camera.image_effects import ImageEffects
+from mavlink_sim.camera.renderer import Rendered, Renderer
+from mavlink_sim.world.shapes import CLASS_NAMES, CLUTTER_NAMES, shape_of, variant_of
+from mavlink_sim.world.textures import KINDS, Image
+from mavlink_sim.world.world import Ground, Light, Patch, Sky, World, WorldObject
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import matrix_from_euler
+
+Boxes = NDArray[np.float32]
+ClassIds = NDArray[np.int64]
+
+MIN_VISIBLE_FRACTION = 0.35
+MIN_SIDE_PX = 8.0
+MIN_AREA_PX = 120.0
+
+EMPTY_SHARE = 0.08
+MAX_OBJECTS = 14
+TILES = 56
+PAINTED_TILES = 6
+BEFORE_LENS_M = 1.2
+"""Nothing is put nearer to the camera than this."""
+CLASS_WEIGHTS = {
+    "person": 1.5,
+    "bicycle": 1.0,
+    "car": 1.5,
+    "truck": 0.9,
+    "boat": 0.9,
+    "dog": 1.0,
+    "chair": 1.0,
+}
+NARROW_SIDE_M = np.array([0.5, 0.5, 1.5, 2.2, 1.7, 0.4, 0.5])
+"""Of each class: how wide it looks at least, from most sides. Smaller than MIN_SIDE_PX is not tried."""
+
+
+def random_scene(
+    rng: np.random.Generator,
+    width: int = 384,
+    height: int = 384,
+    focal_px: tuple[float, float] | None = None,
+) -> tuple[Image, Boxes, ClassIds]:
+    """One labelled picture.
+
+    Args:
+        rng: all that is random is drawn from it.
+        focal_px: least and greatest focal length; by default 0.6 to 1.7 times the width.
+
+    Returns:
+        The image (height, width, 3) uint8 BGR; boxes (N, 4) float32, left, top, right, bottom edges, pixels;
+        class ids (N,) int64, indices into CLASS_NAMES. Only things of which at least a third is seen
+        (MIN_VISIBLE_FRACTION) and whose box is not tiny are truth.
+    """
+    rendered = random_frame(rng, width, height, focal_px)
+    boxes: list[tuple[float, float, float, float]] = []
+    ids: list[int] = []
+    for item in rendered.objects:
+        class_name = item.world_object.class_name
+        if class_name in CLASS_NAMES and _counts(item.xyxy, item.visible_fraction):
+            boxes.append(item.xyxy)
+            ids.append(CLASS_NAMES.index(class_name))
+    return rendered.image, np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+
+
+def random_frame(
+    rng: np.random.Generator, width: int, height: int, focal_px: tuple[float, float] | None = None
+) -> Rendered:
+    """The frame behind `random_scene`, with depth and all that is seen; the same draws, the same picture."""
+    least, greatest = focal_px or (0.6 * width, 1.7 * width)
+    altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(60.0))))
+    # Looking down from higher up with a longer lens, so that people stay visible.
+    lens = rng.beta(1.0 + altitude / 25.0, 1.6)
+    focal = float(least * (greatest / least) ** lens)
+    camera = CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    pitch = -_pitch_down(rng, altitude)
+    roll = math.radians(float(np.clip(rng.normal(0.0, 9.0), -25.0, 25.0)))
+    attitude = matrix_from_euler(roll, pitch, float(rng.uniform(-math.pi, math.pi)))
+    ground = _random_ground(rng)
+    position = (float(rng.uniform(-45, 45)), float(rng.uniform(-45, 45)), -altitude)
+    light = _random_light(rng)
+    sky = _random_sky(rng)
+    buffers = _buffers(width, height)
+    renderer = Renderer(World((), ground, light, sky), camera, CameraMount(), None, buffers)
+    objects = _random_objects(rng, renderer, position, attitude, ground)
+    effects = _random_effects(rng)
+    renderer = Renderer(World(objects, ground, light, sky), camera, CameraMount(), effects, buffers, rng)
+    return renderer.render(position, attitude)
+
+
+def render_dataset(
+    count: int, seed: int, width: int = 384, height: int = 384
+) -> Iterator[tuple[Image, Boxes, ClassIds]]:
+    """`count` labelled pictures; picture i of a seed is the same whatever the count."""
+    for index in range(count):
+        yield random_scene(np.random.default_rng((seed, index)), width, height)
+
+
+def _counts(xyxy: tuple[float, float, float, float], visible_fraction: float) -> bool:
+    wide, high = xyxy[2] - xyxy[0], xyxy[3] - xyxy[1]
+    large = min(wide, high) >= MIN_SIDE_PX and wide * high >= MIN_AREA_PX
+    return large and visible_fraction >= MIN_VISIBLE_FRACTION
+
+
+@lru_cache(maxsize=4)
+def _buffers(width: int, height: int) -> Buffers:
+    return Buffers(width, height)
+
+
+def _pitch_down(rng: np.random.Generator, altitude_m: float) -> float:
+    """How far the camera looks down: from slightly up to straight down; higher up, mostly down."""
+    if rng.random() < 0.18:
+        return math.radians(float(rng.uniform(75, 90)))
+    middle = 12.0 + 14.0 * math.log(max(altitude_m, 1.5) / 1.5)
+    return math.radians(float(np.clip(rng.normal(middle, 16.0), -10.0, 90.0)))
+
+
+def _random_ground(rng: np.random.Generator) -> Ground:
+    gain = rng.uniform(0.72, 1.2) * rng.uniform(0.93, 1.07, 3)
+    tint = (float(gain[0]), float(gain[1]), float(gain[2]))
+    if rng.random() < 0.22:
+        return _painted_ground(int(rng.integers(PAINTED_TILES)), tint)
+    seed = int(rng.integers(TILES))
+    kinds, texels, texel_m = _tile_recipe(seed)
+    origin = (float(rng.uniform(-50, 50)), float(rng.uniform(-50, 50)))
+    size = texel_m * float(rng.uniform(0.7, 1.4))
+    return Ground(kinds, seed, texels, size, float(rng.uniform(-math.pi, math.pi)), origin, gain=tint)
+
+
+@lru_cache(maxsize=TILES)
+def _tile_recipe(seed: int) -> tuple[tuple[str, ...], int, float]:
+    rng = np.random.default_rng((seed, 31))
+    names = tuple(KINDS)
+    kinds: tuple[str, ...] = (names[seed % len(names)],)
+    if rng.random() < 0.4:
+        kinds += (names[int(rng.integers(len(names)))],)
+    return kinds, (512 if rng.random() < 0.7 else 1024), float(rng.uniform(0.04, 0.12))
+
+
+@lru_cache(maxsize=PAINTED_TILES)
+def _painted(seed: int) -> Ground:
+    rng = np.random.default_rng((seed, 32))
+    patches = tuple(
+        Patch(
+            str(rng.choice(["water", "gravel", "asphalt", "sand", "soil", "concrete", "rows"])),
+            float(rng.uniform(-40, 40)),
+            float(rng.uniform(-40, 40)),
+            float(rng.uniform(3, 10)),
+        )
+        for _ in range(int(rng.integers(3, 9)))
+    )
+    kinds: tuple[tuple[str, ...], ...] = (
+        ("meadow", "grass"),
+        ("grass",),
+        ("grass", "soil"),
+        ("sand",),
+        ("snow",),
+        ("soil", "grass"),
+    )
+    road = None if seed == 4 else float(rng.uniform(-25, 25)) or 1.0
+    return Ground(kinds[seed % 6], seed, 1024, 0.1, patches=patches, road_east_m=road, pad=seed % 2 == 0)
+
+
+def _painted_ground(seed: int, gain: tuple[float, float, float]) -> Ground:
+    base = _painted(seed)
+    return Ground(
+        base.kinds,
+        base.seed,
+        base.tile_texels,
+        base.texel_m,
+        0.0,
+        (0.0, 0.0),
+        base.patches,
+        base.road_east_m,
+        base.pad,
+        gain,
+    )
+
+
+def _random_light(rng: np.random.Generator) -> Light:
+    overcast = rng.random() < 0.3
+    warm = float(rng.uniform(-0.04, 0.12))
+    return Light(
+        sun_azimuth_rad=float(rng.uniform(-math.pi, math.pi)),
+        sun_elevation_rad=math.radians(float(rng.uniform(18, 80))),
+        sun=float(rng.uniform(0.05, 0.25) if overcast else rng.uniform(0.45, 0.8)),
+        ambient=float(rng.uniform(0.6, 0.85) if overcast else rng.uniform(0.38, 0.58)),
+        tint=(1.0 - warm, 1.0, 1.0 + 0.6 * warm),
+        shadow=float(rng.uniform(0.0, 0.2) if overcast else rng.uniform(0.3, 0.65)),
+    )
+
+
+def _random_sky(rng: np.random.Generator) -> Sky:
+    grey = float(rng.uniform(0, 1)) ** 2
+    bright = float(rng.uniform(0.75, 1.08))
+    horizon = np.array((226.0, 216.0, 202.0)) * (1 - grey) + np.array((206.0, 206.0, 204.0)) * grey
+    zenith = np.array((196.0, 138.0, 74.0)) * (1 - grey) + np.array((178.0, 172.0, 166.0)) * grey
+    far, high = horizon * bright, zenith * bright
+    return Sky(
+        visibility_m=float(math.exp(rng.uniform(math.log(120.0), math.log(3000.0)))),
+        horizon=(float(far[0]), float(far[1]), float(far[2])),
+        zenith=(float(high[0]), float(high[1]), float(high[2])),
+        clouds=float(rng.uniform(0, 1)),
+        seed=int(rng.integers(4)),
+    )
+
+
+def _random_effects(rng: np.random.Generator) -> ImageEffects:
+    balance = rng.uniform(0.9, 1.1, 3)
+    return ImageEffects(
+        blur_sigma_px=float(rng.uniform(0.3, 1.3)) if rng.random() < 0.35 else 0.0,
+        motion_px=float(rng.uniform(2, 6)) if rng.random() < 0.12 else 0.0,
+        motion_rad=float(rng.uniform(0, math.pi)),
+        exposure=float(rng.uniform(0.6, 1.35)),
+        white_balance=(float(balance[0]), float(balance[1]), float(balance[2])),
+        contrast=float(rng.uniform(0.75, 1.2)),
+        gamma=float(rng.uniform(0.8, 1.3)),
+        grey=float(rng.uniform(0.3, 1.0)) if rng.random() < 0.08 else 0.0,
+        noise_sigma=float(rng.uniform(0.5, 9.0)) if rng.random() < 0.7 else 0.0,
+    )
+
+
+def _random_objects(
+    rng: np.random.Generator,
+    renderer: Renderer,
+    position: tuple[float, float, float],
+    attitude: NDArray[np.float64],
+    ground: Ground,
+) -> tuple[WorldObject, ...]:
+    """Things put where the camera sees them large enough, and not much hidden by each other."""
+    view = renderer.view(position, attitude)
+    empty = rng.random() < EMPTY_SHARE
+    wanted = 0 if empty else 1 + int(rng.integers(MAX_OBJECTS))
+    clutter = int(rng.integers(0, 9))
+    water = ground.kinds[0] == "water"
+    weights = np.array(list(CLASS_WEIGHTS.values()))
+    if water:
+        weights[CLASS_NAMES.index("boat")] *= 6.0
+    placed: list[WorldObject] = []
+    boxes: list[NDArray[np.float64]] = []
+    depths: list[float] = []
+    true_class: list[bool] = []
+    found = {True: 0, False: 0}
+    for attempt in range(6 * (wanted + clutter)):
+        real = attempt % 6 < 4
+        if found[real] >= (wanted if real else clutter):
+            continue
+        pixel = np.array([rng.uniform(0, view.width), rng.uniform(0, view.height), 1.0])
+        ray = view.ned_from_pixel @ pixel
+        if ray[2] <= 1e-3:
+            continue
+        depth = float(-view.eye[2] / ray[2])
+        if real:
+            fitting = weights * (NARROW_SIDE_M * view.focal_px / depth > MIN_SIDE_PX)
+            if not fitting.any():
+                continue
+            class_name = CLASS_NAMES[int(rng.choice(len(CLASS_NAMES), p=fitting / fitting.sum()))]
+        else:
+            class_name = CLUTTER_NAMES[int(rng.integers(len(CLUTTER_NAMES)))]
+        appearance = int(rng.integers(2**31))
+        scale = float(rng.uniform(0.9, 1.12))
+        yaw = float(rng.uniform(-math.pi, math.pi))
+        where = view.eye + depth * ray
+        item = WorldObject(
+            len(placed), class_name, (float(where[0]), float(where[1]), 0.0), yaw, scale, appearance
+        )
+        outline = _outline(item, view)
+        if outline is None:
+            continue
+        box, inside = outline
+        sides = box[2:] - box[:2]
+        limit = MIN_SIDE_PX * 1.35
+        if real and (sides.min() < limit or sides.prod() < 2.2 * MIN_AREA_PX or inside < 0.5):
+            continue
+        if not real and (inside < 0.2 or sides.prod() > 0.3 * view.width * view.height or sides.max() < 4):
+            continue
+        if any(_touch(item, other) for other in placed):
+            continue
+        if _hidden(box, depth, real, boxes, depths, true_class):
+            continue
+        placed.append(item)
+        boxes.append(box)
+        depths.append(depth)
+        true_class.append(real)
+        found[real] += 1
+    return tuple(placed)
+
+
+def _outline(item: WorldObject, view: View) -> tuple[NDArray[np.float64], float] | None:
+    """The box (4,) in the image around the object's bounding box, and the share of it that is inside."""
+    shape = shape_of(item.class_name, variant_of(item.class_name, item.appearance))
+    low, high = shape.low * item.scale, shape.high * item.scale
+    x, y, z = np.meshgrid((low[0], high[0]), (low[1], high[1]), (low[2], high[2]))
+    c, s = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
+    x, y, z = x.ravel(), y.ravel(), z.ravel()
+    corners = np.column_stack([c * x - s * y, s * x + c * y, z]) + item.position_ned_m
+    seen = (corners - view.eye) @ view.pixel_from_ned.T
+    if seen[:, 2].min() < BEFORE_LENS_M:
+        return None
+    points = seen[:, :2] / seen[:, 2:]
+    size = (view.width, view.height)
+    low_px, high_px = points.min(axis=0), points.max(axis=0)
+    inside_low, inside_high = np.clip(low_px, 0, size), np.clip(high_px, 0, size)
+    whole = float(np.prod(high_px - low_px))
+    inside = float(np.prod(inside_high - inside_low)) / max(whole, 1e-9)
+    return np.concatenate([inside_low, inside_high]), inside
+
+
+def _touch(one: WorldObject, other: WorldObject) -> bool:
+    apart = math.hypot(
+        one.position_ned_m[0] - other.position_ned_m[0], one.position_ned_m[1] - other.position_ned_m[1]
+    )
+    reach = 0.0
+    for item in (one, other):
+        rear, front, left, right = item.footprint_m
+        reach += (front - rear + right - left) / 4
+    return apart < reach * 1.1
+
+
+def _hidden(
+    box: NDArray[np.float64],
+    depth_m: float,
+    real: bool,
+    boxes: list[NDArray[np.float64]],
+    depths: list[float],
+    true_class: list[bool],
+) -> bool:
+    """Whether this thing hides, or is hidden by, another for more than about half."""
+    area = float(np.prod(box[2:] - box[:2]))
+    for other, other_depth, other_real in zip(boxes, depths, true_class, strict=True):
+        shared = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
+        if shared.min() <= 0.0:
+            continue
+        common = float(np.prod(shared))
+        behind_real = other_real if depth_m < other_depth else real
+        hidden_area = float(np.prod(other[2:] - other[:2])) if depth_m < other_depth else area
+        if behind_real and common > 0.5 * hidden_area:
+            return True
+    return False

@@ -1,0 +1,278 @@
+"""Faults of the vehicle itself: position, estimate, battery, rotors, air, pilot, refused modes, a reboot."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import TYPE_CHECKING
+
+from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
+from mavlink_sim.autopilot.position_failsafe import needs_position
+from mavlink_sim.faults.grammar import FaultError
+from mavlink_sim.flight.tasks import Trajectory
+from mavlink_sim.physics.estimate_errors import ZERO
+from mavlink_sim.px4.modes import Mode, mode_of
+from mavlink_sim.wire.announcements import Text
+
+if TYPE_CHECKING:
+    from mavlink_sim.faults.schedule import ActiveFault
+    from mavlink_sim.physics.airframe import Vector
+    from mavlink_sim.vehicle import Vehicle
+
+DEAD_RECKONING_S = 5.0  # EKF2_NOAID_TOUT
+REACQUISITION_S = 1.0  # from the first fix to a position that is fused again
+DEAD_RECKONING_BIAS_MPS2 = 0.03  # of an accelerometer, after PX4 learnt most of it
+GUST_S = 4.0
+WARNING, INFO = 4, 6  # MAV_SEVERITY
+
+# Commands that are a request for a mode; DO_SET_MODE (176) names it in its parameters.
+_MODE_OF_COMMAND = {
+    20: Mode.RTL,
+    21: Mode.LAND,
+    22: Mode.TAKEOFF,
+    34: Mode.ORBIT,
+    186: Mode.HOLD,
+    192: Mode.HOLD,
+    300: Mode.MISSION,
+}
+_DO_SET_MODE = 176
+
+
+# ---- position and estimate
+
+
+def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
+    """No fix: dead reckoning drifts for 5 s, then the position is invalid until a moment after the end."""
+    estimate, faults = vehicle.estimate, vehicle.faults
+    angle = random.Random(one.seed).uniform(0.0, math.tau)
+    north, east = DEAD_RECKONING_BIAS_MPS2 * math.cos(angle), DEAD_RECKONING_BIAS_MPS2 * math.sin(angle)
+    began_s = faults.now_s
+    estimate.fix_lost += 1
+    vehicle.autopilot.texts.append(Text(WARNING, "GNSS data fusion stopped\t"))
+
+    def each_step(dt_s: float) -> None:
+        since_s = faults.now_s - began_s
+        if since_s < DEAD_RECKONING_S:
+            drift = since_s * since_s / 2.0
+            error = (north * drift, east * drift, 0.0)
+            vehicle.estimate.set_error(one.number, error, (north * since_s, east * since_s, 0.0))
+        elif estimate.held_xy_m is None:
+            x, y, _ = estimate.position
+            estimate.held_xy_m = (x, y)  # EKF2 fuses a made-up standstill from here on
+            estimate.count_reset(2)
+            estimate.position_valid = vehicle.autopilot.position_valid = False
+
+    def fuse_again() -> None:
+        estimate.set_error(one.number, None)
+        if estimate.fix_lost:
+            return
+        if estimate.held_xy_m is not None:
+            estimate.held_xy_m = None
+            estimate.position_valid = vehicle.autopilot.position_valid = True
+        _jumped(vehicle, 2)
+        vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
+
+    def undo() -> None:
+        estimate.fix_lost -= 1
+        vehicle.after(REACQUISITION_S, fuse_again)
+
+    one.each_step = each_step
+    one.undo.append(undo)
+
+
+def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
+    """The receiver's position wanders; the estimate follows it, and the vehicle holds the estimate."""
+    values = one.fault.values
+    angle = _direction(values["towards"], one.seed)
+    drifted_m = 0.0
+
+    def each_step(dt_s: float) -> None:
+        nonlocal drifted_m
+        speed = values["speed"] if drifted_m < values["limit"] else 0.0
+        drifted_m = min(drifted_m + speed * dt_s, values["limit"])
+        north, east = math.cos(angle), math.sin(angle)
+        error = (drifted_m * north, drifted_m * east, 0.0)
+        vehicle.estimate.gps_drift[one.number] = error
+        vehicle.estimate.set_error(one.number, error, (speed * north, speed * east, 0.0))
+
+    def undo() -> None:
+        vehicle.estimate.gps_drift.pop(one.number, None)
+        vehicle.estimate.set_error(one.number, None)
+        _jumped(vehicle)
+
+    one.each_step = each_step
+    one.undo.append(undo)
+
+
+def ekf_reset(vehicle: Vehicle, one: ActiveFault) -> None:
+    """The estimate jumps; when the fault is ended it jumps back."""
+    values = one.fault.values
+    error = (values["north"], values["east"], values["down"])
+    yaw_rad = math.radians(values["yaw"])
+    vehicle.estimate.set_error(one.number, error, ZERO, yaw_rad)
+    _jumped(vehicle, (error != ZERO) + (yaw_rad != 0.0), yaw_rad)
+
+    def undo() -> None:
+        vehicle.estimate.set_error(one.number, None)
+        _jumped(vehicle, (error != ZERO) + (yaw_rad != 0.0), -yaw_rad)
+
+    one.undo.append(undo)
+
+
+def _jumped(vehicle: Vehicle, resets: int = 1, yaw_rad: float = 0.0) -> None:
+    """What PX4 does at a reset: count it, and go on planning from where the vehicle now thinks it is.
+
+    An absolute goal stays where it is, so the vehicle then flies the difference.
+    """
+    vehicle.estimate.update(0.0)
+    vehicle.estimate.count_reset(resets)
+    for trajectory in _trajectories(vehicle.autopilot.task):
+        trajectory.position = vehicle.estimate.position
+        trajectory.yaw_rad = math.remainder(trajectory.yaw_rad + yaw_rad, math.tau)
+
+
+def _trajectories(task: object) -> list[Trajectory]:
+    """Those of a flight task and of the task within it (Return lands by one of its own)."""
+    found = []
+    for value in vars(task).values() if task is not None else ():
+        if isinstance(value, Trajectory):
+            found.append(value)
+        elif value is not None and any(isinstance(inner, Trajectory) for inner in _attributes(value)):
+            found += [inner for inner in _attributes(value) if isinstance(inner, Trajectory)]
+    return found
+
+
+def _attributes(value: object) -> list[object]:
+    return list(getattr(value, "__dict__", {}).values())
+
+
+# ---- power and rotors
+
+
+def battery(vehicle: Vehicle, one: ActiveFault) -> None:
+    """So much charge is left, and goes on being used while armed."""
+    cells = vehicle.autopilot.supervision.battery
+    cells.forced_charge = one.fault.values["remaining"]
+    cells.settle()
+
+    def undo() -> None:
+        cells.forced_charge = None
+        cells.settle()
+
+    one.undo.append(undo)
+
+
+def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
+    """The rotor stops; it turns again when the fault ends."""
+    motor = one.fault.values["motor"]
+    vehicle.airframe.fail_motor(motor - 1)
+
+    one.undo.append(lambda: vehicle.airframe.fail_motor(motor - 1, 1.0))
+
+
+# ---- air
+
+
+def wind(vehicle: Vehicle, one: ActiveFault) -> None:
+    """So much more wind."""
+    values = one.fault.values
+    vehicle.faults.winds[one.number] = _blowing(values["speed"], _direction(values["from"], one.seed))
+    one.undo.append(lambda: _calm(vehicle, one))
+
+
+def gust(vehicle: Vehicle, one: ActiveFault) -> None:
+    """One gust of `for` seconds (4 if not given): the wind rises and falls as 1 - cos."""
+    values = one.fault.values
+    angle = _direction(values["from"], one.seed)
+    began_s = vehicle.faults.now_s
+    if math.isinf(one.ends_s):
+        one.ends_s = began_s + GUST_S
+    length_s = one.ends_s - began_s
+
+    def each_step(dt_s: float) -> None:
+        phase = math.tau * (vehicle.faults.now_s - began_s) / length_s
+        vehicle.faults.winds[one.number] = _blowing(values["speed"] * (1.0 - math.cos(phase)) / 2.0, angle)
+
+    one.each_step = each_step
+    one.undo.append(lambda: _calm(vehicle, one))
+
+
+def _direction(degrees: float | None, seed: int) -> float:
+    return random.Random(seed).uniform(0.0, math.tau) if degrees is None else math.radians(degrees)
+
+
+def _blowing(speed_mps: float, from_rad: float) -> Vector:
+    return (-speed_mps * math.cos(from_rad), -speed_mps * math.sin(from_rad), 0.0)
+
+
+def _calm(vehicle: Vehicle, one: ActiveFault) -> None:
+    vehicle.faults.winds.pop(one.number, None)
+    vehicle.reload_wind(vehicle.faults.winds.values())
+
+
+# ---- command
+
+
+def pilot_takeover(vehicle: Vehicle, one: ActiveFault) -> None:
+    """A pilot's sticks are there and the mode is switched; at the end the sticks go, the mode stays.
+
+    Where a remote control counts (COM_RC_IN_MODE other than 4), it is lost then, and NAV_RCL_ACT follows.
+    """
+    mode = Mode[one.fault.values["mode"]]
+    had_sticks = vehicle.autopilot.supervision.pilot_attached
+    if vehicle.autopilot.pilot_takes_over(mode) != 0:
+        vehicle.autopilot.pilot_has_sticks = had_sticks
+        raise FaultError(f"pilot_takeover: mode {mode.name} cannot be flown now")
+
+    def undo() -> None:
+        vehicle.autopilot.pilot_has_sticks = had_sticks
+
+    one.undo.append(undo)
+
+
+def requested_mode(command: int, parameters: tuple[float, ...]) -> Mode | None:
+    """The mode that a command asks for; None if it asks for none."""
+    if command != _DO_SET_MODE:
+        return _MODE_OF_COMMAND.get(command)
+    main, sub = parameters[1:3]
+    return mode_of(int(main), int(sub)) if math.isfinite(main) and math.isfinite(sub) else None
+
+
+def refused_for_position(vehicle: Vehicle, command: int, parameters: tuple[float, ...]) -> int | None:
+    """An armed vehicle without a valid position takes no mode that needs one."""
+    mode = requested_mode(command, parameters)
+    if mode is None or vehicle.autopilot.position_valid or not vehicle.autopilot.armed:
+        return None
+    return TEMPORARILY_REJECTED if needs_position(mode) else None
+
+
+def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Requests for the mode are refused, all or the next so many."""
+    values = one.fault.values
+    left = math.inf if values["count"] == "all" else int(values["count"])
+
+    def refusal(command: int, parameters: tuple[float, ...]) -> int | None:
+        nonlocal left
+        mode = requested_mode(command, parameters)
+        if mode is None or values["mode"] not in ("any", mode.name):
+            return None
+        left -= 1
+        if left <= 0:
+            vehicle.faults.finish(one.number)
+        return TEMPORARILY_REJECTED
+
+    vehicle.faults.refusals[one.number] = refusal
+    one.undo.append(lambda: vehicle.faults.refusals.pop(one.number))
+
+
+def reboot(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Power was lost for a moment: `Vehicle.reboot`, deaf and silent until PX4 has started."""
+    faults = vehicle.faults
+    one.ends_s = min(one.ends_s, faults.now_s + one.fault.values["seconds"])
+    faults.deaf = True
+    vehicle.reboot()
+
+    def undo() -> None:
+        faults.deaf = any(each.fault.kind.name == "reboot" for each in faults.active)
+
+    one.undo.append(undo)

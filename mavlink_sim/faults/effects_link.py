@@ -1,0 +1,96 @@
+"""Faults of the links: which impairment goes on which direction of which link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from mavlink_sim.faults.grammar import FaultError
+from mavlink_sim.wire.link_faults import (
+    Channel,
+    Corruption,
+    Delay,
+    Duplication,
+    Impairment,
+    Loss,
+    RateLimit,
+    Reorder,
+)
+
+if TYPE_CHECKING:
+    from mavlink_sim.faults.schedule import ActiveFault
+    from mavlink_sim.vehicle import Vehicle
+
+
+def chosen_links(vehicle: Vehicle, link: str) -> list[str]:
+    """The names of the links that are meant. Raises FaultError for one that the vehicle does not have."""
+    if not vehicle.links:
+        raise FaultError("a fault of the link: this vehicle has no links")
+    if link == "all":
+        return list(vehicle.links)
+    if link not in vehicle.links:
+        raise FaultError(f"there is no link {link!r}; there are: all, {', '.join(vehicle.links)}")
+    return [link]
+
+
+def _channels(vehicle: Vehicle, one: ActiveFault) -> list[tuple[str, Channel]]:
+    """The directions that are meant, each with the seed of its own random numbers."""
+    values = one.fault.values
+    found = []
+    for name in chosen_links(vehicle, values["link"]):
+        stage = vehicle.faults.stage(name)
+        for way, channel in (("out", stage.outbound), ("in", stage.inbound)):
+            if values["way"] in ("both", way):
+                found.append((f"{one.seed}:{name}:{way}", channel))
+    return found
+
+
+def _impair(vehicle: Vehicle, one: ActiveFault, make: Callable[[str], Impairment]) -> None:
+    for seed, channel in _channels(vehicle, one):
+        impairment = make(seed)
+        channel.impair(impairment)
+        one.undo.append(lambda channel=channel, impairment=impairment: channel.mend(impairment))  # type: ignore[misc]
+
+
+def link_loss(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Nothing gets through, and what was on its way is lost too."""
+    for _, channel in _channels(vehicle, one):
+        channel.drop_waiting()
+    _impair(vehicle, one, lambda seed: Loss(1.0, seed))
+
+
+def link_delay(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Everything is late."""
+    values = one.fault.values
+    _impair(vehicle, one, lambda seed: Delay(values["seconds"], values["jitter"], seed))
+
+
+def link_jitter(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Everything is late, each by another amount."""
+    _impair(vehicle, one, lambda seed: Delay(0.0, one.fault.values["seconds"], seed))
+
+
+def packet_loss(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Datagrams get lost."""
+    _impair(vehicle, one, lambda seed: Loss(one.fault.values["share"], seed))
+
+
+def duplicate(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Datagrams arrive twice."""
+    _impair(vehicle, one, lambda seed: Duplication(one.fault.values["share"], seed))
+
+
+def reorder(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Datagrams overtake each other."""
+    values = one.fault.values
+    _impair(vehicle, one, lambda seed: Reorder(values["share"], values["hold"], seed))
+
+
+def corrupt(vehicle: Vehicle, one: ActiveFault) -> None:
+    """Bytes change on the way."""
+    _impair(vehicle, one, lambda seed: Corruption(one.fault.values["share"], seed))
+
+
+def rate_limit(vehicle: Vehicle, one: ActiveFault) -> None:
+    """The line is slow."""
+    _impair(vehicle, one, lambda seed: RateLimit(one.fault.values["bytes_per_s"]))

@@ -1,0 +1,255 @@
+"""Every kind of fault: how it is asked for, and the function that begins it.
+
+A beginning gets the vehicle and its `ActiveFault`, and appends to `undo` what sets right what it changed;
+what grows with time goes into `each_step`. docs/faults.md says what each is like in reality.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from mavlink_sim.faults import effects_flight as flight
+from mavlink_sim.faults import effects_link as link
+from mavlink_sim.faults import effects_messages as messages
+from mavlink_sim.faults.grammar import REQUIRED, Field, Kind, choice, number, positive, probability, whole
+from mavlink_sim.px4.modes import Mode
+
+if TYPE_CHECKING:
+    from mavlink_sim.faults.schedule import ActiveFault
+    from mavlink_sim.vehicle import Vehicle
+
+Effect = Callable[["Vehicle", "ActiveFault"], None]
+
+
+def _battery(text: str) -> float:
+    words = {"low": 0.14, "critical": 0.065, "emergency": 0.04}
+    if text.lower() in words:
+        return words[text.lower()]
+    try:
+        return number(0.0, 1.0)(text)
+    except ValueError:
+        raise ValueError("0 to 1, or low, critical, emergency") from None
+
+
+def _which(text: str) -> str:
+    return "all" if text == "all" else str(_positive_whole(text))
+
+
+_positive_whole = whole(1, 1_000_000)
+
+_LINK = Field("link", str, "all", "onboard, gcs, or all")
+_WAY = Field("way", choice("both", "out", "in"), "both", "out: from the vehicle, in: to it, both")
+
+
+def _on_links(name: str, summary: str, *fields: Field) -> Kind:
+    return Kind(name, summary, (*fields, _LINK, _WAY))
+
+
+_TABLE: tuple[tuple[Kind, Effect], ...] = (
+    (_on_links("link_loss", "nothing gets through"), link.link_loss),
+    (
+        _on_links(
+            "link_delay",
+            "everything is late, in order",
+            Field("seconds", number(0.0, 60.0, "s"), REQUIRED, "how late"),
+            Field("jitter", number(0.0, 60.0, "s"), 0.0, "up to so many seconds more, each time another"),
+        ),
+        link.link_delay,
+    ),
+    (
+        _on_links(
+            "link_jitter",
+            "everything is late by a varying amount, in order",
+            Field("seconds", number(0.0, 60.0, "s"), REQUIRED, "at most so late"),
+        ),
+        link.link_jitter,
+    ),
+    (
+        _on_links(
+            "packet_loss",
+            "datagrams get lost at random",
+            Field("share", probability, REQUIRED, "probability, 0 to 1"),
+        ),
+        link.packet_loss,
+    ),
+    (
+        _on_links(
+            "duplicate",
+            "datagrams arrive twice",
+            Field("share", probability, REQUIRED, "probability, 0 to 1"),
+        ),
+        link.duplicate,
+    ),
+    (
+        _on_links(
+            "reorder",
+            "datagrams overtake each other",
+            Field("share", probability, REQUIRED, "probability of being held back, 0 to 1"),
+            Field("hold", number(0.001, 10.0, "s"), 0.05, "how long it is held back, seconds"),
+        ),
+        link.reorder,
+    ),
+    (
+        _on_links(
+            "corrupt",
+            "bytes of datagrams are other ones",
+            Field("share", probability, REQUIRED, "probability for a datagram, 0 to 1"),
+        ),
+        link.corrupt,
+    ),
+    (
+        _on_links(
+            "rate_limit",
+            "the line carries so many bytes a second, with a radio's small buffer",
+            Field("bytes_per_s", number(10.0, 1e9, "bytes/s"), REQUIRED, "a 57600 baud radio: 5760"),
+        ),
+        link.rate_limit,
+    ),
+    (Kind("heartbeat_only", "of the vehicle only HEARTBEAT is heard", (_LINK,)), messages.heartbeat_only),
+    (
+        Kind(
+            "lost_ack",
+            "acknowledgements of commands are not sent",
+            (
+                Field("which", _which, "all", "all, or N: the Nth from now alone"),
+                Field("command", whole(0, 65535), 0, "of this MAV_CMD alone; 0: of any"),
+                _LINK,
+            ),
+        ),
+        messages.lost_ack,
+    ),
+    (
+        Kind("gps_loss", "no fix; the position becomes invalid after 5 s of dead reckoning"),
+        flight.gps_loss,
+    ),
+    (
+        Kind(
+            "gps_drift",
+            "the measured position wanders off, and the vehicle with it",
+            (
+                Field("speed", number(0.01, 50.0, "m/s"), 0.5, "m/s"),
+                Field(
+                    "towards", number(0.0, 360.0, "degrees"), None, "degrees from north; seeded if not given"
+                ),
+                Field("limit", number(0.1, 10000.0, "m"), 100.0, "metres at most"),
+            ),
+        ),
+        flight.gps_drift,
+    ),
+    (
+        Kind(
+            "ekf_reset",
+            "the estimate jumps, the vehicle does not; reset_counter tells of it",
+            (
+                Field("north", number(-1000.0, 1000.0, "m"), 2.0, "metres"),
+                Field("east", number(-1000.0, 1000.0, "m"), 0.0, "metres"),
+                Field("down", number(-100.0, 100.0, "m"), 0.0, "metres"),
+                Field("yaw", number(-180.0, 180.0, "degrees"), 0.0, "degrees of the heading"),
+            ),
+        ),
+        flight.ekf_reset,
+    ),
+    (
+        Kind(
+            "battery",
+            "so much is left",
+            (Field("remaining", _battery, REQUIRED, "0 to 1, or low, critical…"),),
+        ),
+        flight.battery,
+    ),
+    (
+        Kind(
+            "motor_failure",
+            "a rotor gives no thrust",
+            (Field("motor", whole(1, 4), REQUIRED, "PX4's number: 1 front right, 2 rear left, 3, 4"),),
+        ),
+        flight.motor_failure,
+    ),
+    (
+        Kind(
+            "wind",
+            "a steady wind blows",
+            (
+                Field("speed", number(0.0, 40.0, "m/s"), REQUIRED, "m/s"),
+                Field(
+                    "from",
+                    number(0.0, 360.0, "degrees"),
+                    None,
+                    "degrees from north it comes from; else seeded",
+                ),
+            ),
+        ),
+        flight.wind,
+    ),
+    (
+        Kind(
+            "gust",
+            "one gust, rising and falling as a cosine",
+            (
+                Field("speed", number(0.0, 40.0, "m/s"), REQUIRED, "m/s at its peak"),
+                Field(
+                    "from",
+                    number(0.0, 360.0, "degrees"),
+                    None,
+                    "degrees from north it comes from; else seeded",
+                ),
+            ),
+        ),
+        flight.gust,
+    ),
+    (
+        Kind(
+            "pilot_takeover",
+            "a pilot with a remote control switches the mode",
+            (Field("mode", choice(*(mode.name for mode in Mode)), "POSCTL", "a mode's name"),),
+        ),
+        flight.pilot_takeover,
+    ),
+    (
+        Kind(
+            "refuse_mode",
+            "requests for a mode are answered TEMPORARILY_REJECTED",
+            (
+                Field("mode", choice("any", *(mode.name for mode in Mode)), "any", "a mode's name, or any"),
+                Field("count", _which, "all", "all, or so many"),
+            ),
+        ),
+        flight.refuse_mode,
+    ),
+    (
+        Kind(
+            "reboot",
+            "the autopilot restarts: motors off, silent for a while, its clock begins at 0",
+            (Field("seconds", positive, 4.0, "of silence"),),
+        ),
+        flight.reboot,
+    ),
+    (
+        Kind(
+            "time_jump",
+            "the boot clock jumps",
+            (Field("seconds", number(-1e5, 1e5, "s"), REQUIRED, "forward, or back if negative"),),
+        ),
+        messages.time_jump,
+    ),
+    (
+        Kind(
+            "second_autopilot",
+            "another autopilot on the same links: it sends its streams and answers",
+            (Field("system", whole(0, 255), 0, "its system id; 0: the same as this vehicle's"),),
+        ),
+        messages.second_autopilot,
+    ),
+    (
+        Kind(
+            "stall",
+            "the vehicle stands still, or goes at a part of its pace",
+            (Field("pace", number(0.0, 0.99), 0.0, "simulated seconds per second"),),
+        ),
+        messages.stall,
+    ),
+)
+
+KINDS: dict[str, Kind] = {kind.name: kind for kind, _ in _TABLE}
+EFFECTS: dict[str, Effect] = {kind.name: effect for kind, effect in _TABLE}

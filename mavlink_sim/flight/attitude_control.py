@@ -1,0 +1,177 @@
+"""Flying by attitude or by body rates: PX4's attitude controller and its ATTITUDE_TARGET.
+
+The control law is that of Brescianini, Hehn, D'Andrea, "Nonlinear Quadrocopter Attitude Control" (2013): the
+thrust direction is corrected first, the heading with a smaller weight (MC_YAW_WEIGHT). Thrust 0..1 is the
+share of the airframe's greatest thrust, as PX4 hands it to its mixer: MPC_THR_HOVER plays no part, and this
+airframe hovers at 9.81 / 20 = 0.49.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from mavlink_sim.flight.position_control import Demand, PositionController
+from mavlink_sim.physics.airframe import MAX_THRUST_MPS2, Multirotor, Vector
+from mavlink_sim.physics.quaternions import IDENTITY, inverse, product, third_axis, unit
+from mavlink_sim.px4.parameters import Parameters
+from vision.rotation import Quaternion, quaternion_from_euler
+
+NAN = math.nan
+MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may ask for any number
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSetpoint:
+    """An attitude to hold.
+
+    Attributes:
+        quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation leaves the vehicle
+            turning as it turned; PX4 makes no torque then.
+        yaw_rate_radps: feed-forward about the world's down axis; NaN for none.
+        thrust: collective, 0..1.
+    """
+
+    quaternion: Quaternion
+    yaw_rate_radps: float
+    thrust: float
+
+
+@dataclass(frozen=True, slots=True)
+class RatesSetpoint:
+    """Body rates (FRD, rad/s) to turn at; NaN: as the vehicle turned when the setpoint came.
+
+    `thrust`: collective, 0..1.
+    """
+
+    rates: Vector
+    thrust: float
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeTarget:
+    """What ATTITUDE_TARGET tells: attitude (w, x, y, z), body rates in rad/s, collective thrust 0..1."""
+
+    quaternion: Quaternion
+    rates: Vector
+    thrust: float
+
+
+class AttitudeController:
+    """The loop between an attitude setpoint and the airframe's body rates."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._revision = -1
+        self._target: AttitudeTarget | None = None
+        self._setpoint: AttitudeSetpoint | RatesSetpoint | None = None
+        self._rates: Vector = (0.0, 0.0, 0.0)
+        self._load()
+
+    def _load(self) -> None:
+        value = self._parameters.number
+        self._revision = self._parameters.revision
+        self._yaw_weight = min(max(value("MC_YAW_WEIGHT"), 0.0), 1.0)
+        yaw_gain = value("MC_YAW_P")
+        if self._yaw_weight > 1e-4:
+            yaw_gain /= self._yaw_weight  # the weight shall not slow a pure turn down
+        self._gains = (value("MC_ROLL_P"), value("MC_PITCH_P"), yaw_gain)
+        self._limits = tuple(
+            min(math.radians(self._parameters.positive(name)), MAX_RATE_RADPS)
+            for name in ("MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX")
+        )
+
+    def release(self) -> None:
+        """Another controller has the vehicle."""
+        if self._target is not None:
+            self._target = self._setpoint = None
+
+    @property
+    def active(self) -> bool:
+        """The vehicle is flown by attitude or rates, so there is no position target."""
+        return self._target is not None
+
+    def target(self, airframe: Multirotor, outer: PositionController, demand: Demand) -> AttitudeTarget:
+        """For ATTITUDE_TARGET; `demand` is what the position controller `outer` wants, if that one flies.
+
+        While rates are flown, attitude and thrust stay those of the last attitude setpoint, as in PX4.
+        """
+        if self._target is not None:
+            return self._target
+        quaternion = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, outer.yaw_rad)
+        thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
+        setpoint = AttitudeSetpoint(quaternion, outer.yaw_rate_radps, thrust)
+        return AttitudeTarget(quaternion, self.rates(setpoint, airframe), thrust)
+
+    def fly(
+        self,
+        dt_s: float,
+        setpoint: AttitudeSetpoint | RatesSetpoint,
+        airframe: Multirotor,
+        outer: PositionController,
+        demand: Demand,
+    ) -> Demand:
+        """One step of control and of the airframe. Returns the new demand; `demand` is the one before."""
+        before = self.target(airframe, outer, demand)
+        if isinstance(setpoint, AttitudeSetpoint):
+            told = self.rates(setpoint, airframe)
+            rates = _possible(told, airframe.rates)
+            self._target = AttitudeTarget(unit(setpoint.quaternion) or IDENTITY, told, abs(setpoint.thrust))
+        else:
+            if setpoint is not self._setpoint:
+                self._rates = _possible(setpoint.rates, airframe.rates)
+            rates = self._rates
+            self._target = AttitudeTarget(before.quaternion, setpoint.rates, before.thrust)
+        self._setpoint = setpoint
+        outer.reset(airframe.yaw_rad)  # so that it begins afresh, with the heading of that moment
+        thrust_mps2 = min(max(setpoint.thrust, 0.0), 1.0) * MAX_THRUST_MPS2
+        airframe.step_rates(dt_s, thrust_mps2, rates)
+        return Demand(thrust_mps2, airframe.roll_rad, airframe.pitch_rad, airframe.rates[2])
+
+    def rates(self, setpoint: AttitudeSetpoint, airframe: Multirotor) -> Vector:
+        """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation."""
+        if self._revision != self._parameters.revision:
+            self._load()
+        wanted = unit(setpoint.quaternion)
+        if wanted is None:
+            return (NAN, NAN, NAN)
+        attitude = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
+        error = product(inverse(attitude), _weighted(attitude, wanted, self._yaw_weight))
+        sign = 2.0 if error[0] >= 0.0 else -2.0
+        feed_forward = setpoint.yaw_rate_radps if math.isfinite(setpoint.yaw_rate_radps) else 0.0
+        down = third_axis(inverse(attitude))
+        p, q, r = (
+            min(max(gain * sign * part + feed_forward * axis, -limit), limit)
+            for gain, part, axis, limit in zip(self._gains, error[1:], down, self._limits, strict=True)
+        )
+        return (p, q, r)
+
+
+def _possible(rates: Vector, now: Vector) -> Vector:
+    p, q, r = (
+        min(max(rate, -MAX_RATE_RADPS), MAX_RATE_RADPS) if math.isfinite(rate) else present
+        for rate, present in zip(rates, now, strict=True)
+    )
+    return (p, q, r)
+
+
+def _weighted(attitude: Quaternion, wanted: Quaternion, yaw_weight: float) -> Quaternion:
+    """The wanted attitude with only a share of its turn about the thrust axis."""
+    reduced = _shortest(third_axis(attitude), third_axis(wanted))
+    if reduced is None:
+        return wanted  # upside down: every way round is as short
+    reduced = product(reduced, attitude)
+    about_thrust = product(inverse(reduced), wanted)
+    angle = 2.0 * math.atan2(about_thrust[3], about_thrust[0])
+    half = 0.5 * yaw_weight * math.remainder(angle, math.tau)
+    return product(reduced, (math.cos(half), 0.0, 0.0, math.sin(half)))
+
+
+def _shortest(first: Vector, second: Vector) -> Quaternion | None:
+    """The shortest rotation that takes one unit vector to another; None if they are opposite."""
+    ax, ay, az = first
+    bx, by, bz = second
+    cosine = ax * bx + ay * by + az * bz
+    if cosine < -1.0 + 1e-9:
+        return None
+    return unit((1.0 + cosine, ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

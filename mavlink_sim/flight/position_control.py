@@ -1,0 +1,219 @@
+"""PX4's multirotor position control: position P, velocity PID, then thrust and tilt.
+
+All vectors NED. A NaN axis is not controlled by that stage, as in PX4's trajectory setpoint.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Vector
+from mavlink_sim.px4.parameters import Parameters
+
+NAN = math.nan
+NOTHING: Vector = (NAN, NAN, NAN)
+# Tuned so that a 10 m step overshoots as measured on the real vehicle (0.6-1.15 m), gains being PX4's own.
+ANTI_WINDUP = 0.5
+# Far above what any vehicle can do: keeps absurd setpoints and gains, which PX4 accepts, within arithmetic.
+MAX_DEMAND_MPS2 = 1000.0
+MAX_TILT_DEG = 80.0
+
+
+# Not frozen, though nobody changes them: freezing makes a dataclass three times as dear to make, and each
+# control step makes both.
+@dataclass(slots=True)
+class TrajectorySetpoint:
+    """What a flight task asks of the controller; NaN: not controlled. NED, metres, seconds, radians."""
+
+    position: Vector = NOTHING
+    velocity: Vector = NOTHING
+    acceleration: Vector = NOTHING
+    yaw_rad: float = NAN
+    yaw_rate_radps: float = NAN
+
+
+@dataclass(slots=True)
+class Demand:
+    """What the airframe is asked for."""
+
+    thrust_mps2: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rate_radps: float
+
+
+class PositionController:
+    """The cascade with its integrator; `position`, `velocity`, `acceleration`: the last inner setpoints."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._revision = -1
+        self._integral: Vector = (0.0, 0.0, 0.0)
+        self.position: Vector = NOTHING
+        self.velocity: Vector = NOTHING
+        self.acceleration: Vector = NOTHING
+        self.yaw_rad = 0.0
+        self.yaw_rate_radps = 0.0
+        self._load()
+
+    def _load(self) -> None:
+        value = self._parameters.number
+        positive = self._parameters.positive
+        self._revision = self._parameters.revision
+        self._position_p = (value("MPC_XY_P"), value("MPC_XY_P"), value("MPC_Z_P"))
+        self._velocity_p = (
+            positive("MPC_XY_VEL_P_ACC"),
+            positive("MPC_XY_VEL_P_ACC"),
+            positive("MPC_Z_VEL_P_ACC"),
+        )
+        self._velocity_i = (value("MPC_XY_VEL_I_ACC"), value("MPC_XY_VEL_I_ACC"), value("MPC_Z_VEL_I_ACC"))
+        self._velocity_d = (value("MPC_XY_VEL_D_ACC"), value("MPC_XY_VEL_D_ACC"), value("MPC_Z_VEL_D_ACC"))
+        self._max_xy = value("MPC_XY_VEL_MAX")
+        self._max_up = value("MPC_Z_VEL_MAX_UP")
+        self._max_down = value("MPC_Z_VEL_MAX_DN")
+        self._max_tilt_tan = math.tan(math.radians(min(positive("MPC_TILTMAX_AIR"), MAX_TILT_DEG)))
+        self._yaw_p = value("MC_YAW_P")
+
+    def reset(self, yaw_rad: float) -> None:
+        """Forget the integrator and hold this yaw (on the ground)."""
+        self._integral = (0.0, 0.0, 0.0)
+        self.position = self.velocity = NOTHING
+        self.acceleration = (0.0, 0.0, 100.0)  # PX4's "idle thrust" setpoint on the ground
+        self.yaw_rad = yaw_rad
+        self.yaw_rate_radps = 0.0
+
+    def update(
+        self,
+        dt_s: float,
+        setpoint: TrajectorySetpoint,
+        position: Vector,
+        velocity: Vector,
+        acceleration: Vector,
+        yaw_rad: float,
+        max_up_mps: float = math.inf,
+    ) -> Demand:
+        """One control step. `max_up_mps` further limits the climb (the take-off ramp)."""
+        if self._revision != self._parameters.revision:
+            self._load()
+        velocity_setpoint = self._velocity_setpoint(setpoint, position, max_up_mps)
+        # axis by axis rather than in a loop: this is the dearest part of a flight in lockstep
+        (px, _, pz), (dx, _, dz) = self._velocity_p, self._velocity_d
+        ix, iy, iz = self._integral
+        ux, uy, uz = velocity_setpoint
+        fx, fy, fz = setpoint.acceleration
+        ex = ey = ez = ax = ay = az = 0.0
+        if ux == ux:
+            ex = ux - velocity[0]
+            ax = px * ex + ix - dx * acceleration[0]
+        if uy == uy:
+            ey = uy - velocity[1]
+            ay = px * ey + iy - dx * acceleration[1]
+        if uz == uz:
+            ez = uz - velocity[2]
+            az = pz * ez + iz - dz * acceleration[2]
+        if fx == fx:
+            ax += fx
+        if fy == fy:
+            ay += fy
+        if fz == fz:
+            az += fz
+        if not (-MAX_DEMAND_MPS2 < ax < MAX_DEMAND_MPS2 and -MAX_DEMAND_MPS2 < ay < MAX_DEMAND_MPS2):
+            ax = min(max(ax, -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
+            ay = min(max(ay, -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
+        if not -MAX_DEMAND_MPS2 < az < MAX_DEMAND_MPS2:
+            az = min(max(az, -MAX_DEMAND_MPS2), MAX_DEMAND_MPS2)
+        demanded = (ax, ay, az)
+        thrust, achieved_x, achieved_y, achieved_z = self._allocate(ax, ay, az)
+        self._integrate(dt_s, (ex, ey, ez), demanded, (achieved_x, achieved_y, achieved_z))
+        self.position = setpoint.position
+        self.velocity = velocity_setpoint
+        self.acceleration = demanded
+        roll, pitch = _tilt(achieved_x, achieved_y, yaw_rad)
+        return Demand(thrust, roll, pitch, self._yaw_rate(setpoint, yaw_rad, dt_s))
+
+    def _velocity_setpoint(self, setpoint: TrajectorySetpoint, position: Vector, max_up_mps: float) -> Vector:
+        target_x, target_y, target_z = setpoint.position
+        x, y, z = setpoint.velocity
+        gain_x, gain_y, gain_z = self._position_p
+        if target_x == target_x:
+            forward = x if x == x else 0.0
+            x = gain_x * (target_x - position[0]) + forward
+        if target_y == target_y:
+            forward = y if y == y else 0.0
+            y = gain_y * (target_y - position[1]) + forward
+        if target_z == target_z:
+            forward = z if z == z else 0.0
+            z = gain_z * (target_z - position[2]) + forward
+        if x == x and y == y:
+            if math.hypot(x, y) > self._max_xy:
+                x, y = _limited(setpoint.velocity[:2], x, y, self._max_xy)
+        else:
+            x, y = (
+                min(max(value, -self._max_xy), self._max_xy) if value == value else NAN for value in (x, y)
+            )
+        if z == z:
+            z = min(max(z, -min(self._max_up, max_up_mps)), self._max_down)
+        return (x, y, z)
+
+    def _allocate(self, ax: float, ay: float, az: float) -> tuple[float, float, float, float]:
+        """Collective thrust, and the acceleration that tilt and thrust limits leave of the demand."""
+        lift = min(max(GRAVITY_MPS2 - az, 0.12 * MAX_THRUST_MPS2), 0.97 * MAX_THRUST_MPS2)
+        sideways = math.hypot(ax, ay)
+        # horizontal demand is met relative to hover (MPC_ACC_DECOUPLE): tilt as if flying level
+        limit = GRAVITY_MPS2 * self._max_tilt_tan
+        scale = limit / sideways if sideways > limit else 1.0
+        ax, ay = ax * scale, ay * scale
+        cosine = GRAVITY_MPS2 / math.sqrt(GRAVITY_MPS2 * GRAVITY_MPS2 + ax * ax + ay * ay)
+        thrust = min(lift / cosine, MAX_THRUST_MPS2)
+        return thrust, ax, ay, GRAVITY_MPS2 - thrust * cosine
+
+    def _integrate(self, dt_s: float, error: Vector, demanded: Vector, achieved: Vector) -> None:
+        (px, _, pz), (kx, _, kz) = self._velocity_p, self._velocity_i
+        x, y, z = self._integral
+        # back-calculation: a saturated demand must not wind the integrator up
+        share = ANTI_WINDUP / px
+        x += kx * (error[0] - (demanded[0] - achieved[0]) * share) * dt_s
+        y += kx * (error[1] - (demanded[1] - achieved[1]) * share) * dt_s
+        z += kz * (error[2] - (demanded[2] - achieved[2]) * ANTI_WINDUP / pz) * dt_s
+        limit = GRAVITY_MPS2
+        self._integral = (
+            limit if x > limit else -limit if x < -limit else x,
+            limit if y > limit else -limit if y < -limit else y,
+            limit if z > limit else -limit if z < -limit else z,
+        )
+
+    def _yaw_rate(self, setpoint: TrajectorySetpoint, yaw_rad: float, dt_s: float) -> float:
+        rate = setpoint.yaw_rate_radps if setpoint.yaw_rate_radps == setpoint.yaw_rate_radps else 0.0
+        self.yaw_rate_radps = rate
+        if setpoint.yaw_rad == setpoint.yaw_rad:
+            self.yaw_rad = math.remainder(setpoint.yaw_rad, math.tau)
+        elif rate != 0.0:
+            self.yaw_rad = yaw_rad
+            return rate
+        return rate + self._yaw_p * math.remainder(self.yaw_rad - yaw_rad, math.tau)
+
+
+def _limited(feed_forward: tuple[float, float], x: float, y: float, limit: float) -> tuple[float, float]:
+    """A horizontal velocity cut to a limit, the part that leads to the position before the feed-forward."""
+    ahead_x, ahead_y = (value if value == value else 0.0 for value in feed_forward)
+    to_x, to_y = x - ahead_x, y - ahead_y
+    to, ahead = math.hypot(to_x, to_y), math.hypot(ahead_x, ahead_y)
+    if to >= limit:
+        return to_x / to * limit, to_y / to * limit
+    if ahead == 0.0:
+        return x, y
+    # the share of the feed-forward at which the sum has just the length of the limit
+    along = (to_x * ahead_x + to_y * ahead_y) / ahead
+    share = (math.sqrt(along * along + limit * limit - to * to) - along) / ahead
+    return to_x + share * ahead_x, to_y + share * ahead_y
+
+
+def _tilt(ax: float, ay: float, yaw_rad: float) -> tuple[float, float]:
+    """(roll, pitch) that point the thrust so that it accelerates by (ax, ay) while carrying the weight."""
+    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+    forward = cosine * ax + sine * ay
+    right = -sine * ax + cosine * ay
+    pitch = math.atan2(-forward, GRAVITY_MPS2)
+    roll = math.atan2(right * math.cos(pitch), GRAVITY_MPS2)
+    return roll, pitch

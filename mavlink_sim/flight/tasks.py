@@ -1,0 +1,259 @@
+"""The flight tasks: what each mode asks of the position controller while it runs.
+
+A task is made when its mode begins and asked for a `TrajectorySetpoint` at every step. Positions: local NED.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
+from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
+from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.px4.parameters import Parameters
+
+Setpoint = TrajectorySetpoint | AttitudeSetpoint | RatesSetpoint
+
+# Share of the acceleration limit that the planned braking uses, so that the vehicle can follow it.
+BRAKING_SHARE = 0.6
+# Climb towards the take-off altitude slows down with the height left; tuned to the recorded 6.5-9 s to HOLD.
+TAKEOFF_APPROACH_PER_S = 0.3
+# On the ramp the planned height must not run away from a vehicle that may not follow it yet.
+TAKEOFF_LEAD_M = 0.3
+# Measured: a take-off to 2.5 m is over at 1.8-2.2 m, a little inside NAV_MC_ALT_RAD.
+TAKEOFF_ACCEPTANCE = 0.8
+
+
+class Trajectory:
+    """A point that moves towards a goal within speed and acceleration limits, and waits for the vehicle."""
+
+    def __init__(self, airframe: Multirotor, parameters: Parameters) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self.position = airframe.position
+        self.velocity = airframe.velocity
+        self.yaw_rad = airframe.yaw_rad
+        self.cruise_mps = NAN  # in place of MPC_XY_CRUISE, if above zero
+
+    def keep_within(self, lead_m: float) -> None:
+        """Let the planned height lead the vehicle's by at most this much."""
+        x, y, z = self.position
+        self.position = (x, y, max(z, self._airframe.position[2] - lead_m))
+
+    def stopping_point(self) -> Vector:
+        """Where the vehicle comes to rest if it brakes now."""
+        braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
+        x, y, z = self.position
+        vx, vy, vz = self.velocity
+        path_s = math.hypot(vx, vy) / (2.0 * braking)
+        return (x + vx * path_s, y + vy * path_s, z + vz * abs(vz) / (2.0 * braking))
+
+    def towards(
+        self,
+        goal: Vector,
+        dt_s: float,
+        yaw_rad: float = NAN,
+        max_up_mps: float = math.inf,
+        max_down_mps: float = math.inf,
+        max_horizontal_mps: float = math.inf,
+    ) -> TrajectorySetpoint:
+        """Advance by `dt_s` and return the setpoint."""
+        value = self._parameters.number
+        lag = math.dist(self.position, self._airframe.position)
+        pace = max(0.0, 1.0 - lag / self._parameters.positive("MPC_XY_ERR_MAX"))
+        braking = BRAKING_SHARE * self._parameters.positive("MPC_ACC_HOR")
+        x, y, z = self.position
+        dx, dy, dz = goal[0] - x, goal[1] - y, goal[2] - z
+        far = math.hypot(dx, dy)
+        cruise = self.cruise_mps if self.cruise_mps > 0.0 else value("MPC_XY_CRUISE")
+        cruise = min(cruise, value("MPC_XY_VEL_MAX"))
+        speed = min(cruise, max_horizontal_mps, math.sqrt(2.0 * braking * far), 1.2 * far)
+        wanted_x, wanted_y = (dx / far * speed, dy / far * speed) if far > 0.0 else (0.0, 0.0)
+        limit = (
+            min(value("MPC_Z_V_AUTO_UP"), max_up_mps)
+            if dz < 0.0
+            else min(value("MPC_Z_V_AUTO_DN"), max_down_mps)
+        )
+        wanted_z = math.copysign(min(limit, abs(dz)), dz)
+        vx, vy, vz = self.velocity
+        change_x, change_y = wanted_x - vx, wanted_y - vy
+        change = math.hypot(change_x, change_y)
+        allowed = self._parameters.positive("MPC_ACC_HOR") * dt_s
+        if change > allowed:
+            change_x, change_y = change_x / change * allowed, change_y / change * allowed
+        allowed_z = value("MPC_ACC_DOWN_MAX") * dt_s
+        vx, vy, vz = vx + change_x, vy + change_y, vz + min(max(wanted_z - vz, -allowed_z), allowed_z)
+        self.velocity = (vx, vy, vz)
+        x, y, z = self.position
+        # a point that waits for the vehicle must not urge it on either, or the two never meet
+        flown = (vx * pace, vy * pace, vz * pace)
+        self.position = (x + flown[0] * dt_s, y + flown[1] * dt_s, z + flown[2] * dt_s)
+        if yaw_rad == yaw_rad:
+            turn = math.radians(value("MPC_YAWRAUTO_MAX")) * dt_s
+            error = math.remainder(yaw_rad - self.yaw_rad, math.tau)
+            self.yaw_rad = math.remainder(self.yaw_rad + min(max(error, -turn), turn), math.tau)
+        return TrajectorySetpoint(self.position, flown, NOTHING, self.yaw_rad)
+
+
+class Task(ABC):
+    """The common face of the flight tasks. `landing` and `finished` are read after each `update`."""
+
+    landing = False  # on the final descent
+    finished = False
+    taking_off = False  # climbing from the ground in a mode other than TAKEOFF
+    goal: Vector | None = None  # where an auto mode flies to, for POSITION_TARGET_GLOBAL_INT
+
+    @abstractmethod
+    def update(self, dt_s: float) -> Setpoint:
+        """Where to be and how to move after another `dt_s` seconds."""
+
+    def cruise_at(self, speed_mps: float) -> None:  # noqa: B027 - a task without a route has no cruise speed
+        """Fly the rest of the route at this horizontal speed (DO_CHANGE_SPEED, DO_REPOSITION)."""
+
+
+class TrajectoryTask(Task):
+    """A task that asks for positions and velocities, never for attitudes."""
+
+    @abstractmethod
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        """Where to be and how to move after another `dt_s` seconds."""
+
+
+class Hold(Task):
+    """Brake and stay, or fly to a goal and stay there (DO_REPOSITION, the end of a take-off)."""
+
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        goal: Vector | None = None,
+        yaw_rad: float = NAN,
+    ) -> None:
+        self._trajectory = Trajectory(airframe, parameters)
+        self.goal = self._trajectory.stopping_point() if goal is None else goal
+        self._yaw_rad = yaw_rad
+
+    def cruise_at(self, speed_mps: float) -> None:
+        self._trajectory.cruise_mps = speed_mps
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        assert self.goal is not None
+        return self._trajectory.towards(self.goal, dt_s, self._yaw_rad)
+
+
+class Takeoff(Task):
+    """Climb straight up to an altitude (NED z of `down_m`); finished within NAV_MC_ALT_RAD of it."""
+
+    def __init__(self, airframe: Multirotor, parameters: Parameters, down_m: float) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._trajectory = Trajectory(airframe, parameters)
+        x, y, z = airframe.position
+        self.goal = (x, y, min(down_m, z))
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        assert self.goal is not None
+        left = self._airframe.position[2] - self.goal[2]
+        climb = min(self._parameters.number("MPC_TKO_SPEED"), max(0.25, TAKEOFF_APPROACH_PER_S * abs(left)))
+        self.finished = abs(left) < TAKEOFF_ACCEPTANCE * self._parameters.number("NAV_MC_ALT_RAD")
+        self._trajectory.keep_within(TAKEOFF_LEAD_M)
+        return self._trajectory.towards(self.goal, dt_s, max_up_mps=climb)
+
+
+class Land(TrajectoryTask):
+    """Descend at one place until the ground: MPC_LAND_SPEED low down, MPC_LAND_CRWL in the last metre."""
+
+    landing = True
+
+    def __init__(self, airframe: Multirotor, parameters: Parameters, place: Vector | None = None) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._trajectory = Trajectory(airframe, parameters)
+        self.goal = self._trajectory.stopping_point() if place is None else place
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        assert self.goal is not None
+        value = self._parameters.number
+        height = -self._airframe.position[2]
+        slow, fast = value("MPC_LAND_SPEED"), value("MPC_Z_V_AUTO_DN")
+        upper, lower = value("MPC_LAND_ALT1"), value("MPC_LAND_ALT2")
+        share = min(max((height - lower) / max(upper - lower, 0.1), 0.0), 1.0)
+        speed = slow + (fast - slow) * share
+        if height < value("MPC_LAND_ALT3"):
+            speed = value("MPC_LAND_CRWL")
+        place = (self.goal[0], self.goal[1], self._airframe.position[2])
+        level = self._trajectory.towards(place, dt_s)
+        return TrajectorySetpoint(
+            (level.position[0], level.position[1], NAN),
+            (level.velocity[0], level.velocity[1], speed),
+            NOTHING,
+            level.yaw_rad,
+        )
+
+
+class Return(Task):
+    """RTL of type 0: climb to the return altitude, fly home, descend to RTL_DESCEND_ALT, land."""
+
+    def __init__(self, airframe: Multirotor, parameters: Parameters, home: Vector) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._trajectory = Trajectory(airframe, parameters)
+        self._home = home
+        self._land: TrajectoryTask | None = None
+        self._phase = "climb"
+        x, y, z = self._trajectory.stopping_point()
+        self.return_height_m = self._return_height(math.hypot(x - home[0], y - home[1]), home[2] - z)
+        self.goal = (x, y, home[2] - self.return_height_m)
+
+    def _return_height(self, distance_m: float, height_m: float) -> float:
+        """Metres above home. Within RTL_MIN_DIST of home a cone (RTL_CONE_ANG) allows to stay lower."""
+        value = self._parameters.number
+        height = value("RTL_RETURN_ALT")
+        cone = value("RTL_CONE_ANG")
+        if distance_m < value("RTL_MIN_DIST") and 0.0 < cone < 90.0:
+            height = min(height, distance_m / math.tan(math.radians(cone)))
+        return max(height, height_m)
+
+    def cruise_at(self, speed_mps: float) -> None:
+        self._trajectory.cruise_mps = speed_mps
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        if self._land is not None:
+            return self._land.update(dt_s)
+        assert self.goal is not None
+        value = self._parameters.number
+        home_x, home_y, home_z = self._home
+        x, y, z = self._airframe.position
+        yaw = NAN
+        if self._phase == "climb" and z - self.goal[2] < value("NAV_MC_ALT_RAD"):
+            self._phase = "return"
+            self.goal = (home_x, home_y, self.goal[2])
+        if self._phase == "return":
+            distance = math.hypot(home_x - x, home_y - y)
+            if distance > value("NAV_ACC_RAD"):
+                yaw = math.atan2(home_y - y, home_x - x)
+            elif distance < 1.0:
+                self._phase = "descend"
+                descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
+                self.goal = (home_x, home_y, home_z - descend)
+        if self._phase == "descend" and self.goal[2] - z < value("NAV_MC_ALT_RAD"):
+            self._land = self.landing_task((home_x, home_y, home_z))
+            self.goal = self._land.goal
+            self.landing = True
+            return self._land.update(dt_s)
+        return self._trajectory.towards(self.goal, dt_s, yaw)
+
+    def landing_task(self, place: Vector) -> TrajectoryTask:
+        """The descent at a place."""
+        return Land(self._airframe, self._parameters, place)
+
+
+class Offboard(Task):
+    """Follow the newest setpoint; until the first one after the mode began, stay at rest."""
+
+    def __init__(self) -> None:
+        self.setpoint: Setpoint = TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))
+
+    def update(self, dt_s: float) -> Setpoint:
+        return self.setpoint

@@ -1,0 +1,396 @@
+"""PX4's Navigator in small: what is stored of plans, how the mission goes, the geofence, where RTL leads.
+
+Belongs to one Autopilot, which calls `update` at every step and asks for the tasks of MISSION, RTL, PRECLAND.
+What clients are to hear of it waits in `announcements`, what other components are to do in `commands`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.collision_prevention import ObstacleMap, Plane, limited_acceleration
+from mavlink_sim.flight.precision_landing import LandingTarget, Precision, PrecisionLanding
+from mavlink_sim.missions import items as mission_items
+from mavlink_sim.missions.feasibility import complaints
+from mavlink_sim.missions.geofence import Action, Geofence
+from mavlink_sim.missions.items import MissionItem, PlanType
+from mavlink_sim.missions.mission_flight import MissionFlight
+from mavlink_sim.missions.plan import Mission, MissionState, Plan
+from mavlink_sim.missions.return_flight import (
+    Goal,
+    ReturnFlight,
+    RouteReturn,
+    destination,
+    landing_route,
+    mission_route,
+)
+from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.geography import geographic
+from mavlink_sim.px4.modes import Mode
+from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
+
+if TYPE_CHECKING:
+    from mavlink_sim.autopilot.commander import Autopilot
+
+FENCE_PERIOD_S = 0.2  # GEOFENCE_CHECK_INTERVAL_US
+REACHED_REPETITIONS = 10  # MISSION_ITEM_REACHED is told again so often, once a second
+REACHED_PERIOD_S = 1.0
+ACTIVE, SUSPENDED = 1, 2  # MISSION_CURRENT.mission_mode
+_MISSION_MODES = frozenset({Mode.MISSION, Mode.TAKEOFF, Mode.LAND})
+
+
+@dataclass(frozen=True, slots=True)
+class Current:
+    """The current item changed: MISSION_CURRENT is due."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """MISSION_ITEM_REACHED is due."""
+
+    sequence: int
+
+
+class Navigator:
+    """Missions, fence and destinations of one vehicle.
+
+    Attributes:
+        plans: what is stored, by type. mission: the mission and the progress in it.
+        fence: what the vehicle is held to. obstacles: for collision prevention.
+        target: the newest landing target.
+        uploading: name of the link over which a client uploads. sessions: the mission protocol, by link.
+    """
+
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        airframe: Multirotor,
+        parameters: Parameters,
+        on_event: Callable[[str], None],
+    ) -> None:
+        self._autopilot = autopilot
+        self._airframe = airframe
+        self._parameters = parameters
+        self._on_event = on_event
+        self.plans: dict[PlanType, Plan] = dict.fromkeys(PlanType, Plan())
+        self.mission = Mission()
+        self.fence = Geofence(parameters)
+        self.obstacles = ObstacleMap()
+        self.target: LandingTarget | None = None
+        self.uploading: str | None = None
+        self.sessions: dict[str, Any] = {}
+        self.announcements: deque[Current | Reached] = deque()
+        self.commands: deque[MissionItem] = deque()
+        self._checked_with: object = None
+        self._state = MissionState.NO_MISSION
+        self._flown = False  # the mission on board was begun
+        self._disarmed_since_flown = False
+        self._breaches: list[str] = []
+        self._next_fence_check_s = 0.0
+        self._held_for_obstacles = False
+        self._next_reached_s = 0.0
+        self._repetitions = 0
+
+    # ---- what others read -------------------------------------------------------------------------------
+
+    @property
+    def now_s(self) -> float:
+        return self._autopilot.now_s
+
+    @property
+    def landed(self) -> bool:
+        return self._autopilot.landed
+
+    @property
+    def cruise_mps(self) -> float:
+        """Of DO_CHANGE_SPEED; NaN: MPC_XY_CRUISE."""
+        return self._autopilot.cruise_mps
+
+    @property
+    def home(self) -> Vector:
+        return self._autopilot.home
+
+    @property
+    def is_breached(self) -> bool:
+        """The vehicle is where the fence does not allow it, and GF_ACTION is not to ignore that."""
+        return bool(self._breaches)
+
+    @property
+    def in_progress(self) -> bool:
+        """A mission is being flown; it is not disarmed by itself then."""
+        return self._autopilot.mode is Mode.MISSION and not self.mission.finished
+
+    @property
+    def mission_mode(self) -> int:
+        return ACTIVE if self._autopilot.mode in _MISSION_MODES else SUSPENDED
+
+    def mission_state(self) -> MissionState:
+        """MISSION_CURRENT.mission_state, with PX4's memory: a pause before any item keeps the last state."""
+        mission = self.mission
+        if not mission.items or not mission.valid:
+            self._state = MissionState.NO_MISSION
+        elif mission.finished:
+            self._state = MissionState.COMPLETE
+        elif self.mission_mode == ACTIVE:
+            self._state = MissionState.ACTIVE
+        elif mission.reached >= 0:
+            self._state = MissionState.PAUSED
+        elif mission.current < 1:
+            self._state = MissionState.NOT_STARTED
+        return self._state
+
+    def allows_goal(self, place: Vector) -> bool:
+        """Whether a command (DO_REPOSITION, DO_ORBIT) may send the vehicle to a local NED place."""
+        return self.fence.allows_goal(place, self._known_home())
+
+    def allowed_acceleration(self, acceleration: Plane, velocity: Plane) -> Plane:
+        """Collision prevention for Position mode: what is allowed of the acceleration the sticks ask for.
+
+        Both m/s² and m/s, (north, east). Without data for 5 s the vehicle is put into HOLD, as PX4 does.
+        """
+        limited = limited_acceleration(
+            acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
+        )
+        if limited.hold and not self._held_for_obstacles:
+            self._on_event("no obstacle data: HOLD")
+            self._autopilot.set_mode(Mode.HOLD)
+        self._held_for_obstacles = limited.hold
+        return limited.acceleration
+
+    def take_stored(self, before: Navigator) -> None:
+        """A reboot: the plans and the current item are on PX4's card, all else is forgotten."""
+        self.plans, self.fence = before.plans, before.fence
+        mission = before.mission
+        self.mission = Mission(mission.items, mission.current, jumps=mission.jumps)
+
+    # ---- what clients do --------------------------------------------------------------------------------
+
+    def store(self, plan_type: PlanType, plan: Plan, current: int = -1) -> None:
+        """Take a whole new plan. An identical one changes nothing.
+
+        Args:
+            current: the mission item marked as current, -1 for none.
+        """
+        if plan.identifier and plan.identifier == self.plans[plan_type].identifier:
+            return
+        self.plans[plan_type] = plan
+        if plan_type is PlanType.FENCE:
+            flying = None if self.landed else self._airframe.position
+            for words in self.fence.load(plan.items, self._known_home(), flying):
+                self.say(CRITICAL, words)
+            self._checked_with = None
+        elif plan_type is PlanType.MISSION:
+            self._new_mission(plan, current)
+
+    def _new_mission(self, plan: Plan, current: int) -> None:
+        last = max(len(plan.items) - 1, 0)
+        kept = min(self.mission.current, last)
+        self.mission = Mission(plan.items, kept if current < 0 else current)
+        self._flown = False
+        self._check_mission()
+        self.announcements.append(Current())
+        if self._flies_mission():
+            self._autopilot.restart_task()
+
+    def set_current(self, index: int) -> None:
+        """Fly this item next, or when the mission begins."""
+        if index == self.mission.current or not self.mission.valid:
+            return
+        if not self.mission.go_to(index):
+            return
+        self.mission.finished = False
+        self.current_changed()
+        if self._flies_mission():
+            self._autopilot.restart_task()
+
+    def change_speed(self, speed_mps: float) -> None:
+        """DO_CHANGE_SPEED; not above zero: the usual speed again."""
+        self._autopilot.change_speed(speed_mps if speed_mps > 1e-6 else 0.0, at_once=False)
+
+    def forget_reached(self) -> None:
+        """A new mission begins to arrive: nothing of it is reached."""
+        self.mission.reached = -1
+
+    # ---- what the flight tasks report -------------------------------------------------------------------
+
+    def current_changed(self) -> None:
+        self.announcements.append(Current())
+
+    def reached(self, index: int) -> None:
+        """An item is reached. Told once, then again each second for a while."""
+        if index == self.mission.reached:
+            return
+        self.mission.reached = index
+        self._repetitions = 0
+        self._next_reached_s = self.now_s + REACHED_PERIOD_S
+        self.announcements.append(Reached(index))
+        self._on_event(f"mission item {index} reached")
+
+    def command(self, item: MissionItem) -> None:
+        """An item is a command, for this vehicle or another component."""
+        self.commands.append(item)
+
+    def say(self, severity: int, text: str) -> None:
+        self._autopilot.texts.append(Text(severity, text))
+
+    # ---- tasks ------------------------------------------------------------------------------------------
+
+    def mission_task(self) -> flight.Task:
+        """The task of Mode.MISSION, from the current item on."""
+        mission = self.mission
+        if self._flown and self._disarmed_since_flown and mission.current + 1 == len(mission.items):
+            mission.current = 0  # flown to its end before
+            mission.jumps.clear()
+        self._check_mission()
+        if not mission.valid:
+            then = "refusing takeoff" if self.landed else "loitering"
+            self.say(CRITICAL, f"No valid mission available, {then}\t")
+            return flight.Hold(self._airframe, self._parameters)
+        self.say(INFO, "Executing Mission\t")
+        self._flown, self._disarmed_since_flown = True, False
+        mission.finished, mission.reached = False, -1
+        self.current_changed()
+        return MissionFlight(self, self._airframe, self._parameters)
+
+    def precision_landing(self, precision: Precision, place: Vector | None = None) -> PrecisionLanding:
+        """The task of landing on a target, beginning above `place` (None: here)."""
+        return PrecisionLanding(
+            self._airframe,
+            self._parameters,
+            precision,
+            lambda: self.target,
+            lambda: self.now_s,
+            place,
+            self._on_event,
+        )
+
+    def return_task(self) -> flight.Task:
+        """The task of RTL, by RTL_TYPE and RTL_PLD_MD; says where it leads."""
+        position = self._airframe.position
+        landing = self._return_landing()
+        route = mission_route(self.mission, self._parameters, self.home)
+        if route is not None:
+            return RouteReturn(self._airframe, self._parameters, *route, landing)
+        rally = self.plans[PlanType.RALLY].items
+        found, words = destination(rally, self.mission, self._parameters, self.home, position)
+        for text in words:
+            self.say(CRITICAL, text)
+        direct = ReturnFlight(self._airframe, self._parameters, found.position, landing)
+        height = direct.return_height_m
+        above_sea = geographic(found.position)[2] + height
+        self.say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
+        if found.kind is not Goal.MISSION_LANDING:
+            return direct
+        last = landing_route(self.mission, self.home)
+        climb_to_z = found.position[2] - height
+        return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
+
+    def _return_landing(self) -> Callable[[Vector], flight.TrajectoryTask]:
+        """Makes the task of RTL's last descent."""
+        mode = int(self._parameters.number("RTL_PLD_MD"))
+
+        def landing(place: Vector) -> flight.TrajectoryTask:
+            if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
+                return flight.Land(self._airframe, self._parameters, place)
+            z = self._airframe.position[2]
+            return self.precision_landing(Precision(mode), (place[0], place[1], z))
+
+        return landing
+
+    def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
+        """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""
+        limited = limited_acceleration(
+            acceleration, velocity, self._airframe.yaw_rad, self.obstacles, self._parameters, self.now_s
+        )
+        if limited.hold:
+            self._on_event("no distances to obstacles: collision prevention changes to HOLD")
+            self._autopilot.set_mode(Mode.HOLD)
+        return limited.acceleration
+
+    # ---- one step ---------------------------------------------------------------------------------------
+
+    def update(self) -> None:
+        """Look after the mission's end, its validity and the fence."""
+        autopilot = self._autopilot
+        if not autopilot.armed and self._flown:
+            self._disarmed_since_flown = True
+        task = autopilot.task
+        if isinstance(task, MissionFlight) and task.ended and not self.landed:
+            autopilot.hold_at(task.goal)
+        elif (
+            autopilot.armed and autopilot.mode is Mode.MISSION and not self.landed and not self.mission.valid
+        ):
+            autopilot.set_mode(Mode.HOLD)
+        self._repeat_reached()
+        if self.now_s >= self._next_fence_check_s:
+            self._next_fence_check_s = self.now_s + FENCE_PERIOD_S
+            if self._checked_with != self._check_key():
+                self._check_mission()
+            self._check_fence()
+
+    def _repeat_reached(self) -> None:
+        if self.mission.reached < 0 or self._repetitions >= REACHED_REPETITIONS:
+            return
+        if self.now_s >= self._next_reached_s:
+            self._next_reached_s += REACHED_PERIOD_S
+            self._repetitions += 1
+            self.announcements.append(Reached(self.mission.reached))
+
+    def _flies_mission(self) -> bool:
+        return self._autopilot.armed and self._autopilot.mode is Mode.MISSION
+
+    def _known_home(self) -> Vector | None:
+        return self.home if self._autopilot.sensors_ready else None
+
+    def _check_key(self) -> object:
+        """What the mission was last checked with; a change of it is reason to check again."""
+        return self._known_home(), self.plans[PlanType.FENCE].identifier
+
+    def _check_mission(self) -> None:
+        home = self._known_home()
+        if home is None:
+            return  # PX4 waits for a position
+        self._checked_with = self._check_key()
+        was_valid = self.mission.valid
+        self.mission.valid, words = complaints(
+            self.mission.items, self._parameters, self.fence, home, landed=self.landed
+        )
+        for text in words:
+            self.say(CRITICAL, text)
+        if was_valid != self.mission.valid:
+            self._on_event("mission is valid" if self.mission.valid else "mission is not valid")
+
+    def _check_fence(self) -> None:
+        autopilot, action = self._autopilot, self.fence.action
+        found: list[str] = []
+        if action is not Action.NONE and autopilot.sensors_ready:
+            found = self.fence.breaches(self._airframe.position, self._known_home())
+        fresh = [words for words in found if words not in self._breaches]
+        was_breached, self._breaches = self.is_breached, found
+        for words in fresh:
+            self.say(CRITICAL, words)
+        if not found or was_breached or not autopilot.armed:
+            return
+        self._on_event(f"geofence breached: {found[0]}")  # what is done about it is up to the failsafes
+
+
+def goes_to_camera(command: int) -> bool:
+    """Whether PX4 passes a mission's command on to the camera component instead of obeying itself."""
+    return command in _CAMERA_COMMANDS
+
+
+_CAMERA_COMMANDS = frozenset(
+    {
+        mission_items.START_CAPTURE,
+        mission_items.STOP_CAPTURE,
+        mission_items.SET_CAMERA_MODE,
+        mission_items.SET_CAMERA_SOURCE,
+        mission_items.START_VIDEO,
+        mission_items.STOP_VIDEO,
+    }
+)

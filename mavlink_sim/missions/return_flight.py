@@ -1,0 +1,190 @@
+"""Where RTL leads (RTL_TYPE) and how it lands there (RTL_PLD_MD)."""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavlink_sim.flight import tasks as flight
+from mavlink_sim.flight.position_control import TrajectorySetpoint
+from mavlink_sim.missions import items as mission_items
+from mavlink_sim.missions.items import MissionItem
+from mavlink_sim.missions.plan import Mission
+from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.px4.parameters import Parameters
+
+# A rally point this close to home is no alternative to it (MAX_DIST_FROM_HOME_FOR_LAND_APPROACHES).
+TOO_CLOSE_TO_HOME_M = 10.0
+# Another destination must be that much nearer to be worth it (MIN_DIST_THRESHOLD).
+WORTH_M = 2.0
+USABLE_FRAMES = frozenset({mission_items.GLOBAL, mission_items.GLOBAL_RELATIVE_ALT})
+
+
+class Goal(enum.Enum):
+    """What kind of place RTL leads to."""
+
+    HOME = "home"
+    RALLY = "rally point"
+    MISSION_LANDING = "mission landing"
+    HERE = "here"
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """Local NED metres of the place to land at."""
+
+    kind: Goal
+    position: Vector
+
+
+def destination(
+    rally: tuple[MissionItem, ...],
+    mission: Mission,
+    parameters: Parameters,
+    home: Vector,
+    position: Vector,
+) -> tuple[Destination, list[str]]:
+    """The nearest place that RTL_TYPE allows, and what PX4 complains of on the way.
+
+    0: home or a rally point. 1: a rally point or the mission's landing. 3: any of the three. 5: rally points
+    alone, without one here. With 2 and 4 the vehicle follows its mission instead (see `mission_route`).
+    """
+    kind = int(parameters.number("RTL_TYPE"))
+    best, nearest = Destination(Goal.HOME, home), math.inf
+    if kind not in (1, 5):
+        nearest = math.dist(home[:2], position[:2])
+    landing = mission.landing() if mission.valid else None
+    if landing is not None and kind in (1, 3):
+        place = mission.items[landing].place(home)
+        away = math.dist(place[:2], position[:2])
+        if away + WORTH_M < nearest:
+            best, nearest = Destination(Goal.MISSION_LANDING, place), away
+    complaints = []
+    for item in rally:
+        if item.command != mission_items.RALLY_POINT:
+            continue
+        if item.frame not in USABLE_FRAMES:
+            complaints.append("RTL: unsupported MAV_FRAME\t")
+            continue
+        place = item.place(home)
+        if kind != 5 and math.dist(place[:2], home[:2]) <= TOO_CLOSE_TO_HOME_M:
+            continue
+        away = math.dist(place[:2], position[:2])
+        if away + WORTH_M < nearest:
+            best, nearest = Destination(Goal.RALLY, place), away
+    if kind == 5 and best.kind is not Goal.RALLY:
+        best = Destination(Goal.HERE, position)
+    return best, complaints
+
+
+def mission_route(
+    mission: Mission, parameters: Parameters, home: Vector
+) -> tuple[list[Vector], Vector] | None:
+    """The way back along a valid mission (RTL_TYPE 2 and 4) and where it lands; None for the direct way.
+
+    Forward to the mission's landing, past items that wait; without a landing, or with RTL_TYPE 4 where that
+    is nearer, backwards along what was flown and down at home.
+    """
+    kind = int(parameters.number("RTL_TYPE"))
+    if kind not in (2, 4) or not mission.valid:
+        return None
+    start, landing = mission.land_start(), mission.landing()
+    if landing is not None and not all(map(math.isfinite, mission.items[landing].place(home))):
+        landing = None
+    forward = start is not None and landing is not None and mission.current <= landing
+    if forward and start is not None and kind == 4:
+        forward = start - mission.current < mission.current  # PX4's measure: items left against items flown
+    if forward and landing is not None:
+        places = _places(mission.items[mission.current : landing], home)
+        return places, mission.items[landing].place(home)
+    return _places(mission.items[: mission.current], home)[::-1], home
+
+
+def landing_route(mission: Mission, home: Vector) -> tuple[list[Vector], Vector]:
+    """The places of the mission's landing pattern, from DO_LAND_START on, and the landing itself."""
+    start, landing = mission.land_start(), mission.landing()
+    assert start is not None  # called for a mission's landing alone
+    assert landing is not None
+    return _places(mission.items[start:landing], home), mission.items[landing].place(home)
+
+
+def _places(items: tuple[MissionItem, ...], home: Vector) -> list[Vector]:
+    """Where the items with a place are; those that leave some of it open are left out."""
+    places = [item.place(home) for item in items if item.has_position]
+    return [place for place in places if all(map(math.isfinite, place))]
+
+
+class ReturnFlight(flight.Return):
+    """RTL straight to a destination; `make_landing` gives the task of the last descent."""
+
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        place: Vector,
+        make_landing: Callable[[Vector], flight.TrajectoryTask],
+    ) -> None:
+        super().__init__(airframe, parameters, place)
+        self._make_landing = make_landing
+
+    def landing_task(self, place: Vector) -> flight.TrajectoryTask:
+        """The descent at a place."""
+        return self._make_landing(place)
+
+
+class RouteReturn(flight.TrajectoryTask):
+    """RTL along the places of a mission, then down at the last one.
+
+    Args:
+        places: local NED, in the order of flight. landing: where to land; its height does not matter.
+        climb_to_z: NED height to climb to first, and to keep until the first place; None to go at once.
+    """
+
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        places: list[Vector],
+        landing: Vector,
+        make_landing: Callable[[Vector], flight.TrajectoryTask],
+        climb_to_z: float | None = None,
+    ) -> None:
+        self._airframe = airframe
+        self._parameters = parameters
+        self._make_landing = make_landing
+        self._trajectory = flight.Trajectory(airframe, parameters)
+        self._landing = landing
+        self._descent: flight.TrajectoryTask | None = None
+        x, y, z = self._trajectory.stopping_point()
+        self._ahead = [*places, (landing[0], landing[1], math.nan)]
+        if climb_to_z is not None:
+            z = min(z, climb_to_z)
+            first = self._ahead[0]
+            self._ahead = [(x, y, z), (first[0], first[1], z), *self._ahead]
+        self.goal: Vector = (x, y, z)
+        self._next()
+
+    def _next(self) -> None:
+        """Turn to the next place; one without a height is flown to at the height there is."""
+        x, y, z = self._ahead.pop(0)
+        self.goal = (x, y, z if math.isfinite(z) else self.goal[2])
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        if self._descent is not None:
+            self.goal = self._descent.goal or self.goal
+            return self._descent.update(dt_s)
+        x, y, z = self._airframe.position
+        away = math.hypot(self.goal[0] - x, self.goal[1] - y)
+        radius = self._parameters.number("NAV_ACC_RAD") if self._ahead else 1.0
+        if away < radius and abs(self.goal[2] - z) < self._parameters.number("NAV_MC_ALT_RAD"):
+            if self._ahead:
+                self._next()
+            else:
+                self._descent = self._make_landing(self._landing)
+                self.landing = True
+                return self._descent.update(dt_s)
+        far = away > self._parameters.number("NAV_ACC_RAD")
+        yaw = math.atan2(self.goal[1] - y, self.goal[0] - x) if far else math.nan
+        return self._trajectory.towards(self.goal, dt_s, yaw)

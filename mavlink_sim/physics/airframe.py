@@ -1,0 +1,410 @@
+"""The motion of a multirotor: a rigid body under four rotors, drag, wind, gravity and the ground.
+
+World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag
+and rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated
+quaternion, so no tilt is special; the attitude and rate loops (`rate_loop`) and the mixer run at every step,
+as on the real vehicle. Plain floats in local names throughout: numpy's scalars, or an object for a vector,
+would make the step several times dearer, and with it everything that is tested in lockstep.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+
+from mavlink_sim.physics.normal_numbers import BITS, NORMAL
+from mavlink_sim.physics.rate_loop import MAX_YAW_RATE_RADPS, demanded_rates, mixed_thrusts
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+Rotors = tuple[float, float, float, float]
+
+GRAVITY_MPS2 = 9.80665
+ROTOR_THRUST_MPS2 = 5.0  # SIH_T_MAX 5 N on SIH_MASS 1 kg
+MAX_THRUST_MPS2 = 4.0 * ROTOR_THRUST_MPS2
+LINEAR_DRAG_PER_S = 1.0  # SIH_KDV / SIH_MASS
+ROTOR_TIME_CONSTANT_S = 0.05  # SIH_T_TAU
+INERTIA_XY_KGM2 = 0.025  # SIH_IXX, SIH_IYY
+INERTIA_Z_KGM2 = 0.030  # SIH_IZZ
+ARM_M = 0.2  # SIH_L_ROLL, SIH_L_PITCH
+ROTOR_TORQUE_NM = 0.1  # SIH_Q_MAX
+ANGULAR_DRAG_NMS = 0.025  # SIH_KDW
+_COUPLING_KGM2 = INERTIA_XY_KGM2 - INERTIA_Z_KGM2
+_TORQUE_PER_THRUST_M = ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2
+
+GUST_TIME_CONSTANT_S = 1.5
+GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
+
+# The ground. A multirotor's legs take a landing at a walking pace; at 5 m/s something breaks.
+GEAR_TIME_CONSTANT_S = 0.1
+FRICTION = 0.8
+RESTITUTION = 0.25
+BOUNCE_MPS = 0.8
+HARD_LANDING_MPS = 2.0
+CRASH_MPS = 5.0
+# Leaning farther than this when it touches, it does not come to stand on its legs.
+MAX_STANDING_TILT_COSINE = 0.5
+
+_LEVEL: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_STILL: Vector = (0.0, 0.0, 0.0)
+
+
+class Multirotor:
+    """One airframe with its attitude and rate loops. Deterministic: same seed, same demands, same flight.
+
+    Rotors are numbered as PX4's quad X: 0 front right, 1 rear left (both turn counter-clockwise seen from
+    above), 2 front left, 3 rear right (clockwise).
+
+    Attributes:
+        position: NED metres; velocity: NED m/s; acceleration: NED m/s², kinematic.
+        quaternion: `ned_from_body`, (w, x, y, z), of length 1.
+        rates: body angular rates about FRD, rad/s.
+        rotor_thrusts: of each rotor per vehicle mass, m/s².
+        rotor_commands: what each rotor is asked for, 0..1 of its thrust.
+        rotor_effectiveness: 0..1 for each rotor; 0 is a dead one. See `fail_motor`.
+        on_ground: touching the ground.
+        crashed: it hit the ground too hard or upside down: the rotors are broken.
+        touchdown_mps: the downward speed of the last contact with the ground.
+        on_touch: called with that speed at every contact.
+        wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
+    """
+
+    __slots__ = (
+        "_demand",
+        "_gust",
+        "_gust_left_s",
+        "_matrix",
+        "_random",
+        "_rate_demand",
+        "_spin",
+        "acceleration",
+        "crashed",
+        "gusts_mps",
+        "on_ground",
+        "on_touch",
+        "position",
+        "quaternion",
+        "rates",
+        "rotor_commands",
+        "rotor_effectiveness",
+        "rotor_thrusts",
+        "touchdown_mps",
+        "velocity",
+        "wind",
+    )
+
+    def __init__(self, seed: int = 0, wind: Vector = _STILL, gusts_mps: float = 0.0) -> None:
+        self.position: Vector = _STILL
+        self.velocity: Vector = _STILL
+        self.acceleration: Vector = _STILL
+        self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self.rates: Vector = _STILL
+        self.rotor_thrusts: Rotors = (0.0, 0.0, 0.0, 0.0)
+        self.rotor_commands: Rotors = (0.0, 0.0, 0.0, 0.0)
+        self.rotor_effectiveness: Rotors = (1.0, 1.0, 1.0, 1.0)
+        self.on_ground = True
+        self.crashed = False
+        self.touchdown_mps = 0.0
+        self.on_touch: Callable[[float], None] | None = None
+        self.wind = wind
+        self.gusts_mps = gusts_mps
+        self._matrix = _LEVEL
+        self._spin: Vector = _STILL  # angular acceleration, rad/s²
+        # collective m/s², body axis of the wanted thrust in the heading frame, yaw rate about the vertical
+        self._demand = (0.0, 0.0, 0.0, 1.0, 0.0)
+        self._rate_demand: Vector | None = None
+        self._gust: Vector = _STILL
+        self._gust_left_s = 0.0
+        self._random = random.Random(seed)
+
+    # ---- attitude in other words ------------------------------------------------------------------------
+
+    @property
+    def matrix(self) -> Matrix:
+        """The rotation `ned_from_body`, row by row."""
+        return self._matrix
+
+    @property
+    def roll_rad(self) -> float:
+        return math.atan2(self._matrix[7], self._matrix[8])
+
+    @property
+    def pitch_rad(self) -> float:
+        return math.asin(min(max(-self._matrix[6], -1.0), 1.0))
+
+    @property
+    def yaw_rad(self) -> float:
+        return math.atan2(self._matrix[3], self._matrix[0])
+
+    @yaw_rad.setter
+    def yaw_rad(self, yaw_rad: float) -> None:
+        self.set_attitude(self.roll_rad, self.pitch_rad, yaw_rad)
+
+    def set_attitude(self, roll_rad: float, pitch_rad: float, yaw_rad: float) -> None:
+        """Put it into an attitude (aerospace sequence)."""
+        cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+        cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+        cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+        self.quaternion = (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+        self._matrix = rotation_matrix(self.quaternion)
+
+    @property
+    def thrust_mps2(self) -> float:
+        """Collective thrust per mass, along body up."""
+        return sum(self.rotor_thrusts)
+
+    @thrust_mps2.setter
+    def thrust_mps2(self, thrust_mps2: float) -> None:
+        share = thrust_mps2 / 4.0
+        self.rotor_thrusts = (share, share, share, share)
+
+    @property
+    def specific_force(self) -> Vector:
+        """What an accelerometer feels, body FRD m/s²."""
+        ax, ay, az = self.acceleration
+        az -= GRAVITY_MPS2
+        a, b, c, d, e, f, g, h, i = self._matrix
+        return (a * ax + d * ay + g * az, b * ax + e * ay + h * az, c * ax + f * ay + i * az)
+
+    # ---- demands ----------------------------------------------------------------------------------------
+
+    def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
+        """What to fly from now on: collective thrust, tilt seen from the heading, turn about the vertical."""
+        cosine = math.cos(roll_rad)
+        yaw_rate = min(max(yaw_rate_radps, -MAX_YAW_RATE_RADPS), MAX_YAW_RATE_RADPS)
+        self._demand = (
+            thrust_mps2,
+            math.sin(pitch_rad) * cosine,
+            -math.sin(roll_rad),
+            math.cos(pitch_rad) * cosine,
+            yaw_rate,
+        )
+        self._rate_demand = None
+
+    def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
+        """What to fly from now on: collective thrust and body rates; NaN: go on turning as asked before."""
+        self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
+        before = self._rate_demand or self.rates
+        p, q, r = (
+            asked if math.isnan(rate) else rate for rate, asked in zip(rates_radps, before, strict=True)
+        )
+        self._rate_demand = (p, q, r)
+
+    def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
+        """Let a rotor (0 to 3) give only this share of what it is asked for; 1 makes it whole again.
+
+        Raises:
+            ValueError: there is no such rotor, or the share is not within 0 to 1.
+        """
+        if not 0 <= index < 4:
+            raise ValueError(f"motor {index}: this vehicle has motors 0 to 3")
+        if not 0.0 <= effectiveness <= 1.0:
+            raise ValueError(f"motor effectiveness {effectiveness}: expected 0 (dead) to 1 (whole)")
+        a, b, c, d = (
+            effectiveness if rotor == index else known for rotor, known in enumerate(self.rotor_effectiveness)
+        )
+        self.rotor_effectiveness = (a, b, c, d)
+
+    def step(
+        self, dt_s: float, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float
+    ) -> None:
+        """`command`, then `advance`."""
+        self.command(thrust_mps2, roll_rad, pitch_rad, yaw_rate_radps)
+        self.advance(dt_s)
+
+    def step_rates(self, dt_s: float, thrust_mps2: float, rates: Vector) -> None:
+        """`command_rates`, then `advance`."""
+        self.command_rates(thrust_mps2, rates)
+        self.advance(dt_s)
+
+    # ---- time -------------------------------------------------------------------------------------------
+
+    def advance(self, dt_s: float) -> None:
+        """Advance by `dt_s` (at most ~10 ms) towards what was commanded."""
+        thrust, tilt_x, tilt_y, tilt_z, yaw_rate = self._demand
+        if self.on_ground:
+            blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
+            share = 0.0 if self.crashed else min(max(thrust, 0.0), MAX_THRUST_MPS2) / 4.0
+            command = share / ROTOR_THRUST_MPS2
+            self.rotor_commands = (command, command, command, command)
+            lift = 0.0
+            thrusts = []
+            for now, whole in zip(self.rotor_thrusts, self.rotor_effectiveness, strict=True):
+                now += (share * whole - now) * blend
+                thrusts.append(now)
+                lift += now
+            self.rotor_thrusts = (thrusts[0], thrusts[1], thrusts[2], thrusts[3])
+            if lift * self._matrix[8] <= GRAVITY_MPS2:
+                self._stand(dt_s, lift)
+                return
+            self.on_ground = False
+        matrix = self._matrix
+        rates = self.rates
+        if self._rate_demand is None:
+            wanted = demanded_rates(matrix, tilt_x, tilt_y, tilt_z, yaw_rate)
+        else:
+            wanted = self._rate_demand
+        p, q, r = rates
+        u0, u1, u2, u3 = self.rotor_commands = mixed_thrusts(
+            thrust / MAX_THRUST_MPS2, wanted, rates, self._spin
+        )
+        blend = dt_s / ROTOR_TIME_CONSTANT_S
+        if blend > 1.0:
+            blend = 1.0
+        t0, t1, t2, t3 = self.rotor_thrusts
+        e0, e1, e2, e3 = (0.0, 0.0, 0.0, 0.0) if self.crashed else self.rotor_effectiveness
+        t0 += (ROTOR_THRUST_MPS2 * u0 * e0 - t0) * blend
+        t1 += (ROTOR_THRUST_MPS2 * u1 * e1 - t1) * blend
+        t2 += (ROTOR_THRUST_MPS2 * u2 * e2 - t2) * blend
+        t3 += (ROTOR_THRUST_MPS2 * u3 * e3 - t3) * blend
+        self.rotor_thrusts = (t0, t1, t2, t3)
+
+        # torques of the rotors (1 kg, so m/s² are newtons), drag, and the gyroscopic coupling of the body
+        coupling = _COUPLING_KGM2
+        spin_x = (ARM_M * (t1 + t2 - t0 - t3) - ANGULAR_DRAG_NMS * p + coupling * q * r) / INERTIA_XY_KGM2
+        spin_y = (ARM_M * (t0 + t2 - t1 - t3) - ANGULAR_DRAG_NMS * q - coupling * p * r) / INERTIA_XY_KGM2
+        spin_z = (_TORQUE_PER_THRUST_M * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2
+        self._spin = (spin_x, spin_y, spin_z)
+        p += spin_x * dt_s
+        q += spin_y * dt_s
+        r += spin_z * dt_s
+        self.rates = (p, q, r)
+        half = 0.5 * dt_s
+        w, x, y, z = self.quaternion
+        self._move(dt_s, t0 + t1 + t2 + t3)
+        p *= half
+        q *= half
+        r *= half
+        w, x, y, z = (
+            w - x * p - y * q - z * r,
+            x + w * p + y * r - z * q,
+            y + w * q + z * p - x * r,
+            z + w * r + x * q - y * p,
+        )
+        scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+        w *= scale
+        x *= scale
+        y *= scale
+        z *= scale
+        self.quaternion = (w, x, y, z)
+        xx, yy, zz = x * x, y * y, z * z
+        xy, xz, yz = x * y, x * z, y * z
+        wx, wy, wz = w * x, w * y, w * z
+        self._matrix = (
+            1.0 - 2.0 * (yy + zz),
+            2.0 * (xy - wz),
+            2.0 * (xz + wy),
+            2.0 * (xy + wz),
+            1.0 - 2.0 * (xx + zz),
+            2.0 * (yz - wx),
+            2.0 * (xz - wy),
+            2.0 * (yz + wx),
+            1.0 - 2.0 * (xx + yy),
+        )
+
+    def _move(self, dt_s: float, thrust: float) -> None:
+        x, y, z = self.position
+        vx, vy, vz = self.velocity
+        wx, wy, wz = self.wind
+        if self.gusts_mps > 0.0:
+            self._gust_left_s -= dt_s
+            if self._gust_left_s <= 0.0:
+                self._blow()
+            gx, gy, gz = self._gust
+            wx += gx
+            wy += gy
+            wz += gz
+        matrix = self._matrix
+        ax = LINEAR_DRAG_PER_S * (wx - vx) - thrust * matrix[2]
+        ay = LINEAR_DRAG_PER_S * (wy - vy) - thrust * matrix[5]
+        az = LINEAR_DRAG_PER_S * (wz - vz) - thrust * matrix[8] + GRAVITY_MPS2
+        vx += ax * dt_s
+        vy += ay * dt_s
+        vz += az * dt_s
+        z += vz * dt_s
+        self.acceleration = (ax, ay, az)
+        if z >= 0.0 and vz >= 0.0:
+            z = 0.0
+            vz = self._touch(vz, matrix[8])
+        self.position = (x + vx * dt_s, y + vy * dt_s, z)
+        self.velocity = (vx, vy, vz)
+
+    def blow(self, gust: Vector) -> None:
+        """Let this gust blow, NED m/s, in place of one of its own; to be told again every 32 ms."""
+        self._gust = gust
+        self._gust_left_s = 1.0
+
+    def _blow(self) -> None:
+        """The next gust (a first-order Gauss-Markov process)."""
+        self._gust_left_s += GUST_STEP_S
+        keep = 1.0 - GUST_STEP_S / GUST_TIME_CONSTANT_S
+        spread = self.gusts_mps * math.sqrt(1.0 - keep * keep)
+        bits = self._random.getrandbits
+        gx, gy, gz = self._gust
+        self._gust = (
+            keep * gx + spread * NORMAL[bits(BITS)],
+            keep * gy + spread * NORMAL[bits(BITS)],
+            keep * gz + spread * NORMAL[bits(BITS)],
+        )
+
+    # ---- the ground -------------------------------------------------------------------------------------
+
+    def _touch(self, down_mps: float, tilt_cosine: float) -> float:
+        """Contact at this downward speed; returns the downward speed after it (negative: it bounces)."""
+        self.touchdown_mps = down_mps
+        if down_mps > CRASH_MPS or tilt_cosine < MAX_STANDING_TILT_COSINE:
+            self.crashed = True
+        if self.on_touch is not None:
+            self.on_touch(down_mps)
+        if down_mps > BOUNCE_MPS:
+            return -RESTITUTION * down_mps
+        self.on_ground = True
+        return 0.0
+
+    def _stand(self, dt_s: float, lift: float) -> None:
+        """On the ground: friction stops it, the landing gear levels it and keeps its heading."""
+        self.rates = self._spin = _STILL
+        vx, vy, _ = self.velocity
+        if vx != 0.0 or vy != 0.0:
+            speed = math.hypot(vx, vy)
+            slower = max(speed - FRICTION * (GRAVITY_MPS2 - lift) * dt_s, 0.0) / speed
+            moved = (vx * slower, vy * slower, 0.0)
+            self.acceleration = ((moved[0] - vx) / dt_s, (moved[1] - vy) / dt_s, 0.0)
+            self.velocity = moved
+            x, y, _ = self.position
+            self.position = (x + moved[0] * dt_s, y + moved[1] * dt_s, 0.0)
+        else:
+            self.velocity = self.acceleration = _STILL
+        if self._matrix[8] < 1.0 and not self.crashed:
+            keep = 1.0 - min(1.0, dt_s / GEAR_TIME_CONSTANT_S)
+            self.set_attitude(self.roll_rad * keep, self.pitch_rad * keep, self.yaw_rad)
+
+    def repair(self) -> None:
+        """Whole rotors again, upright where it stands: what a new start of the vehicle finds."""
+        self.crashed = False
+        self.rotor_effectiveness = (1.0, 1.0, 1.0, 1.0)
+        if self.on_ground:
+            self.set_attitude(0.0, 0.0, self.yaw_rad)
+
+
+def rotation_matrix(quaternion: Quaternion) -> Matrix:
+    """The rotation, row by row, of a (w, x, y, z) quaternion of length 1."""
+    w, x, y, z = quaternion
+    return (
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )

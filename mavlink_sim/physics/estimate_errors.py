@@ -1,0 +1,185 @@
+"""An estimate that faults can make wrong: it jumps, drifts, turns, or is lost.
+
+When the horizontal position is lost it behaves as PX4's EKF2 without aiding: dead reckoning for
+EKF2_NOAID_TOUT, then a made-up standstill while height and attitude stay good. PX4 goes on sending
+LOCAL_POSITION_NED, GLOBAL_POSITION_INT and ODOMETRY meanwhile: only ESTIMATOR_STATUS, GPS_RAW_INT and the
+mode tell of it.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
+from mavlink_sim.physics.airframe import Multirotor, Quaternion, Vector
+from mavlink_sim.physics.estimator import Estimate
+
+ZERO: Vector = (0.0, 0.0, 0.0)
+# ESTIMATOR_STATUS_FLAGS without horizontal aiding: attitude, vertical speed, height, height above ground,
+# and CONST_POS_MODE
+FLAGS_WITHOUT_POSITION = 1 | 4 | 32 | 64 | 128
+NO_FIX = 1  # GPS_FIX_TYPE
+UNKNOWN_ACCURACY_M = 100.0
+_GPS_SENSOR = 0x20  # MAV_SYS_STATUS_SENSOR_GPS
+_U16_UNKNOWN = 65535
+
+
+class FallibleEstimate(Estimate):
+    """The estimate of `estimator`, and what faults do to it.
+
+    Attributes:
+        held_xy_m: horizontal position that the estimate is stuck at; None: it follows.
+        reset_counter: how often the estimate jumped, as ODOMETRY tells it (0..255).
+        position_valid: horizontal position and velocity can be flown by.
+        fix_lost: how many reasons there are for GPS to have no fix; 0: it has one.
+        gps_drift: NED metres of the receiver's own error; by fault number.
+    """
+
+    __slots__ = (
+        "_errors",
+        "_yaw_error_rad",
+        "fix_lost",
+        "gps_drift",
+        "held_xy_m",
+        "position_valid",
+        "reset_counter",
+    )
+
+    def __init__(self, truth: Multirotor, seed: int = 0, noise: bool = True) -> None:
+        self._errors: dict[int, tuple[Vector, Vector, float]] = {}
+        self._yaw_error_rad = 0.0
+        self.held_xy_m: tuple[float, float] | None = None
+        self.reset_counter = 0
+        self.position_valid = True
+        self.fix_lost = 0
+        self.gps_drift: dict[int, Vector] = {}
+        super().__init__(truth, seed, noise)
+
+    @property
+    def spoiled(self) -> bool:
+        """Telemetry has to tell of a fault, now or for ever (the reset counter)."""
+        return bool(self.reset_counter or self.fix_lost)
+
+    def set_error(
+        self, number: int, position_m: Vector | None, velocity_mps: Vector = ZERO, yaw_rad: float = 0.0
+    ) -> None:
+        """What a fault adds to the estimate (NED) from its next update on; None: nothing any more."""
+        if position_m is None:
+            self._errors.pop(number, None)
+        else:
+            self._errors[number] = (position_m, velocity_mps, yaw_rad)
+        self.offset = _sum(error[0] for error in self._errors.values())
+        self._yaw_error_rad = sum(error[2] for error in self._errors.values())
+
+    def restart(self, faults: Collection[int]) -> None:
+        """A new start of the filter; what the faults of these numbers spoil is spoiled from the beginning."""
+        for number in [number for number in self._errors if number not in faults]:
+            self.set_error(number, None)
+        self.reset_counter = 0
+        self.held_xy_m = None
+        self.update(0.0)
+        self.position_valid = not self.fix_lost
+        if self.fix_lost:
+            x, y, _ = self.position
+            self.held_xy_m = (x, y)
+            self.update(0.0)
+
+    def count_reset(self, resets: int = 1) -> None:
+        """The estimate jumped."""
+        self.reset_counter = (self.reset_counter + resets) & 0xFF
+
+    def look(self) -> None:
+        """Look at the truth, with every error of this moment."""
+        Estimate.look(self)  # super() would be twice as dear
+        if self.held_xy_m is not None:
+            self.position = (*self.held_xy_m, self.position[2])
+            self.velocity = (0.0, 0.0, self.velocity[2])
+        elif self._errors:
+            vx, vy, vz = self.velocity
+            ex, ey, ez = _sum(error[1] for error in self._errors.values())
+            self.velocity = (vx + ex, vy + ey, vz + ez)
+
+    @property
+    def gps_position(self) -> Vector:
+        """Where the GPS receiver believes to be, NED metres: it knows nothing of the filter's errors."""
+        return _sum((self.truth.position, self.gps_error, *self.gps_drift.values()))
+
+    @property
+    def quaternion(self) -> Quaternion:  # type: ignore[override, misc, unused-ignore]
+        """The attitude with its errors."""
+        w, x, y, z = super().quaternion
+        if self._yaw_error_rad == 0.0:
+            return (w, x, y, z)
+        cosine, sine = math.cos(self._yaw_error_rad / 2.0), math.sin(self._yaw_error_rad / 2.0)
+        return (
+            cosine * w - sine * z,
+            cosine * x - sine * y,
+            cosine * y + sine * x,
+            cosine * z + sine * w,
+        )
+
+    @quaternion.setter
+    def quaternion(self, value: Quaternion) -> None:
+        """Nothing: the attitude is the airframe's own."""
+
+    @property  # type: ignore[misc, unused-ignore]
+    def yaw_rad(self) -> float:  # type: ignore[override, misc, unused-ignore]
+        """Heading, clockwise from north."""
+        yaw_rad = super().yaw_rad
+        return math.remainder(yaw_rad + self._yaw_error_rad, math.tau) if self._yaw_error_rad else yaw_rad
+
+
+def _sum(vectors: Iterable[Vector]) -> Vector:
+    north = east = down = 0.0
+    for x, y, z in vectors:
+        north, east, down = north + x, east + y, down + z
+    return (north, east, down)
+
+
+# ---- what the messages say of it
+
+
+def as_told(estimate: FallibleEstimate, message: Any) -> Any:
+    """The message as PX4 sends it while, or after, the estimate is spoiled."""
+    amend = _AMENDMENTS.get(message.get_type())
+    if amend is None:
+        return message
+    told = copy.copy(message)
+    amend(estimate, told)
+    return told
+
+
+def _odometry(estimate: FallibleEstimate, message: Any) -> None:
+    message.reset_counter = estimate.reset_counter
+    if not estimate.position_valid:
+        covariance = list(message.pose_covariance)
+        covariance[0] = covariance[6] = UNKNOWN_ACCURACY_M**2
+        message.pose_covariance = covariance
+
+
+def _gps_raw_int(estimate: FallibleEstimate, message: Any) -> None:
+    if estimate.fix_lost:
+        message.fix_type, message.satellites_visible = NO_FIX, 0
+        message.eph = message.epv = message.cog = message.vel = _U16_UNKNOWN
+        message.h_acc = message.v_acc = round(UNKNOWN_ACCURACY_M * 1000)
+
+
+def _estimator_status(estimate: FallibleEstimate, message: Any) -> None:
+    if not estimate.position_valid:
+        message.flags = FLAGS_WITHOUT_POSITION
+        message.pos_horiz_accuracy = UNKNOWN_ACCURACY_M
+
+
+def _sys_status(estimate: FallibleEstimate, message: Any) -> None:
+    if estimate.fix_lost:
+        message.onboard_control_sensors_health &= ~_GPS_SENSOR
+
+
+_AMENDMENTS: dict[str, Callable[[FallibleEstimate, Any], None]] = {
+    "ODOMETRY": _odometry,
+    "GPS_RAW_INT": _gps_raw_int,
+    "ESTIMATOR_STATUS": _estimator_status,
+    "SYS_STATUS": _sys_status,
+}

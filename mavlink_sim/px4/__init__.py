@@ -1,0 +1,1 @@
+"""What PX4 calls things: its flight modes, its parameters and their defaults."""

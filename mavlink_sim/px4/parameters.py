@@ -1,0 +1,190 @@
+"""The vehicle's parameters: PX4's names, types and values, with integers sent bytewise in the float field.
+
+`parameters.txt` beside this file is the selection this vehicle has, one `NAME TYPE VALUE` a line.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from importlib import resources
+
+INT32 = 6  # MAV_PARAM_TYPE_INT32
+REAL32 = 9  # MAV_PARAM_TYPE_REAL32
+UINT32 = 5  # MAV_PARAM_TYPE_UINT32, of _HASH_CHECK alone
+HASH_CHECK = "_HASH_CHECK"
+HASH_CHECK_INDEX = 65535
+_FILES = ("parameters.txt", "parameters_pilot.txt")
+_GIMBAL_FILE = "parameters_gimbal.txt"
+_TYPES = {"INT32": INT32, "REAL32": REAL32}
+# PX4's `volatile` parameters: the vehicle itself changes them, so they are no part of _HASH_CHECK.
+_VOLATILE = re.compile(
+    r"CAL_ACC\d_[XYZ](OFF|SCALE)|CAL_GYRO\d_[XYZ]OFF|CAL_BARO\d_OFF"
+    r"|CAL_MAG\d_[XYZ](OFF|SCALE|ODIAG|COMP)|EKF2_MAG_DECL|ASPD_SCALE_\d|SENS_DPRES_OFF"
+    r"|COM_FLIGHT_UUID|COM_MODE\d_HASH|LND_FLIGHT_T_(HI|LO)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter; `kind` is its MAV_PARAM_TYPE."""
+
+    name: str
+    kind: int
+    value: int | float
+
+    @property
+    def wire_value(self) -> float:
+        """The value as PARAM_VALUE.param_value carries it: an integer's bytes read as a float."""
+        if self.kind == INT32:
+            return float(struct.unpack("<f", struct.pack("<i", int(self.value)))[0])
+        return float(self.value)
+
+
+def is_volatile(name: str) -> bool:
+    """Whether PX4 excludes a parameter from _HASH_CHECK because the vehicle changes it by itself."""
+    return _VOLATILE.fullmatch(name) is not None
+
+
+def parameter_hash(parameters: Iterable[Parameter]) -> int:
+    """_HASH_CHECK by PX4's recipe: CRC-32 without inversions over names and values, in alphabetical order.
+
+    Args:
+        parameters: all that are listed, in order; volatile ones are left out here.
+    """
+    crc = 0xFFFFFFFF
+    for parameter in parameters:
+        if not is_volatile(parameter.name):
+            packed = struct.pack("<i" if parameter.kind == INT32 else "<f", parameter.value)
+            crc = zlib.crc32(parameter.name.encode() + packed, crc)
+    return crc ^ 0xFFFFFFFF
+
+
+class UnknownParameterError(KeyError):
+    """No parameter of that name."""
+
+
+def decode_wire_value(kind: int, wire_value: float) -> int | float:
+    """The number in PARAM_SET.param_value: bytewise for INT32."""
+    if kind == INT32:
+        return int(struct.unpack("<i", struct.pack("<f", wire_value))[0])
+    return float(wire_value)
+
+
+def default_parameters(gimbal: bool = False) -> list[Parameter]:
+    """`parameters.txt` and its additions, with `gimbal` those of one too, in alphabetical order."""
+    folder = resources.files(__package__)
+    files = (*_FILES, _GIMBAL_FILE) if gimbal else _FILES
+    text = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in files)
+    found = []
+    for line in text.splitlines():
+        if line and not line.startswith("#"):
+            name, kind, value = line.split()
+            number = int(value) if kind == "INT32" else _single(float(value))
+            found.append(Parameter(name, _TYPES[kind], number))
+    unique = {parameter.name: parameter for parameter in found}  # the last of a name counts
+    return sorted(unique.values(), key=lambda parameter: parameter.name)
+
+
+class Parameters:
+    """The parameter set of one vehicle, in alphabetical order. `revision` grows with every change."""
+
+    def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
+        """With `gimbal`, the parameters of one are among them.
+
+        Raises UnknownParameterError or ValueError if `values` names or sets something that cannot be.
+        """
+        self._defaults = {parameter.name: parameter for parameter in default_parameters(gimbal)}
+        self._parameters = dict(self._defaults)
+        self._names = list(self._parameters)
+        self.revision = 0
+        for name, value in (values or {}).items():
+            self.set(name, value)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self._parameters.values())
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._parameters
+
+    def __getitem__(self, name: str) -> Parameter:
+        try:
+            return self._parameters[name]
+        except KeyError:
+            raise UnknownParameterError(
+                f"this vehicle has no parameter {name!r}; PARAM_REQUEST_LIST names all {len(self)}"
+            ) from None
+
+    def get(self, name: str) -> Parameter | None:
+        return self._parameters.get(name)
+
+    def number(self, name: str) -> float:
+        try:
+            return self._parameters[name].value
+        except KeyError:
+            return self[name].value  # which says what is wrong
+
+    def positive(self, name: str) -> float:
+        """A value to divide by or to take a root of: PX4 accepts any, this stays above zero."""
+        value = self.number(name)
+        return value if value > 0.01 else 0.01
+
+    def at(self, index: int) -> Parameter | None:
+        """The parameter at an index of the list, None outside it."""
+        return self._parameters[self._names[index]] if 0 <= index < len(self._names) else None
+
+    def index(self, name: str) -> int:
+        return self._names.index(name)
+
+    def set(self, name: str, value: float) -> Parameter:
+        """Set a value; PX4 checks no range. Raises UnknownParameterError or ValueError."""
+        parameter = self[name]
+        if not math.isfinite(value):
+            raise ValueError(f"parameter {name} needs a finite number, got {value}")
+        if parameter.kind == INT32:
+            if value != int(value) or not -(2**31) <= value < 2**31:
+                raise ValueError(f"parameter {name} is an INT32, got {value}; give a whole number")
+            value = int(value)
+        else:
+            value = _single(float(value))
+        changed = replace(parameter, value=value)
+        self._parameters[name] = changed
+        self.revision += 1
+        return changed
+
+    def reset(self, keep: Collection[str] = ()) -> list[Parameter]:
+        """Back to the values of `parameters.txt`, except those to keep. Returns what changed."""
+        changed = []
+        for name, default in self._defaults.items():
+            if name not in keep and self._parameters[name].value != default.value:
+                self._parameters[name] = default
+                changed.append(default)
+        self.revision += bool(changed)
+        return changed
+
+    def customised(self) -> list[Parameter]:
+        """The parameters whose value is not that of `parameters.txt`: what PX4 keeps in its file."""
+        return [item for item in self if item.value != self._defaults[item.name].value]
+
+    def hash(self) -> int:
+        """The set's _HASH_CHECK."""
+        return parameter_hash(self)
+
+    def hash_wire_value(self) -> float:
+        """The hash as PARAM_VALUE carries it: its bytes read as a float."""
+        return float(struct.unpack("<f", struct.pack("<I", self.hash()))[0])
+
+
+def _single(value: float) -> float:
+    """The nearest float32, which is what the vehicle stores."""
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    except OverflowError:
+        raise ValueError(f"{value} does not fit a 32-bit float") from None

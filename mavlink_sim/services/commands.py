@@ -1,0 +1,260 @@
+"""COMMAND_LONG and COMMAND_INT: which commands the vehicle knows, and PX4's MAV_RESULT for each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
+from mavlink_sim.flight.orbit import OrbitRequest
+from mavlink_sim.physics.geography import geographic, local
+from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, mode_of
+from mavlink_sim.services import gimbal_protocol, parameter_protocol
+from mavlink_sim.services.mission_start import mission_start
+from mavlink_sim.services.telemetry import MESSAGE_IDS
+from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.messages import dialect, protocol_version
+
+if TYPE_CHECKING:
+    from mavlink_sim.services.links import Link
+    from mavlink_sim.vehicle import Vehicle
+
+DENIED = 2  # MAV_RESULT
+UNSUPPORTED = 3
+FAILED = 4
+
+FORCE_DISARM = 21196.0
+SPEED_TYPE_GROUNDSPEED = 1
+MAX_ALTITUDE_M = 100_000.0
+MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL carries an int32
+NOT_GIVEN = 2**31 - 1  # x and y of COMMAND_INT
+NAN_AS_INTEGER = 0x7FF80000
+GROUND_STATION_COMPONENT = 190  # MAV_COMP_ID_MISSIONPLANNER
+
+NAV_RETURN_TO_LAUNCH = 20
+NAV_LAND = 21
+NAV_TAKEOFF = 22
+DO_ORBIT = 34
+DO_SET_MODE = 176
+DO_CHANGE_SPEED = 178
+DO_CHANGE_ALTITUDE = 186
+DO_REPOSITION = 192
+ARM_DISARM = 400
+GET_MESSAGE_INTERVAL = 510
+SET_MESSAGE_INTERVAL = 511
+REQUEST_MESSAGE = 512
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command; of its parameters, 5 and 6 are latitude and longitude in degrees, 7 is AMSL metres."""
+
+    identifier: int
+    parameters: tuple[float, float, float, float, float, float, float]
+    source_component: int
+    source_system: int = 0
+
+
+def command_of(message: Any) -> Command:
+    """The command of a COMMAND_LONG or COMMAND_INT message."""
+    if message.get_type() == "COMMAND_INT":
+        # both INT32_MAX: "not given", as NaN in COMMAND_LONG. PX4 looks at no frame, z is AMSL in all of them
+        given = (message.x, message.y) != (NOT_GIVEN, NOT_GIVEN)
+        place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
+        tail = (*place, message.z)
+    else:
+        tail = (message.param5, message.param6, message.param7)
+    head = (message.param1, message.param2, message.param3, message.param4)
+    return Command(int(message.command), head + tail, message.get_srcComponent(), message.get_srcSystem())
+
+
+def is_misencoded(message: Any) -> bool:
+    """A COMMAND_INT whose place is a float's NaN put into integers by accident: PX4 denies it."""
+    return message.get_type() == "COMMAND_INT" and (message.x, message.y) == (NAN_AS_INTEGER, NAN_AS_INTEGER)
+
+
+def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+    """Carry out a command. Returns its MAV_RESULT, None where PX4 answers nothing at all."""
+    if command.identifier == 0:
+        return None
+    handler = _HANDLERS.get(command.identifier)
+    return UNSUPPORTED if handler is None else handler(vehicle, link, command)
+
+
+def _arm(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if command.parameters[0] == 1.0:
+        return vehicle.autopilot.arm()
+    if command.parameters[0] == 0.0:
+        return vehicle.autopilot.disarm(force=command.parameters[1] == FORCE_DISARM)
+    return UNSUPPORTED
+
+
+def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
+    autopilot = vehicle.autopilot
+    base, main, sub = command.parameters[:3]
+    if not all(map(math.isfinite, (base, main, sub))) or not int(base) & CUSTOM_MODE_ENABLED:
+        return TEMPORARILY_REJECTED
+    mode = mode_of(int(main), int(sub))
+    if mode is None:
+        autopilot.texts.append(Text(CRITICAL, "Unsupported main mode\t"))
+        return TEMPORARILY_REJECTED
+    return autopilot.set_mode(mode, tell=command.source_component == GROUND_STATION_COMPONENT)
+
+
+def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
+    altitude = command.parameters[6]
+    if not math.isfinite(altitude):
+        return vehicle.autopilot.takeoff(None)
+    altitude = min(max(altitude, -MAX_ALTITUDE_M), MAX_ALTITUDE_M)
+    home_altitude = geographic(vehicle.autopilot.home)[2]
+    return vehicle.autopilot.takeoff(altitude - home_altitude)
+
+
+def _land(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return vehicle.autopilot.land()
+
+
+def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return vehicle.autopilot.return_home()
+
+
+def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
+    flags = command.parameters[1]
+    if not math.isfinite(flags) or int(flags) != 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other
+        return UNSUPPORTED
+    speed, yaw = command.parameters[0], command.parameters[3]
+    latitude, longitude, altitude = command.parameters[4:7]
+    if not _is_on_earth(latitude, longitude, altitude):
+        return DENIED
+    return vehicle.autopilot.reposition(local(latitude, longitude, altitude), yaw, speed)
+
+
+def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
+    altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
+    if not _is_on_earth(0.0, 0.0, altitude):
+        return DENIED
+    return vehicle.autopilot.reposition(local(math.nan, math.nan, altitude), math.nan)
+
+
+def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
+    kind, speed = command.parameters[:2]
+    vehicle.autopilot.change_speed(speed, at_once=_identifier(kind) == SPEED_TYPE_GROUNDSPEED)
+    return ACCEPTED
+
+
+def _orbit(vehicle: Vehicle, link: Link, command: Command) -> int:
+    radius, speed, yaw_behaviour = command.parameters[:3]
+    latitude, longitude, altitude = command.parameters[4:7]
+    if not _is_on_earth(latitude, longitude, altitude):
+        return DENIED
+    centre = local(latitude, longitude, altitude)
+    return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
+
+
+def _is_on_earth(latitude: float, longitude: float, altitude: float) -> bool:
+    """False for a place that cannot be; NaN, "as it is now", can."""
+    return not (abs(latitude) > 90.0 or abs(longitude) > 180.0 or abs(altitude) > MAX_ALTITUDE_M)
+
+
+def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return ACCEPTED
+
+
+def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return mission_start(vehicle.autopilot, command.parameters[0])
+
+
+def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if command.parameters[0] == 1.0:
+        vehicle.autopilot.home = vehicle.estimate.position
+        return ACCEPTED
+    place = command.parameters[4:7]
+    if not _is_on_earth(*place):
+        return DENIED
+    if all(math.isfinite(value) for value in place):
+        vehicle.autopilot.home = local(*place)
+    return ACCEPTED
+
+
+def _flight_termination(vehicle: Vehicle, link: Link, command: Command) -> int:
+    # CBRK_FLIGHTTERM is engaged on this vehicle: a termination is accepted and has no effect
+    return ACCEPTED if command.parameters[0] > 0.5 else DENIED
+
+
+def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return parameter_protocol.reset(vehicle, command.parameters[0])
+
+
+def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
+    name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
+    if name is None or not vehicle.send_built(link, name):
+        return DENIED
+    return ACCEPTED
+
+
+def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if command.parameters[0] != 1.0:
+        return DENIED
+    vehicle.send_built(link, "AUTOPILOT_VERSION")
+    return ACCEPTED
+
+
+def _request_protocol_version(vehicle: Vehicle, link: Link, command: Command) -> int:
+    link.send(protocol_version())
+    return ACCEPTED
+
+
+def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+    name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
+    interval = command.parameters[1]
+    if name is None or name == "HEARTBEAT" or name not in link.streams or not math.isfinite(interval):
+        return FAILED
+    link.streams.set_interval(name, min(round(interval), MAX_INTERVAL_US), vehicle.boot_us)
+    return ACCEPTED
+
+
+def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
+    identifier = _identifier(command.parameters[0])
+    name = MESSAGE_IDS.get(identifier)
+    interval = 0 if name is None else link.streams.interval_us(name)  # 0: no such stream, -1: off
+    link.send(dialect.MAVLink_message_interval_message(identifier & 0xFFFF, interval))
+    return ACCEPTED
+
+
+def _identifier(value: float) -> int:
+    return round(value) if math.isfinite(value) else -1
+
+
+_HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
+    NAV_RETURN_TO_LAUNCH: _return_to_launch,
+    NAV_LAND: _land,
+    NAV_TAKEOFF: _takeoff,
+    DO_ORBIT: _orbit,
+    DO_SET_MODE: _do_set_mode,
+    DO_CHANGE_SPEED: _change_speed,
+    179: _set_home,  # DO_SET_HOME
+    185: _flight_termination,  # DO_FLIGHTTERMINATION
+    DO_CHANGE_ALTITUDE: _change_altitude,
+    DO_REPOSITION: _reposition,
+    gimbal_protocol.DO_SET_ROI_LOCATION: gimbal_protocol.set_roi_location,
+    gimbal_protocol.DO_SET_ROI_NONE: gimbal_protocol.set_roi_none,
+    gimbal_protocol.DO_SET_ROI: gimbal_protocol.set_roi,
+    245: _preflight_storage,  # PREFLIGHT_STORAGE
+    300: _mission_start,
+    ARM_DISARM: _arm,
+    401: _accept,  # RUN_PREARM_CHECKS
+    GET_MESSAGE_INTERVAL: _get_message_interval,
+    SET_MESSAGE_INTERVAL: _set_message_interval,
+    REQUEST_MESSAGE: _request_message,
+    519: _request_protocol_version,  # REQUEST_PROTOCOL_VERSION
+    520: _request_capabilities,  # REQUEST_AUTOPILOT_CAPABILITIES
+    gimbal_protocol.PITCHYAW: gimbal_protocol.pitchyaw,
+    gimbal_protocol.CONFIGURE: gimbal_protocol.configure,
+}
+
+# PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).
+ANSWERED_TWICE = frozenset({DO_SET_MODE})
+# These never get to Commander's queue.
+ANSWERED_BY_RECEIVER = frozenset({GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, 519, 520})

@@ -1,0 +1,374 @@
+"""MAVLink FTP (https://mavlink.io/en/services/ftp.html), as PX4's server answers it: one session a link.
+
+`Server.answer` takes a FILE_TRANSFER_PROTOCOL payload and returns the reply's; `Server.burst` gives what a
+burst read owes now. Files come from a `FileSystem` in memory.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.services.file_system import FileSystem
+from mavlink_sim.wire.messages import dialect
+
+if TYPE_CHECKING:
+    from mavlink_sim.services.links import Link
+    from mavlink_sim.vehicle import Vehicle
+
+logger = logging.getLogger(__name__)
+
+_HEADER = struct.Struct("<HBBBBBBI")
+PAYLOAD_BYTES = 251
+DATA_BYTES = PAYLOAD_BYTES - _HEADER.size  # 239
+SESSION_TIMEOUT_S = 10.0
+# A burst takes its share of the link: so many packets a step (about 480 kB/s), and a pause, with
+# burst_complete set, after 35 kB, as in PX4.
+BURST_PACKETS = 8
+BURST_BYTES = 35_000
+
+
+class Opcode(IntEnum):
+    NONE = 0
+    TERMINATE_SESSION = 1
+    RESET_SESSIONS = 2
+    LIST_DIRECTORY = 3
+    OPEN_FILE_RO = 4
+    READ_FILE = 5
+    CREATE_FILE = 6
+    WRITE_FILE = 7
+    REMOVE_FILE = 8
+    CREATE_DIRECTORY = 9
+    REMOVE_DIRECTORY = 10
+    OPEN_FILE_WO = 11
+    TRUNCATE_FILE = 12
+    RENAME = 13
+    CALC_FILE_CRC32 = 14
+    BURST_READ_FILE = 15
+    ACK = 128
+    NAK = 129
+
+
+class Failure(IntEnum):
+    FAIL = 1
+    FAIL_ERRNO = 2
+    INVALID_DATA_SIZE = 3
+    INVALID_SESSION = 4
+    NO_SESSIONS_AVAILABLE = 5
+    END_OF_FILE = 6
+    UNKNOWN_COMMAND = 7
+    FILE_EXISTS = 8
+    FILE_PROTECTED = 9
+    FILE_NOT_FOUND = 10
+
+
+_FAILURE_OF_ERRNO = {
+    errno.EEXIST: Failure.FILE_EXISTS,
+    errno.ENOENT: Failure.FILE_NOT_FOUND,
+    errno.EROFS: Failure.FILE_PROTECTED,
+}
+
+
+class RequestRefusedError(Exception):
+    """A request that is answered by a NAK with this failure."""
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(failure.name)
+        self.failure = failure
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """The payload of FILE_TRANSFER_PROTOCOL. `size` is as received; `data` is at most 239 bytes."""
+
+    sequence: int
+    session: int
+    opcode: int
+    size: int
+    requested: int
+    burst_complete: bool
+    offset: int
+    data: bytes
+
+    @classmethod
+    def unpack(cls, payload: bytes) -> Packet:
+        """Raises ValueError for a payload that is shorter than its header."""
+        if len(payload) < _HEADER.size:
+            raise ValueError(f"an FTP payload has at least {_HEADER.size} bytes, got {len(payload)}")
+        sequence, session, opcode, size, requested, burst, _, offset = _HEADER.unpack_from(payload)
+        data = payload[_HEADER.size : _HEADER.size + min(size, DATA_BYTES)]
+        return cls(sequence, session, opcode, size, requested, bool(burst), offset, data)
+
+    def pack(self) -> bytes:
+        """251 bytes, filled up with zeros."""
+        header = _HEADER.pack(
+            self.sequence & 0xFFFF,
+            self.session,
+            self.opcode,
+            len(self.data),
+            self.requested,
+            self.burst_complete,
+            0,
+            self.offset,
+        )
+        return (header + self.data).ljust(PAYLOAD_BYTES, b"\0")
+
+    @property
+    def text(self) -> str:
+        """The data up to the first NUL, as a path."""
+        return self.data.split(b"\0", 1)[0].decode(errors="surrogateescape")
+
+
+@dataclass(slots=True)
+class _Session:
+    content: bytes | bytearray
+    size: int  # as it was opened: reading ends there
+    readable: bool
+    writable: bool
+
+
+@dataclass(slots=True)
+class _Burst:
+    sequence: int
+    offset: int
+    sent_bytes: int
+    target: tuple[int, int]
+
+
+class Server:
+    """The FTP server of one link. `now_s` only has to grow."""
+
+    def __init__(self, files: FileSystem) -> None:
+        self._files = files
+        self._session: _Session | None = None
+        self._burst: _Burst | None = None
+        self._heard_s = 0.0
+        self._last_reply: Packet | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is open: `burst` need not be called."""
+        return self._session is None
+
+    def answer(self, payload: bytes, source: tuple[int, int], now_s: float) -> bytes | None:
+        """The reply to a request, None where a burst begins instead. Raises ValueError: no FTP payload."""
+        request = Packet.unpack(payload)
+        self._heard_s = now_s
+        if request.size <= DATA_BYTES and self._last_reply is not None:
+            if (request.sequence + 1) & 0xFFFF == self._last_reply.sequence:
+                return self._last_reply.pack()  # our answer was lost, the client asks again
+            self._last_reply = None
+        try:
+            if request.size > DATA_BYTES:
+                raise RequestRefusedError(Failure.INVALID_DATA_SIZE)
+            if request.opcode == Opcode.BURST_READ_FILE:
+                self._begin_burst(request, source)
+                return None
+            handler = _HANDLERS.get(request.opcode)
+            if handler is None:
+                raise RequestRefusedError(Failure.UNKNOWN_COMMAND)
+            session, data = handler(self, request)
+            reply = replace(request, opcode=Opcode.ACK, session=session, data=data)
+        except RequestRefusedError as refusal:
+            reply = _nak(request, bytes([refusal.failure]))
+        except OSError as error:
+            number = error.errno or errno.EIO
+            failure = _FAILURE_OF_ERRNO.get(number)
+            reason = bytes([Failure.FAIL_ERRNO, number]) if failure is None else bytes([failure])
+            reply = _nak(request, reason)
+        reply = replace(reply, sequence=(request.sequence + 1) & 0xFFFF, requested=request.opcode)
+        # Longer answers are data, which can be read again without harm.
+        if len(reply.data) <= 4 and reply.data[:1] != bytes([Failure.NO_SESSIONS_AVAILABLE]):
+            self._last_reply = reply
+        return reply.pack()
+
+    def burst(self, now_s: float) -> list[tuple[tuple[int, int], bytes]]:
+        """((system, component), payload) of the burst packets that are due; closes a forgotten session."""
+        if self._session is None:
+            return []
+        if now_s - self._heard_s > SESSION_TIMEOUT_S:
+            logger.info("the FTP session was closed after %g s without a request", SESSION_TIMEOUT_S)
+            self._close()
+            self._last_reply = None
+            return []
+        packets: list[tuple[tuple[int, int], bytes]] = []
+        while self._burst is not None and len(packets) < BURST_PACKETS:
+            last = len(packets) == BURST_PACKETS - 1
+            packets.append((self._burst.target, self._next_of(self._session, self._burst, last)))
+        return packets
+
+    def _next_of(self, session: _Session, burst: _Burst, last_of_step: bool) -> bytes:
+        packet = Packet(burst.sequence, 0, Opcode.ACK, 0, Opcode.BURST_READ_FILE, False, burst.offset, b"")
+        burst.sequence = (burst.sequence + 1) & 0xFFFF
+        if burst.offset >= session.size:
+            self._burst = None
+            return _nak(packet, bytes([Failure.END_OF_FILE])).pack()
+        data = bytes(session.content[burst.offset : min(burst.offset + DATA_BYTES, session.size)])
+        burst.offset += len(data)
+        burst.sent_bytes += len(data)
+        complete = last_of_step and burst.sent_bytes > BURST_BYTES
+        if complete or not data:
+            self._burst = None
+        return replace(packet, data=data, burst_complete=complete).pack()
+
+    # ---- one method a request; each returns the reply's session and data
+
+    def _none(self, request: Packet) -> tuple[int, bytes]:
+        return request.session, request.data
+
+    def _terminate(self, request: Packet) -> tuple[int, bytes]:
+        self._opened(request)
+        self._close()
+        return request.session, b""
+
+    def _reset(self, request: Packet) -> tuple[int, bytes]:
+        self._close()
+        return request.session, b""
+
+    def _list(self, request: Packet) -> tuple[int, bytes]:
+        entries = [b"S", b"S"]  # "." and "..", which PX4 counts and does not tell
+        for name, size in self._files.list(request.text):
+            encoded = name.encode(errors="surrogateescape")
+            entries.append(b"D" + encoded if size is None else b"F%s\t%d" % (encoded, size))
+        data = b""
+        for entry in entries[request.offset :]:
+            if len(data) + len(entry) + 1 > DATA_BYTES:
+                break
+            data += entry + b"\0"
+        if not data:
+            raise RequestRefusedError(Failure.END_OF_FILE)
+        return request.session, data
+
+    def _open(
+        self, request: Packet, content: bytes | bytearray, size: int, writable: bool
+    ) -> tuple[int, bytes]:
+        self._session = _Session(content, size, not writable, writable)
+        self._burst = None
+        return 0, struct.pack("<I", size)
+
+    def _open_read(self, request: Packet) -> tuple[int, bytes]:
+        self._check_free()
+        content = self._files.read(request.text)
+        return self._open(request, content, len(content), False)
+
+    def _open_write(self, request: Packet) -> tuple[int, bytes]:
+        self._check_free()
+        content = self._files.create(request.text, truncate=False)
+        return self._open(request, content, len(content), True)
+
+    def _create(self, request: Packet) -> tuple[int, bytes]:
+        self._check_free()
+        content = self._files.create(request.text, truncate=True)
+        return self._open(request, content, 0, True)
+
+    def _check_free(self) -> None:
+        if self._session is not None:
+            raise RequestRefusedError(Failure.NO_SESSIONS_AVAILABLE)
+
+    def _opened(self, request: Packet) -> _Session:
+        if request.session != 0 or self._session is None:
+            raise RequestRefusedError(Failure.INVALID_SESSION)
+        return self._session
+
+    def _read(self, request: Packet) -> tuple[int, bytes]:
+        session = self._opened(request)
+        if request.offset >= session.size:
+            raise RequestRefusedError(Failure.END_OF_FILE)
+        if not session.readable:
+            raise OSError(errno.EBADF, "opened for writing")
+        return 0, bytes(session.content[request.offset : request.offset + request.size])
+
+    def _begin_burst(self, request: Packet, source: tuple[int, int]) -> None:
+        session = self._opened(request)
+        if not session.readable:
+            raise OSError(errno.EBADF, "opened for writing")
+        self._burst = _Burst((request.sequence + 1) & 0xFFFF, request.offset, 0, source)
+
+    def _write(self, request: Packet) -> tuple[int, bytes]:
+        session = self._opened(request)
+        if not session.writable or not isinstance(session.content, bytearray):
+            raise OSError(errno.EBADF, "opened for reading")
+        written = self._files.write(session.content, request.offset, request.data)
+        return 0, struct.pack("<I", written)
+
+    def _remove(self, request: Packet) -> tuple[int, bytes]:
+        self._files.remove(request.text)
+        return request.session, b""
+
+    def _make_directory(self, request: Packet) -> tuple[int, bytes]:
+        self._files.make_directory(request.text)
+        return request.session, b""
+
+    def _remove_directory(self, request: Packet) -> tuple[int, bytes]:
+        self._files.remove_directory(request.text)
+        return request.session, b""
+
+    def _truncate(self, request: Packet) -> tuple[int, bytes]:
+        self._files.truncate(request.text, request.offset)
+        return request.session, b""
+
+    def _rename(self, request: Packet) -> tuple[int, bytes]:
+        old, nul, rest = request.data.partition(b"\0")
+        new = rest.split(b"\0", 1)[0]
+        if not nul or not new:
+            raise OSError(errno.EINVAL, "two paths are expected, parted by a NUL")
+        self._files.rename(old.decode(errors="surrogateescape"), new.decode(errors="surrogateescape"))
+        return request.session, b""
+
+    def _checksum(self, request: Packet) -> tuple[int, bytes]:
+        return request.session, struct.pack("<I", checksum(self._files.read(request.text)))
+
+    def _close(self) -> None:
+        self._session = None
+        self._burst = None
+
+
+def checksum(content: bytes | bytearray) -> int:
+    """MAVLink FTP's CRC-32: the usual polynomial, without inverting before and after."""
+    return zlib.crc32(content, 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def _nak(packet: Packet, reason: bytes) -> Packet:
+    return replace(packet, opcode=Opcode.NAK, data=reason)
+
+
+_HANDLERS: dict[int, Callable[[Server, Packet], tuple[int, bytes]]] = {
+    Opcode.NONE: Server._none,
+    Opcode.TERMINATE_SESSION: Server._terminate,
+    Opcode.RESET_SESSIONS: Server._reset,
+    Opcode.LIST_DIRECTORY: Server._list,
+    Opcode.OPEN_FILE_RO: Server._open_read,
+    Opcode.READ_FILE: Server._read,
+    Opcode.CREATE_FILE: Server._create,
+    Opcode.WRITE_FILE: Server._write,
+    Opcode.REMOVE_FILE: Server._remove,
+    Opcode.CREATE_DIRECTORY: Server._make_directory,
+    Opcode.REMOVE_DIRECTORY: Server._remove_directory,
+    Opcode.OPEN_FILE_WO: Server._open_write,
+    Opcode.TRUNCATE_FILE: Server._truncate,
+    Opcode.RENAME: Server._rename,
+    Opcode.CALC_FILE_CRC32: Server._checksum,
+}
+
+
+def handle(vehicle: Vehicle, link: Link, message: Any) -> None:
+    """FILE_TRANSFER_PROTOCOL from a client."""
+    if link.file_transfer is None:
+        link.file_transfer = Server(vehicle.files)
+    source = (message.get_srcSystem(), message.get_srcComponent())
+    reply = link.file_transfer.answer(bytes(message.payload), source, vehicle.now_s)
+    if reply is not None:
+        link.send(dialect.MAVLink_file_transfer_protocol_message(0, *source, reply))
+
+
+def continue_transfer(link: Link, now_s: float) -> None:
+    """Send what a running burst owes in this step."""
+    if link.file_transfer is not None and not link.file_transfer.idle:
+        for (system, component), payload in link.file_transfer.burst(now_s):
+            link.send(dialect.MAVLink_file_transfer_protocol_message(0, system, component, payload))

@@ -1,0 +1,101 @@
+"""The vehicle's MAVLink connections: what each is sent, who was heard on it, what goes to another."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from mavlink_sim.px4.parameters import Parameter
+from mavlink_sim.services.file_transfer import Server
+from mavlink_sim.wire.announcements import Text
+from mavlink_sim.wire.messages import Outgoing, dialect
+from mavlink_sim.wire.signing import Signing
+from mavlink_sim.wire.streams import Streams
+
+AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
+GROUND_STATION_TIMEOUT_S = 2.5
+STATUS_TEXT_LENGTH = 50
+
+
+class Link:
+    """One connection: its streams, its outbox, and the components heard on it."""
+
+    def __init__(self, name: str, system_id: int, rates_hz: dict[str, float], phase_s: float) -> None:
+        self.name = name
+        self.streams = Streams(rates_hz, phase_s)
+        self.outbox: deque[Outgoing] = deque()
+        self.components: set[tuple[int, int]] = set()
+        self.ground_station_seen_s = -math.inf
+        self.parameters_left: deque[Parameter] = deque()
+        self.parameter_credit = 0.0
+        self.file_transfer: Server | None = None  # made when somebody asks
+        self.signing = Signing()
+        self.tells_parameter_errors = True
+        self.sent = 0
+        self.received = 0
+        self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
+        self._system_id = system_id
+        self._text_identifier = 0
+
+    def send(self, message: Any) -> None:
+        """Queue a message of the vehicle's own."""
+        if self.gate is not None:
+            message = self.gate(self, message)
+            if message is None:
+                return
+        self.sent += 1
+        self.outbox.append(Outgoing(message, self._system_id, AUTOPILOT_COMPONENT))
+
+    def send_text(self, text: Text, now_s: float) -> None:
+        """STATUSTEXT, in chunks where it is long, if a ground station's heartbeat arrives on this link."""
+        if not text.text or now_s - self.ground_station_seen_s >= GROUND_STATION_TIMEOUT_S:
+            return
+        encoded = text.text.encode()
+        if len(encoded) <= STATUS_TEXT_LENGTH:
+            self.send(dialect.MAVLink_statustext_message(text.severity, encoded))
+            return
+        self._text_identifier = self._text_identifier % 65535 + 1
+        for sequence, start in enumerate(range(0, len(encoded), STATUS_TEXT_LENGTH)):
+            chunk = encoded[start : start + STATUS_TEXT_LENGTH]
+            self.send(
+                dialect.MAVLink_statustext_message(text.severity, chunk, self._text_identifier, sequence)
+            )
+
+    def forget(self) -> None:
+        """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
+        self.streams.restart(0)
+        self.sent = self.received = self._text_identifier = 0
+        self.parameter_credit = 0.0
+        self.outbox.clear()
+        self.components.clear()
+        self.ground_station_seen_s = -math.inf
+        self.parameters_left.clear()
+        self.file_transfer = None
+
+    def knows(self, system: int, component: int) -> bool:
+        """Whether a message to this target is worth sending here (PX4's `component_was_seen`)."""
+        if system == 0:
+            return bool(self.components)
+        return any(
+            system == seen_system and component in (0, seen_component)
+            for seen_system, seen_component in self.components
+        )
+
+
+def target_of(message: Any) -> tuple[int, int]:
+    """(system, component) a message is addressed to; (0, 0) where it has no address."""
+    return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+
+
+def forward(message: Any, source: Link, links: Iterable[Link], system_id: int) -> None:
+    """PX4's forwarding: broadcasts, and what is for another component, go on to where that was heard."""
+    system, component = target_of(message)
+    if system not in (0, system_id) or component == AUTOPILOT_COMPONENT:
+        return
+    if message.get_type() == "SETUP_SIGNING":
+        return  # a key is for the one it was told
+    for link in links:
+        if link is not source and link.knows(system, component):
+            link.outbox.append(Outgoing(message, message.get_srcSystem(), message.get_srcComponent(), True))

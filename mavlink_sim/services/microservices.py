@@ -1,0 +1,160 @@
+"""How the vehicle answers each message it understands (MAVLink's "microservices")."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.autopilot.commander import ACCEPTED
+from mavlink_sim.flight.setpoints import (
+    SetpointRejectedError,
+    attitude_setpoint,
+    flyable,
+    global_trajectory_setpoint,
+    trajectory_setpoint,
+)
+from mavlink_sim.physics.geography import geographic
+from mavlink_sim.services import (
+    commands,
+    event_protocol,
+    file_transfer,
+    gimbal_protocol,
+    mission_link,
+    mission_transfer,
+    parameter_protocol,
+    pilot_link,
+)
+from mavlink_sim.wire import signing
+from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.messages import dialect
+
+if TYPE_CHECKING:
+    from mavlink_sim.services.links import Link
+    from mavlink_sim.vehicle import Vehicle
+
+MAV_TYPE_GCS = 6
+MAV_TYPE_ONBOARD_CONTROLLER = 18
+# Commander takes commands from a queue, in order, a moment after they arrived: 0-15 ms were measured.
+COMMANDER_DELAY_S = 0.004
+
+
+def _heartbeat(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if message.type == MAV_TYPE_GCS:
+        link.ground_station_seen_s = vehicle.autopilot.supervision.ground_station_seen_s = vehicle.now_s
+    elif message.type == MAV_TYPE_ONBOARD_CONTROLLER and message.get_srcSystem() == vehicle.system_id:
+        vehicle.companion_heard()
+
+
+def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if commands.is_misencoded(message):
+        _acknowledge(link, message, message.command, commands.DENIED)
+        return
+    command = commands.command_of(message)
+    if command.identifier in commands.ANSWERED_TWICE and vehicle.release.acknowledges_modes_twice:
+        _acknowledge(link, message, command.identifier, ACCEPTED)
+    if command.identifier in commands.ANSWERED_BY_RECEIVER:
+        _execute(vehicle, link, message, command)
+    else:
+        vehicle.after(COMMANDER_DELAY_S, lambda: _execute(vehicle, link, message, command))
+
+
+def _execute(vehicle: Vehicle, link: Link, message: Any, command: commands.Command) -> None:
+    result = vehicle.faults.refuses(command.identifier, command.parameters)
+    if result is None:
+        result = commands.execute(vehicle, link, command)
+    if result is not None:
+        _acknowledge(link, message, command.identifier, result)
+
+
+def _acknowledge(link: Link, message: Any, command: int, result: int) -> None:
+    link.send(
+        dialect.MAVLink_command_ack_message(
+            command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+        )
+    )
+
+
+def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
+    custom = int(message.custom_mode)
+    values = (
+        float(message.base_mode),
+        float(custom >> 16 & 0xFF),
+        float(custom >> 24 & 0xFF),
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
+    command = commands.Command(commands.DO_SET_MODE, values, message.get_srcComponent())
+    vehicle.after(COMMANDER_DELAY_S, lambda: _execute(vehicle, link, message, command))
+
+
+def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+    try:
+        frame = vehicle.estimate
+        setpoint = trajectory_setpoint(message, frame.yaw_rad, frame.roll_rad, frame.pitch_rad)
+    except SetpointRejectedError as error:
+        vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
+        return
+    vehicle.autopilot.offboard_setpoint(flyable(setpoint))
+
+
+def _global_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+    autopilot = vehicle.autopilot
+    home_altitude = geographic(autopilot.home)[2] if autopilot.sensors_ready else None
+    try:
+        setpoint = global_trajectory_setpoint(message, home_altitude)
+    except SetpointRejectedError as error:
+        autopilot.texts.append(Text(CRITICAL, f"{error}\t"))
+        return
+    if setpoint is not None:
+        autopilot.offboard_setpoint(flyable(setpoint))
+
+
+def _attitude_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
+    setpoint = attitude_setpoint(message)
+    if setpoint is not None:
+        vehicle.autopilot.offboard_setpoint(setpoint)
+
+
+def _timesync(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if message.tc1 == 0:
+        link.send(dialect.MAVLink_timesync_message(vehicle.clock_ns(), message.ts1))
+
+
+def _ping(vehicle: Vehicle, link: Link, message: Any) -> None:
+    if message.target_system == 0 and message.target_component == 0:  # else it is an answer
+        link.send(
+            dialect.MAVLink_ping_message(
+                message.time_usec, message.seq, message.get_srcSystem(), message.get_srcComponent()
+            )
+        )
+
+
+Handler = Callable[["Vehicle", "Link", Any], None]
+
+HANDLERS: dict[str, Handler] = {
+    "HEARTBEAT": _heartbeat,
+    "COMMAND_LONG": _command,
+    "COMMAND_INT": _command,
+    "SET_MODE": _set_mode,
+    "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
+    "SET_POSITION_TARGET_GLOBAL_INT": _global_setpoint,
+    "SET_ATTITUDE_TARGET": _attitude_setpoint,
+    "MANUAL_CONTROL": pilot_link.manual_control,
+    "RC_CHANNELS_OVERRIDE": pilot_link.rc_channels_override,
+    "GIMBAL_MANAGER_SET_ATTITUDE": gimbal_protocol.set_attitude,
+    "GIMBAL_MANAGER_SET_PITCHYAW": gimbal_protocol.set_pitchyaw,
+    "GIMBAL_MANAGER_SET_MANUAL_CONTROL": gimbal_protocol.set_manual_control,
+    "TIMESYNC": _timesync,
+    "PING": _ping,
+    "PARAM_REQUEST_LIST": parameter_protocol.request_list,
+    "PARAM_REQUEST_READ": parameter_protocol.request_read,
+    "PARAM_SET": parameter_protocol.set_parameter,
+    "FILE_TRANSFER_PROTOCOL": file_transfer.handle,
+    "SETUP_SIGNING": signing.setup_signing,
+    "UNKNOWN_412": event_protocol.request,
+    **dict.fromkeys(mission_transfer.MESSAGES, mission_transfer.handle),
+    "LANDING_TARGET": mission_link.landing_target,
+    "OBSTACLE_DISTANCE": mission_link.obstacle_distance,
+}

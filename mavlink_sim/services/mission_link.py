@@ -1,0 +1,95 @@
+"""The Navigator's side of the links: announcements, the commands of a mission, targets and obstacles."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.flight.precision_landing import LandingTarget
+from mavlink_sim.missions import items as mission_items
+from mavlink_sim.missions.items import MissionItem
+from mavlink_sim.missions.navigator import Reached, goes_to_camera
+from mavlink_sim.physics.geography import geographic
+from mavlink_sim.services import commands
+from mavlink_sim.services.links import AUTOPILOT_COMPONENT
+from mavlink_sim.services.mission_messages import mission_current
+from mavlink_sim.wire.announcements import CRITICAL, Text
+from mavlink_sim.wire.messages import dialect
+
+if TYPE_CHECKING:
+    from mavlink_sim.services.links import Link
+    from mavlink_sim.vehicle import Vehicle
+
+CAMERA_COMPONENT = 100  # MAV_COMP_ID_CAMERA
+LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
+MAX_PLACE_M = 1e6
+# a single shot goes to PX4's camera trigger as DO_DIGICAM_CONTROL, "shoot"
+_SHOOT = (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+
+
+def update(vehicle: Vehicle) -> None:
+    """Tell the links what happened in this step, send commands on, look after transfers."""
+    navigator = vehicle.autopilot.navigator
+    while navigator.announcements:
+        announcement = navigator.announcements.popleft()
+        for link in vehicle.links.values():
+            if isinstance(announcement, Reached):
+                link.send(dialect.MAVLink_mission_item_reached_message(announcement.sequence))
+            elif navigator.mission.items:
+                link.send(mission_current(vehicle))
+    while navigator.commands:
+        _carry_out(vehicle, navigator.commands.popleft())
+    for session in navigator.sessions.values():
+        session.update()
+
+
+def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
+    """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
+    command, values = item.command, item.parameters
+    if item.frame != mission_items.FRAME_MISSION:
+        values = (*values[:6], geographic(item.place(vehicle.autopilot.home))[2])
+    target = 0
+    if goes_to_camera(command):
+        target = CAMERA_COMPONENT
+        if command not in (mission_items.START_VIDEO, mission_items.STOP_VIDEO) and 1.0 <= values[0] < 256.0:
+            target = int(values[0])
+        if command == mission_items.START_CAPTURE and values[2] == 1.0:
+            command, values = mission_items.DIGICAM_CONTROL, _SHOOT
+    for link in vehicle.links.values():
+        link.send(dialect.MAVLink_command_long_message(vehicle.system_id, target, command, 0, *values))
+    if target == 0 and vehicle.links:
+        own = commands.Command(command, values, AUTOPILOT_COMPONENT)
+        commands.execute(vehicle, next(iter(vehicle.links.values())), own)
+
+
+# ---- messages ---------------------------------------------------------------------------------------------
+
+
+def landing_target(vehicle: Vehicle, link: Link, message: Any) -> None:
+    """LANDING_TARGET. PX4 takes a position in LOCAL_NED; angles are for an infrared beacon's estimator."""
+    if not message.position_valid:
+        return
+    if message.frame != LOCAL_NED:
+        text = Text(CRITICAL, f"Landing target: coordinate frame {message.frame} unsupported\t")
+        vehicle.autopilot.texts.append(text)
+        return
+    place = (message.x, message.y, message.z)
+    if all(abs(value) < MAX_PLACE_M for value in place):
+        vehicle.autopilot.navigator.target = LandingTarget(place, vehicle.autopilot.now_s)
+
+
+def obstacle_distance(vehicle: Vehicle, link: Link, message: Any) -> None:
+    """OBSTACLE_DISTANCE, for collision prevention."""
+    increment = message.increment_f if message.increment_f > 0.0 else float(message.increment)
+    try:
+        vehicle.autopilot.navigator.obstacles.add(
+            message.distances,
+            increment,
+            message.angle_offset,
+            message.min_distance,
+            message.max_distance,
+            message.frame,
+            vehicle.estimate.yaw_rad,
+            vehicle.autopilot.now_s,
+        )
+    except ValueError as error:
+        vehicle.autopilot.texts.append(Text(CRITICAL, f"{error}\t"))

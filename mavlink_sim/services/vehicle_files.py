@@ -1,0 +1,158 @@
+"""The files a vehicle offers by MAVLink FTP: its parameters, the metadata that describes it, its log folder.
+
+As in PX4: parameters that differ from their defaults in BSON; metadata (https://mavlink.io/en/services/
+component_information.html) as xz-compressed JSON under /etc/extras, found through COMPONENT_METADATA.
+ArduPilot's packed parameters (`@PARAM/param.pck`) PX4 does not have; `offer_packed_parameters` adds them.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import struct
+from collections.abc import Callable, Iterable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
+from mavlink_sim.services.file_system import FileSystem
+from mavlink_sim.services.file_transfer import checksum
+from mavlink_sim.wire import announcements
+from mavlink_sim.wire.messages import component_metadata
+
+if TYPE_CHECKING:
+    from mavlink_sim.vehicle import Vehicle
+
+GENERAL = "etc/extras/component_general.json.xz"
+PARAMETERS = "etc/extras/parameters.json.xz"
+EVENTS = "etc/extras/all_events.json.xz"
+# COMP_METADATA_TYPE
+PARAMETER_TYPE = 1
+EVENTS_TYPE = 4
+
+_BSON_DOUBLE, _BSON_INT32 = 0x01, 0x10
+_PACK_MAGIC = 0x671B
+_PACK_INT32, _PACK_FLOAT = 3, 4
+
+
+def vehicle_files(parameters: Parameters) -> FileSystem:
+    """The files of a new vehicle; those made of the parameters follow them."""
+    files = FileSystem()
+    files.provide("parameters.bson", lambda: bson(parameters.customised()))
+    files.provide("parameters_backup.bson", lambda: bson(parameters.customised()))
+    files.provide(GENERAL, lambda: _compressed(general_metadata()))
+    files.provide(PARAMETERS, lambda: _compressed(parameter_metadata()))
+    files.provide(EVENTS, lambda: _compressed(event_metadata()))
+    files.make_directory("log")
+    return files
+
+
+def offer_packed_parameters(files: FileSystem, parameters: Parameters) -> None:
+    """Add `@PARAM/param.pck`, which ArduPilot has and ground stations written for it ask for."""
+    files.provide("@PARAM/param.pck", lambda: packed_parameters(parameters))
+
+
+def bson(parameters: Iterable[Parameter]) -> bytes:
+    """PX4's parameter file: one BSON document (bsonspec.org) of int32 and double elements."""
+    body = bytearray()
+    for parameter in parameters:
+        name = parameter.name.encode() + b"\0"
+        if parameter.kind == INT32:
+            body += bytes([_BSON_INT32]) + name + struct.pack("<i", parameter.value)
+        else:
+            body += bytes([_BSON_DOUBLE]) + name + struct.pack("<d", parameter.value)
+    return struct.pack("<i", len(body) + 5) + body + b"\0"
+
+
+def packed_parameters(parameters: Iterable[Parameter]) -> bytes:
+    """ArduPilot's packed parameters (its AP_Filesystem documentation): names share their beginnings.
+
+    A header (magic, number here, number in all), then of each parameter its type in 4 bits, flags in 4
+    (none), the length shared with the name before in 4 bits, that of the rest less one in 4, the rest, value.
+    """
+    listed = list(parameters)
+    packed = bytearray(struct.pack("<HHH", _PACK_MAGIC, len(listed), len(listed)))
+    before = ""
+    for parameter in listed:
+        name = parameter.name
+        shared = 0
+        while shared < min(len(name) - 1, len(before), 15) and name[shared] == before[shared]:
+            shared += 1
+        kind, code = (_PACK_INT32, "<i") if parameter.kind == INT32 else (_PACK_FLOAT, "<f")
+        packed += bytes([kind, shared | (len(name) - shared - 1) << 4])
+        packed += name[shared:].encode() + struct.pack(code, parameter.value)
+        before = name
+    return bytes(packed)
+
+
+# ---- metadata
+
+
+@cache
+def parameter_metadata() -> bytes:
+    """JSON by MAVLink's parameter schema: name, type, group and default of each."""
+    listed = []
+    for parameter in default_parameters():
+        name = parameter.name
+        entry: dict[str, Any] = {
+            "name": name,
+            "type": "Int32" if parameter.kind == INT32 else "Float",
+            "default": parameter.value,
+            "group": name.split("_")[0],
+            "category": "System" if is_volatile(name) else "Standard",
+            "shortDesc": name,
+        }
+        if is_volatile(name):
+            entry["volatile"] = True
+        listed.append(entry)
+    return _json({"version": 1, "parameters": listed})
+
+
+@cache
+def event_metadata() -> bytes:
+    """JSON by MAVLink's events schema: what the vehicle's events are called and say."""
+    events = {
+        str(identifier & 0xFFFFFF): {
+            "name": name,
+            "message": message,
+            **({"arguments": arguments} if arguments else {}),
+        }
+        for identifier, name, message, arguments in announcements.EVENT_TEXTS
+    }
+    return _json(
+        {
+            "version": 2,
+            "components": {
+                "1": {"namespace": "px4", "event_groups": {"default": {"events": events}}},
+            },
+        }
+    )
+
+
+@cache
+def general_metadata() -> bytes:
+    """JSON by MAVLink's general schema: which other metadata there is, where, with which checksum."""
+    files: list[tuple[int, str, Callable[[], bytes]]] = [
+        (PARAMETER_TYPE, PARAMETERS, parameter_metadata),
+        (EVENTS_TYPE, EVENTS, event_metadata),
+    ]
+    types = [
+        {"type": kind, "uri": f"mftp://{path}", "fileCrc": checksum(content())}
+        for kind, path, content in files
+    ]
+    return _json({"version": 1, "metadataTypes": types})
+
+
+def metadata_message(vehicle: Vehicle) -> Any:
+    """COMPONENT_METADATA: where the general metadata is."""
+    return component_metadata(vehicle.boot_ms, checksum(general_metadata()), f"mftp://{GENERAL}")
+
+
+def _json(value: dict[str, Any]) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+
+
+@cache
+def _compressed(content: bytes) -> bytes:
+    # CRC32 instead of xz's usual CRC64: the decoders on flight controllers' clients know no other
+    return lzma.compress(content, check=lzma.CHECK_CRC32, preset=6)

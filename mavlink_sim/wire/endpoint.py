@@ -1,0 +1,115 @@
+"""UDP endpoints for a vehicle's links: bound like PX4's, sending to a fixed port until somebody answers."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import socket
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from mavlink_sim.wire.faulty_socket import FaultySocket
+from mavlink_sim.wire.messages import Outgoing, parser
+from mavlink_sim.wire.signing import Signing
+
+logger = logging.getLogger(__name__)
+
+# A peer that was silent this long may be replaced by another one (PX4 itself keeps its first peer for ever).
+PEER_SILENCE_S = 5.0
+# A socket buffer's worth of full-size datagrams; more in one go means a client that floods us.
+MAX_DATAGRAMS_PER_READ = 200
+
+
+class PortInUseError(OSError):
+    """The port that an endpoint should bind is taken."""
+
+
+class UdpEndpoint:
+    """One bound UDP socket, non-blocking.
+
+    Sends to `peer_port` from the start, as PX4 does, then to its first correspondent until that falls silent.
+    Each outgoing message is one datagram. `on_packet` is shown every packet, sent or received, if it is set.
+
+    Raises:
+        PortInUseError: `bind_port` is taken; 0 chooses a free one.
+        OSError: `host` is no address of this machine.
+    """
+
+    def __init__(self, host: str, bind_port: int, peer_port: int, system_id: int = 1) -> None:
+        self.socket: socket.socket | FaultySocket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        try:
+            self.socket.bind((host, bind_port))
+        except OSError as error:
+            self.socket.close()
+            if error.errno == errno.EADDRINUSE:
+                raise PortInUseError(
+                    f"UDP port {host}:{bind_port} is already in use; stop its user or choose another port"
+                ) from error
+            raise OSError(f"cannot bind UDP {host}:{bind_port}: {error}") from error
+        self.peer: tuple[str, int] = (host, peer_port)
+        self._peer_heard_s: float | None = None
+        self._codec = parser(system_id)
+        self.signing = Signing()
+        self._refused = False
+        self.on_packet: Callable[[bytes], None] | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it is bound to."""
+        return int(self.socket.getsockname()[1])
+
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    def receive(self) -> list[Any]:
+        """Every message that has arrived; damaged bytes are skipped and counted by the codec."""
+        messages: list[Any] = []
+        for _ in range(MAX_DATAGRAMS_PER_READ):
+            try:
+                datagram, sender = self.socket.recvfrom(65535)
+            except BlockingIOError:
+                break
+            except ConnectionRefusedError:
+                continue  # an ICMP answer to something we sent earlier: nobody listens there now
+            found = [
+                message
+                for message in self._codec.parse_buffer(datagram) or []
+                if message.get_type() != "BAD_DATA" and self.signing.accepts(message.get_msgbuf())
+            ]
+            if found:
+                self._hear(sender)
+                messages.extend(found)
+                if self.on_packet is not None:
+                    for message in found:
+                        self.on_packet(bytes(message.get_msgbuf()))
+        return messages
+
+    def _hear(self, sender: tuple[str, int]) -> None:
+        now = time.monotonic()
+        if self._peer_heard_s is None or sender == self.peer or now - self._peer_heard_s > PEER_SILENCE_S:
+            if sender != self.peer:
+                logger.info("the link on port %d talks to %s:%d", self.port, *sender)
+            self.peer = sender
+            self._peer_heard_s = now
+
+    def send(self, outgoing: Iterable[Outgoing]) -> None:
+        """Send each message; what the network cannot take now is dropped, as a radio would."""
+        for item in outgoing:
+            packet = item.pack(self._codec)
+            if self.signing.has_key and not item.forwarded:
+                packet = self.signing.signed(packet)
+            if self.on_packet is not None:
+                self.on_packet(packet)
+            try:
+                self.socket.sendto(packet, self.peer)
+            except (BlockingIOError, ConnectionRefusedError):
+                continue
+            except OSError as error:
+                if not self._refused:
+                    logger.warning("cannot send to %s:%d: %s", *self.peer, error)
+                    self._refused = True
+
+    def close(self) -> None:
+        self.socket.close()

@@ -1,0 +1,1 @@
+"""What there is to see: the solids, colours and textures of what stands on the ground."""
