@@ -16,8 +16,8 @@ DEFAULT_RECIPE = TrainingSettings(
     width_multiple=0.125,
     max_channels=1024,
     # Small pictures have the same field of view: as many objects for a quarter of the work, at half the
-    # pixels. Then the frames' own size; and, because small objects were what was missed, both once more.
-    # Scenes come round, augmented anew.
+    # pixels. Then the frames' own size; and, because small objects were what was missed, both once and
+    # again. Scenes come round, augmented anew.
     stages=(
         Stage(320, 256, 16, 3970, scenes=12_000),
         Stage(640, 480, 8, 3900, scenes=6_000, decay_steps=3900),
