@@ -12,7 +12,7 @@ from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.target import Target
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.state import FlightMode, Vector3, VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 
 
@@ -97,6 +97,10 @@ class Behaviour(ABC):
     class_names: tuple[str, ...] = ()
     # Vehicles whose poses must be fresh, where it requires NEIGHBOURS.
     neighbour_names: tuple[str, ...] = ()
+
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """Where it would fly to if it began now, local NED metres, as far as that is known before."""
+        return ()
 
     def on_activate(self, situation: Situation) -> None:  # noqa: B027  (a hook that may be left out)
         """Called once, before the first update."""

@@ -395,7 +395,7 @@ class Formation(Command):
 
     shape: Annotated[str, Choice("shape", SHAPES, "of the formation")]
     leader: Annotated[str, Word("leader", 'vehicle.name of the leader, or "virtual"')]
-    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 5.0
+    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 6.0
     slot: Annotated[str, Word("slot", "number of the slot to take, from 1, or auto")] = "auto"
     points: Annotated[
         str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')

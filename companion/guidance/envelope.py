@@ -99,6 +99,17 @@ class Envelope:
         """Forget the last setpoint: the next one starts from how the vehicle really moves."""
         self._velocity = self._yaw_rad = None
 
+    def why_not_there(self, goal: Vector3, state: VehicleState) -> str | None:
+        """Why a goal (local NED metres) is nowhere to fly to; None: it is allowed. Height is not judged."""
+        home = state.home_position_ned_m or self._home or (0.0, 0.0, 0.0)
+        away = (goal[0] - home[0], goal[1] - home[1])
+        where = f"{away[0]:.1f} m north and {away[1]:.1f} m east of home"
+        if math.hypot(*away) > self.limits.max_distance_m:
+            return f"{where} is farther than guidance.max_distance_m = {self.limits.max_distance_m:g}"
+        if not self.limits.fence.holds(away):
+            return f"{where} is not inside the fence (guidance.fence_include, fence_exclude)"
+        return None
+
     def apply(
         self,
         setpoint: Setpoint,

@@ -22,6 +22,11 @@ class FigureEightBehaviour(PathFlight):
         super().__init__(speed_mps, laps=laps, nose_along=nose_along)
         self._radius_m = radius_m
 
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        centre, yaw_rad = position_and_yaw(situation.state)
+        return tuple(lemniscate(centre, yaw_rad, self._radius_m))
+
     def _path(self, situation: Situation) -> Path:
         centre, yaw_rad = position_and_yaw(situation.state)
         return Path(lemniscate(centre, yaw_rad, self._radius_m), self._speed_mps, closed=True)

@@ -35,13 +35,22 @@ class FollowPathBehaviour(PathFlight):
         self._points = tuple(points)
         self._round_trip = round_trip or laps != 1.0
 
-    def _path(self, situation: Situation) -> Path:
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        return tuple(self._places(situation))
+
+    def _places(self, situation: Situation) -> list[Vector3]:
         position, _ = position_and_yaw(situation.state)
         home = home_of(situation.state)
         down, places = position[2], list[Vector3]()
         for north, east, *height in self._points:
             down = home[2] - height[0] if height else down
             places.append((home[0] + north, home[1] + east, down))
+        return places
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        places = self._places(situation)
         if self._round_trip:
             return Path(places, self._speed_mps, closed=True)
         return Path([position, *places], self._speed_mps)

@@ -76,7 +76,7 @@ class FormationBehaviour(Behaviour):
         self,
         shape: str,
         leader: str,
-        spacing_m: float = 5.0,
+        spacing_m: float = 6.0,
         slot: int | None = None,
         *,
         points: Sequence[tuple[float, ...]] = (),

@@ -51,6 +51,13 @@ class GotoBehaviour(PathFlight):
             position = (goal[0], goal[1], goal[2] - NEAREST_M)
         return Path([position, goal], self._speed_mps)
 
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        try:
+            return (self._goal(situation),)
+        except ValueError:
+            return ()  # it says so when it begins
+
     def _goal(self, situation: Situation) -> Vector3:
         state = situation.state
         position, yaw_rad = position_and_yaw(state)

@@ -76,6 +76,10 @@ class PatrolBehaviour(Behaviour):
         self._blind_since_ns: int | None = None
         self._found = 0
 
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        return self._way.goals(situation)
+
     def on_activate(self, situation: Situation) -> None:
         self._way.on_activate(situation)
         self._sightings.reset(situation.now_ns)

@@ -173,9 +173,14 @@ class Pilot:
 
     def refusal_of(self, behaviour: Behaviour) -> str | None:
         """Why this behaviour could not begin now; None: it could."""
-        return refusal(
-            behaviour, self._situation, self._class_names(), self._battery.minimum, self._obstacles
-        )
+        situation = self._situation
+        missing = refusal(behaviour, situation, self._class_names(), self._battery.minimum, self._obstacles)
+        if missing is not None or situation is None:
+            return missing
+        for goal in behaviour.goals(situation):
+            if (why := self._envelope.why_not_there(goal, situation.state)) is not None:
+                return f"{behaviour.name} would leave the limits: {why}"
+        return None
 
     def update(self, situation: Situation) -> None:
         """One turn of the guidance loop. Never waits."""

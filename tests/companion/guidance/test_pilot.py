@@ -5,10 +5,16 @@ import pytest
 from kinematic_vehicle import KinematicVehicle
 from scripted_autopilot import Cockpit
 
+from companion.fence import Fence
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement
+from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.figure_eight import FigureEightBehaviour
+from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.pilot import PilotEventKind
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.stop import StopBehaviour
@@ -435,6 +441,39 @@ async def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_doe
     assert not future.done()
     assert cockpit.pilot.phase == "offboard"
     assert cockpit.pilot.asked.yaw_rate_radps in (None, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "where"),
+    [
+        (GotoBehaviour(from_home_m=(30.0, 5000.0)), "30.0 m north and 5000.0 m east of home is farther than"),
+        (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "0.0 m north and -7000.0 m east of home"),
+        (PatrolBehaviour([(0.0, 0.0), (9000.0, 0.0)], ("car",)), "9000.0 m north"),
+        (FigureEightBehaviour(6000.0, 3.0, 1.0), "is farther than guidance.max_distance_m"),
+    ],
+)
+async def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(behaviour, where):
+    cockpit = Cockpit(flying())
+    await cockpit.turn(0.1)
+    outcome = cockpit.pilot.command(behaviour).result()
+    assert not outcome.success
+    assert outcome.reason.startswith(f"{behaviour.name} would leave the limits: ")
+    assert where in outcome.reason
+    assert not cockpit.autopilot.setpoints
+
+
+async def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not():
+    cockpit = Cockpit(flying())
+    cockpit.pilot._envelope = Envelope(
+        Limits(fence=Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))))
+    )
+    await cockpit.turn(0.1)
+    outcome = cockpit.pilot.command(GotoBehaviour(from_home_m=(30.0, 0.0))).result()
+    assert outcome.reason == (
+        "goto would leave the limits: 30.0 m north and 0.0 m east of home is not inside the fence "
+        "(guidance.fence_include, fence_exclude)"
+    )
+    assert not cockpit.pilot.command(GotoBehaviour(from_home_m=(10.0, 0.0))).done()
 
 
 async def test_a_refusal_leaves_the_current_behaviour_flying():
