@@ -254,7 +254,11 @@ def test_at_most_fifty_attitudes_a_second_go_to_the_worker_and_none_twice(rate_h
 @pytest.mark.parametrize("key", ["tracker.enabled", "tracker.camera_motion", "detector.enabled"])
 def test_an_attitude_nobody_wants_is_not_sent(key: str) -> None:
     told = Turned()
-    keeper_with(told, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    blind = {"guidance.obstacles": "off"}
+    keeper_with(told, **blind, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
     assert told.stamps_ns == []
+    keeper_with(told, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    assert told.stamps_ns == [1], "obstacles need it"
+    told.stamps_ns.clear()
     keeper_with(told).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
     assert told.stamps_ns == [1]

@@ -174,7 +174,9 @@ def test_a_gimbal_and_a_parameter_of_px4s_are_refused_in_words() -> None:
 def test_a_whole_flight_by_mavutil(tmp_path: Path) -> None:
     """As the tutorials for ArduPilot fly: modes by name, arm, take off, go, come home."""
     with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=6.0) as simulator:
-        link = mavutil.mavlink_connection(simulator.pymavlink_device, source_system=255)
+        link = mavutil.mavlink_connection(
+            simulator.pymavlink_device, source_system=255, dialect="ardupilotmega"
+        )
         link.wait_heartbeat(timeout=20)
         assert link.mode_mapping()["GUIDED"] == 4
 
@@ -186,8 +188,12 @@ def test_a_whole_flight_by_mavutil(tmp_path: Path) -> None:
                     return message
             raise TimeoutError(name)
 
-        link.mav.request_data_stream_send(1, 1, 0, 10, 1)
-        until("EKF_STATUS_REPORT", lambda m: m.flags & 16)
+        deadline = time.monotonic() + 40.0
+        positioned = None
+        while positioned is None:  # a request may be lost, as any datagram
+            assert time.monotonic() < deadline
+            link.mav.request_data_stream_send(1, 1, 0, 10, 1)
+            positioned = link.recv_match(condition="EKF_STATUS_REPORT.flags & 16", blocking=True, timeout=2.0)
         link.set_mode("GUIDED")
         until("HEARTBEAT", lambda m: m.custom_mode == 4)
         link.arducopter_arm()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import tty
 from collections.abc import Callable
 from pathlib import Path
@@ -66,6 +67,7 @@ def test_a_terminal_is_read_and_may_go_away(command, said) -> None:
     tty.setraw(terminal)
     console = FaultConsole(terminal, command, said.append)
     os.write(controller, b"gust 5\n")
+    assert select.select([terminal], [], [], 10.0)[0]  # the terminal hands it on in its own time
     console.poll()
     assert said == ["fault 1 gust 5"]
     os.close(controller)
