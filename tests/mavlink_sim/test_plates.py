@@ -58,7 +58,7 @@ def test_every_dictionary_is_found_by_opencv(dictionary: str) -> None:
 @settings(max_examples=25, deadline=None)
 @given(
     yaw=st.floats(-math.pi, math.pi),
-    height=st.floats(1.5, 6.0),
+    height=st.floats(2.0, 6.0),
     north=st.floats(-0.5, 0.5),
     identifier=st.integers(0, 49),
 )
