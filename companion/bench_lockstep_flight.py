@@ -136,7 +136,7 @@ class LockstepFlight:
         self._seen_ns: int | None = None
         self.vehicle.take_off(height_m)
         still = Setpoint.brake(self.now_ns)
-        self._stream = self.vehicle.repeat(self._message(still), SETPOINT_RATE_HZ)
+        self._stream = self.vehicle.repeat(setpoint_message(still), SETPOINT_RATE_HZ)
         self.vehicle.step(0.5)
         self._take()
         self.vehicle.set_mode("OFFBOARD")
@@ -156,7 +156,9 @@ class LockstepFlight:
 
     def turn_to(self, yaw_rad: float, limit_s: float = 15.0) -> None:
         """Turn on the spot before the behaviour begins."""
-        self._stream.message = self._message(Setpoint.velocity((0.0, 0.0, 0.0), self.now_ns, yaw_rad=yaw_rad))
+        self._stream.message = setpoint_message(
+            Setpoint.velocity((0.0, 0.0, 0.0), self.now_ns, yaw_rad=yaw_rad)
+        )
         self.vehicle.run_until(
             lambda truth: abs(math.remainder(truth.yaw_rad - yaw_rad, math.tau)) < 0.05, limit_s
         )
@@ -208,7 +210,7 @@ class LockstepFlight:
                     sent, reasons = Limited(Setpoint.brake(now_ns), (blind,))
                 else:
                     sent, reasons = envelope.apply(step, situation.state, now_ns, dt_s)
-                self._stream.message = self._message(sent)
+                self._stream.message = setpoint_message(sent)
                 moment = Moment(self.seconds, self.vehicle.truth, situation, step, sent, reasons)
                 log.moments.append(moment)
                 self._judge(moment, log)
@@ -301,17 +303,19 @@ class LockstepFlight:
             if by > 0.0:
                 log.violated(what, by)
 
-    def _message(self, setpoint: Setpoint) -> object:
-        zero = (0.0, 0.0, 0.0)  # the type mask says what counts
-        return dialect.MAVLink_set_position_target_local_ned_message(
-            0,
-            1,
-            1,
-            dialect.MAV_FRAME_LOCAL_NED,
-            setpoint.type_mask,
-            *(setpoint.position_ned_m or zero),
-            *(setpoint.velocity_ned_mps or zero),
-            *zero,
-            setpoint.yaw_rad or 0.0,
-            setpoint.yaw_rate_radps or 0.0,
-        )
+
+def setpoint_message(setpoint: Setpoint) -> object:
+    """SET_POSITION_TARGET_LOCAL_NED as the drivers send it."""
+    zero = (0.0, 0.0, 0.0)  # the type mask says what counts
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        0,
+        1,
+        1,
+        dialect.MAV_FRAME_LOCAL_NED,
+        setpoint.type_mask,
+        *(setpoint.position_ned_m or zero),
+        *(setpoint.velocity_ned_mps or zero),
+        *zero,
+        setpoint.yaw_rad or 0.0,
+        setpoint.yaw_rate_radps or 0.0,
+    )

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from companion.bench_lockstep_flight import setpoint_message
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.marker_target import MarkerSight, MarkerTarget, marker_targets
@@ -73,7 +74,7 @@ class LandingFlight:
         self._seen: tuple[MarkerTarget, ...] = ()
         self._seen_ns = 0
         self._told_ns = 0
-        self._stream = self.vehicle.repeat(self._message(Setpoint.brake(0)), SETPOINT_RATE_HZ)
+        self._stream = self.vehicle.repeat(setpoint_message(Setpoint.brake(0)), SETPOINT_RATE_HZ)
         self._stream.stop()
         self._offboard = False
 
@@ -125,7 +126,7 @@ class LandingFlight:
                         self._enter_offboard()
                         envelope.reset()
                     sent, _ = envelope.apply(step, situation.state, now_ns, dt_s)
-                    self._stream.message = self._message(sent)
+                    self._stream.message = setpoint_message(sent)
                 self._tell(behaviour)
                 each(self.vehicle.truth)
             self.vehicle.step(TICK_S)
@@ -140,7 +141,7 @@ class LandingFlight:
             self._take()
 
     def _enter_offboard(self) -> None:
-        self._stream = self.vehicle.repeat(self._message(Setpoint.brake(0)), SETPOINT_RATE_HZ)
+        self._stream = self.vehicle.repeat(setpoint_message(Setpoint.brake(0)), SETPOINT_RATE_HZ)
         self.settle(0.1)
         self.vehicle.set_mode("OFFBOARD")
         self._take()
@@ -188,21 +189,6 @@ class LandingFlight:
             self._told_ns = target.captured_ns
             fields = landing_target_fields(target, AUTOPILOT_PX4)
             self.vehicle.send(dialect.MAVLink_landing_target_message(**fields))
-
-    def _message(self, setpoint: Setpoint) -> object:
-        zero = (0.0, 0.0, 0.0)  # the type mask says what counts
-        return dialect.MAVLink_set_position_target_local_ned_message(
-            0,
-            1,
-            1,
-            dialect.MAV_FRAME_LOCAL_NED,
-            setpoint.type_mask,
-            *(setpoint.position_ned_m or zero),
-            *(setpoint.velocity_ned_mps or zero),
-            *zero,
-            setpoint.yaw_rad or 0.0,
-            setpoint.yaw_rate_radps or 0.0,
-        )
 
 
 def beside_m(truth: Truth, place: tuple[float, float]) -> float:
