@@ -66,7 +66,8 @@ def test_followers_take_their_slots_and_keep_them_through_turns(shape):
 def test_one_that_joins_gets_a_slot_and_nobody_comes_near_anybody():
     fleet = flying(5)
     follow(fleet, "bc", "line")
-    assert fleet.run_until(lambda: settled(fleet, "bc"), 30.0)
+    # c goes a long way round: d and e stand where the short one leads.
+    assert fleet.run_until(lambda: settled(fleet, "bc"), 60.0)
     follow(fleet, "de", "line")
     assert fleet.run_until(lambda: settled(fleet, "bcde"), 40.0)
     assert sorted(slots(fleet, "b").values()) == [1, 2, 3, 4]
