@@ -15,6 +15,7 @@ _LONGEST_TEXT = 2 << 20
 _MOST_EVENTS = 100_000
 _DEEPEST = 32
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DumperBase: Any = yaml.SafeDumper
 
 
 class PlainYamlError(ValueError):
@@ -27,8 +28,13 @@ class _PlainLoader(_Base):  # type: ignore[misc]
     yaml_implicit_resolvers: ClassVar[dict[str, list[tuple[str, re.Pattern[str]]]]] = {}
 
 
+class PlainDumper(_DumperBase):  # type: ignore[misc]
+    """The safe dumper for this reader: a text that it would take for a number (`1e5`) gets quotes."""
+
+
 def _resolve(tag: str, pattern: str, first: str) -> None:
-    _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{tag}", re.compile(pattern), list(first))
+    for side in (_PlainLoader, PlainDumper):
+        side.add_implicit_resolver(f"tag:yaml.org,2002:{tag}", re.compile(pattern), list(first))
 
 
 _resolve("null", r"^(?:~|null|Null|NULL|)$", "~nN")

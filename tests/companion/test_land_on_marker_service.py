@@ -76,7 +76,7 @@ def test_the_service_lands_on_the_marker_that_it_is_told(tmp_path: Path, method:
         )
         # What a take-off needs to know is told within the first seconds.
         deadline_s = time.monotonic() + 20.0
-        while not (lifted := service.command("takeoff 4", timeout_s=60.0))["success"]:
+        while not (lifted := service.command("takeoff 3", timeout_s=60.0))["success"]:
             assert "needs" in lifted["reason"], lifted
             assert time.monotonic() < deadline_s, lifted
         landed = service.command(f"land-on-marker 7 method={method}", timeout_s=150.0)
@@ -113,6 +113,8 @@ def test_a_camera_that_looks_ahead_and_a_service_without_markers_refuse_by_name(
             assert "perception that looks for markers (markers.dictionary is not set)" in refused["reason"]
         ahead = flags(camera, "--markers-dictionary", "4X4_50", "--camera-mount-pitch-deg", "-20")
         with running_service(simulator.onboard_port, ahead, cwd=tmp_path) as service:
-            refused = service.command("land-on-marker 7")
+            deadline_s = time.monotonic() + 20.0
+            while "nothing came from it yet" in (refused := service.command("land-on-marker 7"))["reason"]:
+                assert time.monotonic() < deadline_s, refused
             assert not refused["success"]
             assert "camera that sees straight down (camera.mount_pitch_deg is -20)" in refused["reason"]

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 from torch import Tensor
 
-from vision.plain_yaml import PlainYamlError, load_plain_yaml
+from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml
 from vision.yolo.safe_pickle import CheckpointError, one_line
 from vision.yolo.safetensors_file import read_safetensors, write_safetensors
 
@@ -176,7 +176,7 @@ class _Row(list[Any]):
     """A list to be written on one line."""
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(PlainDumper):
     pass
 
 
