@@ -7,11 +7,11 @@ import os
 import queue
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import pytest
 from service_process import ServiceProcess, running_service
 
@@ -152,13 +152,13 @@ def test_a_service_that_is_ended_in_flight_lets_the_autopilot_hold(
         simulator.wait_for_event("mode HOLD", since=offboard)
 
 
-def test_frames_from_standard_input(small_model: Path, tmp_path: Path) -> None:
+def test_frames_that_ffmpeg_writes_to_standard_input(small_model: Path, tmp_path: Path) -> None:
     writer = subprocess.Popen(
         [
-            sys.executable,
-            "-c",
-            "import os, time\nwhile True:\n    os.write(1, bytes(64 * 48 * 3)); time.sleep(0.05)\n",
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-re", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=20"),
+            *("-f", "rawvideo", "-pix_fmt", "bgr24", "-"),
         ],
+        stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     )
