@@ -125,7 +125,7 @@ class LandingFlight:
                         requested = None
                         self._enter_offboard()
                         envelope.reset()
-                    sent, _ = envelope.apply(step, situation.state, now_ns, dt_s)
+                    sent, _ = envelope.apply(step, situation.state, now_ns, dt_s, landing=behaviour.landing)
                     self._stream.message = setpoint_message(sent)
                 self._tell(behaviour)
                 each(self.vehicle.truth)

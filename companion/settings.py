@@ -340,7 +340,7 @@ class GuidanceSection(Section):
     max_acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 2.0
     """largest change of the velocity asked for, metres a second squared"""
     min_altitude_m: Annotated[float, Field(gt=0, le=1000)] = 1.0
-    """never asks to fly lower than this above home (landing is the autopilot's own), metres"""
+    """never asks to fly lower than this above home, unless to land (on a marker, too), metres"""
     max_altitude_m: Annotated[float, Field(gt=0, le=5000)] = 50.0
     """never asks to fly higher than this above home, metres"""
     max_distance_m: Annotated[float, Field(gt=0, le=100000)] = 200.0

@@ -131,6 +131,11 @@ class Behaviour(ABC):
         return None
 
     @property
+    def landing(self) -> bool:
+        """Whether it comes down to the ground on purpose: the lowest altitude does not hold then."""
+        return False
+
+    @property
     def status(self) -> str:
         """A few words on what it is doing now, for people."""
         return self.name

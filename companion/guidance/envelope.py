@@ -93,6 +93,7 @@ class Envelope:
         self._home: Vector3 | None = None
         self._yaw_rad: float | None = None
         self._neighbours: Sequence[Neighbour] = ()
+        self._landing = False
         self.near: tuple[tuple[float, float, float], ...] = ()
 
     def reset(self) -> None:
@@ -117,6 +118,8 @@ class Envelope:
         now_ns: int,
         dt_s: float,
         neighbours: Sequence[Neighbour] = (),
+        *,
+        landing: bool = False,
     ) -> Limited:
         """What may be sent of a setpoint.
 
@@ -126,11 +129,12 @@ class Envelope:
             now_ns: CLOCK_MONOTONIC nanoseconds.
             dt_s: since the last call; more than 0.2 s counts as that.
             neighbours: other vehicles, to keep apart from.
+            landing: the lowest altitude does not hold: the way leads to the ground.
 
         Without a known position a position setpoint cannot be judged: a brake takes its place.
         """
         dt_s = max(0.0, min(dt_s, LONGEST_STEP_S))
-        self._neighbours = neighbours
+        self._neighbours, self._landing = neighbours, landing
         reasons: list[str] = []
         if state.home_position_ned_m is not None:
             self._home = state.home_position_ned_m
@@ -187,7 +191,7 @@ class Envelope:
         if down < -self._towards_fence(limits.max_altitude_m - altitude_m):
             down = -self._towards_fence(limits.max_altitude_m - altitude_m)
             reasons.append(f"altitude limited to {limits.max_altitude_m:g} m")
-        elif down > self._towards_fence(altitude_m - limits.min_altitude_m):
+        elif not self._landing and down > self._towards_fence(altitude_m - limits.min_altitude_m):
             down = self._towards_fence(altitude_m - limits.min_altitude_m)
             reasons.append(f"altitude kept above {limits.min_altitude_m:g} m")
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
@@ -253,7 +257,8 @@ class Envelope:
     ) -> Vector3:
         limits = self.limits
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
-        down = max(home[2] - limits.max_altitude_m, min(home[2] - limits.min_altitude_m, asked[2]))
+        lowest_down = math.inf if self._landing else home[2] - limits.min_altitude_m
+        down = max(home[2] - limits.max_altitude_m, min(lowest_down, asked[2]))
         if down != asked[2]:
             reasons.append(f"altitude kept within {limits.min_altitude_m:g} to {limits.max_altitude_m:g} m")
         away = _shorten((asked[0] - home[0], asked[1] - home[1], 0.0), limits.max_distance_m)

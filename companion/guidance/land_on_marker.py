@@ -22,15 +22,15 @@ from companion.vehicle.state import FlightMode, LandedState, Vector3
 # A sighting is a rumour: so many, the newest no older than this, make a pad.
 SIGHTINGS_NEEDED, SIGHT_FRESH_S = 3, 0.6
 # Unseen for so long, the descent waits; for so long, it is given up.
-WAIT_AFTER_S, LOST_AFTER_S = 0.4, 1.5
+WAIT_AFTER_S, LOST_AFTER_S = 0.4, 2.2
 # From higher up than this there is time: the place is remembered, and flown to, for longer.
 LOW_M, LOST_HIGH_AFTER_S = 3.5, 5.0
 # The cone: allowed distance beside the pad's centre, metres, at the ground and for each metre of height.
 CONE_M, CONE_PER_M = 0.10, 0.20
 # The answer to a distance beside the pad, 1/s, and how much more of a velocity is asked for where the vehicle
-# does not follow: like an MPC_XY_VEL_P_ACC of 5, the most PX4 allows. Measured in lockstep in gusts: it is
-# 0.2 m beside (median), with `motion.pressed` 0.3 m; with an acceleration limit of 2 m/s² it swings.
-GAIN_PER_S, PRESS = 1.0, 1.75
+# does not follow: like an MPC_XY_VEL_P_ACC of 5, the most PX4 allows. Measured in lockstep in gusts, with an
+# acceleration limit of 5 m/s².
+GAIN_PER_S, PRESS = 1.6, 1.75
 DESCENT_MPS, SLOWEST_DESCENT_MPS, DESCENT_PER_M = 0.8, 0.2, 0.3
 # Unseen, it rises a little: from higher up more is in the picture. So slowly, m/s.
 RISE_MPS = 0.3
@@ -39,13 +39,11 @@ HEIGHT_GAIN_PER_S, HEIGHT_LEASH_M = 1.2, 0.5
 # Blind from here on: a marker of a pad's size no longer fits into the picture.
 FINAL_M = 0.45
 # What may be off when the blind part begins: the distance, and what the speed will make of it.
-FINAL_ERROR_M, FINAL_LOOKAHEAD_S = 0.13, 0.35
+FINAL_ERROR_M, FINAL_LOOKAHEAD_S = 0.12, 0.35
 # In gusts it never stands that still: after so long of waiting, what is allowed has grown by as much again.
 PATIENCE_S = 6.0
 # Seen so far off during the blind part, and still so high, it is not landed.
 MISSED_M, MISSED_HEIGHT_M = 0.3, 0.45
-# The envelope's floor keeps us from going lower: asked and not let through for so long, it is the floor.
-FLOOR_S, FLOOR_HEIGHT_M = 0.4, 4.0
 CLIMB_MPS, CLIMB_M = 1.0, 2.5
 TOUCHDOWN_MPS = 0.7
 BASE_TIMEOUT_S, BLIND_TIMEOUT_S, LANDING_TIMEOUT_S, DELEGATED_TIMEOUT_S = 60.0, 5.0, 30.0, 150.0
@@ -99,7 +97,6 @@ class LandOnMarkerBehaviour(Behaviour):
         self._newest_ns = 0
         self._blind_since_ns: int | None = None
         self._waiting_s = self._blocked_s = 0.0
-        self._asked_down_mps = 0.0
         self._wanted_down_m = 0.0
         self._until_ns: float = math.inf
         self._touching = False
@@ -132,6 +129,10 @@ class LandOnMarkerBehaviour(Behaviour):
     @property
     def landing_target(self) -> LandingTarget | None:
         return self._target if self._by_autopilot else None
+
+    @property
+    def landing(self) -> bool:
+        return self._phase in (_Phase.DESCEND, _Phase.FINAL)
 
     @property
     def status(self) -> str:
@@ -184,7 +185,7 @@ class LandOnMarkerBehaviour(Behaviour):
     def _enter(self, phase: _Phase, now_ns: int, timeout_s: float) -> None:
         self._phase, self._phase_ns = phase, now_ns
         self._until_ns = now_ns + timeout_s * 1e9
-        self._waiting_s = self._blocked_s = self._asked_down_mps = 0.0
+        self._waiting_s = self._blocked_s = 0.0
         self._touching = False
 
     def _begin_search(self, situation: Situation, position: Vector3) -> None:
@@ -223,9 +224,7 @@ class LandOnMarkerBehaviour(Behaviour):
             return self._climb(f"lost {self._height_m:.1f} m above it", situation, position)
         place, drift = pad.at(now_ns), pad.velocity_mps
         error_m = math.dist(place[:2], position[:2])
-        self._notice_floor(dt_s, situation)
-        low = self._height_m <= FINAL_M or self._blocked_s > FLOOR_S
-        if low:
+        if self._height_m <= FINAL_M:
             self._waiting_s += dt_s
             if unseen_s < LOST_AFTER_S and self._well_above(error_m, situation, drift):
                 self._enter(_Phase.FINAL, now_ns, LANDING_TIMEOUT_S)
@@ -237,7 +236,6 @@ class LandOnMarkerBehaviour(Behaviour):
             rate = -RISE_MPS if self._height_m < LOW_M else 0.0
         elif self._height_m <= FINAL_M:
             rate = 0.0
-        self._asked_down_mps = rate
         return self._to(place, situation, position, drift, self._held(rate, dt_s, position))
 
     def _held(self, rate_mps: float, dt_s: float, position: Vector3) -> float:
@@ -246,15 +244,6 @@ class LandOnMarkerBehaviour(Behaviour):
         wanted_m = max(position[2] - HEIGHT_LEASH_M, min(position[2] + HEIGHT_LEASH_M, wanted_m))
         self._wanted_down_m = wanted_m
         return max(-CLIMB_MPS, min(DESCENT_MPS, rate_mps + HEIGHT_GAIN_PER_S * (wanted_m - position[2])))
-
-    def _notice_floor(self, dt_s: float, situation: Situation) -> None:
-        """Count how long the envelope has let through less than half of the descent."""
-        sent = situation.sent.velocity_ned_mps if situation.sent is not None else None
-        held = sent is not None and self._asked_down_mps > 0.1 and sent[2] < 0.5 * self._asked_down_mps
-        if held and self._height_m < FLOOR_HEIGHT_M:
-            self._blocked_s += dt_s
-        elif self._blocked_s <= FLOOR_S:
-            self._blocked_s = 0.0
 
     def _well_above(self, error_m: float, situation: Situation, drift: tuple[float, float]) -> bool:
         north, east, _ = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
@@ -274,11 +263,6 @@ class LandOnMarkerBehaviour(Behaviour):
         if self._touching or on_ground:
             self._touching |= on_ground
             return ModeRequest(FlightMode.LAND)
-        self._notice_floor(dt_s, situation)
-        if self._blocked_s > FLOOR_S:
-            self._touching = True
-            return ModeRequest(FlightMode.LAND)
-        self._asked_down_mps = TOUCHDOWN_MPS
         return self._to(place, situation, position, drift, TOUCHDOWN_MPS)
 
     def _climb(self, why: str, situation: Situation, position: Vector3) -> Step:

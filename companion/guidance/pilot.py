@@ -252,7 +252,12 @@ class Pilot:
                 self._envelope.near = self._obstacles.rows(self._memory.filled(situation))
                 self.asked = replace(step, deadline_ns=deadline_ns)
                 self.sent, self.limited_by = self._envelope.apply(
-                    self.asked, situation.state, situation.now_ns, dt_s, situation.neighbours
+                    self.asked,
+                    situation.state,
+                    situation.now_ns,
+                    dt_s,
+                    situation.neighbours,
+                    landing=behaviour.flown.landing,
                 )
                 self._streamer.submit(self.sent)
             case Setpoint() if self._phase is not _Phase.ENGAGING:

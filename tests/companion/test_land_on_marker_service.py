@@ -47,8 +47,7 @@ def flags(camera: str, *more: str) -> list[str]:
     return [
         "--source-uri", f"shm://{camera}", "--detector-enabled", "false",
         "--camera-horizontal-fov-deg", "80", "--markers-size-m", "0.5",
-        "--guidance-perception-max-age-s", "1.0", "--guidance-max-acceleration-mps2", "5",
-        "--guidance-min-altitude-m", "0.05", *more,
+        "--guidance-perception-max-age-s", "1.0", "--guidance-max-acceleration-mps2", "5", *more,
     ]  # fmt: skip
 
 

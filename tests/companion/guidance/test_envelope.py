@@ -160,6 +160,19 @@ def test_at_a_fence_nothing_goes_further_out(asked, state, component, sign):
     assert reasons
 
 
+def test_the_lowest_altitude_does_not_hold_for_a_landing_and_all_else_does():
+    state, down = vehicle((0.0, 0.0, -0.6)), Setpoint.velocity((0.0, 0.0, 3.0), NOW)
+    envelope = Envelope(LIMITS)
+    for _ in range(100):
+        sent, _ = envelope.apply(down, state, NOW, 0.05, landing=True)
+    assert sent.velocity_ned_mps == pytest.approx((0.0, 0.0, LIMITS.max_descend_mps))
+    place = Setpoint.position((0.0, 0.0, 0.0), NOW)
+    assert envelope.apply(place, state, NOW, 0.05, landing=True).sent is place
+    # Only as long as it is said.
+    assert envelope.apply(down, state, NOW, 0.05).sent.velocity_ned_mps[2] <= 0.0
+    assert envelope.apply(place, state, NOW, 0.05).sent.position_ned_m[2] == -LIMITS.min_altitude_m
+
+
 def test_along_and_back_from_the_fence_the_vehicle_may_fly():
     state = vehicle((220.0, 0.0, -10.0))
     back, _ = settled(Envelope(LIMITS), Setpoint.velocity((-3.0, 0.0, 0.0), NOW), state)
