@@ -108,7 +108,7 @@ class DrawnDetector:
         """What is seen from a true pose (attitude: body FRD to NED)."""
         ned_from_body = matrix_from_quaternion(attitude)
         eye = np.asarray(position_ned_m) + ned_from_body @ self._mount.position_frd_m
-        optical_from_ned = (ned_from_body @ self._mount.body_from_optical).T
+        optical_from_ned = self._mount.ned_from_optical(ned_from_body).T
         rng, faults = self._rng, self._faults
         boxes: list[NDArray[np.float64]] = []
         confidences, classes, ranges = [], [], []

@@ -163,7 +163,7 @@ class ProjectedCamera:
         if seconds < self._gap_until_s or self._rng.random() < MISSED:
             return ()
         ned_from_body = matrix_from_quaternion(truth.quaternion)
-        ned_from_optical = ned_from_body @ self._mount.body_from_optical
+        ned_from_optical = self._mount.ned_from_optical(ned_from_body)
         eye = np.array(truth.position_ned_m) + ned_from_body @ self._mount.position_frd_m
         markers = []
         for identifier, size_m in SIZES_M.items():

@@ -266,7 +266,7 @@ class LockstepFlight:
                 view = (
                     None
                     if ned_from_body is None
-                    else CameraView(sight.camera, ned_from_body @ sight.mount.body_from_optical)
+                    else CameraView(sight.camera, sight.mount.ned_from_optical(ned_from_body))
                 )
                 detections = self._tracker.update(detections, captured_ns, view).detections
             self._seen_ns = captured_ns

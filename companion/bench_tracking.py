@@ -198,7 +198,7 @@ def _in_picture(xyxy: XYXY) -> bool:
 
 def _view(attitudes: AttitudeHistory | None, stamp_ns: int) -> CameraView | None:
     ned_from_body = None if attitudes is None else attitudes.at(stamp_ns)
-    return None if ned_from_body is None else CameraView(CAMERA, ned_from_body @ MOUNT.body_from_optical)
+    return None if ned_from_body is None else CameraView(CAMERA, MOUNT.ned_from_optical(ned_from_body))
 
 
 def _against_truth(

@@ -276,13 +276,15 @@ def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame]
     """Where the camera looked when it took a frame; None without the vehicle's attitude of that moment."""
     if not settings.tracker.camera_motion:
         return lambda _: None
-    body_from_optical = settings.camera.mount().body_from_optical
+    mount = settings.camera.mount()
 
     def view_at(frame: Frame) -> CameraView | None:
         ned_from_body = attitudes.at(frame.captured_ns)
         if ned_from_body is None:
             return None
-        return CameraView(settings.camera.model(frame.width, frame.height), ned_from_body @ body_from_optical)
+        return CameraView(
+            settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
+        )
 
     return view_at
 

@@ -137,6 +137,8 @@ class CameraSection(Section):
     """the camera's pitch on the body, degrees; negative looks down"""
     mount_yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """the camera's yaw on the body, degrees clockwise"""
+    mount_levelled: bool = False
+    """a gimbal holds the camera: its roll and pitch count from the horizon, its yaw from the nose"""
     fx_px: Annotated[float | None, Field(gt=0)] = None
     """calibrated focal length along x, pixels; with it fy_px, cx_px, cy_px and calibrated_* are needed"""
     fy_px: Annotated[float | None, Field(gt=0)] = None
@@ -198,6 +200,7 @@ class CameraSection(Section):
             math.radians(self.mount_roll_deg),
             math.radians(self.mount_pitch_deg),
             math.radians(self.mount_yaw_deg),
+            self.mount_levelled,
         )
 
 
@@ -258,7 +261,7 @@ class TrackerSection(Section):
     end_s: Annotated[float, Field(gt=0, le=600)] = 2.0
     """unseen for so long, a track has ended: what comes then is another, seconds"""
     camera_motion: bool = True
-    """remove the camera's turning by the vehicle's attitude; false for recorded films and gimbals"""
+    """remove the camera's turning by the vehicle's attitude; false for recorded films"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

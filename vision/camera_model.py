@@ -107,6 +107,9 @@ class CameraMount:
     """Where the camera sits on the body (FRD, metres) and how it is turned from looking forward.
 
     A negative pitch looks down. With everything zero the camera looks along the body's forward axis.
+
+    Attributes:
+        levelled: a gimbal holds it: roll and pitch count from the horizon, yaw from where the nose points.
     """
 
     forward_m: float = 0.0
@@ -115,6 +118,7 @@ class CameraMount:
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     yaw_rad: float = 0.0
+    levelled: bool = False
 
     @property
     def position_frd_m(self) -> NDArray[np.float64]:
@@ -123,8 +127,15 @@ class CameraMount:
 
     @property
     def body_from_optical(self) -> NDArray[np.float64]:
-        """(3, 3) rotation from the optical frame to the body frame (FRD)."""
+        """(3, 3) rotation from the optical frame to the body frame (FRD), for a levelled one a level body."""
         turned: NDArray[np.float64] = (
             matrix_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad) @ BODY_FROM_OPTICAL
         )
         return turned
+
+    def ned_from_optical(self, ned_from_body: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3, 3) rotation from the optical frame to NED, for the body's (3, 3) attitude."""
+        if self.levelled:
+            heading_rad = math.atan2(float(ned_from_body[1, 0]), float(ned_from_body[0, 0]))
+            ned_from_body = matrix_from_euler(0.0, 0.0, heading_rad)
+        return ned_from_body @ self.body_from_optical

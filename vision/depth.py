@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 # Of the box, in each direction: its edges show more of what is behind the object than of the object.
 CENTRAL_FRACTION = 0.5
-# The near quarter: the object is what is nearest there, and single wrong near pixels do not decide.
-NEAR_PERCENTILE = 25.0
+# The near tenth: the object is what is nearest there (of a lorry seen askew, its corner), and single wrong
+# near pixels do not decide.
+NEAR_PERCENTILE = 10.0
 # With fewer pixels of known depth than this share, what is known may well be something else.
 MIN_KNOWN_FRACTION = 0.1
 # A grid of about this many rows and columns is enough for a percentile, however large the box.

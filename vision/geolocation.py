@@ -17,7 +17,7 @@ def direction_ned(
     pixels: NDArray[Any],
 ) -> NDArray[np.float64]:
     """(N, 2) pixels → (N, 3) unit directions in NED, given the vehicle's attitude when they were captured."""
-    directions: NDArray[np.float64] = camera.rays(pixels) @ (ned_from_body @ mount.body_from_optical).T
+    directions: NDArray[np.float64] = camera.rays(pixels) @ mount.ned_from_optical(ned_from_body).T
     return directions
 
 
@@ -31,8 +31,9 @@ def point_at_depth(
     """(N, 3) NED offsets from the vehicle of points seen at `pixels` with a depth along the optical axis."""
     rays = camera.rays(pixels)
     points = rays / rays[:, 2:] * np.asarray(depth_m, np.float64).reshape(-1, 1)
-    body = points @ mount.body_from_optical.T + mount.position_frd_m
-    offsets: NDArray[np.float64] = body @ ned_from_body.T
+    offsets: NDArray[np.float64] = (
+        points @ mount.ned_from_optical(ned_from_body).T + ned_from_body @ mount.position_frd_m
+    )
     return offsets
 
 

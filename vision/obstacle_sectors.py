@@ -76,7 +76,7 @@ def obstacle_sectors(
     columns = slice(None, None, max(1, math.ceil(camera.width / GRID_COLUMNS)))
     depth = depth_m[rows, columns].ravel()
     rays = _rays(camera, rows.step, columns.step)
-    turn = (ned_from_body @ mount.body_from_optical).astype(np.float32)
+    turn = mount.ned_from_optical(ned_from_body).astype(np.float32)
     eye = (ned_from_body @ mount.position_frd_m).astype(np.float32)
 
     level = rays @ turn.T

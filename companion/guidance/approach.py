@@ -27,10 +27,10 @@ DECELERATION_MPS2 = 0.7
 MAX_RETREAT_MPS = 1.0
 # There: so near (m), so slow (m/s), for so long (s). A real PX4 holds a position to 0.26 m (one sigma) in
 # calm air and moves at up to 0.5 m/s doing so; in gusts it never stands as still: what lasts may be coarser,
-# but it is there at a moment at which it is as near as in calm air.
+# but it ends at a moment at which it is near.
 STANDING_MPS = 0.3
-NEAR_M = 0.3
-ARRIVALS = ((NEAR_M, 0.5, 1.0), (0.8, 1.0, 5.0))
+NEAR_M = 0.2
+ARRIVALS = ((0.3, 0.5, 1.0), (0.8, 1.0, 5.0))
 # The last of the way is flown to a fixed place before the object, so that wind does not carry the vehicle
 # around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
 ANCHOR_M = (1.5, 3.0)

@@ -14,7 +14,9 @@ from vision.rotation import wrap_angle
 
 # Answer to what is missing in distance and along the circle, 1/s, and the fastest that is made good: on top
 # of the object's own velocity.
-GAIN_PER_S = 0.8
+GAIN_PER_S = 1.2
+# More of a velocity is asked for where the vehicle does not follow it, see `motion.pressed`.
+PRESS = 1.0
 MOST_CLOSING_MPS = 2.5
 MOST_CIRCLING_MPS = 2.0
 # An object slower than this has no course: the last one is kept.
@@ -105,7 +107,7 @@ class FollowBehaviour(Behaviour):
         towards_rad = math.atan2(east, north)
         self._yaw_rad = towards_rad
         wanted = self._wanted(track, towards_rad, dt_s)
-        north_mps, east_mps = pressed(wanted, state, self._speed_mps)
+        north_mps, east_mps = pressed(wanted, state, self._speed_mps, PRESS)
         return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)
 
     def _wanted(self, track: MovingTrack, towards_rad: float, dt_s: float) -> tuple[float, float]:

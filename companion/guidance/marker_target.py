@@ -120,7 +120,7 @@ def looks_down(camera: CameraModel, mount: CameraMount) -> bool:
 def _target(
     marker: Marker, captured_ns: int, mount: CameraMount, pose: Pose, on_pads: Mapping[int, PadMarker]
 ) -> MarkerTarget:
-    ned_from_optical = pose.ned_from_body @ mount.body_from_optical
+    ned_from_optical = mount.ned_from_optical(pose.ned_from_body)
     place, rotation = marker.position_camera_m, marker.rotation
     if marker.other is not None and marker.ambiguity > AMBIGUOUS:
         # The one whose face looks up more: NED, so up is -z.

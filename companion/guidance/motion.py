@@ -55,7 +55,9 @@ def stay_at(place: Vector3, position: Vector3) -> Vector3:
     return (*towards(place, position, POSITION_GAIN), correction(place[2] - position[2]))
 
 
-def pressed(wanted: tuple[float, float], state: VehicleState, top_speed_mps: float) -> tuple[float, float]:
+def pressed(
+    wanted: tuple[float, float], state: VehicleState, top_speed_mps: float, gain: float = VELOCITY_GAIN
+) -> tuple[float, float]:
     """A velocity over ground, with more of it where the vehicle does not follow; never above the top speed.
 
     PX4's velocity controller has gathered what drag cost it on the way (MPC_XY_VEL_I_ACC), and goes on with
@@ -63,8 +65,8 @@ def pressed(wanted: tuple[float, float], state: VehicleState, top_speed_mps: flo
     acts like a higher MPC_XY_VEL_P_ACC: 2.7 instead of 1.8, well inside the range PX4 allows.
     """
     north_mps, east_mps, _ = state.velocity_ned_mps or (*wanted, 0.0)
-    north = wanted[0] + VELOCITY_GAIN * (wanted[0] - north_mps)
-    east = wanted[1] + VELOCITY_GAIN * (wanted[1] - east_mps)
+    north = wanted[0] + gain * (wanted[0] - north_mps)
+    east = wanted[1] + gain * (wanted[1] - east_mps)
     speed = math.hypot(north, east)
     scale = min(1.0, top_speed_mps / speed) if speed > 1e-6 else 1.0
     return (north * scale, east * scale)

@@ -25,6 +25,9 @@ ACCELERATION_M2_PER_S3 = 1.5
 # Before two looks nothing is known of the velocity, one sigma.
 FIRST_VELOCITY_SIGMA_MPS = 2.0
 FASTEST_MPS = 15.0
+# What is off in a range by attitude, height and slope is off by the same from frame to frame: what one says
+# against the last is surer than what it says of the place, by so much of a sigma.
+FRAME_TO_FRAME = 0.35
 # Unseen, the gate grows without end: a stranger is taken for the object no farther than this from where it is
 # expected, and so much more for each second.
 REACH_M, REACH_MPS = 1.5, 1.0
@@ -191,4 +194,5 @@ def _innovation(target: Target, state: Vector, vehicle: Vector3) -> tuple[Vector
                 vehicle[1] + range_m * math.sin(target.bearing_rad),
             )
         )
-    return measured - state[:2], measurement_noise(target, measured - vehicle[:2])
+    noise = measurement_noise(target, measured - vehicle[:2]) * FRAME_TO_FRAME**2
+    return measured - state[:2], noise

@@ -172,7 +172,7 @@ class Renderer:
     ) -> View:
         """The camera's pose for a body's pose, with matrices between the drawn picture's pixels and NED."""
         mount = mount or self.mount
-        ned_from_optical = ned_from_body @ mount.body_from_optical
+        ned_from_optical = mount.ned_from_optical(ned_from_body)
         eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ mount.position_frd_m
         eye[2] = min(eye[2], -LOWEST_EYE_M)
         matrix = self._drawn.matrix

@@ -83,7 +83,7 @@ class SimulatedCamera:
         time_s = stamp_ns / 1e9 if time_s is None else time_s
         self._sequence += 1
         used = mount or settings.mount
-        ned_from_optical = ned_from_body @ used.body_from_optical
+        ned_from_optical = used.ned_from_optical(ned_from_body)
         eye = np.asarray(position_ned_m, np.float64) + ned_from_body @ used.position_frd_m
         last, self._last = self._last, (stamp_ns, eye, ned_from_optical)
         if settings.loss > 0.0 and self._losses.random() < settings.loss:
