@@ -38,6 +38,7 @@ class FlightResult:
 Flight = Callable[[int], FlightResult]
 
 _PREFIX = "bench_flights_"
+_FIGURES = ("mean", "p5", "p50", "p95", "max")
 
 
 class UnknownFlightError(LookupError):
@@ -86,7 +87,7 @@ def _fly_one(name: str, seed: int) -> FlightResult:
 
 
 def summary(name: str, results: Sequence[FlightResult]) -> dict[str, Any]:
-    """Success rate, p50, p95 and max of each value, and what went wrong; plain values, ready for JSON.
+    """Success rate, mean and spread of each value, and what went wrong; plain values, ready for JSON.
 
     Raises:
         ValueError: there are no results.
@@ -98,12 +99,15 @@ def summary(name: str, results: Sequence[FlightResult]) -> dict[str, Any]:
     for key in names:
         numbers = np.array([result.values.get(key, np.nan) for result in results], np.float64)
         known = numbers[np.isfinite(numbers)]
-        low, middle, high, largest = (
-            (float(value) for value in (*np.percentile(known, (5, 50, 95)), known.max()))
+        figures = (
+            (known.mean(), *np.percentile(known, (5, 50, 95)), known.max())
             if len(known)
-            else (float("nan"),) * 4
+            else (np.nan,) * len(_FIGURES)
         )
-        values[key] = {"p5": low, "p50": middle, "p95": high, "max": largest, "flights": len(known)}
+        values[key] = {
+            **{name: float(value) for name, value in zip(_FIGURES, figures, strict=True)},
+            "flights": len(known),
+        }
     return {
         "flight": name,
         "runs": len(results),
@@ -119,8 +123,8 @@ def flights_table(figures: dict[str, Any]) -> Table:
     rate, runs = figures["success_rate"], figures["runs"]
     table = Table(title=f"{figures['flight']}: {figures['successes']} of {runs} flights, {rate:.1%}")
     table.add_column("value")
-    for heading in ("p5", "p50", "p95", "max"):
+    for heading in _FIGURES:
         table.add_column(heading, justify="right")
     for name, spread in figures["values"].items():
-        table.add_row(name, *(f"{spread[key]:.3g}" for key in ("p5", "p50", "p95", "max")))
+        table.add_row(name, *(f"{spread[key]:.3g}" for key in _FIGURES))
     return table

@@ -1,4 +1,4 @@
-"""The command line of measurements: `companion bench detector|tracking|latency|setpoints|flights`."""
+"""The command line of measurements: `companion bench detector|tracking|latency|setpoints|deadman|flights`."""
 
 from __future__ import annotations
 
@@ -90,6 +90,27 @@ def bench_setpoints(
     from companion.bench import measure_setpoints
 
     _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
+
+
+@bench.command("deadman")
+def bench_deadman(
+    runs: Annotated[int, typer.Option(min=1, help="flights of each fault, half a minute each")] = 3,
+    as_json: _JSON = False,
+) -> None:
+    """Seconds until the vehicle brakes, stands and leaves OFFBOARD when a process of ours hangs or dies."""
+    from rich.console import Console
+
+    from companion.bench_deadman import deadman_table, measure_deadman
+    from companion.bus.client import NoAnswerError
+    from companion.bus.session import BusError
+    from companion.rehearsal import RehearsalError
+
+    with plain_errors(RehearsalError, BusError, NoAnswerError):
+        figures = measure_deadman(runs)
+    if as_json:
+        typer.echo(json.dumps(figures))
+    else:
+        Console().print(deadman_table(figures))
 
 
 @bench.command("tracking")
