@@ -3,7 +3,7 @@
 Each sector that a depth camera saw something in bounds the speed in its direction. With an answer that comes
 after L seconds and a deceleration a, v may be flown towards what is d away where v·L + v²/(2a) + margin <= d.
 The bounds join the fence's in one projection (`Fence.slowed`): a wall shortens what leads into it and leaves
-what leads along it. Inside the margin the vehicle backs out, at half a metre a second at most.
+what leads along it. Inside the margin the vehicle backs out, at 0.8 m/s at most.
 
 What the camera cannot see is unknown, not free. By default its speed is not limited all the same: a camera
 that looks forward sees a fifth of the circle, and a vehicle that could not fly aside or follow its path round
@@ -28,8 +28,9 @@ ObstacleUse = Literal["off", "auto", "required"]
 LATENCY_S = 0.6
 DECELERATION_MPS2 = 0.7
 # Against the nearest obstacle it is braked by asking for less than nothing, and what drifts into the margin
-# is backed out of it, slowly: a zero alone is left with the wind and what was gathered.
-BRAKING_GAIN, MOST_BRAKING_MPS, MOST_RETREAT_MPS = 1.0, 1.5, 0.5
+# is backed out of it: a zero alone is left with the wind and what was gathered, and so is a slow way back
+# that is only asked for (one flight of a hundred was blown into a wall so).
+BRAKING_GAIN, MOST_BRAKING_MPS, MOST_RETREAT_MPS = 1.5, 2.0, 0.8
 # So the last metres are flown with no more speed than this for each of them.
 GAIN_PER_S = 0.4
 MAX_AGE_S = 0.5
@@ -101,12 +102,12 @@ class ObstacleRules:
     ) -> float:
         """The speed allowed towards the nearest: below zero where the vehicle is too fast or too near."""
         left_m = distance_m - self.margin_m
-        allowed = speed_towards(left_m, late_s)
+        allowed = speed_towards(left_m, late_s) if left_m >= 0.0 else max(-MOST_RETREAT_MPS, left_m)
         north_mps, east_mps, _ = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
         excess = north_mps * direction[0] + east_mps * direction[1] - allowed
         if excess > 0.0:
             allowed -= min(MOST_BRAKING_MPS, BRAKING_GAIN * excess)
-        return min(allowed, max(-MOST_RETREAT_MPS, left_m)) if left_m < 0.0 else allowed
+        return allowed
 
 
 NO_RULES = ObstacleRules()
