@@ -1,7 +1,8 @@
 """What the vehicle does when a part of the companion hangs or dies in flight, timed by the simulator's truth.
 
-The service is a process of its own, as in use. It flies an orbit at 2 m/s; then a process is stopped or
-killed (signal(7)), and the true velocity and mode tell the rest. Real time: a busy machine shows.
+The service is a process of its own, as in use. It flies an orbit, or towards a car, at 2 m/s; then a process
+is stopped or killed (signal(7)), and the true velocity and mode tell the rest. Real time: a busy machine
+shows.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import zenoh
 from rich.table import Table
 
 from companion.bus.client import client_settings, listen, open_client, send_command
+from companion.bus.topics import command_key
 from companion.config import to_toml
 from companion.rehearsal import ALTITUDE_M, RehearsalError, free_port, rehearsal_settings, simulator
 from companion.settings import Settings
@@ -32,7 +34,7 @@ SPEED_MPS = 2.0
 BRAKING_SHARE, STANDING_MPS = 0.8, 0.3
 _READY_S, _COMMAND_S, _WATCHED_S, _STEADY_S = 40.0, 60.0, 8.0, 2.0
 _SETPOINTS = f"orbit radius=8 speed={SPEED_MPS:g}"
-_BY_SIGHT = f"orbit car radius=8 speed={SPEED_MPS:g}"
+_BY_SIGHT = f"approach car distance=5 speed={SPEED_MPS:g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +165,10 @@ def _fly_into(fault: Fault, settings: Settings, service_pid: int, truth: Path) -
         _command(session, settings, f"takeoff {ALTITUDE_M:g}", patient=True)
         if fault.flown is _BY_SIGHT:
             _command(session, settings, "seek car")
-        _command(session, settings, fault.flown)
+        # Not waited for: an approach answers when it is there.
+        session.get(
+            command_key(settings.vehicle.name), lambda _: None, payload=fault.flown, timeout=_COMMAND_S
+        )
         deadline_s = time.monotonic() + _COMMAND_S
         while not (statuses and _steady(truth)):
             if time.monotonic() > deadline_s:

@@ -38,7 +38,7 @@ class FlightResult:
 Flight = Callable[[int], FlightResult]
 
 _PREFIX = "bench_flights_"
-_FIGURES = ("mean", "p5", "p50", "p95", "max")
+_FIGURES = ("mean", "min", "p5", "p50", "p95", "max")
 
 
 class UnknownFlightError(LookupError):
@@ -100,7 +100,7 @@ def summary(name: str, results: Sequence[FlightResult]) -> dict[str, Any]:
         numbers = np.array([result.values.get(key, np.nan) for result in results], np.float64)
         known = numbers[np.isfinite(numbers)]
         figures = (
-            (known.mean(), *np.percentile(known, (5, 50, 95)), known.max())
+            (known.mean(), known.min(), *np.percentile(known, (5, 50, 95)), known.max())
             if len(known)
             else (np.nan,) * len(_FIGURES)
         )
