@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import queue
 import threading
@@ -41,7 +42,7 @@ class Recording:
     Attributes:
         lines: text to draw on the next frames.
         highlight: the class whose surest detection is drawn as the one that matters, or None.
-        skipped: frames that the encoder had no time for.
+        skipped: pictures of the film that the encoder had no time for; the one before stands in their place.
     """
 
     def __init__(self, path: Path | str, rate_hz: float) -> None:
@@ -61,6 +62,7 @@ class Recording:
         self._rate_hz = rate_hz
         self._first_ns: int | None = None
         self._next_slot = 0
+        self._refused_slot: int | None = None
         self._queue: queue.Queue[_Picture | None] = queue.Queue(_QUEUED_FRAMES)
         self._failed = threading.Event()
         # A size is known only with the first frame; that nothing can be written there is known now.
@@ -79,9 +81,17 @@ class Recording:
         try:
             self._queue.put_nowait(_Picture(frame, detections, self.lines, self.highlight))
         except queue.Full:
-            self.skipped += 1
+            # Not lost yet: a later frame may still take this picture's place in the film.
+            self._note_lost_before(slot)
+            self._refused_slot = slot
         else:
+            self._note_lost_before(slot)
+            self._refused_slot = None
             self._next_slot = slot + 1
+
+    def _note_lost_before(self, slot: float) -> None:
+        if self._refused_slot is not None and self._refused_slot < slot:
+            self.skipped += 1
 
     def close(self) -> None:
         """Finish the file; no file is left if it got no frame. A second call does nothing."""
@@ -89,9 +99,10 @@ class Recording:
             return
         self._queue.put(None)
         self._thread.join()
+        self._note_lost_before(math.inf)
         if self.skipped:
             logger.warning(
-                "%s: %d frames are not in it, the encoder was too slow; a lower rate_hz suits this computer",
+                "%s: %d pictures are missing, the encoder was slow; a lower rate_hz suits this computer",
                 self._path,
                 self.skipped,
             )
