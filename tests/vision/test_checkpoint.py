@@ -293,9 +293,10 @@ def test_every_generation_is_built_from_what_the_pickled_layers_show(
     assert loaded.model.end_to_end == model.end_to_end
     assert loaded.description.rows == model.description.rows
     assert loaded.description.light_classes == model.description.light_classes
-    assert loaded.model.state_dict().keys() == model.state_dict().keys()
-    for name, tensor in model.state_dict().items():
-        assert torch.equal(loaded.model.state_dict()[name].half(), tensor.half()), name
+    weights, written = loaded.model.state_dict(), model.state_dict()
+    assert weights.keys() == written.keys()
+    for name, tensor in written.items():
+        assert torch.equal(weights[name].half(), tensor.half()), name
 
 
 @pytest.mark.parametrize("generation", ["YOLOv5u", "YOLOv8"])

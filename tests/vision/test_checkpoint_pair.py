@@ -40,8 +40,9 @@ def test_either_file_of_a_pair_loads_the_model_that_was_saved(pair: Path, model:
         assert loaded.class_names == NAMES
         assert loaded.description == model.description
         assert loaded.metadata == METADATA
+        weights = loaded.model.state_dict()
         for name, tensor in model.state_dict().items():
-            torch.testing.assert_close(loaded.model.state_dict()[name], tensor, rtol=1e-3, atol=1e-3)
+            torch.testing.assert_close(weights[name], tensor, rtol=1e-3, atol=1e-3)
     assert sorted(path.name for path in pair.parent.iterdir()) == ["model.safetensors", "model.yaml"]
 
 
