@@ -9,7 +9,7 @@ from enum import StrEnum
 from companion.vehicle.state import Vector3
 
 # What to say when only doubtful objects were seen.
-DOUBTED = "what was seen does not count as true (tracker.true_score)"
+DOUBTED = "what was seen does not count as true (tracker.true_score), or may be of another class"
 
 
 class RangeSource(StrEnum):
@@ -35,7 +35,8 @@ class Target:
         box_xyxy: pixels, as detected.
         track_id: of the object, the same from frame to frame; None without a track.
         track_score: median confidence over the track; None without a track.
-        trusted: it may be chosen to be flown to: its track counts as true, or nobody looks for tracks.
+        trusted: it may be chosen to be flown to: its track counts as true, or nobody looks for tracks; and it
+            is not as likely of another class.
     """
 
     class_name: str

@@ -21,6 +21,7 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import direction_ned, point_at_depth, point_on_ground
 from vision.rotation import matrix_from_quaternion, slerp
+from vision.tracking.association import overlaps
 
 HISTORY_S = 3.0
 # Beyond the ends of the history the nearest sample is taken for this long; a quadrotor turns 10° in it.
@@ -31,6 +32,8 @@ EDGE_PX = 2.0
 MIN_DEPRESSION_RAD = math.radians(2.0)
 # Below this height the ground plane says nothing about range.
 MIN_HEIGHT_M = 0.3
+# Boxes that overlap by so much are of one thing. A name must be surer by this than any other it is given.
+SAME_THING_IOU, CLEARLY_SURER = 0.5, 0.1
 
 
 class HistoryError(LookupError):
@@ -101,15 +104,45 @@ def targets_from_detections(
     is taken as flat and level with home. There is no range if the box touches the picture's lower edge, or
     the ray points less than 2° down.
 
+    What the detector also calls something else, (nearly) as surely, is not `trusted`: a car that may be a
+    truck is not flown to.
+
     Raises:
         HistoryError: the vehicle's pose at `captured_ns` is not known.
     """
     pose = history.at(captured_ns)
-    return tuple(_target(detection, captured_ns, camera, mount, pose) for detection in detections)
+    doubtful = _named_otherwise(detections)
+    return tuple(
+        _target(detection, captured_ns, camera, mount, pose, trusted=not doubt)
+        for detection, doubt in zip(detections, doubtful, strict=True)
+    )
+
+
+def _named_otherwise(detections: Sequence[DetectionRecord]) -> list[bool]:
+    """Of each: a box of another class, (nearly) as sure, is about the same thing."""
+    if len(detections) < 2:
+        return [False] * len(detections)
+    boxes = np.array([detection["xyxy"] for detection in detections])
+    scores = np.array([_score(detection) for detection in detections])
+    names = np.array([detection["class_name"] for detection in detections])
+    rivals = (names[:, None] != names) & (scores[:, None] < scores + CLEARLY_SURER)
+    doubtful: list[bool] = (rivals & (overlaps(boxes, boxes) >= SAME_THING_IOU)).any(axis=1).tolist()
+    return doubtful
+
+
+def _score(detection: DetectionRecord) -> float:
+    score = detection.get("track_score")
+    return detection["confidence"] if score is None else score
 
 
 def _target(
-    detection: DetectionRecord, captured_ns: int, camera: CameraModel, mount: CameraMount, pose: Pose
+    detection: DetectionRecord,
+    captured_ns: int,
+    camera: CameraModel,
+    mount: CameraMount,
+    pose: Pose,
+    *,
+    trusted: bool,
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
     centre = np.array([[(left + right) / 2, (top + bottom) / 2]])
@@ -142,7 +175,7 @@ def _target(
         box_xyxy=(left, top, right, bottom),
         track_id=detection.get("track_id"),
         track_score=detection.get("track_score"),
-        trusted=detection.get("track_state") in (None, TRACK_CONFIRMED),
+        trusted=trusted and detection.get("track_state") in (None, TRACK_CONFIRMED),
     )
 
 

@@ -8,7 +8,7 @@ from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.seek import SeekBehaviour
-from companion.guidance.target import RangeSource, Target
+from companion.guidance.target import DOUBTED, RangeSource, Target
 from companion.guidance.track import ObjectTrack
 
 T0 = 10**12
@@ -62,7 +62,7 @@ def test_approach_does_not_begin_with_what_does_not_count_as_true():
     outcome = Flight(ApproachBehaviour("car"), objects=[ghost]).run(20.0)
     assert outcome is not None
     assert outcome.reason.startswith("lost the car"), outcome.reason
-    assert outcome.reason.endswith("what was seen does not count as true (tracker.true_score)")
+    assert outcome.reason.endswith(DOUBTED)
 
 
 def test_approach_prefers_the_true_one_to_the_one_before_its_nose():
@@ -110,9 +110,7 @@ def test_seek_does_not_end_with_what_does_not_count_as_true():
     outcome = Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0)
     assert outcome is not None
     assert not outcome.success
-    assert outcome.reason == (
-        "no car seen in 1 lap: what was seen does not count as true (tracker.true_score)"
-    )
+    assert outcome.reason == f"no car seen in 1 lap: {DOUBTED}"
 
 
 def test_seek_ends_when_what_it_sees_comes_to_count():

@@ -10,6 +10,7 @@ from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search import SearchBehaviour
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
+from companion.guidance.target import DOUBTED
 
 
 def beside(place, points):
@@ -79,9 +80,7 @@ def test_an_area_without_the_object_is_flown_whole_and_the_reason_is_told():
     flight = Flight(SearchBehaviour("car", radius_m=8.0, spacing_m=8.0), KinematicVehicle(), [doubtful])
     outcome = flight.run(120.0)
     assert outcome is not None
-    assert outcome.reason == (
-        "no car seen in the whole area: what was seen does not count as true (tracker.true_score)"
-    )
+    assert outcome.reason == f"no car seen in the whole area: {DOUBTED}"
 
 
 def test_without_spacing_or_camera_a_search_says_what_is_missing():

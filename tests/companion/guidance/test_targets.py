@@ -67,6 +67,34 @@ def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_tru
     assert [target.score for target in targets] == [0.8, 0.8, 0.6, 0.7]
 
 
+@pytest.mark.parametrize(
+    ("other", "trusted"),
+    [
+        ({"class_name": "truck", "confidence": 0.65}, [True, False]),
+        ({"class_name": "truck", "confidence": 0.75}, [False, False]),
+        ({"class_name": "truck", "confidence": 0.85}, [False, False]),
+        ({"class_name": "truck", "confidence": 0.95}, [False, True]),
+        ({"class_name": "truck", "confidence": 0.95, "xyxy": [300, 300, 310, 400]}, [True, True]),
+        ({"class_name": "car", "confidence": 0.85}, [True, True]),
+    ],
+    ids=["much less sure", "nearly as sure", "a little surer", "surer", "beside it", "of its class"],
+)
+def test_one_thing_with_two_names_is_chosen_only_by_the_one_that_is_clearly_surer(other, trusted):
+    car = detection((310, 300, 330, 400))
+    both = [car, detection((311, 300, 331, 400)) | other]
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    assert [t.trusted for t in targets_from_detections(both, T0, CAMERA, MOUNT, history)] == trusted
+
+
+def test_of_two_names_the_score_of_the_track_counts_not_that_of_a_frame():
+    tracks = {"track_state": "confirmed"}
+    car = detection((310, 300, 330, 400)) | tracks | {"track_id": 1, "track_score": 0.9, "confidence": 0.5}
+    truck = car | tracks | {"track_id": 2, "track_score": 0.6, "confidence": 0.8, "class_name": "truck"}
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    targets = targets_from_detections([car, truck], T0, CAMERA, MOUNT, history)
+    assert [target.trusted for target in targets] == [True, False]
+
+
 angles = st.floats(-0.5, 0.5)
 scenes = st.tuples(
     angles,
