@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from companion.guidance.target import Target
@@ -9,10 +10,15 @@ from vision.rotation import wrap_angle
 
 # From the first true object on it is looked for so long whether another is nearer to the nose.
 CHOOSING_S = 0.4
+# Before the nose are all within this, and of them the one that is nearest to the vehicle is meant.
+BEFORE_RAD = math.radians(10.0)
 
 
 class Choice:
-    """Collects the true objects of the first moments and takes the one nearest to the nose."""
+    """Collects the true objects of the first moments and takes the nearest of those before the nose.
+
+    With none before it, the one nearest to the nose.
+    """
 
     def __init__(self) -> None:
         self._seen: dict[int | None, Target] = {}
@@ -42,4 +48,9 @@ class Choice:
 
 
 def _nearest(targets: Sequence[Target], yaw_rad: float) -> Target:
-    return min(targets, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
+    def rank(target: Target) -> tuple[float, float]:
+        off_rad = abs(wrap_angle(target.bearing_rad - yaw_rad))
+        range_m = target.range_m if math.isfinite(target.range_m) else math.inf
+        return (max(off_rad, BEFORE_RAD), range_m)
+
+    return min(targets, key=rank)

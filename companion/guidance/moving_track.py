@@ -36,6 +36,11 @@ CLEARLY_NEARER = 3.0
 # χ² with two degrees of freedom: 99 % of the object's own detections are inside, and the picture's tracker is
 # believed without question where 90 % are: where two cars pass each other identities leap.
 GATE, SURE_GATE = 9.2, 4.6
+# So long unseen, an identity in the picture may have gone over to another.
+IDENTITY_S = 0.5
+# Unseen for longer than the first, it is in doubt who came out again: for the second, one that fits far
+# better what was expected before may take its place.
+PARTED_S, DOUBT_S = 0.25, 2.0
 # Two boxes in one direction may both be the object.
 SAME_BEARING_RAD = 0.03
 
@@ -49,6 +54,16 @@ class _Fit(NamedTuple):
     target: Target
     innovation: Vector
     spread: Vector
+
+
+class _Parting(NamedTuple):
+    """What was known when the object was seen last, kept while it is in doubt who came out again."""
+
+    state: Vector
+    covariance: Vector
+    captured_ns: int
+    others: frozenset[int]
+    until_ns: float
 
 
 class MovingTrack:
@@ -70,6 +85,7 @@ class MovingTrack:
         self._captured_ns = target.captured_ns
         self._track_id = target.track_id
         self._others: set[int] = set()
+        self._parting: _Parting | None = None
 
     @property
     def captured_ns(self) -> int:
@@ -107,6 +123,7 @@ class MovingTrack:
         fresh = [t for t in targets if t.class_name == self._class_name and t.captured_ns > self._captured_ns]
         if not fresh:
             return False
+        self._go_back(fresh, vehicle)
         elapsed_s = (fresh[0].captured_ns - self._captured_ns) / 1e9
         state, covariance = _predicted(self._state, self._covariance, elapsed_s)
         fitting = []
@@ -117,7 +134,8 @@ class MovingTrack:
             if squared <= GATE:
                 fitting.append(_Fit(squared, target, innovation, spread))
         # The picture's own tracker knows best, unless its identity has leapt to where the object cannot be.
-        own = self._track_id
+        # Nor does it know who comes out again from behind something.
+        own = None if elapsed_s > IDENTITY_S else self._track_id
         fits = [fit for fit in fitting if own is not None and fit.target.track_id == own]
         if not fits or fits[0].squared > SURE_GATE:
             fits += self._strangers(fitting, state, elapsed_s)
@@ -125,6 +143,14 @@ class MovingTrack:
         if not fits or (len(fits) > 1 and fits[1].squared < CLEARLY_NEARER * max(fits[0].squared, 0.3)):
             return False
         _, target, innovation, spread = fits[0]
+        if elapsed_s > PARTED_S and self._parting is None:
+            self._parting = _Parting(
+                self._state,
+                self._covariance,
+                self._captured_ns,
+                frozenset(self._others),
+                target.captured_ns + DOUBT_S * 1e9,
+            )
         gain = np.linalg.solve(spread, covariance[:2, :]).T
         self._state = state + gain @ innovation
         # Joseph's form keeps it symmetric and positive.
@@ -142,15 +168,54 @@ class MovingTrack:
         self._note_others([other for other in fresh if id(other) not in fitted], target)
         return True
 
+    def _go_back(self, fresh: Sequence[Target], vehicle: Vector3) -> None:
+        """Undo it if the wrong one was taken: another is far nearer to where the object was expected."""
+        parting = self._parting
+        if parting is None:
+            return
+        now_ns = fresh[0].captured_ns
+        if now_ns > parting.until_ns:
+            self._parting = None
+            return
+        elapsed_s = (now_ns - parting.captured_ns) / 1e9
+        state, covariance = _predicted(parting.state, parting.covariance, elapsed_s)
+
+        def squared(target: Target) -> float:
+            innovation, noise = _innovation(target, state, vehicle)
+            return float(innovation @ np.linalg.solve(covariance[:2, :2] + noise, innovation))
+
+        expected = self.place(now_ns)
+        seen = [
+            (math.dist(target.position_ned_m[:2], expected), target)
+            for target in fresh
+            if target.trusted and target.position_ned_m is not None and target.track_id not in parting.others
+        ]
+        followed = min(seen, key=lambda one: one[0], default=None)
+        others = set(parting.others)
+        if followed is not None and followed[0] <= REACH_M:
+            taken = squared(followed[1])
+            seen.remove(followed)
+            if followed[1].track_id is not None:
+                others.add(followed[1].track_id)
+        else:
+            aside = np.array(expected) - state[:2]
+            taken = float(aside @ np.linalg.solve(covariance[:2, :2], aside))
+        if seen and CLEARLY_NEARER * max(min(squared(target) for _, target in seen), 0.1) < taken:
+            self._state, self._covariance = parting.state, parting.covariance
+            self._captured_ns, self._others = parting.captured_ns, others
+            self._track_id = self._parting = None
+
     def _strangers(self, fitting: list[_Fit], state: Vector, unseen_s: float) -> list[_Fit]:
         """Those that may be this object under another identity: they count as true, and are near enough."""
         reach_m = REACH_M + REACH_MPS * unseen_s
+        # Itself, not believed by its identity alone, is one of them where it was away.
+        known = self._others if unseen_s > IDENTITY_S else {self._track_id, *self._others}
         near = []
         for fit in fitting:
             target = fit.target
             if not target.trusted or target.position_ned_m is None:
                 continue
-            if target.track_id is not None and target.track_id in {self._track_id, *self._others}:
+            if target.track_id is not None and target.track_id in known:
                 continue
             north, east, _ = target.position_ned_m
             if math.hypot(north - state[0], east - state[1]) <= reach_m:

@@ -1,0 +1,127 @@
+"""Who is followed on after it was hidden: identities of the picture leap, and its like is near."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.guidance.choosing import CHOOSING_S, Choice
+from companion.guidance.moving_track import DOUBT_S, MovingTrack
+from companion.guidance.target import RangeSource, Target
+
+SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
+
+
+def seen(
+    place: tuple[float, float], vehicle: tuple[float, float, float], seconds: float, identity: int
+) -> Target:
+    north, east = place[0] - vehicle[0], place[1] - vehicle[1]
+    return Target(
+        "car",
+        0.9,
+        round(seconds * 1e9),
+        math.atan2(east, north),
+        -0.3,
+        math.hypot(north, east),
+        RangeSource.GROUND_PLANE,
+        (*place, 0.0),
+        track_id=identity,
+        track_score=0.9,
+    )
+
+
+class Road:
+    """A car that drives north, and the vehicle behind it. `see` shows places, told from where the car is."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.track = MovingTrack(seen(self.car, self.vehicle, 0.0, 1), self.vehicle)
+
+    @property
+    def car(self) -> tuple[float, float]:
+        return (BEHIND_M + SPEED_MPS * self.seconds, 0.0)
+
+    @property
+    def vehicle(self) -> tuple[float, float, float]:
+        return (SPEED_MPS * self.seconds, 0.0, -4.0)
+
+    def see(self, for_s: float, **beside: tuple[float, float]) -> None:
+        """`id1=(2.0, 0.0)`: identity 1, two metres before where the car is."""
+        for _ in range(round(for_s / FRAME_S)):
+            self.seconds += FRAME_S
+            self.track.update(
+                [
+                    seen((self.car[0] + north, self.car[1] + east), self.vehicle, self.seconds, int(name[2:]))
+                    for name, (north, east) in beside.items()
+                ],
+                self.vehicle,
+            )
+
+    @property
+    def off_m(self) -> float:
+        return math.dist(self.track.place(round(self.seconds * 1e9)), self.car)
+
+
+@pytest.fixture
+def road() -> Road:
+    road = Road()
+    road.see(5.0, id1=(0.0, 0.0))
+    assert road.off_m < 0.3
+    return road
+
+
+def test_what_was_taken_for_it_is_left_when_it_comes_out_itself(road: Road) -> None:
+    road.see(1.8)
+    road.see(0.3, id1=(-0.5, 2.4))  # its like, under its identity
+    assert road.off_m > 1.0
+    road.see(1.0, id1=(-0.5, 2.4), id37=(0.2, 0.1))
+    assert road.track.track_id == 37
+    assert road.off_m < 0.5
+
+
+def test_it_is_found_again_under_its_own_identity_too(road: Road) -> None:
+    road.see(1.5)
+    road.see(0.1, id1=(1.0, 2.2))
+    road.see(0.2)
+    road.see(1.0, id1=(0.0, 0.2))
+    assert road.off_m < 0.5
+
+
+def test_what_came_out_aside_of_its_way_is_followed_on_while_nobody_fits_better(road: Road) -> None:
+    road.see(1.5)
+    road.see(1.0, id5=(0.3, 1.5), id6=(9.0, 7.0))
+    assert road.track.track_id == 5
+    assert road.off_m == pytest.approx(1.5, abs=0.4)
+
+
+def test_after_a_while_it_is_no_longer_in_doubt(road: Road) -> None:
+    road.see(1.5)
+    road.see(DOUBT_S + 0.5, id5=(0.0, 2.0))
+    road.see(1.0, id5=(0.0, 2.0), id6=(0.0, 0.0))
+    assert road.track.track_id == 5
+
+
+def test_an_identity_that_was_away_is_not_believed_far_from_where_it_is_expected(road: Road) -> None:
+    road.see(1.3)
+    road.see(0.5, id1=(0.5, -3.9))
+    assert road.off_m < 0.5
+
+
+def test_of_those_before_the_nose_the_nearest_is_meant() -> None:
+    vehicle = (0.0, 0.0, -4.0)
+
+    def chosen(*places: tuple[float, float]) -> tuple[float, float]:
+        choice = Choice()
+        found = None
+        for frame in range(round(CHOOSING_S / FRAME_S) + 2):
+            targets = [seen(place, vehicle, frame * FRAME_S, index) for index, place in enumerate(places)]
+            found = choice.take(targets, 0.0, round(frame * FRAME_S * 1e9))
+        assert found is not None
+        assert found.position_ned_m is not None
+        return found.position_ned_m[:2]
+
+    assert chosen((56.0, 1.0), (10.0, 0.9)) == (10.0, 0.9)
+    # Aside of the nose only the direction counts.
+    assert chosen((30.0, 1.0), (5.0, 5.0)) == (30.0, 1.0)
+    assert chosen((5.0, 5.0), (30.0, 12.0)) == (30.0, 12.0)
