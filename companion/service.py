@@ -16,6 +16,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from companion.bus import topics
+from companion.bus.messages import (
+    detections_message,
+    labels_message,
+    setpoint_message,
+    tracks_message,
+    vehicle_message,
+)
 from companion.bus.session import Bus
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
@@ -25,23 +32,18 @@ from companion.guidance.commands import Command, Mission
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.obstacles import ObstacleRules, obstacles_message
 from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
+from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.targets import StateHistory
-from companion.messages import (
-    detections_message,
-    labels_message,
-    setpoint_message,
-    tracks_message,
-    vehicle_message,
-)
-from companion.mission import MissionError, mission_behaviour
+from companion.missions.mission_file import MissionError, mission_behaviour
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
-from companion.perception import PerceptionKeeper, PerceptionStartError
-from companion.perception_messages import Preview
-from companion.pose_sharing import PoseSharing
+from companion.perception.keeper import PerceptionKeeper, PerceptionStartError
+from companion.perception.messages import Preview
+from companion.perception.views import View, open_views
+from companion.perception.views_markers import MarkerWatch
 from companion.settings import Settings
 from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
@@ -49,8 +51,6 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.signing import read_key
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
-from companion.views import View, open_views
-from companion.views_markers import MarkerWatch
 from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 

@@ -12,8 +12,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-from companion.fence import Fence, Polygon
-from companion.points import points_from
+from companion.geometry.fence import Fence, Polygon
+from companion.geometry.points import points_from
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.frame_selection import Selection

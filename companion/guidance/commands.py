@@ -7,7 +7,8 @@ import re
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
-from companion.formation import SHAPES
+from companion.geometry.formation import SHAPES
+from companion.geometry.points import points_from
 from companion.guidance.arguments import (
     Argument,
     Choice,
@@ -21,7 +22,6 @@ from companion.guidance.arguments import (
     check,
     names_in,
 )
-from companion.points import points_from
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0

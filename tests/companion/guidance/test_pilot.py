@@ -5,7 +5,7 @@ import pytest
 from kinematic_vehicle import KinematicVehicle
 from scripted_autopilot import Cockpit
 
-from companion.fence import Fence
+from companion.geometry.fence import Fence
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.figure_eight import FigureEightBehaviour
