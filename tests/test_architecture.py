@@ -14,7 +14,6 @@ FLOORS = {
     "geometry": 0,
     "systemd_notify": 0,
     "settings": 1,
-    "config": 2,
     "vehicle": 2,
     "bus": 3,
     "guidance": 3,
@@ -87,9 +86,8 @@ def _top_level(tree: ast.Module) -> list[ast.stmt]:
 
 
 def room(module: str) -> str:
-    """`companion.guidance.pilot` → guidance; `companion.settings_fields` → settings."""
-    name = module.split(".")[1]
-    return name if name in FLOORS else name.split("_")[0]
+    """`companion.guidance.pilot` → guidance."""
+    return module.split(".")[1]
 
 
 def test_vision_imports_nothing_of_the_others() -> None:

@@ -70,9 +70,9 @@ def bench_latency(
     """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
     from companion.bench.latency import measure_latency
     from companion.bus.session import BusError
-    from companion.config import ConfigurationError
     from companion.perception.keeper import PerceptionStartError
     from companion.rehearsal import RehearsalError
+    from companion.settings.reading import ConfigurationError
     from companion.vehicle.driver import LinkError
 
     with plain_errors(RehearsalError, ConfigurationError, LinkError, PerceptionStartError, BusError):

@@ -246,7 +246,7 @@ def train(
 @with_settings
 def config(settings: Settings) -> None:
     """Print the effective settings as a TOML file with a comment on every key."""
-    from companion.config import to_toml
+    from companion.settings.reading import to_toml
 
     typer.echo(to_toml(settings), nl=False)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from companion.config import ConfigurationError, Flag, flags, load_settings
+from companion.settings.reading import ConfigurationError, Flag, flags, load_settings
 
 EXIT_BAD_INPUT = 2
 

@@ -7,9 +7,9 @@ import os
 import time
 from collections.abc import Callable
 
-from companion.config import load_settings
 from companion.guidance.behaviour import Situation
 from companion.service import Service
+from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from companion.config import load_settings
 from companion.geometry.fence import Fence
+from companion.settings.reading import load_settings
 
 SQUARE = ((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))
 POND = ((5.0, 5.0), (10.0, 5.0), (10.0, 10.0), (5.0, 10.0))

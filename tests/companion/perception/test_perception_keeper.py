@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.config import Settings, load_settings
 from companion.perception.keeper import PerceptionKeeper, PerceptionStartError, PerceptionState
+from companion.settings.reading import Settings, load_settings
 from vision.pipeline import PerceptionResult
 from vision.sources import SourceSettings, open_source
 
@@ -314,7 +314,7 @@ async def test_a_replaced_worker_films_into_a_file_of_its_own(photos: Path, tmp_
 
 SERVICE = """
 import asyncio, sys
-from companion.config import load_settings
+from companion.settings.reading import load_settings
 from companion.perception.keeper import PerceptionKeeper
 
 async def main():

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.config import load_settings
 from companion.perception.keeper import PerceptionKeeper, PerceptionState
 from companion.perception.messages import Attitude, Ended, Hud, Report, packed, receive
 from companion.perception.outbox import Outbox
 from companion.perception.tracks import LiveTracks
 from companion.perception.worker import Orders
 from companion.settings import Settings
+from companion.settings.reading import load_settings
 from vision.detections import NO_TRACK, Detections
 from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_euler, quaternion_from_euler

@@ -14,9 +14,9 @@ import pytest
 from service_process import running_service
 
 from companion.bus.client import listen
-from companion.config import ConfigurationError, load_settings, to_toml
 from companion.perception.views import threads_each
 from companion.settings import DetectorSection
+from companion.settings.reading import ConfigurationError, load_settings, to_toml
 from mavlink_sim.testing import running_simulator
 
 

@@ -11,7 +11,9 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen, MultipleOf
 from pydantic import StringConstraints
 from pydantic.fields import FieldInfo
 
-from companion.settings import PATTERN_MEANINGS, Section, Settings, ViewSections
+from companion.settings.section import Section
+from companion.settings.settings import Settings, ViewSections
+from companion.settings.texts import PATTERN_MEANINGS
 
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 _UNSET = ("", "none")

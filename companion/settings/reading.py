@@ -16,8 +16,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from companion.settings import Section, Settings
-from companion.settings_fields import (
+from companion.settings.fields import (
     SECTIONS_OF_VIEW,
     expectation,
     expectation_of_key,
@@ -29,6 +28,8 @@ from companion.settings_fields import (
     toml_value,
     value_from_text,
 )
+from companion.settings.section import Section
+from companion.settings.settings import Settings
 
 __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
 

@@ -8,15 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config import ConfigurationError, Settings, default_path, flags, load_settings, to_toml
+from companion.settings.reading import (
+    ConfigurationError,
+    Settings,
+    default_path,
+    flags,
+    load_settings,
+    to_toml,
+)
 from vision.detector import DEFAULT_MODEL
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(autouse=True)
 def _no_file_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.config.DEFAULT_PATHS", (Path("companion.toml"),))
+    monkeypatch.setattr("companion.settings.reading.DEFAULT_PATHS", (Path("companion.toml"),))
 
 
 def written(path: Path, text: str) -> Path:
