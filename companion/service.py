@@ -31,7 +31,8 @@ from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.commands import Command, Mission
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.obstacles import ObstacleRules, obstacles_message
-from companion.guidance.pilot import Pilot, PilotEvent, PilotEventKind
+from companion.guidance.pilot import Pilot
+from companion.guidance.pilot_event import PilotEvent, PilotEventKind
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search_pattern import Footprint

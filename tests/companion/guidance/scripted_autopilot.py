@@ -11,7 +11,8 @@ from kinematic_vehicle import KinematicVehicle
 from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Outcome, Situation
 from companion.guidance.envelope import Envelope
-from companion.guidance.pilot import Pilot, PilotEvent
+from companion.guidance.pilot import Pilot
+from companion.guidance.pilot_event import PilotEvent
 from companion.vehicle.driver import CommandRefusedError, SystemStatus
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState

@@ -15,7 +15,7 @@ from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.guidance.patrol import PatrolBehaviour
-from companion.guidance.pilot import PilotEventKind
+from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
