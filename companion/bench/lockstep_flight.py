@@ -29,7 +29,7 @@ from vision.detections import Detections
 from vision.rotation import Quaternion
 from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings
 
-# What the drivers ask of an autopilot (`autopilot_driver.WANTED_RATES_HZ`), and home.
+# What the drivers ask of an autopilot (`manners.Manners.rates_hz`), and home.
 RATES_HZ = {
     "HEARTBEAT": 1.0,
     "ATTITUDE_QUATERNION": 50.0,

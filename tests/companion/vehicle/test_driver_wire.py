@@ -12,7 +12,7 @@ import pytest
 from fake_autopilot import MISSION, OFFBOARD, FakeAutopilot, free_port, state_shows, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle import autopilot_driver
+from companion.vehicle import flight_commands, stream_requests
 from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
@@ -23,7 +23,7 @@ from companion.vehicle.state import FlightMode, LandedState
 @pytest.fixture(autouse=True)
 def short_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
     """How long the rates of the streams are measured before any is asked for."""
-    monkeypatch.setattr(autopilot_driver, "_MEASURE_S", 0.3)
+    monkeypatch.setattr(stream_requests, "_MEASURE_S", 0.3)
 
 
 SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
@@ -271,7 +271,7 @@ async def test_takeoff_goes_to_a_height_above_home(driver, autopilot) -> None:
 
 
 async def test_takeoff_without_a_known_home_is_refused_here(driver, autopilot, monkeypatch) -> None:
-    monkeypatch.setattr(autopilot_driver, "_SHOWN_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(flight_commands, "_SHOWN_TIMEOUT_S", 0.2)
     with pytest.raises(CommandRefusedError, match="needs home's altitude"):
         await driver.takeoff(4.0)
     with pytest.raises(CommandRefusedError, match="above 0 m"):
