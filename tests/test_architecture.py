@@ -12,7 +12,6 @@ ROOT = Path(__file__).parent.parent
 # Each room of `companion` and its floor; a room may import from lower floors alone.
 FLOORS = {
     "geometry": 0,
-    "systemd_notify": 0,
     "settings": 1,
     "vehicle": 2,
     "bus": 3,

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from companion.bus import topics
@@ -25,50 +24,36 @@ from companion.bus.messages import (
 )
 from companion.bus.session import Bus
 from companion.guidance import grammar
-from companion.guidance.arguments import GrammarError
-from companion.guidance.battery import BatteryMinimum
-from companion.guidance.behaviour import Behaviour, Outcome, Situation
-from companion.guidance.commands import Command, Mission
-from companion.guidance.envelope import Envelope, Limits
-from companion.guidance.obstacles import ObstacleRules, obstacles_message
+from companion.guidance.behaviour import Situation
+from companion.guidance.envelope import Envelope
+from companion.guidance.obstacles import obstacles_message
 from companion.guidance.pilot import Pilot
 from companion.guidance.pilot_event import PilotEvent, PilotEventKind
 from companion.guidance.pose_sharing import PoseSharing
-from companion.guidance.registry import behaviour_for
-from companion.guidance.search_pattern import Footprint
-from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.targets import StateHistory
-from companion.missions.mission_file import MissionError, mission_behaviour
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.keeper import PerceptionKeeper, PerceptionStartError
 from companion.perception.messages import Preview
 from companion.perception.views import View, open_views
 from companion.perception.views_markers import MarkerWatch
+from companion.service.commands import Commands
+from companion.service.event import Event
+from companion.service.parts import battery_minimum_of, driver_of, limits_of, obstacle_rules_of
+from companion.service.status import status_message
+from companion.service.systemd_notify import SystemdNotifier
 from companion.settings import Settings
-from companion.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
-from companion.vehicle.drivers import open_driver
-from companion.vehicle.signing import read_key
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 
-logger = logging.getLogger(__name__)
+logger = logging.getLogger(__package__)
 
 _HEARTBEAT_PERIOD_S = 1.0
 _HUD_PERIOD_S = 0.2
 _EVENTS_KEPT = 100
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something a person should know. `level` is info, warning or error."""
-
-    stamp_ns: int
-    level: str
-    text: str
 
 
 class Service:
@@ -93,33 +78,24 @@ class Service:
         self._console = console
         self.events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
         guidance = settings.guidance
-        self.driver: Driver = open_driver(
-            settings.vehicle.driver,
-            settings.vehicle.url,
-            system_id=settings.vehicle.system_id,
-            own_system_id=settings.vehicle.system_id,
-            signing_key=None
-            if settings.vehicle.signing_key_file is None
-            else read_key(settings.vehicle.signing_key_file),
-        )
+        self.driver: Driver = driver_of(settings)
         self.streamer = Streamer(
             self.driver.send_setpoint, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s
         )
         self.pilot = Pilot(
             self.driver,
             self.streamer,
-            Envelope(_limits(settings)),
+            Envelope(limits_of(settings)),
             on_event=self._pilot_event,
             class_names=self._class_names,
             lifetime_s=guidance.setpoint_lifetime_s,
-            battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
-            obstacles=ObstacleRules(
-                guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps
-            ),
+            battery=battery_minimum_of(settings),
+            obstacles=obstacle_rules_of(settings),
         )
         self._obstacles: ObstacleSectors | None = None
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
+        self._commands = Commands(self.pilot, self.steering, self._event)
         self.poses = PoseSharing(settings.vehicle.name, self._event)
         self.markers = MarkerWatch(self.views)
         self._landing_target_ns = 0
@@ -135,7 +111,6 @@ class Service:
         self._told: dict[str, Any] | None = None
         self._notifier = SystemdNotifier()
         self._history = StateHistory()
-        self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
         self._started_ns = time.monotonic_ns()
         self._linked = False
         self._seen = asyncio.Event()
@@ -195,50 +170,7 @@ class Service:
         if not self.ready or self._ending:
             reason = "the service is ending" if self._ending else "the service is still starting"
             return {"command": text, "success": False, "reason": reason}
-        # Of a mission that is not on this computer the text may follow its name.
-        text, _, enclosed = text.strip().partition("\n")
-        try:
-            command = grammar.parse(text, self._class_names())
-            behaviour = self._behaviour_for(command, enclosed)
-        except (GrammarError, MissionError) as error:
-            return {"command": text, "success": False, "reason": "; ".join(str(error).splitlines())}
-        self._event("info", f"command: {command}")
-        outcome = await self._outcome_of(command, behaviour)
-        more: dict[str, Any] = {}
-        if isinstance(behaviour, SequenceBehaviour):
-            outcome, more = behaviour.told(outcome), {"steps": [asdict(step) for step in behaviour.records]}
-        self._event("info" if outcome.success else "warning", f"{command}: {outcome.reason}")
-        return {"command": str(command), **asdict(outcome), **more}
-
-    def _behaviour_for(self, command: Command, enclosed: str) -> Behaviour:
-        """Raises GrammarError or MissionError with what is wrong, a line for each."""
-        camera = self.steering.settings.camera
-        footprint = Footprint(math.radians(camera.horizontal_fov_deg), math.radians(-camera.mount_pitch_deg))
-        if isinstance(command, Mission):
-            names = self._class_names()
-            return mission_behaviour(command, enclosed, names, self.pilot.refusal_of, footprint)
-        if enclosed:
-            raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
-        return behaviour_for(command, footprint)
-
-    async def _outcome_of(self, command: Command, behaviour: Behaviour) -> Outcome:
-        ended = self.pilot.command(behaviour)
-        if ended.done() or not command.endless:
-            return await asyncio.shield(ended)
-        under_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._awaited = (behaviour, under_way)
-        waited: set[asyncio.Future[Any]] = {ended, under_way}
-        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
-        return ended.result() if ended.done() else Outcome(True, "under way")
-
-    def _answer_under_way(self) -> None:
-        """A command without an end counts as done when the vehicle flies it."""
-        if self._awaited is None:
-            return
-        behaviour, under_way = self._awaited
-        flown = self.driver.state.mode is FlightMode.OFFBOARD and self.streamer.state is StreamState.FRESH
-        if self.pilot.behaviour is behaviour and flown and not under_way.done():
-            under_way.set_result(None)
+        return await self._commands.do(text)
 
     async def _start(self) -> None:
         starts = [
@@ -302,7 +234,8 @@ class Service:
             self._tell_landing_target()
             if seen:
                 self.streamer.hasten(now_ns)
-            self._answer_under_way()
+            flown = self.driver.state.mode is FlightMode.OFFBOARD and self.streamer.state is StreamState.FRESH
+            self._commands.answer_under_way(flown)
             now_s = now_ns / 1e9
             if now_s >= next_heartbeat_s:
                 next_heartbeat_s = now_s + _HEARTBEAT_PERIOD_S
@@ -360,37 +293,18 @@ class Service:
     def status(self) -> dict[str, Any]:
         """How every part is, as published on `status`."""
         now_ns = time.monotonic_ns()
-        state = self.driver.state
-        return {
-            "stamp_ns": now_ns,
-            "uptime_s": round((now_ns - self._started_ns) / 1e9, 1),
-            "healthy": self._healthy(now_ns),
-            "vehicle": {
-                "connected": state.connected(now_ns),
-                "mode": state.mode.value,
-                "armed": state.armed,
-                "failsafe": state.failsafe,
-            },
-            "pilot": {
-                "in_command": self.pilot.in_command,
-                "behaviour": self.pilot.status,
-                "stream": self.streamer.state.value,
-                "setpoints_sent": self.streamer.sent_count,
-            },
-            "perception": self.views[0].keeper.status.as_dict(),
-            "views": {view.name: view.keeper.status.as_dict() for view in self.views if view.name},
-            "targets": {
-                "view": self.steering.name,
-                "count": len(self.steering.targets),
-                "problem": self.steering.unplaced,
-            },
-            "neighbours": self.poses.status(now_ns),
-            "bus": {
-                "connected": self.bus.connected,
-                "published": dict(self.bus.published),
-                "unsent": self.bus.unsent,
-            },
-        }
+        return status_message(
+            now_ns,
+            uptime_s=(now_ns - self._started_ns) / 1e9,
+            healthy=self._healthy(now_ns),
+            state=self.driver.state,
+            pilot=self.pilot,
+            streamer=self.streamer,
+            views=self.views,
+            steering=self.steering,
+            poses=self.poses,
+            bus=self.bus,
+        )
 
     def _situation(self, now_ns: int) -> Situation:
         age_s = self.steering.age_s(now_ns)
@@ -503,20 +417,3 @@ async def _start(view: View) -> None:
         if view.name is None:
             raise
         raise PerceptionStartError(f"view {view.name}: {error}") from error
-
-
-def _limits(settings: Settings) -> Limits:
-    """The envelope's limits, from the settings of the same names."""
-    guidance = settings.guidance
-    return Limits(
-        max_horizontal_speed_mps=guidance.max_horizontal_speed_mps,
-        max_climb_mps=guidance.max_climb_mps,
-        max_descend_mps=guidance.max_descend_mps,
-        max_yaw_rate_radps=guidance.max_yaw_rate_radps,
-        max_acceleration_mps2=guidance.max_acceleration_mps2,
-        min_altitude_m=guidance.min_altitude_m,
-        max_altitude_m=guidance.max_altitude_m,
-        max_distance_m=guidance.max_distance_m,
-        fence=guidance.fence(),
-        min_separation_m=guidance.min_separation_m,
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
-from companion.systemd_notify import SystemdNotifier
+from companion.service.systemd_notify import SystemdNotifier
 
 
 def test_systemd_hears_that_the_service_is_ready_alive_and_stopping(tmp_path: Path) -> None:
