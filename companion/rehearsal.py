@@ -15,9 +15,9 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from companion.config import load_settings
 from companion.service import Service
 from companion.settings import Settings
+from companion.settings.reading import load_settings
 
 # High enough to see far, low enough that a car at 5 m is in the picture.
 ALTITUDE_M = 4.0

@@ -1,6 +1,6 @@
 """Ultralytics and ours on the same pictures in the same run, in turn; for development only.
 
-Each contestant is a process of its own (`companion.bench_detector`), and they take turns, so that whatever
+Each contestant is a process of its own (`companion.bench.detector`), and they take turns, so that whatever
 else the machine does falls on all alike. Ultralytics is measured as anybody calls it, `predict` on a picture:
 as installed (it chooses its threads), with the threads forced, and on its own OpenVINO export.
 
@@ -31,8 +31,8 @@ OURS = ("torch", "onnxruntime", "openvino")
 
 
 def contestant() -> int:
-    """The process that is measured; see `companion.bench_detector`."""
-    from companion.bench_detector import memory_mb
+    """The process that is measured; see `companion.bench.detector`."""
+    from companion.bench.detector import memory_mb
 
     order = json.loads(sys.stdin.readline())
     sys.stdout = sys.stderr  # their messages must not mix with the answers
@@ -88,7 +88,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--contestant", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    from companion.bench_detector import Measured, draw_pictures, in_turn, machine, table
+    from companion.bench.detector import Measured, draw_pictures, in_turn, machine, table
 
     width, height = (int(number) for number in arguments.frame.split("x"))
     wanted = arguments.only.split(",") if arguments.only else [*CONTESTANTS, *OURS]
@@ -105,7 +105,7 @@ def main() -> int:
         try:
             for one in wanted:
                 if one in OURS:
-                    command = [sys.executable, "-m", "companion.bench_detector"]
+                    command = [sys.executable, "-m", "companion.bench.detector"]
                     asked = {"runtime": one, "threads": arguments.threads}
                 else:
                     command = [sys.executable, __file__, "--model", "-", "--contestant"]

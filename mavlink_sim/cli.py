@@ -55,6 +55,14 @@ def _parameters(assignments: list[str]) -> dict[str, float]:
     return values
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        _say(f"mavlink-sim {version('mavlink-companion')}")
+        raise typer.Exit
+
+
 def _check(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         _fail(f"--{name} {value:g}: expected {low:g} to {high:g}")
@@ -133,6 +141,10 @@ def simulate(
         Path | None, typer.Option(help="Write pid and ports here as JSON once the vehicle runs.")
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Log the links too.")] = False,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_say_version, is_eager=True, help="Show the version."),
+    ] = False,
 ) -> None:
     """Fly a PX4-like multirotor on UDP until interrupted (Ctrl-C)."""
     logging.basicConfig(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink import mavutil
 
-from mavlink_sim.services.telemetry import PREARM_CHECK
+from mavlink_sim.services.telemetry_of_system import PREARM_CHECK
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import parser
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.points import points_from
+from companion.geometry.points import points_from
 
 MOST_POINTS = 500
 FARTHEST_M = 5000.0

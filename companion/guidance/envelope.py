@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
-from companion.fence import Fence
+from companion.geometry.fence import Fence
 from companion.guidance.neighbours import Neighbour
 from companion.guidance.separation import BRAKING, Row, apart, level_rows, rows_at
 from companion.vehicle.setpoint import Setpoint

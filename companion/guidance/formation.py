@@ -2,8 +2,8 @@
 
 The slot is where the shape says, in the leader's heading frame; its velocity (the leader's, and what the turn
 adds) is flown by as it is, and what is missing to the slot by a proportional law, the same for every vehicle:
-so vehicles that change slots do not cross (`companion.formation.assign`). A leader that is not heard any more
-is not guessed at: its followers brake, hold, and after a while end.
+so vehicles that change slots do not cross (`companion.geometry.formation.assign`). A leader that is not heard
+any more is not guessed at: its followers brake, hold, and after a while end.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from companion.formation import Vector3, slot_motion
+from companion.geometry.formation import Vector3, slot_motion
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.formation_group import Agreement, Group
 from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from companion.formation import Vector3, assign, radius_m, slots
+from companion.geometry.formation import Vector3, assign, radius_m, slots
 from companion.guidance.neighbours import Neighbour
 from companion.guidance.pose import FormationNote, Plan
 

@@ -31,7 +31,8 @@ from companion.guidance.arguments import (
     nearest,
     range_of,
 )
-from companion.guidance.commands import COMMANDS, Command, arguments_of, default_of
+from companion.guidance.command import Command, arguments_of, default_of
+from companion.guidance.commands import COMMANDS
 
 
 def parse(text: str, class_names: Sequence[str] | None = None) -> Command:

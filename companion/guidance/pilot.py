@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 
 from companion.guidance.authority import Authority
@@ -20,6 +20,7 @@ from companion.guidance.envelope import Envelope
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.mode_request import perform
 from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
+from companion.guidance.pilot_event import PilotEvent, PilotEventKind
 from companion.guidance.refusal import refusal
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
@@ -33,29 +34,6 @@ SETPOINTS_BEFORE_OFFBOARD = 3
 ENGAGE_TIMEOUT_S = 3.0
 # In OFFBOARD without knowing where we are: brake so long, then leave it to the autopilot.
 POSITION_LOSS_S = 2.0
-
-
-class PilotEventKind(StrEnum):
-    """What can happen to a behaviour."""
-
-    STARTED = "started"
-    ENGAGED = "engaged"  # the vehicle shows OFFBOARD and flies our setpoints
-    NOTED = "noted"  # something on the way that people should know
-    ENDED = "ended"
-    REFUSED = "refused"
-    LOST = "lost"  # command was taken from us
-    BATTERY = "battery"  # too little charge to fly on, or none is told
-
-
-@dataclass(frozen=True, slots=True)
-class PilotEvent:
-    """One line for the record. `behaviour` is its word; `outcome` is there when it ended or was refused."""
-
-    stamp_ns: int
-    kind: PilotEventKind
-    behaviour: str
-    message: str
-    outcome: Outcome | None = None
 
 
 class _Phase(StrEnum):

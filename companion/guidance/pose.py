@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from companion.formation import SHAPES
+from companion.geometry.formation import SHAPES
 from companion.vehicle.state import LandedState, Vector3, VehicleState
 
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.

@@ -116,7 +116,7 @@ class MavsdkDriver(AutopilotDriver):
 
     def _message(self, message: MavlinkMessage) -> None:
         if message.component_id == AUTOPILOT_COMPONENT and self._mavsdk is not None:
-            self._handle(message.message_name, json.loads(message.fields_json))
+            self._heard.handle(message.message_name, json.loads(message.fields_json))
 
     async def _in_thread(self, call: Callable[..., _T], *arguments: object) -> _T:
         return await self._loop.run_in_executor(self._blocking, call, *arguments)

@@ -11,11 +11,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, IN_PROGRESS, AutopilotDriver
+from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame
 from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.manners import ARDUPILOT, PX4
+from companion.vehicle.mav_result import IN_PROGRESS
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, Fields
 
 logger = logging.getLogger(__name__)
@@ -87,7 +88,7 @@ class PymavlinkDriver(AutopilotDriver):
                 continue
             if frame.message_id == CURRENT_MODE_ID:
                 custom_mode, _ = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
-                self._handle("CURRENT_MODE", {"custom_mode": custom_mode})
+                self._heard.handle("CURRENT_MODE", {"custom_mode": custom_mode})
             elif frame.message_id in _DECODED_IDS:
                 try:
                     message = self._codec.decode(bytearray(frame.raw))
@@ -98,7 +99,7 @@ class PymavlinkDriver(AutopilotDriver):
                 if frame.message_id == _PARAM_VALUE_ID:
                     # An integer's bytes read as a float may be a signalling NaN, which the reading changes.
                     fields["value_bytes"] = frame.padded(4)
-                self._handle(message.get_type(), fields)
+                self._heard.handle(message.get_type(), fields)
 
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
@@ -114,7 +115,7 @@ class PymavlinkDriver(AutopilotDriver):
             if name == "COMMAND_ACK" and fields["command"] == command and self._ack_is_ours(fields):
                 results.put_nowait(fields["result"])
 
-        async with self._watching(watch):
+        async with self._heard.watching(watch):
             for attempt in range(_ATTEMPTS):
                 if self._link is None:
                     raise CommandRefusedError(f"{self.url}: the link was closed before an answer came")
@@ -152,7 +153,7 @@ class PymavlinkDriver(AutopilotDriver):
     async def set_parameter(self, name: str, value: float) -> None:
         """See Driver."""
         _, kind = await self._read_parameter(name)
-        wanted = _parameter_bytes(name, value, kind, bytewise=self._manners.parameters_bytewise)
+        wanted = _parameter_bytes(name, value, kind, bytewise=self._heard.manners.parameters_bytewise)
         payload = _PARAM_SET.pack(
             wanted, self._system_id or 0, AUTOPILOT_COMPONENT, _parameter_id(name), kind
         )
@@ -182,7 +183,7 @@ class PymavlinkDriver(AutopilotDriver):
         kind = fields["param_type"]
         if kind not in _PARAM_LAYOUT:
             raise CommandRefusedError(f"parameter {name} has type {kind}, which no autopilot here uses")
-        layout = _PARAM_LAYOUT[kind if self._manners.parameters_bytewise else _REAL32]
+        layout = _PARAM_LAYOUT[kind if self._heard.manners.parameters_bytewise else _REAL32]
         return float(struct.unpack(layout, fields["value_bytes"])[0]), kind
 
     async def _exchange_parameter(
@@ -202,7 +203,7 @@ class PymavlinkDriver(AutopilotDriver):
                 reason = _PARAM_ERRORS.get(fields["error"], f"PARAM_ERROR {fields['error']}")
                 answer.set_exception(CommandRefusedError(f"parameter {name}: {reason}"))
 
-        async with self._watching(watch):
+        async with self._heard.watching(watch):
             for _ in range(_ATTEMPTS):
                 send()
                 await asyncio.wait([answer], timeout=_ATTEMPT_S)

@@ -8,7 +8,6 @@ parameters; times are seconds.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -25,58 +24,15 @@ from mavlink_sim.autopilot.failsafe_actions import (
     motor_response,
     wind_response,
 )
+from mavlink_sim.autopilot.failsafe_announcements import failsafe_entered, failsafe_overruled
+from mavlink_sim.autopilot.failsafe_conditions import Conditions
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
-from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
-
-# Log levels of an EVENT: the lower four bits for ground stations, the upper four for the vehicle's own log.
-INFO_LEVELS = 0x66
-WARNING_LEVELS = 0x44
-CRITICAL_LEVELS = 0x42
+from mavlink_sim.wire.announcements import Text
 
 MANUAL_CONTROL_DISABLED = 4  # COM_RC_IN_MODE
 DELAY_RECOVERY = 0.25  # a delay that was used up comes back this much slower, so that flicker cannot stall it
-
-
-@dataclass(slots=True)
-class Conditions:
-    """What is wrong at this moment; whoever watches something sets its field.
-
-    Attributes:
-        manual_control_lost: neither a remote control nor a joystick counts.
-        ground_station_lost: no ground station's heartbeat (true until the first one).
-        battery_warning: of the emptiest battery.
-        offboard_signal_lost: no setpoint stream.
-        geofence_breached, mission_failed, wind_exceeded, flight_time_exceeded, motor_failed: as they say.
-        mission_finished: the mission's last item is done.
-    """
-
-    manual_control_lost: bool = True
-    ground_station_lost: bool = True
-    battery_warning: BatteryWarning = BatteryWarning.NONE
-    offboard_signal_lost: bool = True
-    geofence_breached: bool = False
-    mission_failed: bool = False
-    mission_finished: bool = False
-    wind_exceeded: bool = False
-    flight_time_exceeded: bool = False
-    motor_failed: bool = False
-
-    def snapshot(self) -> tuple[object, ...]:
-        """All of it, to compare with what was before."""
-        return (
-            self.manual_control_lost,
-            self.ground_station_lost,
-            self.battery_warning,
-            self.offboard_signal_lost,
-            self.geofence_breached,
-            self.mission_failed,
-            self.mission_finished,
-            self.wind_exceeded,
-            self.flight_time_exceeded,
-            self.motor_failed,
-        )
 
 
 @dataclass(slots=True)
@@ -386,14 +342,14 @@ class FailsafeMachine:
                 if sticks_request and not self.user_took_over:
                     intended = Mode.POSCTL
                 if not self.user_took_over:
-                    self._event("failsafe_rc_override", INFO_LEVELS)
+                    self._say(failsafe_overruled())
                 took_over, delayed = True, Action.NONE
                 action = max(Action.WARN, self._mode_fallback(conditions, intended))
             action, cause = self._possible(action, cause)
             action, delayed = self._softened(action, delayed, intended)
         self._use_delay(dt_s, delayed is not Action.NONE)
         if action > before or (action is not Action.NONE and self._must_notify):
-            self._notify(intended, action, delayed, cause)
+            self._say(failsafe_entered(intended, action, delayed, cause, self._delay_s))
         self._must_notify = False
         if before > Action.WARN >= action and intended is Mode.ORBIT:
             intended = Mode.HOLD  # the circle that it had been flying is forgotten
@@ -435,43 +391,3 @@ class FailsafeMachine:
             self._start_delay_s = max(self._start_delay_s - dt_s, 0.0)
         else:
             self._start_delay_s = min(self._start_delay_s + DELAY_RECOVERY * dt_s, self._act_delay_s)
-
-    # ---- what is said -----------------------------------------------------------------------------------
-
-    def _notify(self, intended: Mode, action: Action, delayed: Action, cause: Cause) -> None:
-        mode = struct.pack("<I", intended.custom_mode)
-        if action is Action.HOLD and delayed is not Action.NONE:
-            seconds = int(self._delay_s + 0.5)
-            arguments = mode + struct.pack("<BH", delayed, seconds)
-            name = "commander_failsafe_enter_generic_hold"
-            if cause is not Cause.GENERIC:
-                name, arguments = "commander_failsafe_enter_hold", arguments + bytes([cause])
-            text = f"Failsafe activated: entering Hold for {seconds} seconds\t"
-            self._event(name, CRITICAL_LEVELS, arguments, text)
-            return
-        text = "" if action is Action.WARN else "Failsafe activated\t"
-        if cause is Cause.GENERIC:
-            if action is Action.WARN:
-                self._event("commander_failsafe_enter_generic_warn", WARNING_LEVELS, mode)
-            elif action in (Action.DESCEND, Action.FALLBACK_ALTITUDE, Action.FALLBACK_STABILIZED):
-                name = "commander_failsafe_enter_autopilot_disengaged"
-                self._event(name, CRITICAL_LEVELS, mode + bytes([action]), text)
-            else:
-                self._event("commander_failsafe_enter_generic", CRITICAL_LEVELS, mode + bytes([action]), text)
-        elif action is Action.WARN:
-            self._warn(mode, cause)
-        else:
-            self._event("commander_failsafe_enter", CRITICAL_LEVELS, mode + bytes([action, cause]), text)
-
-    def _warn(self, mode: bytes, cause: Cause) -> None:
-        if cause is Cause.BATTERY_LOW:
-            self._event("commander_failsafe_enter_low_bat", 0x64)
-        elif cause is Cause.BATTERY_CRITICAL:
-            self._event("commander_failsafe_enter_crit_bat_warn", 0x62)
-        elif cause is Cause.BATTERY_EMERGENCY:
-            self._event("commander_failsafe_enter_crit_low_bat_warn", 0x60)
-        else:
-            self._event("commander_failsafe_enter_warn", WARNING_LEVELS, mode + bytes([cause]))
-
-    def _event(self, name: str, levels: int, arguments: bytes = b"", text: str = "") -> None:
-        self._say(Text(CRITICAL, text, (event_identifier(name), levels, arguments)))

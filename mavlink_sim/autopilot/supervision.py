@@ -11,7 +11,9 @@ import struct
 from typing import TYPE_CHECKING
 
 from mavlink_sim.autopilot.failsafe_actions import Action
-from mavlink_sim.autopilot.failsafes import INFO_LEVELS, Conditions, FailsafeMachine
+from mavlink_sim.autopilot.failsafe_announcements import INFO_LEVELS
+from mavlink_sim.autopilot.failsafe_conditions import Conditions
+from mavlink_sim.autopilot.failsafes import FailsafeMachine
 from mavlink_sim.autopilot.manual_control import GESTURE, ManualControl, Request, RequestKind, Source
 from mavlink_sim.autopilot.position_failsafe import needs_position
 from mavlink_sim.flight.transmitter import Sticks, Transmitter, read_sticks, read_switches

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from mavlink_sim.autopilot.failsafe_actions import Action
-from mavlink_sim.autopilot.failsafes import Conditions, FailsafeMachine
+from mavlink_sim.autopilot.failsafe_conditions import Conditions
+from mavlink_sim.autopilot.failsafes import FailsafeMachine
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode

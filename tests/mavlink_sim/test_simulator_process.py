@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,11 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
     assert finished.stderr.strip() == (
         f"mavlink-sim: UDP port 127.0.0.1:{port} is already in use; stop its user or choose another port"
     )
+
+
+def test_the_version_is_told() -> None:
+    finished = run("--version")
+    assert (finished.returncode, finished.stdout) == (0, f"mavlink-sim {version('mavlink-companion')}\n")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

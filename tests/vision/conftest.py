@@ -1,6 +1,8 @@
-"""Classes that bear the names of Ultralytics' layers, so that a pickle can name them."""
+"""Classes that bear the names of Ultralytics' layers, so that a pickle can name them; and no proxy."""
 
 from __future__ import annotations
+
+from urllib.request import getproxies
 
 import pytest
 from foreign_checkpoints import FOREIGN, foreign_classes
@@ -21,3 +23,11 @@ def early_foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]
         for name, place in FOREIGN.items()
     }
     return foreign_classes(monkeypatch, places)
+
+
+@pytest.fixture
+def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loopback is asked directly, whatever the machine's environment says."""
+    for name in getproxies():
+        monkeypatch.delenv(f"{name}_proxy", raising=False)
+        monkeypatch.delenv(f"{name.upper()}_PROXY", raising=False)

@@ -9,9 +9,11 @@ from dataclasses import replace
 from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
-from companion.guidance.behaviour import Outcome, Situation
+from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.envelope import Envelope
-from companion.guidance.pilot import Pilot, PilotEvent
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.pilot import Pilot
+from companion.guidance.pilot_event import PilotEvent, PilotEventKind
 from companion.vehicle.driver import CommandRefusedError, SystemStatus
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -210,3 +212,27 @@ class Cockpit:
     async def outcome(self, future: asyncio.Future[Outcome], seconds: float = 120.0) -> Outcome:
         await self.until(future.done, seconds)
         return future.result()
+
+
+def flying(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:
+    """In the air."""
+    return KinematicVehicle(mode=mode)
+
+
+def parked(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:
+    """On the ground, disarmed."""
+    return KinematicVehicle(position=[0.0, 0.0, 0.0], mode=mode, armed=False, landed=LandedState.ON_GROUND)
+
+
+async def engaged(cockpit: Cockpit, behaviour: Behaviour | None = None) -> asyncio.Future[Outcome]:
+    """Flying a behaviour in OFFBOARD."""
+    await cockpit.turn(0.1)
+    future = cockpit.pilot.command(behaviour or HoldBehaviour())
+    await cockpit.until(lambda: cockpit.pilot.phase == "offboard", 5.0)
+    await cockpit.turn(0.5)
+    return future
+
+
+def kinds(cockpit: Cockpit) -> list[PilotEventKind]:
+    """What the pilot has told of, in order."""
+    return [event.kind for event in cockpit.events]

@@ -6,7 +6,7 @@ from companion.guidance.battery import BATTERY_MAX_AGE_S, BatteryMinimum
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.pilot import PilotEventKind
+from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kinematic_vehicle import KinematicVehicle
 
-from companion.fence import Fence
+from companion.geometry.fence import Fence
 from companion.guidance.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState

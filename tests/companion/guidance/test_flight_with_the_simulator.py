@@ -11,7 +11,8 @@ from pymavlink import mavutil
 from companion.guidance.behaviour import Situation
 from companion.guidance.envelope import Envelope
 from companion.guidance.grammar import parse
-from companion.guidance.pilot import Pilot, PilotEventKind
+from companion.guidance.pilot import Pilot
+from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.registry import behaviour_for
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.state import FlightMode

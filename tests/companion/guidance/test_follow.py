@@ -3,8 +3,8 @@ import math
 import pytest
 from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
 
-from companion.bench_flights import UnknownFlightError, flight_named, flights, summary
-from companion.bench_flights_follow import run
+from companion.bench.flights import UnknownFlightError, flight_named, flights, summary
+from companion.bench.flights_follow import run
 from companion.guidance.follow import FollowBehaviour
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for

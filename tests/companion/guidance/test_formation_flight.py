@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from companion.bench_formation import Fleet, PointAirframe
+from companion.bench.formation import Fleet, PointAirframe
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour

@@ -18,8 +18,8 @@ from companion.guidance.envelope import Envelope
 from companion.guidance.formation import FormationBehaviour
 from companion.guidance.grammar import parse
 from companion.guidance.pilot import Pilot
+from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.registry import behaviour_for
-from companion.pose_sharing import PoseSharing
 from companion.settings import ZenohSection
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.streamer import Streamer

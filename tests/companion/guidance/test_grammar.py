@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.guidance.arguments import GrammarError
+from companion.guidance.command import arguments_of
 from companion.guidance.commands import (
     COMMANDS,
     Approach,
@@ -19,7 +20,6 @@ from companion.guidance.commands import (
     Seek,
     Stop,
     Takeoff,
-    arguments_of,
 )
 from companion.guidance.grammar import describe, parse
 from companion.guidance.registry import behaviour_for

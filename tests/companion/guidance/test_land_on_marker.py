@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.bench_flights_land import land
+from companion.bench.flights_land import land
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Requirement, Situation
 from companion.guidance.grammar import parse

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from kinematic_vehicle import KinematicVehicle
 from scripted_autopilot import Cockpit
 
-from companion.bench_flights_obstacles import ALLOWED_M, MARGIN_M, run
+from companion.bench.flights_obstacles import ALLOWED_M, MARGIN_M, run
 from companion.guidance.behaviour import Situation
 from companion.guidance.envelope import Envelope
 from companion.guidance.goto import GotoBehaviour

@@ -6,9 +6,9 @@ from scripted_autopilot import Cockpit
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement
 from companion.guidance.hold import HoldBehaviour
-from companion.guidance.pilot import PilotEventKind
+from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.sequence import Plan, PlannedStep, SequenceBehaviour
-from companion.mission import plan_from
+from companion.missions.mission_file import plan_from
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
 

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Iterator
 import pytest
 from fake_autopilot import FakeAutopilot, free_port
 
+from companion.vehicle import stream_requests
 from companion.vehicle.driver import Driver
 from companion.vehicle.drivers import open_driver
 
@@ -36,6 +37,12 @@ async def driver(kind: str, port: int, autopilot: FakeAutopilot) -> AsyncIterato
     await opened.connect(10.0)
     yield opened
     await opened.close()
+
+
+@pytest.fixture
+def short_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How long the rates of the streams are measured before any is asked for."""
+    monkeypatch.setattr(stream_requests, "_MEASURE_S", 0.3)
 
 
 @pytest.fixture(autouse=True)

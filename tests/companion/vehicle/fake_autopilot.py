@@ -15,6 +15,7 @@ from companion.vehicle.framing import frames_of
 from companion.vehicle.state import VehicleState
 
 HOLD, OFFBOARD, MISSION = 0x03040000, 0x00060000, 0x04040000
+SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
 
 
 class FakeAutopilot:

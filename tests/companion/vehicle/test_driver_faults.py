@@ -172,7 +172,7 @@ async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(kind: str, 
             before = driver.state.home_altitude_amsl_m
             await driver.arm()
             # A restart is a clock that goes back by more than datagrams overtake each other.
-            await wait_until(lambda: driver._boot_ms > 6_000, 10.0)
+            await wait_until(lambda: driver._heard._boot_ms > 6_000, 10.0)
             simulator.fault("reboot 2")
             await state_shows(driver, lambda s: not s.armed)
             await wait_until(lambda: "has restarted" in caplog.text, 10.0)
@@ -226,7 +226,7 @@ async def test_a_second_autopilot_of_the_same_id_is_named(kind: str, caplog) -> 
             await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
             simulator.fault("end all")
             await asyncio.to_thread(simulator.wait_for_event, "second_autopilot ends")
-            await wait_until(lambda: not driver._two_autopilots(time.monotonic_ns()), 10.0)
+            await wait_until(lambda: not driver._heard.two_autopilots(time.monotonic_ns()), 10.0)
             await state_shows(driver, lambda s: s.ready_to_arm)
             await driver.arm()
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config import load_settings, to_toml
+from companion.settings.reading import load_settings, to_toml
 from companion.vehicle.driver import CommandRefusedError, LinkError
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import Framer

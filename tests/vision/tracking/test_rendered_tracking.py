@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from companion.bench_scenes import MOTIONS, DrawnDetector, Motion, scene_frames, without_image
-from companion.bench_tracking import Seen, attitudes_of, no_tracking, tracked
+from companion.bench.scenes import MOTIONS, DrawnDetector, Motion, scene_frames, without_image
+from companion.bench.tracking import Seen, attitudes_of, no_tracking, tracked
 from vision.tracking import TrackerSettings
 from vision.tracking.clear_mot import MotScore, clear_mot
 

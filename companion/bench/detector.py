@@ -1,0 +1,263 @@
+"""Measuring the detector: every runtime in a process of its own, in turn, so that all meet the same weather.
+
+`python -m companion.bench.detector` is that process. It takes its order as a line of JSON, says when its
+first detection is done, then for each number it reads detects in so many pictures and tells how long each
+took. Whoever measures something else beside it (`development/bench_ultralytics.py`) speaks the same lines.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROUNDS = 5
+_WARM_UP = 8
+_PICTURES = 8
+# Columns of the table, with their widths.
+_TABLE = {
+    "runtime": 12,
+    "precision": 9,
+    "threads": 7,
+    "fastest_ms": 10,
+    "p50_ms": 9,
+    "p99_ms": 9,
+    "around_p50_ms": 13,
+    "frames_per_s": 12,
+    "memory_mb": 9,
+    "first_detection_s": 17,
+}
+
+
+class BenchError(Exception):
+    """A measured process did not do what it was told; the message has its last words."""
+
+
+class Measured:
+    """A process that detects when it is told. A context: leaving it ends the process.
+
+    Attributes:
+        label: how messages name it.
+        answer: what it said of itself after its first detection.
+        first_detection_s: from the process's start to the end of its first detection.
+    """
+
+    def __init__(self, label: str, command: Sequence[str], order: dict[str, Any]) -> None:
+        self.label = label
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the process
+        started = time.perf_counter()
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True
+        )
+        try:
+            self.answer = self._ask(json.dumps(order))
+        except BaseException:
+            self.close()
+            raise
+        self.first_detection_s = time.perf_counter() - started
+        self._times: list[list[float]] = []
+
+    def __enter__(self) -> Measured:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.communicate()
+        self._errors.close()
+
+    def detect(self, pictures: int, *, count: bool = True) -> None:
+        """Detect in so many pictures; `count` False: only to get warm."""
+        told = self._ask(str(pictures))
+        self.answer |= {"memory_mb": told["memory_mb"]}
+        if count:
+            self._times += told["times_ms"]
+
+    def figures(self) -> dict[str, Any]:
+        """All that was measured, milliseconds of one picture, pixels in, boxes out."""
+        table = np.asarray(self._times)
+        total = table.sum(axis=1)
+        return {
+            **{name: value for name, value in self.answer.items() if name != "memory_mb"},
+            "frames": len(total),
+            "fastest_ms": round(float(total.min()), 3),
+            "p50_ms": round(float(np.percentile(total, 50)), 3),
+            "p99_ms": round(float(np.percentile(total, 99)), 3),
+            "max_ms": round(float(total.max()), 3),
+            "network_p50_ms": round(float(np.percentile(table[:, 1], 50)), 3),
+            "around_p50_ms": round(float(np.percentile(table[:, 0] + table[:, 2], 50)), 3),
+            "frames_per_s": round(1e3 * len(total) / float(total.sum()), 1),
+            "memory_mb": self.answer["memory_mb"],
+            "first_detection_s": round(self.first_detection_s, 2),
+        }
+
+    def _ask(self, line: str) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(line + "\n")
+            self._process.stdin.flush()
+            told: dict[str, Any] = json.loads(self._process.stdout.readline())
+        except (OSError, ValueError):
+            self._process.wait(timeout=10)
+            self._errors.seek(0)
+            last = (self._errors.read().strip().splitlines() or ["it said nothing"])[-1]
+            raise BenchError(f"{self.label}: {last}") from None
+        if "error" in told:
+            raise BenchError(f"{self.label}: {told['error']}")
+        return told
+
+
+def measure_detectors(
+    model: str,
+    *,
+    runtimes: Sequence[str],
+    image_size: int,
+    frames: int,
+    threads: int | None,
+    precision: str = "auto",
+    classes: Sequence[str | int] | None = None,
+    width: int = 640,
+    height: int = 480,
+) -> dict[str, Any]:
+    """Every runtime in `runtimes`, in turn, on the same drawn pictures of `width` × `height`.
+
+    Returns:
+        `machine`, what was asked, and `rows`, one a runtime.
+    """
+    order = {
+        "model": model,
+        "image_size": image_size,
+        "threads": threads,
+        "precision": precision,
+        "classes": None if classes is None else list(classes),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        pictures = draw_pictures(Path(folder) / "pictures.npy", width, height)
+        command = [sys.executable, "-m", "companion.bench.detector"]
+        measured: list[Measured] = []
+        try:
+            for runtime in runtimes:
+                one = Measured(runtime, command, {**order, "runtime": runtime, "pictures": str(pictures)})
+                measured.append(one)
+            in_turn(measured, frames)
+            rows = [one.figures() for one in measured]
+        finally:
+            for one in measured:
+                one.close()
+    return {"machine": machine(), **order, "frame": f"{width}x{height}", "rows": rows}
+
+
+def in_turn(measured: Sequence[Measured], frames: int) -> None:
+    """Let each detect in `frames` pictures, a part of them each time it is its turn."""
+    for one in measured:
+        one.detect(_WARM_UP, count=False)
+    parts = [frames // ROUNDS + (number < frames % ROUNDS) for number in range(ROUNDS)]
+    for part in filter(None, parts):
+        for one in measured:
+            one.detect(part)
+
+
+def draw_pictures(path: Path, width: int, height: int) -> Path:
+    """A few pictures of the built-in world, (N, height, width, 3) uint8 BGR, as a numpy file."""
+    from mavlink_sim.datasets.training_scenes import random_scene
+
+    rng = np.random.default_rng(0)
+    np.save(path, np.stack([random_scene(rng, width, height)[0] for _ in range(_PICTURES)]))
+    return path
+
+
+def machine() -> dict[str, Any]:
+    """What the figures hang on."""
+    from vision.runtimes.trial import board
+
+    return {"board": board(), "processors": len(os.sched_getaffinity(0)), "python": platform.python_version()}
+
+
+def table(result: dict[str, Any], against: dict[str, Any] | None = None) -> list[str]:
+    """The rows as lines; with an earlier result, how each compares."""
+    longest = max(len(str(row["runtime"])) for row in result["rows"])
+    columns = _TABLE | {"runtime": max(longest, _TABLE["runtime"])}
+    lines = ["  ".join(f"{name:>{width}}" for name, width in columns.items())]
+    before = {_key(row): row for row in (against or {}).get("rows", [])}
+    for row in result["rows"]:
+        line = "  ".join(f"{row[name]!s:>{width}}" for name, width in columns.items())
+        earlier = before.get(_key(row))
+        if earlier is not None:
+            line += f"   p50 was {earlier['p50_ms']} ms: {row['p50_ms'] / earlier['p50_ms']:.2f} of it"
+        elif against is not None:
+            line += "   not measured before"
+        lines.append(line)
+    return lines
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """An earlier result, as `--json` printed it. Raises `BenchError`."""
+    try:
+        result = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BenchError(f"{path}: is no result of `companion bench detector --json` ({error})") from error
+    rows = result.get("rows") if isinstance(result, dict) else None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and "p50_ms" in row for row in rows):
+        raise BenchError(f"{path}: is no result of `companion bench detector --json`: it has no rows")
+    found: dict[str, Any] = result
+    return found
+
+
+def memory_mb() -> float:
+    """Of this process, resident now."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return round(int(line.split()[1]) / 1024, 1)
+    raise BenchError("/proc/self/status does not tell the memory")
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row.get(name) for name in ("runtime", "precision", "threads"))
+
+
+def main() -> int:
+    order = json.loads(sys.stdin.readline())
+    try:
+        from vision.detector import Detector
+
+        detector = Detector(
+            order["model"],
+            image_size=order["image_size"],
+            threads=order["threads"],
+            precision=order["precision"],
+            classes=order["classes"],
+            runtime=order["runtime"],
+        )
+        pictures = np.load(order["pictures"])
+        detector.detect(pictures[0])
+    except (ValueError, OSError, RuntimeError) as error:  # told to who asked
+        print(json.dumps({"error": " ".join(str(error).split())}), flush=True)
+        return 1
+    said = {"runtime": detector.runtime, "precision": detector.precision, "threads": detector.threads}
+    print(json.dumps({**said, "memory_mb": memory_mb()}), flush=True)
+    for line in sys.stdin:
+        times = []
+        for number in range(int(line)):
+            detector.detect(pictures[number % len(pictures)])
+            timing = detector.last_timing
+            assert timing is not None
+            times.append([timing.preprocess_ms, timing.inference_ms, timing.postprocess_ms])
+        print(json.dumps({"times_ms": times, "memory_mb": memory_mb()}), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,221 @@
+"""A detector made of the truth: boxes projected through the camera's model, with a detector's faults.
+
+Many flights of a behaviour cannot each run a network. Here boxes are off by a share of their size, single
+frames miss an object, what is half hidden is seen with less confidence, and now and then something is seen
+that is not there. Objects are upright boxes on level ground, which hide each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.vehicle.state import Quaternion, Vector3
+from vision.camera_model import CameraModel, CameraMount
+from vision.depth import CENTRAL_FRACTION, NEAR_PERCENTILE
+from vision.detections import Detections
+from vision.rotation import matrix_from_quaternion
+
+# Of an object's outline inside the picture and not hidden: with less it is not found.
+LEAST_VISIBLE = 0.35
+LEAST_PIXELS = 5.0
+NEAR_M = 0.1
+# Rays of a box, from its middle in halves of its sides.
+GRID = np.array([[x, y] for x in np.linspace(-1.0, 1.0, 7) for y in np.linspace(-1.0, 1.0, 7)])
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-1.0, 0.0)])
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where something stands: north, east in metres, heading in radians."""
+
+    north_m: float
+    east_m: float
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """An upright box on the ground.
+
+    Attributes:
+        class_name: as the detector calls it; empty: it only hides others.
+        size_m: length, width, height.
+        pose: at seconds of the flight.
+        hidden: at seconds of the flight it is behind something that is not drawn.
+    """
+
+    class_name: str
+    size_m: Vector3
+    pose: Callable[[float], Pose]
+    hidden: Callable[[float], bool] = lambda _: False
+
+    def range_m(self, place: Sequence[float], seconds: float) -> float:
+        """Horizontal metres from (north, east) to the nearest point of its footprint, 0 inside."""
+        pose = self.pose(seconds)
+        north, east = place[0] - pose.north_m, place[1] - pose.east_m
+        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+        along = max(abs(c * north + s * east) - self.size_m[0] / 2, 0.0)
+        across = max(abs(c * east - s * north) - self.size_m[1] / 2, 0.0)
+        return math.hypot(along, across)
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What is wrong with the detector. Shares 0..1; the jitter is one sigma of the box's own side."""
+
+    jitter: float = 0.03
+    missed: float = 0.10
+    false_per_frame: float = 0.25
+    range_sigma: float = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class _Outline:
+    thing: int
+    xyxy: NDArray[np.float64]
+    nearest_m: float
+    inside: float
+
+
+class DrawnDetector:
+    """Callable as `lockstep_flight.Sight.detect`. The same seed and calls give the same detections.
+
+    Args:
+        with_depth: detections have a range, as with a depth camera.
+    """
+
+    def __init__(
+        self,
+        things: Sequence[Thing],
+        camera: CameraModel,
+        mount: CameraMount,
+        *,
+        seed: int = 0,
+        with_depth: bool = False,
+        faults: Faults | None = None,
+    ) -> None:
+        self._things, self._camera, self._mount = tuple(things), camera, mount
+        self._with_depth, self._faults = with_depth, faults or Faults()
+        self._rng = np.random.default_rng((seed, 71))
+        self.class_names = tuple(dict.fromkeys(thing.class_name for thing in things if thing.class_name))
+
+    def __call__(self, position_ned_m: Vector3, attitude: Quaternion, seconds: float) -> Detections:
+        """What is seen from a true pose (attitude: body FRD to NED)."""
+        ned_from_body = matrix_from_quaternion(attitude)
+        eye = np.asarray(position_ned_m) + ned_from_body @ self._mount.position_frd_m
+        optical_from_ned = self._mount.ned_from_optical(ned_from_body).T
+        rng, faults = self._rng, self._faults
+        boxes: list[NDArray[np.float64]] = []
+        confidences, classes, ranges = [], [], []
+        outlines = [
+            outline
+            for index, thing in enumerate(self._things)
+            if (outline := self._outline(index, thing, eye, optical_from_ned, seconds)) is not None
+        ]
+        for outline in outlines:
+            thing = self._things[outline.thing]
+            missed, shake = rng.random() < faults.missed, rng.normal(0.0, faults.jitter, 4)
+            unsure, far = rng.normal(0.0, 0.06), rng.normal(0.0, faults.range_sigma)
+            sides = np.tile(outline.xyxy[2:] - outline.xyxy[:2], 2)
+            visible = outline.inside * (1.0 - _hidden(outline, outlines))
+            if (
+                not thing.class_name
+                or thing.hidden(seconds)
+                or missed
+                or visible < LEAST_VISIBLE
+                or sides.min() < LEAST_PIXELS
+            ):
+                continue
+            box = outline.xyxy + shake * sides
+            boxes.append(box)
+            confidences.append(0.15 + 0.65 * min(1.0, visible / 0.8) + unsure)
+            classes.append(self.class_names.index(thing.class_name))
+            depth = self._depth(thing, box, eye, optical_from_ned, seconds) if self._with_depth else math.nan
+            ranges.append(depth * (1.0 + far))
+        for _ in range(int(rng.poisson(faults.false_per_frame))):
+            width, height = rng.uniform(10, 80, 2)
+            left = rng.uniform(0, self._camera.width - width)
+            top = rng.uniform(0, self._camera.height - height)
+            boxes.append(np.array([left, top, left + width, top + height]))
+            confidences.append(rng.uniform(0.1, 0.5))
+            classes.append(int(rng.integers(len(self.class_names))))
+            ranges.append(rng.uniform(2.0, 30.0) if self._with_depth else math.nan)
+        if not boxes:
+            return Detections.empty(self.class_names)
+        limits = (self._camera.width - 1.0, self._camera.height - 1.0) * 2
+        return Detections(
+            np.clip(np.array(boxes), 0.0, limits).astype(np.float32),
+            np.clip(confidences, 0.02, 0.98).astype(np.float32),
+            np.array(classes, np.int64),
+            self.class_names,
+            np.array(ranges, np.float32),
+        )
+
+    def _outline(
+        self,
+        index: int,
+        thing: Thing,
+        eye: NDArray[np.float64],
+        optical_from_ned: NDArray[np.float64],
+        seconds: float,
+    ) -> _Outline | None:
+        pose = thing.pose(seconds)
+        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        corners = (CORNERS * thing.size_m) @ turn.T + (pose.north_m, pose.east_m, 0.0)
+        points = (corners - eye) @ optical_from_ned.T
+        if points[:, 2].min() < NEAR_M:
+            return None
+        pixels = self._camera.project(points)
+        whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+        limits = np.array((self._camera.width - 1.0, self._camera.height - 1.0) * 2)
+        shown = np.clip(whole, 0.0, limits)
+        area, kept = float(np.prod(whole[2:] - whole[:2])), float(np.prod(shown[2:] - shown[:2]))
+        if kept <= 0.0:
+            return None
+        return _Outline(index, shown, float(np.linalg.norm(points, axis=1).min()), kept / area)
+
+    def _depth(
+        self,
+        thing: Thing,
+        box: NDArray[np.float64],
+        eye: NDArray[np.float64],
+        optical_from_ned: NDArray[np.float64],
+        seconds: float,
+    ) -> float:
+        """Along the optical axis to the object's near surface in its box, as `vision.depth` takes it.
+
+        Rays through the central part of the box meet the object's sides (slab method).
+        """
+        pose = thing.pose(seconds)
+        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+        to_object = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * CENTRAL_FRACTION
+        pixels = middle + GRID * half
+        rays = self._camera.rays(pixels)
+        directions = (rays / rays[:, 2:]) @ (to_object @ optical_from_ned.T).T
+        origin = to_object @ (eye - (pose.north_m, pose.east_m, 0.0))
+        length, width, height = thing.size_m
+        low, high = np.array([-length / 2, -width / 2, -height]), np.array([length / 2, width / 2, 0.0])
+        with np.errstate(divide="ignore"):
+            first, second = (low - origin) / directions, (high - origin) / directions
+        enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+        met = enters[(leaves >= enters) & (enters > 0.0)]
+        return float(np.percentile(met, NEAR_PERCENTILE)) if len(met) else math.nan
+
+
+def _hidden(outline: _Outline, outlines: Sequence[_Outline]) -> float:
+    """Share of an outline that what is nearer covers; the most by one of them."""
+    area = float(np.prod(outline.xyxy[2:] - outline.xyxy[:2]))
+    worst = 0.0
+    for other in outlines:
+        if other.thing == outline.thing or other.nearest_m >= outline.nearest_m:
+            continue
+        low, high = np.maximum(outline.xyxy[:2], other.xyxy[:2]), np.minimum(outline.xyxy[2:], other.xyxy[2:])
+        worst = max(worst, float(np.prod(np.maximum(high - low, 0.0))) / area)
+    return worst

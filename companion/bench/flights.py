@@ -1,0 +1,130 @@
+"""How well a behaviour flies: the same flight over many seeds, in lockstep, and a table of what came out.
+
+A flight is a module `companion/bench/flights_NAME.py` with a function `run(seed: int) -> FlightResult`; it is
+found by that name (`_` is written `-`). The same seed gives the same flight, every time.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+
+@dataclass(frozen=True, slots=True)
+class FlightResult:
+    """One flight.
+
+    Attributes:
+        success: it did what the behaviour promises.
+        values: figures by name; the unit stands in the name (`range_error_m`). NaN where there is none.
+        reason: how it ended, in words.
+    """
+
+    seed: int
+    success: bool
+    values: dict[str, float] = field(default_factory=dict)
+    reason: str = ""
+
+
+Flight = Callable[[int], FlightResult]
+
+_PREFIX = "flights_"
+_FIGURES = ("mean", "min", "p5", "p50", "p95", "max")
+
+
+class UnknownFlightError(LookupError):
+    """There is no such flight. The message names those that there are."""
+
+
+def flights() -> tuple[str, ...]:
+    """What can be flown, by name, in order."""
+    package = importlib.import_module("companion.bench")
+    modules = (module.name for module in pkgutil.iter_modules(package.__path__))
+    return tuple(
+        sorted(name.removeprefix(_PREFIX).replace("_", "-") for name in modules if name.startswith(_PREFIX))
+    )
+
+
+def flight_named(name: str) -> Flight:
+    """The function that flies it. Raises UnknownFlightError."""
+    known = flights()
+    if name not in known:
+        raise UnknownFlightError(f"no flight is called {name!r}; there are: {', '.join(known) or 'none'}")
+    flight: Flight = importlib.import_module(f"companion.bench.{_PREFIX}{name.replace('-', '_')}").run
+    return flight
+
+
+def fly(name: str, seeds: Sequence[int], processes: int = 1) -> Iterator[FlightResult]:
+    """Fly it once with each seed, the results in the seeds' order.
+
+    Args:
+        processes: at once; 1 flies in this one.
+
+    Raises:
+        UnknownFlightError: before the first flight.
+    """
+    flight = flight_named(name)
+    if processes <= 1 or len(seeds) <= 1:
+        yield from map(flight, seeds)
+        return
+    with ProcessPoolExecutor(min(processes, len(seeds)), get_context("spawn")) as pool:
+        yield from pool.map(_fly_one, [name] * len(seeds), seeds)
+
+
+def _fly_one(name: str, seed: int) -> FlightResult:
+    # A network's thread pool in every process would have them wait for each other.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    return flight_named(name)(seed)
+
+
+def summary(name: str, results: Sequence[FlightResult]) -> dict[str, Any]:
+    """Success rate, mean and spread of each value, and what went wrong; plain values, ready for JSON.
+
+    Raises:
+        ValueError: there are no results.
+    """
+    if not results:
+        raise ValueError(f"{name}: no flights were flown")
+    names = dict.fromkeys(key for result in results for key in result.values)
+    values = {}
+    for key in names:
+        numbers = np.array([result.values.get(key, np.nan) for result in results], np.float64)
+        known = numbers[np.isfinite(numbers)]
+        figures = (
+            (known.mean(), known.min(), *np.percentile(known, (5, 50, 95)), known.max())
+            if len(known)
+            else (np.nan,) * len(_FIGURES)
+        )
+        values[key] = {
+            **{name: float(value) for name, value in zip(_FIGURES, figures, strict=True)},
+            "flights": len(known),
+        }
+    return {
+        "flight": name,
+        "runs": len(results),
+        "successes": sum(result.success for result in results),
+        "success_rate": sum(result.success for result in results) / len(results),
+        "values": values,
+        "failures": {result.seed: result.reason for result in results if not result.success},
+    }
+
+
+def flights_table(figures: dict[str, Any]) -> Table:
+    """The same for people."""
+    rate, runs = figures["success_rate"], figures["runs"]
+    table = Table(title=f"{figures['flight']}: {figures['successes']} of {runs} flights, {rate:.1%}")
+    table.add_column("value")
+    for heading in _FIGURES:
+        table.add_column(heading, justify="right")
+    for name, spread in figures["values"].items():
+        table.add_row(name, *(f"{spread[key]:.3g}" for key in _FIGURES))
+    return table

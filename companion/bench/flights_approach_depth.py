@@ -1,0 +1,11 @@
+"""Flights of `approach` with a depth camera: as `flights_approach`, but right to half a metre."""
+
+from __future__ import annotations
+
+from companion.bench.flights import FlightResult
+from companion.bench.flights_approach import WITH_DEPTH_M, fly
+
+
+def run(seed: int) -> FlightResult:
+    """One flight with depth."""
+    return fly(seed, with_depth=True, tolerance_m=WITH_DEPTH_M)

@@ -1,0 +1,5 @@
+"""The command line: `companion`, one file for each command that is long; `flags.py` holds what they share."""
+
+from companion.cli.commands import app, main
+
+__all__ = ["app", "main"]

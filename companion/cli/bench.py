@@ -1,0 +1,168 @@
+"""The command line of measurements: `companion bench detector|tracking|latency|setpoints|deadman|flights`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion.cli.flags import plain_errors
+
+bench = typer.Typer(help="Measure on this machine. Figures, never verdicts.", no_args_is_help=True)
+
+_JSON = Annotated[bool, typer.Option("--json", help="one JSON object")]
+
+
+@bench.command("detector")
+def bench_detector(
+    model: Annotated[str, typer.Option(help="a checkpoint, or an exported file")] = "default",
+    runtime: Annotated[
+        str | None,
+        typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto; else all that are installed"),
+    ] = None,
+    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
+    frame: Annotated[str, typer.Option(help="size of the pictures, WIDTHxHEIGHT")] = "640x480",
+    frames: Annotated[int, typer.Option(min=5, help="measured, after a warm-up")] = 100,
+    threads: Annotated[int | None, typer.Option(min=1, help="of each runtime; else its own choice")] = None,
+    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "auto",
+    classes: Annotated[str | None, typer.Option(help="only these: names or ids, comma separated")] = None,
+    against: Annotated[Path | None, typer.Option(help="an earlier --json result to compare with")] = None,
+    as_json: _JSON = False,
+) -> None:
+    """Milliseconds a frame, pixels in, boxes out, of each runtime, measured in turn."""
+    from companion.bench.detector import BenchError, measure_detectors, read_result, table
+    from vision.runtimes.contract import RUNTIMES, installed
+
+    try:
+        width, height = (int(number) for number in frame.split("x"))
+    except ValueError:
+        raise typer.BadParameter(f"{frame!r} is not WIDTHxHEIGHT", param_hint="--frame") from None
+    wanted = [name for name in RUNTIMES if installed(name)] if runtime is None else [runtime]
+    named = None if classes is None else [name.strip() for name in classes.split(",") if name.strip()]
+    with plain_errors(BenchError, ValueError):
+        earlier = None if against is None else read_result(against)
+        result = measure_detectors(
+            model,
+            runtimes=wanted,
+            image_size=image_size,
+            frames=frames,
+            threads=threads,
+            precision=precision,
+            classes=named,
+            width=width,
+            height=height,
+        )
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    for line in table(result, earlier):
+        typer.echo(line)
+
+
+@bench.command("latency")
+def bench_latency(
+    seconds: Annotated[float, typer.Option(min=1, help="measured, in flight")] = 10.0,
+    driver: Annotated[str, typer.Option(help="mavsdk or pymavlink")] = "mavsdk",
+    as_json: _JSON = False,
+) -> None:
+    """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
+    from companion.bench.latency import measure_latency
+    from companion.bus.session import BusError
+    from companion.perception.keeper import PerceptionStartError
+    from companion.rehearsal import RehearsalError
+    from companion.settings.reading import ConfigurationError
+    from companion.vehicle.driver import LinkError
+
+    with plain_errors(RehearsalError, ConfigurationError, LinkError, PerceptionStartError, BusError):
+        _print_figures(measure_latency(seconds, driver=driver), as_json)
+
+
+@bench.command("setpoints")
+def bench_setpoints(
+    seconds: Annotated[float, typer.Option(min=1)] = 10.0,
+    rate_hz: Annotated[float, typer.Option(min=5, max=250)] = 50.0,
+    load: Annotated[int, typer.Option(min=0, help="busy processes beside the loop")] = 2,
+    as_json: _JSON = False,
+) -> None:
+    """Spacing of setpoints as a receiver sees them, while other processes keep every core busy."""
+    from companion.bench.setpoints import measure_setpoints
+
+    _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
+
+
+@bench.command("deadman")
+def bench_deadman(
+    runs: Annotated[int, typer.Option(min=1, help="flights of each fault, half a minute each")] = 3,
+    as_json: _JSON = False,
+) -> None:
+    """Seconds until the vehicle brakes, stands and leaves OFFBOARD when a process of ours hangs or dies."""
+    from rich.console import Console
+
+    from companion.bench.deadman import deadman_table, measure_deadman
+    from companion.bus.client import NoAnswerError
+    from companion.bus.session import BusError
+    from companion.rehearsal import RehearsalError
+
+    with plain_errors(RehearsalError, BusError, NoAnswerError):
+        figures = measure_deadman(runs)
+    if as_json:
+        typer.echo(json.dumps(figures))
+    else:
+        Console().print(deadman_table(figures))
+
+
+@bench.command("tracking")
+def bench_tracking(
+    seconds: Annotated[float, typer.Option(min=1, help="of each rendered sequence")] = 12.0,
+    rate_hz: Annotated[float, typer.Option(min=1, max=120, help="frames a second")] = 30.0,
+    model: Annotated[str | None, typer.Option(help="a checkpoint; unset: boxes made of the truth")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    as_json: _JSON = False,
+) -> None:
+    """Identity switches, fragmentation and MOTA with and without tracking, on rendered sequences."""
+    from rich.console import Console
+
+    from companion.bench.tracking import measure_tracking, tracking_table
+    from vision.yolo.checkpoint import CheckpointError
+
+    with plain_errors(CheckpointError, ValueError):
+        figures = measure_tracking(seconds, rate_hz=rate_hz, model=model, seed=seed)
+    if as_json:
+        typer.echo(json.dumps(figures))
+    else:
+        Console().print(tracking_table(figures))
+        typer.echo(f"tracker: {figures['tracker_ms']}")
+
+
+@bench.command("flights")
+def bench_flights(
+    behaviour: Annotated[str, typer.Argument(help="which flight; any other word lists them")],
+    runs: Annotated[int, typer.Option(min=1, help="flights, one for each seed")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="the first one")] = 0,
+    processes: Annotated[int, typer.Option(min=1, help="flights at once")] = 1,
+    as_json: _JSON = False,
+) -> None:
+    """How well a behaviour flies over many seeds, in lockstep with the built-in vehicle."""
+    from rich.console import Console
+
+    from companion.bench.flights import UnknownFlightError, flights_table, fly, summary
+
+    with plain_errors(UnknownFlightError):
+        figures = summary(behaviour, list(fly(behaviour, range(seed, seed + runs), processes)))
+    if as_json:
+        typer.echo(json.dumps(figures))
+        return
+    Console().print(flights_table(figures))
+    for failed, reason in figures["failures"].items():
+        typer.echo(f"seed {failed}: {reason}")
+
+
+def _print_figures(figures: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(figures))
+        return
+    width = max(len(name) for name in figures)
+    for name, value in figures.items():
+        typer.echo(f"{name:<{width}}  {value}")

@@ -1,0 +1,309 @@
+"""The command line: `companion run|demo|detect|models|evaluate|send|mission|echo|config|train|bench`.
+
+Heavy parts are imported when their command runs, so that `companion send` starts at once.
+What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from companion.cli.bench import bench
+from companion.cli.evaluate import evaluate
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, with_settings
+from companion.cli.mission import mission
+from companion.cli.models import models
+from companion.settings import Settings
+
+if TYPE_CHECKING:
+    from companion.service import Service
+
+app = typer.Typer(
+    name="companion",
+    help="See, steer and share: the companion-computer service for PX4 vehicles.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+app.add_typer(models, name="models")
+app.command()(evaluate)
+app.command()(mission)
+app.add_typer(bench, name="bench")
+
+EXIT_FAILED = 1
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"companion {version('mavlink-companion')}")
+        raise typer.Exit
+
+
+@app.callback()
+def every_command(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_say_version, is_eager=True, help="show the version"),
+    ] = False,
+) -> None:
+    """What holds for every command."""
+
+
+@app.command()
+@with_settings
+def run(settings: Settings) -> None:
+    """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
+    from companion.bus.session import BusError
+    from companion.operator.metrics import MetricsError
+    from companion.perception.keeper import PerceptionStartError
+    from companion.service import Service
+    from companion.vehicle.driver import LinkError
+
+    logging.basicConfig(
+        level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
+    with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError):
+        asyncio.run(_run_until_signal(settings, Service))
+
+
+async def _run_until_signal(settings: Settings, make: type[Service]) -> None:
+    service = make(settings, console=True)
+    loop = asyncio.get_running_loop()
+    running = asyncio.ensure_future(service.run())
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Before the service is up there is nothing to leave in order: end at once.
+        loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
+    try:
+        await running
+    except asyncio.CancelledError:
+        raise typer.Exit(EXIT_FAILED) from None
+
+
+@app.command()
+def demo(
+    duration: Annotated[float, typer.Option(min=20, help="give up after so many seconds")] = 90.0,
+    output: Annotated[Path, typer.Option(help="where the video and summary.json go")] = Path("demo-output"),
+    seed: Annotated[int, typer.Option(min=0, help="of the world: where the car stands, the wind")] = 1,
+) -> None:
+    """Fly the built-in vehicle to a car it has to find: the whole way, from frames to landing."""
+    from companion.bus.session import BusError
+    from companion.demo import run_demo
+    from companion.perception.keeper import PerceptionStartError
+    from companion.rehearsal import RehearsalError
+    from companion.vehicle.driver import LinkError
+
+    with plain_errors(RehearsalError, LinkError, PerceptionStartError, BusError, OSError):
+        summary = run_demo(output, seed=seed, limit_s=duration, say=_say_with_time())
+    if not summary.success:
+        typer.echo(f"the demonstration failed: {summary.failure}; see {output}", err=True)
+        raise typer.Exit(EXIT_FAILED)
+    typer.echo(
+        f"found, reached (stopped {summary.final_range_m} m from the car, by the simulator's truth), landed; "
+        f"{summary.detections_published} detection messages. Video: {output / summary.video}"
+    )
+
+
+def _say_with_time() -> Callable[[str], None]:
+    started = time.monotonic()
+    return lambda text: typer.echo(f"{time.monotonic() - started:6.1f} s  {text}")
+
+
+@app.command()
+def detect(
+    source: Annotated[str, typer.Argument(help="file, folder, /dev/video0, FIFO, - or network address")],
+    model: Annotated[
+        str, typer.Option(help="a checkpoint, an exported file, or a name in the models folder")
+    ] = "default",
+    classes: Annotated[str | None, typer.Option(help="only these: names or ids, comma separated")] = None,
+    confidence: Annotated[float, typer.Option(min=0, max=1)] = 0.25,
+    iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
+    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
+    runtime: Annotated[str, typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto")] = "torch",
+    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "auto",
+    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
+    every: Annotated[int, typer.Option(min=1, help="look at every N-th frame")] = 1,
+    limit: Annotated[int | None, typer.Option(min=1, help="end after so many frames")] = None,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="look at large frames in tiles too: small objects, much slower")
+    ] = False,
+    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the frame")] = 640,
+    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
+    track: Annotated[
+        bool, typer.Option("--track", help="tell which object is which from frame to frame")
+    ] = False,
+    save: Annotated[Path | None, typer.Option(help="folder for inputs and annotated images")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object a frame")] = False,
+    width: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
+    height: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
+    rate: Annotated[float | None, typer.Option(min=0.1, help="of a camera or raw file, Hz")] = None,
+    pixel_format: Annotated[str | None, typer.Option(help="bgr24, rgb24, gray8, y4m, mjpeg, YUYV…")] = None,
+) -> None:
+    """Detect objects in every frame of a source; one line a frame on standard output."""
+    from companion.detect import detect_source
+    from vision.detector import Detector
+    from vision.pipeline import FrameDetector
+    from vision.sources import SourceError, SourceSettings, open_source
+    from vision.tiling import TiledDetector
+    from vision.tracking import Tracker, TrackerSettings
+    from vision.yolo.checkpoint import CheckpointError
+
+    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    following = TrackerSettings(keep_confidence=confidence)
+    with plain_errors(CheckpointError, ValueError):
+        detector = Detector(
+            model,
+            classes=parse_classes(classes),
+            # A tracker wants to see the weak ones too, and leaves them out again.
+            confidence=min(confidence, following.low_confidence) if track else confidence,
+            iou=iou,
+            image_size=image_size,
+            precision=precision,  # type: ignore[arg-type]
+            threads=threads,
+            runtime=runtime,  # type: ignore[arg-type]
+        )
+        if runtime == "auto":
+            typer.echo(f"companion: on {detector.runtime} ({detector.runtime_reason})", err=True)
+        looking: FrameDetector = detector
+        if tiles:
+            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
+        settings = SourceSettings(
+            width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
+        )
+    write = functools.partial(print, flush=True)
+    with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
+        looked_at = detect_source(
+            frames,
+            looking,
+            every=every,
+            limit=limit,
+            save=save,
+            as_json=as_json,
+            tracker=Tracker(following) if track else None,
+            write=write,
+        )
+    if not looked_at:
+        typer.echo(f"companion: {source} had no frames", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
+
+
+def parse_classes(text: str | None) -> list[str | int] | None:
+    """`person,car` or `0,2` as a detector takes them; None for all."""
+    if text is None or not text.strip():
+        return None
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    return [int(word) if word.isdigit() else word for word in words]
+
+
+@app.command()
+def train(
+    output: Annotated[Path, typer.Option(help="what to write: NAME.safetensors and NAME.yaml")] = Path(
+        "runs/model.safetensors"
+    ),
+    seed: Annotated[int | None, typer.Option(min=0, help="of weights and scenes; else the recipe's")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="a shorter or longer course")] = None,
+    hours: Annotated[float | None, typer.Option(min=0.001, help="stop after so long")] = None,
+    workers: Annotated[int | None, typer.Option(min=0, help="processes that draw scenes")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of torch")] = None,
+    resume: Annotated[bool, typer.Option(help="go on from OUTPUT's training state")] = False,
+    held_out: Annotated[int, typer.Option(min=1, help="scenes to judge the result on")] = 400,
+) -> None:
+    """Train the default detector on drawn scenes, judge it on held-out ones, write it with its score."""
+    from companion.train import train_default
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    with plain_errors(FileNotFoundError, ValueError, OSError):
+        score = train_default(
+            output,
+            seed=seed,
+            steps=steps,
+            time_limit_s=None if hours is None else hours * 3600,
+            workers=workers,
+            threads=threads,
+            resume=resume,
+            held_out=held_out,
+        )
+    typer.echo(
+        f"{output.with_suffix('.safetensors')}: mAP50 {score.map50:.3f}, mAP50-95 {score.map50_95:.3f} "
+        f"on {held_out} held-out scenes"
+    )
+
+
+@app.command()
+@with_settings
+def config(settings: Settings) -> None:
+    """Print the effective settings as a TOML file with a comment on every key."""
+    from companion.settings.reading import to_toml
+
+    typer.echo(to_toml(settings), nl=False)
+
+
+@app.command()
+@with_settings
+def send(
+    settings: Settings,
+    command: Annotated[str, typer.Argument(help='such as "seek car" or "approach person distance=3"')],
+    connect: Annotated[str | None, typer.Option(help="zenoh endpoint of the service or its router")] = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for the outcome")] = 300.0,
+) -> None:
+    """Send one command to a running service and wait for its outcome."""
+    from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
+
+    with plain_errors(NoAnswerError):
+        where = client_settings(settings.zenoh, (connect,) if connect else ())
+        with open_client(where) as session:
+            reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
+    typer.echo(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
+    if not reply["success"]:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+@with_settings
+def echo(
+    settings: Settings,
+    key: Annotated[str, typer.Argument(help="a topic (labels), or a zenoh key with wildcards")] = "**",
+    connect: Annotated[str | None, typer.Option(help="zenoh endpoint of the service or its router")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="end after so many messages")] = None,
+) -> None:
+    """Print what a running service publishes: key and message, one line each."""
+    import queue
+
+    from companion.bus.client import NoAnswerError, client_settings, listen, open_client
+
+    messages: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+    with plain_errors(NoAnswerError):
+        where = client_settings(settings.zenoh, (connect,) if connect else ())
+        with open_client(where) as session:
+            subscriber = listen(session, key, lambda name, text: messages.put((name, text)))
+            try:
+                printed = 0
+                while limit is None or printed < limit:
+                    name, text = messages.get()
+                    print(f"{name} {text}", flush=True)
+                    printed += 1
+            except KeyboardInterrupt:
+                return
+            finally:
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def main() -> None:
+    """The console script."""
+    # The reader of our output may go (`| head`): end quietly, as other programs of a pipeline do.
+    if sys.argv[1:2] in (["detect"], ["echo"]):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    app()

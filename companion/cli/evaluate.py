@@ -1,0 +1,82 @@
+"""The command line of `companion evaluate`."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.flags import plain_errors
+
+
+def evaluate(
+    dataset: Annotated[Path, typer.Argument(help="a YOLO-format folder or data.yaml, or a COCO JSON")],
+    model: Annotated[str, typer.Option(help="a checkpoint, or a name in the models folder")] = "default",
+    split: Annotated[str | None, typer.Option(help="of a data.yaml: train, val or test; else val")] = None,
+    images: Annotated[Path | None, typer.Option(help="folder of a COCO file's images")] = None,
+    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
+    iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
+    runtime: Annotated[str, typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto")] = "torch",
+    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "float32",
+    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
+    tiles: Annotated[bool, typer.Option("--tiles", help="look in tiles too, as `detect --tiles`")] = False,
+    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the image")] = 640,
+    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
+    limit: Annotated[int | None, typer.Option(min=1, help="only the first so many images")] = None,
+    misses: Annotated[Path, typer.Option(help="the picture of the worst misses")] = Path("misses.png"),
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Judge a model on a labelled data set: mAP50 and mAP50-95, per class too, and the worst misses."""
+    from companion.evaluate import (
+        JUDGED_CONFIDENCE,
+        evaluate_dataset,
+        map_classes,
+        report_lines,
+        write_sheet,
+    )
+    from vision.detector import Detector
+    from vision.evaluation.dataset import DatasetError, open_dataset
+    from vision.pipeline import FrameDetector
+    from vision.tiling import TiledDetector
+    from vision.yolo.checkpoint import CheckpointError
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    with plain_errors(CheckpointError, DatasetError, ValueError, OSError):
+        data = open_dataset(dataset, split=split, images=images)
+        if limit is not None:
+            data = replace(data, samples=data.samples[:limit])
+        detector = Detector(
+            model,
+            confidence=JUDGED_CONFIDENCE,
+            iou=iou,
+            image_size=image_size,
+            precision=precision,  # type: ignore[arg-type]
+            threads=threads,
+            runtime=runtime,  # type: ignore[arg-type]
+        )
+        looking: FrameDetector = detector
+        if tiles:
+            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
+        evaluation = evaluate_dataset(data, looking, map_classes(detector.class_names, data))
+        shown = write_sheet(evaluation, misses)
+    if as_json:
+        settings = {
+            "model": model,
+            "dataset": str(dataset),
+            "image_size": image_size,
+            "runtime": detector.runtime,
+            "precision": detector.precision,
+            "tiles": tiles,
+        }
+        sheet = str(misses) if shown else None
+        typer.echo(json.dumps({**settings, **evaluation.plain(), "misses_picture": sheet}))
+        return
+    for line in report_lines(evaluation):
+        typer.echo(line)
+    if shown:
+        typer.echo(f"the worst misses: {misses}")

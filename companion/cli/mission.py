@@ -1,0 +1,54 @@
+"""The command line of `companion mission`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from companion.cli.flags import plain_errors, with_settings
+from companion.settings import Settings
+
+EXIT_FAILED = 1
+
+
+@with_settings
+def mission(
+    settings: Settings,
+    file: Annotated[str, typer.Argument(help="a mission file, or the name of one that came along: demo")],
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="only check it, for the detector's classes too, and print the plan"),
+    ] = False,
+    connect: Annotated[str | None, typer.Option(help="zenoh endpoint of the service or its router")] = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for the outcome")] = 3600.0,
+) -> None:
+    """Check a mission file, send it to a running service and wait for its outcome."""
+    from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
+    from companion.guidance.commands import Mission
+    from companion.missions.mission_file import MissionError, describe, find_mission, plan_from, read_mission
+
+    with plain_errors(MissionError, NoAnswerError, ValueError):
+        text = read_mission(find_mission(file))
+        plan = plan_from(text, file, _class_names(settings) if check else None)
+        for line in describe(plan):
+            typer.echo(line)
+        if check:
+            return
+        where = client_settings(settings.zenoh, (connect,) if connect else ())
+        with open_client(where) as session:
+            # With its text: the service may run on another computer.
+            command = f"{Mission(file)}\n{text}"
+            reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
+    typer.echo(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
+    if not reply["success"]:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _class_names(settings: Settings) -> tuple[str, ...] | None:
+    """What the configured detector knows; None where nothing is to be detected."""
+    if not settings.detector.enabled:
+        return None
+    from vision.detector import Detector
+
+    return Detector(settings.detector.model, runtime=settings.detector.runtime).class_names

@@ -1,0 +1,1 @@
+"""Geometry without a vehicle: fences, formations, rows of points."""

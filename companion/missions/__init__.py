@@ -1,0 +1,1 @@
+"""Mission files: how one is read, and those that come along."""

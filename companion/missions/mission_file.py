@@ -1,0 +1,346 @@
+"""Mission files: TOML, a table `[[step]]` for each step, checked whole before anything is flown.
+
+name = "find the car"
+timeout_s = 600                  # of everything, if given
+
+[[step]]
+do = "takeoff 5"                 # any command of the grammar, except another mission
+on_failure = "abort"             # or "continue", "rtl", "land", "end", or the name of a step
+
+[[step]]
+name = "look"                    # for branches to lead to
+do = "seek car"
+timeout_s = 60                   # a command without an end of its own needs it, and ends well with it
+visits = 3                       # once more, and the mission has failed
+on_success = "continue"          # the next step; after the last one: "end"
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from companion.guidance import grammar
+from companion.guidance.arguments import GrammarError, nearest
+from companion.guidance.behaviour import Behaviour
+from companion.guidance.commands import Command, Mission
+from companion.guidance.registry import behaviour_for
+from companion.guidance.search_pattern import Footprint
+from companion.guidance.sequence import (
+    ABORT,
+    CONTINUE,
+    END,
+    LAND,
+    RTL,
+    Plan,
+    PlannedStep,
+    SequenceBehaviour,
+)
+
+MISSIONS_FOLDER = Path(__file__).parent
+LARGEST_BYTES = 100_000
+MOST_STEPS = 200
+_ENDS = (END, ABORT, RTL, LAND)
+_WORDS = (CONTINUE, *_ENDS)
+_Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+_Count = Annotated[int, Field(ge=1, le=1000)]
+
+
+class MissionError(ValueError):
+    """A mission that cannot be flown. `problems` has one line each, with file and step; the text is those."""
+
+    def __init__(self, *problems: str) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+class StepTable(BaseModel):
+    """One `[[step]]` as it is written."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    do: str
+    name: Annotated[str, Field(min_length=1, max_length=60)] | None = None
+    timeout_s: _Seconds | None = None
+    repeat: _Count = 1
+    visits: _Count | None = None
+    on_success: str = CONTINUE
+    on_failure: str = ABORT
+
+
+class MissionTable(BaseModel):
+    """The whole file as it is written."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    name: Annotated[str, Field(min_length=1, max_length=60)] | None = None
+    description: str = ""
+    timeout_s: _Seconds | None = None
+    step: Annotated[list[StepTable], Field(min_length=1, max_length=MOST_STEPS)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """A step with its command, and where it leads: the index of a step, or a word."""
+
+    table: StepTable
+    command: Command
+    on_success: int | str
+    on_failure: int | str
+
+
+def mission_behaviour(
+    command: Mission,
+    enclosed: str,
+    class_names: Sequence[str] | None,
+    refused: Callable[[Behaviour], str | None],
+    footprint: Footprint | None = None,
+) -> SequenceBehaviour:
+    """What flies a mission: of the text that came with the command, or else of the file it names.
+
+    Args:
+        refused: as `SequenceBehaviour`. footprint: as `behaviour_for`.
+
+    Raises:
+        MissionError: as `find_mission`, `read_mission` and `plan_from`.
+    """
+    if len(enclosed.encode()) > LARGEST_BYTES:
+        raise MissionError(f"{command.file}: a mission has at most {LARGEST_BYTES} bytes")
+    text = enclosed if enclosed.strip() else read_mission(find_mission(command.file))
+    return SequenceBehaviour(plan_from(text, command.file, class_names, footprint), refused)
+
+
+def find_mission(name: str) -> Path:
+    """The file that a name means: a path, or `NAME.toml` here or among those that come with this package.
+
+    Raises:
+        MissionError: there is none.
+    """
+    path = Path(name)
+    bundled = sorted(file.stem for file in MISSIONS_FOLDER.glob("*.toml"))
+    for candidate in (path, path.with_name(f"{path.name}.toml")):
+        if candidate.is_file():
+            return candidate
+    if name in bundled:
+        return MISSIONS_FOLDER / f"{name}.toml"
+    raise MissionError(
+        f"no mission {name!r}: no such file in {Path.cwd()}, and those that come along are: "
+        f"{', '.join(bundled)}"
+    )
+
+
+def read_mission(path: Path) -> str:
+    """The text of a mission file. Raises MissionError with a line for a person."""
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_BYTES:
+            raise MissionError(f"{path}: a mission has at most {LARGEST_BYTES} bytes, this file has {size}")
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise MissionError(f"{path}: cannot be read: {error}") from error
+
+
+def plan_from(
+    text: str,
+    source: str,
+    class_names: Sequence[str] | None = None,
+    footprint: Footprint | None = None,
+) -> Plan:
+    """A mission, checked.
+
+    Args:
+        text: of the file. source: its name, for what is said about it.
+        class_names: what the detector knows; None: not known, any is taken.
+        footprint: as `behaviour_for`.
+
+    Raises:
+        MissionError: with every problem found: no TOML, an unknown key, a step that is no command, an unknown
+            class or step, a step that is never reached, a loop that is never left.
+    """
+    try:
+        table = MissionTable.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise MissionError(f"{source}: no TOML: {error}") from error
+    except ValidationError as error:
+        raise MissionError(*(_said(source, dict(problem)) for problem in error.errors())) from error
+    problems: list[str] = []
+    read = _read_steps(table, source, class_names, problems)
+    if problems:
+        raise MissionError(*problems)
+    problems += _unreached(read, source)
+    problems += _never_left(read, source)
+    if problems:
+        raise MissionError(*problems)
+    return Plan(
+        name=table.name or Path(source).stem,
+        steps=tuple(_planned(step, footprint) for step in read),
+        way_down=lambda word: behaviour_for(grammar.parse(word)),
+        timeout_s=table.timeout_s,
+    )
+
+
+def describe(plan: Plan) -> list[str]:
+    """The plan, a line a step, for people."""
+    lines = [f"mission {plan.name}: {len(plan.steps)} steps"]
+    if plan.timeout_s is not None:
+        lines[0] += f", {plan.timeout_s:g} s at most"
+    for index, step in enumerate(plan.steps):
+        told = [f"{index + 1}. {step.command}"]
+        if step.title != step.command:
+            told.append(f"({step.title})")
+        if step.repeat > 1:
+            told.append(f"{step.repeat} times")
+        if step.timeout_s is not None:
+            told.append(f"for {step.timeout_s:g} s" if step.endless else f"within {step.timeout_s:g} s")
+        if step.visits is not None:
+            told.append(f"begun {step.visits} times at most")
+        told.append(f"→ {_shown(plan, step.on_success)}; failing → {_shown(plan, step.on_failure)}")
+        lines.append(" ".join(told))
+    return lines
+
+
+def _shown(plan: Plan, follows: int | str) -> str:
+    return follows if isinstance(follows, str) else f"{plan.steps[follows].title}"
+
+
+def _planned(step: _Read, footprint: Footprint | None) -> PlannedStep:
+    table = step.table
+    return PlannedStep(
+        title=table.name or str(step.command),
+        command=str(step.command),
+        make=lambda: behaviour_for(step.command, footprint),
+        endless=step.command.endless,
+        timeout_s=table.timeout_s,
+        repeat=table.repeat,
+        visits=table.visits,
+        on_success=step.on_success,
+        on_failure=step.on_failure,
+    )
+
+
+def _called(index: int, table: StepTable) -> str:
+    return f"step {index + 1}" + ("" if table.name is None else f" ({table.name})")
+
+
+def _said(source: str, problem: dict[str, object]) -> str:
+    """One of pydantic's problems as a line: file, step, key, what is wrong."""
+    place = problem["loc"]
+    assert isinstance(place, tuple)
+    words = [source]
+    if len(place) >= 2 and place[0] == "step" and isinstance(place[1], int):
+        words.append(f"step {place[1] + 1}")
+        place = place[2:]
+    # Of a union, the last names only which of its types it was.
+    key = next((str(part) for part in place if isinstance(part, str)), "")
+    if problem["type"] == "extra_forbidden":
+        known = list(StepTable.model_fields if len(words) == 2 else MissionTable.model_fields)
+        return f"{': '.join(words)}: unknown key {key!r}; {nearest(key, known)}"
+    if problem["type"] == "missing":
+        told = "a mission has at least one [[step]]" if key == "step" else f"{key} is missing"
+        return f"{': '.join(words)}: {told}"
+    came = str(problem.get("input"))[:60]
+    return f"{': '.join(words)}: {key}: {problem['msg']}, got {came}"
+
+
+def _read_steps(
+    table: MissionTable, source: str, class_names: Sequence[str] | None, problems: list[str]
+) -> list[_Read]:
+    """Every step with its command and its branches. What is wrong is added to `problems`."""
+    named: dict[str, int] = {}
+    for index, step in enumerate(table.step):
+        if step.name is None:
+            continue
+        where = f"{source}: {_called(index, step)}"
+        if step.name in _WORDS:
+            problems.append(f"{where}: a step cannot be called {step.name!r}: that is where branches lead to")
+        elif step.name in named:
+            problems.append(f"{where}: the name is taken by step {named[step.name] + 1}")
+        named.setdefault(step.name, index)
+    read = []
+    for index, step in enumerate(table.step):
+        where = f"{source}: {_called(index, step)}"
+        followers = []
+        for key, word in (("on_success", step.on_success), ("on_failure", step.on_failure)):
+            if word == CONTINUE:
+                followers.append(index + 1 if index + 1 < len(table.step) else END)
+            elif word in _ENDS:
+                followers.append(word)
+            elif word in named:
+                followers.append(named[word])
+            else:
+                known = [*_WORDS, *named]
+                problems.append(f"{where}: {key}: unknown step {word!r}; {nearest(word, known)}")
+                followers.append(ABORT)
+        try:
+            command = grammar.parse(step.do, class_names)
+        except GrammarError as error:
+            problems.append(f"{where}: {error}")
+            continue
+        if isinstance(command, Mission):
+            problems.append(f"{where}: a mission flies no other mission")
+        if command.endless and step.timeout_s is None:
+            problems.append(f"{where}: {step.do!r} never ends by itself: give it timeout_s")
+        read.append(_Read(step, command, *followers))
+    return read
+
+
+def _unreached(read: Sequence[_Read], source: str) -> list[str]:
+    """A line for every step to which nothing leads."""
+    reached, waiting = {0}, [0]
+    while waiting:
+        fresh = _steps_after(read[waiting.pop()]) - reached
+        reached |= fresh
+        waiting += fresh
+    return [
+        f"{source}: {_called(index, step.table)}: is never reached"
+        for index, step in enumerate(read)
+        if index not in reached
+    ]
+
+
+def _never_left(read: Sequence[_Read], source: str) -> list[str]:
+    """A line for every loop of steps that only a failure of the whole mission would end.
+
+    A loop is all right if one of its branches leads out of it, other than to `abort`, or a step of it has a
+    limit of visits.
+    """
+    reach = [_reach(read, index) for index in range(len(read))]
+    problems, told = [], set[int]()
+    for index in range(len(read)):
+        if index in told or index not in reach[index]:
+            continue
+        loop = {other for other in reach[index] if index in reach[other]}
+        told |= loop
+        ways_out = {
+            follows
+            for step in loop
+            for follows in (read[step].on_success, read[step].on_failure)
+            if follows not in loop and follows != ABORT
+        }
+        if ways_out or any(read[step].table.visits is not None for step in loop):
+            continue
+        names = ", ".join(_called(step, read[step].table) for step in sorted(loop))
+        problems.append(
+            f"{source}: {names}: a loop without exit: lead one of its branches out, or limit a step's visits"
+        )
+    return problems
+
+
+def _reach(read: Sequence[_Read], start: int) -> set[int]:
+    """Every step that can come after this one."""
+    reached: set[int] = set()
+    waiting = [start]
+    while waiting:
+        fresh = _steps_after(read[waiting.pop()]) - reached
+        reached |= fresh
+        waiting += fresh
+    return reached
+
+
+def _steps_after(step: _Read) -> set[int]:
+    return {follows for follows in (step.on_success, step.on_failure) if isinstance(follows, int)}

@@ -1,0 +1,162 @@
+"""`companion models list` and `info`: what is there, and what a model file says of itself."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.models.catalog import KNOWN, known_by_digest
+from vision.detector import Detector
+from vision.model_files import kept_models
+from vision.runtimes.selection import RuntimeChoice
+from vision.weights import DEFAULT_WEIGHTS
+from vision.yolo.checkpoint import load_checkpoint
+from vision.yolo.checkpoint_pair import is_pair, pair_paths, weights_sha256
+from vision.yolo.generation import describe
+
+
+@dataclass(frozen=True, slots=True)
+class ModelInfo:
+    """What `info` tells.
+
+    Attributes:
+        file, size_bytes, sha256: of the file that holds the weights.
+        generation, scale: such as YOLOv8 and n; a network of no published size has the scale "own".
+        parameters: numbers that training sets.
+        gflops: a multiplication and an addition each counted, for one image of `image_size` square.
+        end_to_end: the head needs no suppression of overlaps.
+        classes: id → name.
+        licence: as the file states it; None where it states none.
+        official: the name under which the catalogue knows this very file; None for any other.
+        runtime, runtime_reason: what runs it on this computer, and why.
+        precision, precision_reason: what that computes in here, and why.
+        stated: whatever else the file tells of itself.
+    """
+
+    file: str
+    size_bytes: int
+    sha256: str
+    generation: str
+    scale: str
+    parameters: int
+    gflops: float
+    image_size: int
+    end_to_end: bool
+    classes: tuple[str, ...]
+    licence: str | None
+    official: str | None
+    runtime: str
+    runtime_reason: str
+    precision: str
+    precision_reason: str
+    stated: dict[str, Any]
+
+    def plain(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torch") -> ModelInfo:
+    """Read a checkpoint, describe it, and make it ready to see what it would compute in on this computer.
+
+    Raises:
+        CheckpointError: it cannot be read. ValueError: the image size is no multiple of 32.
+        RuntimeUnusableError: the runtime is missing, or does not run it.
+    """
+    if image_size < 32 or image_size % 32:
+        raise ValueError(f"the image size must be a multiple of 32, got {image_size}")
+    loaded = load_checkpoint(path)
+    weights = pair_paths(path)[0] if is_pair(path) else path
+    digest = weights_sha256(path)
+    facts = describe(loaded.model, image_size)
+    official = known_by_digest(digest)
+    detector = Detector(path, image_size=image_size, runtime=runtime)
+    stated = dict(loaded.metadata)
+    licence = stated.pop("licence", None)
+    return ModelInfo(
+        file=str(weights),
+        size_bytes=weights.stat().st_size,
+        sha256=digest,
+        generation=facts.generation,
+        scale=facts.scale or "own",
+        parameters=facts.parameters,
+        gflops=round(facts.gflops, 2),
+        image_size=image_size,
+        end_to_end=facts.end_to_end,
+        classes=loaded.class_names,
+        licence=None if licence is None else str(licence),
+        official=None if official is None else official.name,
+        runtime=detector.runtime,
+        runtime_reason=detector.runtime_reason,
+        precision=detector.precision,
+        precision_reason=detector.precision_reason,
+        stated=stated,
+    )
+
+
+def info_lines(info: ModelInfo) -> list[str]:
+    """The same for a person."""
+    shown_classes = ", ".join(info.classes[:12]) + (", …" if len(info.classes) > 12 else "")
+    rows = {
+        "file": f"{info.file} ({info.size_bytes} bytes)",
+        "sha256": info.sha256,
+        "official": f"{info.official} ({KNOWN[info.official].url})"
+        if info.official
+        else "no file of the catalogue",
+        "generation": f"{info.generation}, scale {info.scale}",
+        "head": "end to end, without suppression" if info.end_to_end else "with suppression of overlaps",
+        "parameters": f"{info.parameters / 1e6:.2f} million",
+        "work": f"{info.gflops:.1f} GFLOPs for {info.image_size}x{info.image_size}",
+        "classes": f"{len(info.classes)}: {shown_classes}",
+        "runs here": f"on {info.runtime} ({info.runtime_reason})",
+        "precision": f"{info.precision} ({info.precision_reason})",
+        "licence": info.licence or "not stated in the file",
+        **{
+            key: str(value)
+            for key, value in info.stated.items()
+            if isinstance(value, str | int | float) and key not in ("file",)
+        },
+    }
+    width = max(map(len, rows))
+    return [f"{name:<{width}}  {value}" for name, value in rows.items()]
+
+
+def list_rows(folder: Path) -> list[dict[str, Any]]:
+    """Every model there is to name: bundled, kept in `folder`, and known by address; with `state` for
+    each.
+    """
+    kept = {path.name: path for path in kept_models(folder)}
+    rows: list[dict[str, Any]] = [
+        {
+            "name": "default",
+            "state": "bundled",
+            "size_bytes": DEFAULT_WEIGHTS.stat().st_size if DEFAULT_WEIGHTS.is_file() else None,
+            "licence": "Apache-2.0",
+            "about": "the model of this package, for drawn scenes",
+            "path": str(DEFAULT_WEIGHTS),
+        }
+    ]
+    for model in KNOWN.values():
+        path = kept.pop(model.file, None)
+        rows.append(
+            {
+                "name": model.name,
+                "state": "can be pulled" if path is None else "here",
+                "size_bytes": model.size_bytes if path is None else path.stat().st_size,
+                "licence": model.licence,
+                "about": model.about + ("" if model.sha256 else "; no SHA-256 known"),
+                "path": None if path is None else str(path),
+            }
+        )
+    rows.extend(
+        {
+            "name": path.name,
+            "state": "here",
+            "size_bytes": path.stat().st_size,
+            "licence": None,
+            "about": "in the models folder",
+            "path": str(path),
+        }
+        for path in kept.values()
+    )
+    return rows

@@ -1,0 +1,132 @@
+"""The perception worker seen from the service: one process, the socket to it, and its end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+from typing import Self
+
+from companion.perception.messages import Attitude, Begin, Hud, Message, Stop, Watched, packed, read_message
+from companion.settings import Settings
+
+# Results that wait in the kernel are old before they are read: room for about ten, no more.
+_SEND_BUFFER_BYTES = 16384
+# Above this much that the worker has not taken (it is stopped, or busy) no more lines for the video go there.
+_UNREAD_BYTES = 65536
+
+
+class PerceptionProcess:
+    """A worker that was started. Make one with `spawn`."""
+
+    def __init__(
+        self,
+        process: asyncio.subprocess.Process,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+    ) -> None:
+        self._process = process
+        self._reader = reader
+        self._writer = writer
+
+    @classmethod
+    async def spawn(cls, settings: Settings, standard_input: int, first_track_id: int = 1) -> Self:
+        """Start a fresh interpreter that has nothing of this one but the search path.
+
+        Args:
+            standard_input: the descriptor that becomes the worker's, or `subprocess.DEVNULL`.
+            first_track_id: the number of its first track.
+
+        Raises:
+            OSError: no more processes or descriptors.
+        """
+        ours, theirs = socket.socketpair()
+        with theirs:
+            try:
+                theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+                process = await asyncio.create_subprocess_exec(
+                    sys.executable,
+                    "-P",  # the search path below, and not the working directory, says what is imported
+                    "-m",
+                    "companion.perception.worker",
+                    str(theirs.fileno()),
+                    str(os.getpid()),
+                    pass_fds=(theirs.fileno(),),
+                    stdin=standard_input,
+                    stdout=2,  # standard output is the service's own
+                    env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                    # A Ctrl-C in the terminal is for the service, which then asks the worker to end.
+                    process_group=0,
+                )
+            except BaseException:
+                ours.close()
+                raise
+        reader, writer = await asyncio.open_connection(sock=ours)
+        worker = cls(process, reader, writer)
+        worker._put(Begin(settings, first_track_id))
+        return worker
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    async def read(self) -> Message | None:
+        """The next message; None when the worker has closed its end, which it does by dying too."""
+        return await read_message(self._reader)
+
+    def show(self, hud: Hud) -> None:
+        """Tell what to draw on the recorded video. Left out while the worker takes no orders."""
+        if self._writer.transport.get_write_buffer_size() < _UNREAD_BYTES:
+            self._put(hud)
+
+    def turn(self, attitude: Attitude) -> None:
+        """Tell how the vehicle was turned. Left out while an older one waits: a newer will come."""
+        if not self._writer.transport.get_write_buffer_size():
+            self._put(attitude)
+
+    def watch(self, watched: bool) -> None:
+        """Tell whether anybody wants pictures."""
+        self._put(Watched(watched))
+
+    def ask_to_stop(self) -> None:
+        self._put(Stop())
+
+    def terminate(self) -> None:
+        self._signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self._signal(signal.SIGKILL)
+
+    async def ends_within(self, timeout_s: float) -> bool:
+        """Whether it is dead by then."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._process.wait()
+            return True
+        return False
+
+    async def wait(self) -> str:
+        """Wait for its death; how it died, in words."""
+        code = await self._process.wait()
+        self._writer.close()
+        with contextlib.suppress(ConnectionError):
+            await self._writer.wait_closed()
+        if code >= 0:
+            return f"process {self.pid} exited with code {code}"
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:  # a real-time signal has no name
+            name = f"signal {-code}"
+        return f"process {self.pid} was killed by {name}"
+
+    def _signal(self, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self._process.send_signal(number)
+
+    def _put(self, message: Message) -> None:
+        # A write to a worker that is gone is dropped by the transport; its death shows in `read`.
+        if not self._writer.is_closing():
+            self._writer.write(packed(message))

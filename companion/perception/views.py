@@ -1,0 +1,146 @@
+"""What the service looks through: a camera with its model each, a process each, published under its own name.
+
+The first view is the one of the sections `source`, `camera` and `detector`; it has no name. One view steers.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import statistics
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from companion.guidance.target import Target
+from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
+from companion.perception.keeper import PerceptionKeeper, PerceptionState
+from companion.perception.messages import Preview
+from companion.perception.pulse import START_S
+from companion.settings import DetectorSection, Section, Settings
+from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__name__)
+
+# A view is unwell when its newest result is older than this, and than what is usual for it.
+_SEEING_S = 1.0
+
+
+class View:
+    """One perception worker, and what it saw last.
+
+    Attributes:
+        name: None for the first.
+        settings: with this view's own sections.
+        newest: the newest result; None before the first.
+        targets: where the newest result's objects are, after `place`.
+        unplaced: why they have no place; empty if they have.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        name: str | None,
+        *,
+        on_result: Callable[[View, PerceptionResult], None],
+        on_preview: Callable[[View, Preview], None],
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self.name = name
+        self.settings = settings
+        self.newest: PerceptionResult | None = None
+        self.targets: tuple[Target, ...] = ()
+        self.unplaced = ""
+        self._between_s: deque[float] = deque(maxlen=9)
+        self._on_result = on_result
+        self._on_event = on_event
+        self.keeper = PerceptionKeeper(
+            settings,
+            on_result=self._take,
+            on_event=self._tell,
+            on_preview=lambda preview: on_preview(self, preview),
+        )
+
+    @property
+    def class_names(self) -> tuple[str, ...] | None:
+        """What the detector knows; None while there is none to ask."""
+        return self.keeper.class_names or None
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Of the newest result, from its capture; None before the first."""
+        return None if self.newest is None else (now_ns - self.newest.captured_ns) / 1e9
+
+    def seeing(self, now_ns: int) -> bool:
+        """Results come as they should, or none are to be expected."""
+        if not self.settings.detector.enabled or self.keeper.state is PerceptionState.FINISHED:
+            return True
+        age_s = self.age_s(now_ns)
+        allowed_s = max(_SEEING_S, self.settings.guidance.perception_max_age_s)
+        # Just before the next result the newest is as old as its own latency and one interval.
+        usual_s = statistics.median(self._between_s) if self._between_s else 0.0
+        return age_s is not None and age_s <= allowed_s + 2 * usual_s
+
+    def place(self, result: PerceptionResult, history: StateHistory) -> None:
+        """Work out where what a result shows is."""
+        try:
+            self.targets = targets_from_detections(
+                result.detections.records(),
+                result.captured_ns,
+                self.settings.camera.model(result.width, result.height),
+                self.settings.camera.mount(),
+                history,
+            )
+            self.unplaced = ""
+        except HistoryError as error:
+            # Without the attitude of that moment a box has no direction: seen and published, not steered by.
+            self.targets, self.unplaced = (), str(error)
+
+    def _take(self, result: PerceptionResult) -> None:
+        if self.newest is not None:
+            self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
+        self.newest = result
+        try:
+            self._on_result(self, result)
+        except Exception as error:
+            # Perception itself is well: it must not be ended for a fault on this side.
+            logger.exception("a detection message could not be used")
+            self.targets, self.unplaced = (), f"{type(error).__name__}: {error}"
+
+    def _tell(self, level: str, text: str) -> None:
+        self._on_event(level, text if self.name is None else f"view {self.name}: {text}")
+
+
+def open_views(
+    settings: Settings,
+    *,
+    on_result: Callable[[View, PerceptionResult], None],
+    on_preview: Callable[[View, Preview], None],
+    on_event: Callable[[str, str], None],
+) -> tuple[View, ...]:
+    """Every view there is, the first one first. None is started yet."""
+    own_settings = {name: settings.of_view(name) for name in (None, *settings.views)}
+    threads = threads_each([own.detector for own in own_settings.values()])
+    shared = {f"shm://{source.share}" for source in settings.sources().values() if source.share}
+    views = []
+    for name, own in own_settings.items():
+        changes: dict[str, Section] = {}
+        if own.detector.threads is None:
+            changes["detector"] = own.detector.model_copy(update={"threads": threads})
+        if own.source.uri in shared:
+            # Whoever shares it loads a model first.
+            patient_s = own.source.open_timeout_s + START_S
+            changes["source"] = own.source.model_copy(update={"open_timeout_s": patient_s})
+        own = own.model_copy(update=changes)
+        views.append(View(own, name, on_result=on_result, on_preview=on_preview, on_event=on_event))
+    return tuple(views)
+
+
+def threads_each(detectors: Sequence[DetectorSection]) -> int:
+    """What every network gets that was not given a number of threads; 1 or more.
+
+    All processors but one, less what the others were given, shared out: the service, and whoever talks to it,
+    must not wait for them.
+    """
+    working = [detector for detector in detectors if detector.enabled]
+    asking = [detector for detector in working if detector.threads is None]
+    taken = sum(detector.threads or 0 for detector in working)
+    return max(1, (len(os.sched_getaffinity(0)) - 1 - taken) // max(1, len(asking)))

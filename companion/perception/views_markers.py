@@ -1,0 +1,105 @@
+"""What the views see of markers: the newest of each, what is missing, and the message about a frame."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from companion.guidance.marker_target import MarkerSight, MarkerTarget, looks_down, marker_targets
+from companion.guidance.targets import HistoryError, StateHistory
+from companion.perception.views import View
+from vision.markers import Marker
+from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    captured_ns: int
+    targets: tuple[MarkerTarget, ...]
+    looks_down: bool
+
+
+class MarkerWatch:
+    """The markers of all views that look for some; any may look down, not only the one that steers."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        self._looking = tuple(view for view in views if view.settings.markers.dictionary is not None)
+        self._on_pads = {
+            view.name: {marker.identifier: marker for marker in view.settings.markers.pad_markers()}
+            for view in self._looking
+        }
+        self._seen: dict[str | None, _Seen] = {}
+
+    def take(
+        self, view: View, result: PerceptionResult, history: StateHistory, vehicle: str, published_ns: int
+    ) -> dict[str, Any]:
+        """Work out where the markers of one frame are; returns what is published of it."""
+        markers, camera = result.markers or (), view.settings.camera
+        problem = ""
+        targets: tuple[MarkerTarget, ...] = ()
+        try:
+            targets = marker_targets(
+                markers, result.captured_ns, camera.mount(), history, self._on_pads[view.name]
+            )
+        except HistoryError as error:
+            # As with detections: without the attitude of that moment it is seen, and not steered by.
+            problem = str(error)
+        down = looks_down(camera.model(result.width, result.height), camera.mount())
+        self._seen[view.name] = _Seen(result.captured_ns, targets, down)
+        placed: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
+        return {
+            "vehicle": vehicle,
+            "view": view.name,
+            "sequence": result.sequence,
+            "captured_ns": result.captured_ns,
+            "published_ns": published_ns,
+            "width": result.width,
+            "height": result.height,
+            "unplaced": problem,
+            "markers": [_message(marker, place) for marker, place in zip(markers, placed, strict=True)],
+        }
+
+    def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
+        """What behaviours see: the markers of the views that look down."""
+        if not self._looking:
+            return MarkerSight()
+        down = [seen for seen in self._seen.values() if seen.looks_down]
+        if self._seen and not down:
+            return MarkerSight(missing=self._no_camera_below())
+        if not down:
+            return MarkerSight(missing="")
+        newest_ns = max(seen.captured_ns for seen in down)
+        age_s = (now_ns - newest_ns) / 1e9
+        fresh = [seen for seen in down if now_ns - seen.captured_ns <= max_age_s * 1e9]
+        targets = tuple(target for seen in fresh for target in seen.targets)
+        return MarkerSight(targets, newest_ns, age_s, bool(fresh), "")
+
+    def _no_camera_below(self) -> str:
+        cameras = ", ".join(
+            f"{'camera' if view.name is None else f'views.{view.name}.camera'}.mount_pitch_deg is "
+            f"{view.settings.camera.mount_pitch_deg:g}"
+            for view in self._looking
+        )
+        return f"a camera that sees straight down ({cameras})"
+
+
+def _message(marker: Marker, target: MarkerTarget | None) -> dict[str, Any]:
+    """One marker; metres, radians, local NED, pixels. Without a place only what the picture tells."""
+    message: dict[str, Any] = {
+        "id": marker.identifier,
+        "size_m": marker.size_m,
+        "corners_px": [[round(float(value), 2) for value in corner] for corner in marker.corners_px],
+        "position_camera_m": [round(float(value), 4) for value in marker.position_camera_m],
+        "reprojection_px": round(marker.reprojection_px, 3),
+        "ambiguity": round(marker.ambiguity, 3),
+    }
+    placed = {} if target is None else asdict(target)
+    for name in ("pad", "bearing_rad", "elevation_rad", "distance_m", "range_m", "heading_rad"):
+        message[name] = None if target is None else round(placed[name], 4)
+    for name in ("position_ned_m", "pad_ned_m"):
+        message[name] = None if target is None else [round(value, 3) for value in placed[name]]
+    return message

@@ -1,0 +1,358 @@
+"""The perception worker: the process in which frames live. `process.py` starts it.
+
+It is given one end of a socket, takes its orders there, says there what it sees, and ends when the other end
+does: frames without anyone to tell are of no use, and a camera can have only one owner.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+
+from companion.perception.messages import (
+    Attitude,
+    Begin,
+    Ended,
+    Heartbeat,
+    Hud,
+    Ready,
+    Report,
+    StartFailed,
+    Stop,
+    Watched,
+    receive,
+)
+from companion.perception.outbox import Outbox, OutboxHandler
+from companion.perception.preview import PreviewEncoder
+from companion.settings import Settings
+from vision.detections import Detections
+from vision.frame import Frame
+from vision.markers import Marker, MarkerDetector
+from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
+from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
+from vision.recording import Recording
+from vision.sources import EndOfStream, Source, SourceError, open_source
+from vision.sources.sharing import FrameSharing
+from vision.tracking import AttitudeHistory, CameraView, Tracker
+from vision.video_writer import VideoWriterError
+
+if TYPE_CHECKING:
+    from vision.detector import Detector
+
+# The loop says at least this often that it turns.
+HEARTBEAT_S = 0.25
+# How long the last messages may take to leave, and everything may take to end once the service is gone.
+FAREWELL_S = 2.0
+_LOADING_PERIOD_S = 2.0
+GRACE_S = 5.0
+# The service's loop, which steers, comes first where they share a core.
+NICENESS = 5
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+class Orders:
+    """What the service wants, taken from the socket by a thread.
+
+    Attributes:
+        stop: end now.
+        hud: for the recorded video's next frames.
+        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
+        watched: whether anybody wants pictures.
+    """
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.stop = threading.Event()
+        self.hud = Hud((), None)
+        self.watched = False
+        self.attitudes = AttitudeHistory()
+        self.height_m: float | None = None
+        self._connection = connection
+        self._finished = threading.Event()
+        threading.Thread(target=self._take, name="inbox", daemon=True).start()
+
+    def finished(self) -> None:
+        """The work has ended in time."""
+        self._finished.set()
+
+    def _take(self) -> None:
+        while (message := receive(self._connection)) is not None:
+            if isinstance(message, Hud):
+                self.hud = message
+            elif isinstance(message, Attitude):
+                self.attitudes.add(message.stamp_ns, message.wxyz)
+                self.height_m = message.height_m
+            elif isinstance(message, Watched):
+                self.watched = message.watched
+            elif isinstance(message, Stop):
+                self.stop.set()
+        # The service is gone. Whoever is stuck in a driver by then will not come back from there.
+        self.stop.set()
+        if not self._finished.wait(GRACE_S):
+            os._exit(1)
+
+
+@dataclass(frozen=True, slots=True)
+class Perception:
+    """Everything that was opened."""
+
+    source: Source
+    detector: Detector | None
+    recording: Recording | None
+    preview: PreviewEncoder
+
+    def write(self, frame: Frame, detections: Detections) -> None:
+        """Give a frame, after its result has left, to all who keep or show pictures."""
+        if self.recording is not None:
+            self.recording.write(frame, detections)
+        self.preview.write(frame, detections)
+
+
+def main(arguments: list[str]) -> int:
+    """Work until the source, the service or the order ends it.
+
+    Args:
+        arguments: the socket's descriptor and the service's process id.
+    """
+    descriptor, service_pid = (int(argument) for argument in arguments)
+    _end_with(service_pid)
+    os.nice(NICENESS)
+    connection = socket.socket(fileno=descriptor)
+    begin = receive(connection)
+    if not isinstance(begin, Begin):
+        return 1
+    orders = Orders(connection)
+    signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop.set())
+    outbox = Outbox(connection, on_lost=orders.stop.set)
+    logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[OutboxHandler(outbox)])
+    last = _work(begin, orders, outbox)
+    outbox.close(last, FAREWELL_S)
+    orders.finished()
+    return 0 if isinstance(last, Ended) and last.finished else 1
+
+
+def _end_with(service_pid: int) -> None:
+    """Be told by the kernel when the service dies; and a Ctrl-C in the terminal is for the service alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != service_pid:  # it died before the kernel was asked to tell
+        os._exit(1)
+
+
+def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
+    settings = begin.settings
+    frames = 0
+    with contextlib.ExitStack() as stack:
+        try:
+            with _saying_that_it_loads(settings, outbox):
+                perception = _open(settings, stack, outbox)
+        except (
+            SourceError,
+            VideoWriterError,
+            ValueError,
+            OSError,
+        ) as error:  # CheckpointError is a ValueError
+            return StartFailed(_one_line(error))
+        except Exception as error:  # a fault of ours: where it happened goes to standard error
+            traceback.print_exc()
+            return StartFailed(f"perception cannot start: {type(error).__name__}: {_one_line(error)}")
+        outbox.put(_ready(settings, perception))
+        pipeline = Pipeline(
+            perception.source,
+            _looking(settings, perception.detector),
+            selection=settings.detector.selection(),
+            recorder=perception,
+            tracker=_tracker(begin),
+            view_at=_view_at(settings, orders.attitudes),
+            find_markers=_find_markers(settings),
+            obstacles_in=_obstacles_in(settings, orders),
+        )
+        try:
+            _run(pipeline, perception, orders, outbox)
+        except EndOfStream:
+            return Ended(True, "end of stream", pipeline.frames)
+        except SourceError as error:
+            return Ended(False, _one_line(error), pipeline.frames)
+        except Exception as error:
+            traceback.print_exc()
+            return Ended(False, f"{type(error).__name__}: {_one_line(error)}", pipeline.frames)
+        frames = pipeline.frames
+    return Ended(True, "asked to stop", frames)
+
+
+@contextlib.contextmanager
+def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
+    """To convert a model for another runtime, and to try which is the fastest, may take minutes."""
+    loaded = threading.Event()
+
+    def say() -> None:
+        while not loaded.wait(_LOADING_PERIOD_S):
+            outbox.put_newest(Heartbeat(0))
+
+    if settings.detector.runtime != "torch":
+        threading.Thread(target=say, name="loading", daemon=True).start()
+    try:
+        yield
+    finally:
+        loaded.set()
+
+
+def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Perception:
+    recording = None
+    if settings.recording.video is not None:
+        recording = Recording(settings.recording.video, settings.recording.rate_hz)
+        stack.callback(recording.close)
+    detector = _load(settings) if settings.detector.enabled else None
+    on_frame = None
+    if settings.source.share is not None:
+        on_frame = stack.enter_context(FrameSharing(settings.source.share)).write
+    source = stack.enter_context(open_source(settings.source.uri, settings.source.opening(on_frame)))
+    if recording is not None:
+        # Once more, to be finished before the source closes, which may take its time in a driver.
+        stack.callback(recording.close)
+    preview = PreviewEncoder(settings.preview, outbox.put_preview)
+    stack.callback(preview.close)
+    return Perception(source, detector, recording, preview)
+
+
+def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | None:
+    """The detector as the pipeline uses it."""
+    wanted = settings.detector
+    if detector is None or not wanted.tiles:
+        return detector
+    from vision.tiling import TiledDetector
+
+    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
+
+
+def _load(settings: Settings) -> Detector:
+    # Only here: this import brings torch, and a worker that only records needs none.
+    from vision.detector import Detector
+
+    wanted = settings.detector
+    if wanted.threads is not None:
+        # Else its resizing takes every core, whatever the network was given.
+        cv2.setNumThreads(wanted.threads)
+    return Detector(
+        wanted.model,
+        classes=wanted.classes or None,
+        confidence=_least_confidence(settings),
+        iou=wanted.iou,
+        image_size=wanted.image_size,
+        precision=wanted.precision,
+        threads=wanted.threads,
+        runtime=wanted.runtime,
+    )
+
+
+def _least_confidence(settings: Settings) -> float:
+    """A tracker wants to see the weak ones too; it leaves out again what `detector.confidence` leaves out."""
+    wanted, tracker = settings.detector.confidence, settings.tracker
+    return min(wanted, tracker.low_confidence) if tracker.enabled else wanted
+
+
+def _tracker(begin: Begin) -> Tracker | None:
+    settings = begin.settings
+    if not settings.tracker.enabled or not settings.detector.enabled:
+        return None
+    following = settings.tracker.following(settings.detector.confidence)
+    return Tracker(following, first_track_id=begin.first_track_id)
+
+
+def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame], CameraView | None]:
+    """Where the camera looked when it took a frame; None without the vehicle's attitude of that moment."""
+    if not settings.tracker.camera_motion:
+        return lambda _: None
+    mount = settings.camera.mount()
+
+    def view_at(frame: Frame) -> CameraView | None:
+        ned_from_body = attitudes.at(frame.captured_ns)
+        if ned_from_body is None:
+            return None
+        return CameraView(
+            settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
+        )
+
+    return view_at
+
+
+def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] | None:
+    """What looks for markers in a frame; None where the settings do not ask for it."""
+    kind = settings.markers.kind()
+    if kind is None:
+        return None
+    detector = MarkerDetector(kind)
+    return lambda frame: detector.detect(frame.image, settings.camera.model(frame.width, frame.height))
+
+
+def _obstacles_in(settings: Settings, orders: Orders) -> Callable[[Frame], ObstacleSectors | None]:
+    """How far obstacles are in a frame with depth; None without the vehicle's attitude of that moment."""
+    mount = settings.camera.mount()
+
+    def obstacles_in(frame: Frame) -> ObstacleSectors | None:
+        ned_from_body = orders.attitudes.at(frame.captured_ns)
+        if settings.guidance.obstacles == "off" or frame.depth_m is None or ned_from_body is None:
+            return None
+        camera = settings.camera.model(frame.width, frame.height)
+        return obstacle_sectors(
+            frame.depth_m, frame.captured_ns, camera, mount, ned_from_body, orders.height_m
+        )
+
+    return obstacles_in
+
+
+def _ready(settings: Settings, perception: Perception) -> Ready:
+    detector = perception.detector
+    if detector is None:
+        return Ready(perception.source.uri, None, (), None)
+    return Ready(
+        perception.source.uri,
+        settings.detector.model,
+        detector.class_names,
+        detector.precision,
+        detector.runtime,
+        f"{detector.runtime_reason}; {detector.precision}: {detector.precision_reason}",
+    )
+
+
+def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Outbox) -> None:
+    said_s = time.monotonic()
+
+    def deliver(result: PerceptionResult) -> None:
+        nonlocal said_s
+        outbox.put_newest(Report(result, pipeline.frames, replaced=0))
+        said_s = time.monotonic()
+
+    while not orders.stop.is_set():
+        if perception.recording is not None:
+            perception.recording.lines = orders.hud.lines
+            perception.recording.highlight = orders.hud.highlight
+        perception.preview.watched = orders.watched
+        pipeline.step(HEARTBEAT_S, deliver)
+        if time.monotonic() - said_s >= HEARTBEAT_S:
+            outbox.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.left_out))
+            said_s = time.monotonic()
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    code = main(sys.argv[1:])
+    sys.stderr.flush()
+    # Without the interpreter's own farewell: a thread that is still in a driver would hold it up or break it.
+    os._exit(code)

@@ -1,0 +1,13 @@
+"""Everything that can be set: one frozen value, a section for each part of the service.
+
+Every key is declared once, with its default, its range and one line of help; the file's comments, the flags,
+the checks and their messages (`reading.py`) all come from that declaration. Sections stand in a file named
+after the room they are for.
+"""
+
+from companion.settings.bus import ZenohSection
+from companion.settings.perception import DetectorSection, PreviewSection, SourceSection
+from companion.settings.section import Section
+from companion.settings.settings import Settings
+
+__all__ = ["DetectorSection", "PreviewSection", "Section", "Settings", "SourceSection", "ZenohSection"]

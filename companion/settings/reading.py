@@ -1,0 +1,266 @@
+"""Reading the settings: a TOML file, then the environment, then flags; the later wins. And printing them.
+
+Whatever is wrong is told at once, one line a problem: the key, what was expected, what came, and from where.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from companion.settings.fields import (
+    SECTIONS_OF_VIEW,
+    expectation,
+    expectation_of_key,
+    fields_of_sections,
+    help_line,
+    plain_type,
+    section_of,
+    shown,
+    toml_value,
+    value_from_text,
+)
+from companion.settings.section import Section
+from companion.settings.settings import Settings
+
+__all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
+
+DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
+# COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. A section's name has no underscore.
+ENVIRONMENT_PREFIX = "COMPANION_"
+
+
+class ConfigurationError(ValueError):
+    """Settings that cannot be used. `problems` has one line each; the text is those lines."""
+
+    def __init__(self, *problems: str) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+class Flag(NamedTuple):
+    """One value that can be set.
+
+    Attributes:
+        key: dotted: `detector.image_size` is `image_size` in the section `[detector]`.
+        type: bool, int, float, str, or tuple (its items separated by commas).
+        default: None where the value may be left unset.
+        help: one line, with the range.
+    """
+
+    key: str
+    type: type
+    default: Any
+    help: str
+
+
+def flags() -> list[Flag]:
+    """Every value there is, in the order of the file."""
+    return [
+        Flag(f"{section}.{name}", plain_type(field), field.default, help_line(field))
+        for section, fields in fields_of_sections().items()
+        for name, field in fields.items()
+    ]
+
+
+def default_path() -> Path | None:
+    """The file that is read when none is named: the first of `DEFAULT_PATHS` that exists."""
+    return next((path for path in DEFAULT_PATHS if path.exists()), None)
+
+
+def load_settings(
+    path: str | Path | None = None,
+    overrides: Mapping[str, str] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> Settings:
+    """The settings in effect.
+
+    Args:
+        path: the TOML file; None: `default_path()`, and the defaults alone if there is none.
+        overrides: dotted key → text, as flags give them. An empty text or `none` unsets what may be unset,
+            and commas separate the items of a list.
+        environment: `COMPANION_SECTION_KEY` → text; None: the process's own.
+
+    Raises:
+        ConfigurationError: with every problem found.
+    """
+    chosen = Path(path) if path is not None else default_path()
+    reading = _Reading()
+    if chosen is not None:
+        reading.take_file(chosen)
+    reading.take_environment(os.environ if environment is None else environment)
+    for key, text in (overrides or {}).items():
+        reading.take_text(key, text, "given as a flag")
+    return reading.settings()
+
+
+def to_toml(settings: Settings) -> str:
+    """The settings as a TOML file with a comment on every key; `load_settings` reads the same back."""
+    paragraphs = [_table(section, getattr(settings, section)) for section in fields_of_sections()]
+    for view, sections in settings.views.items():
+        paragraphs += [
+            _table(f"views.{view}.{section}", getattr(sections, section)) for section in SECTIONS_OF_VIEW
+        ]
+    return "\n".join(paragraphs)
+
+
+def _table(name: str, section: Section) -> str:
+    lines = [f"# {(type(section).__doc__ or '').strip()}", f"[{name}]"]
+    for key, field in type(section).model_fields.items():
+        value = getattr(section, key)
+        lines.append(f"# {help_line(field)}")
+        # TOML has no null: what is unset stands there as a comment.
+        lines.append(f"# {key} =" if value is None else f"{key} = {toml_value(value)}")
+    return "\n".join(lines) + "\n"
+
+
+class _Reading:
+    """Values gathered key by key, each with where it came from, and the problems met on the way.
+
+    A table is what stands between brackets in the file: `detector`, or `views.down.detector`.
+    """
+
+    def __init__(self) -> None:
+        self._fields = fields_of_sections()
+        self._keys = [f"{section}.{name}" for section, names in self._fields.items() for name in names]
+        self._values: dict[str, dict[str, Any]] = {}
+        self._origins: dict[str, str] = {}
+        self._problems: list[str] = []
+
+    def take_file(self, path: Path) -> None:
+        origin = f"in {path}"
+        for name, content in _read_toml(path).items():
+            if name == "views" and isinstance(content, dict):
+                for view, sections in content.items():
+                    self._take_view(view, sections, origin)
+            else:
+                self._take_table(name, content, origin)
+
+    def take_environment(self, environment: Mapping[str, str]) -> None:
+        for variable in sorted(environment):
+            if not variable.startswith(ENVIRONMENT_PREFIX):
+                continue
+            section, _, name = variable.removeprefix(ENVIRONMENT_PREFIX).lower().partition("_")
+            # Other variables may begin with the prefix too; only those that name a section are ours.
+            if section in self._fields:
+                self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
+
+    def take_text(self, key: str, text: str, origin: str) -> None:
+        table, _, name = key.rpartition(".")
+        field = self._field(table, name)
+        if field is None:
+            self._problems.append(f"unknown key {key} ({origin}); {_nearest(key, self._keys)}")
+            return
+        try:
+            value = value_from_text(field, text)
+        except ValueError:
+            self._problems.append(f"{key}: must be {expectation(field)}, got {text!r} ({origin})")
+            return
+        self._take(table, name, value, origin)
+
+    def settings(self) -> Settings:
+        values: dict[str, Any] = {}
+        for table, items in self._values.items():
+            place = values
+            for word in table.split("."):
+                place = place.setdefault(word, {})
+            place.update(items)
+        try:
+            settings = Settings.model_validate(values)
+        except ValidationError as error:
+            problems = [*self._problems, *(self._explain(details) for details in error.errors())]
+            # A list with several bad items is one problem.
+            raise ConfigurationError(*dict.fromkeys(problems)) from None
+        if self._problems:
+            raise ConfigurationError(*self._problems)
+        return settings
+
+    def _field(self, table: str, name: str) -> FieldInfo | None:
+        section = section_of(table)
+        return None if section is None else self._fields[section].get(name)
+
+    def _take_view(self, view: str, sections: Any, origin: str) -> None:
+        if not isinstance(sections, dict):
+            self._problems.append(
+                f"views.{view}: must hold sections such as [views.{view}.source], got {shown(sections)} "
+                f"({origin})"
+            )
+            return
+        # An empty table is a view, too: all defaults.
+        self._values.setdefault(f"views.{view}", {})
+        for section, content in sections.items():
+            self._take_table(f"views.{view}.{section}", content, origin)
+
+    def _take_table(self, table: str, content: Any, origin: str) -> None:
+        if section_of(table) is None:
+            known = SECTIONS_OF_VIEW if table.startswith("views.") else self._fields
+            self._problems.append(
+                f"unknown section [{table}] ({origin}); {_nearest(table.rpartition('.')[2], known)}"
+            )
+        elif not isinstance(content, dict):
+            self._problems.append(f"{table}: must be a section [{table}], got {shown(content)} ({origin})")
+        else:
+            for name, value in content.items():
+                self._take(table, name, value, origin)
+
+    def _take(self, table: str, name: str, value: Any, origin: str) -> None:
+        key = f"{table}.{name}"
+        if self._field(table, name) is None:
+            own = f"{section_of(table)}.{name}"
+            self._problems.append(f"unknown key {key} ({origin}); {_nearest(own, self._keys)}")
+            return
+        # TOML has arrays; the settings are frozen and hold tuples.
+        self._values.setdefault(table, {})[name] = tuple(value) if isinstance(value, list) else value
+        self._origins[key] = origin
+
+    def _explain(self, details: ErrorDetails) -> str:
+        parts = [str(part) for part in details["loc"]]
+        if parts[-1:] == ["[key]"]:  # a view's name
+            return f"views.{parts[1]}: a view's name must be {expectation_of_key()}, got {parts[1]!r}"
+        depth = 3 if parts[:1] == ["views"] else 1
+        table, rest = ".".join(parts[:depth]), parts[depth:]
+        if not rest:  # a rule about several keys of the section, or of several sections
+            origins = {origin for key, origin in self._origins.items() if key.startswith(f"{table}.")}
+            said = f" ({', '.join(sorted(origins))})" if table else ""
+            return f"{table}{': ' if table else ''}{details['ctx']['error']}{said}"
+        key = f"{table}.{rest[0]}"
+        value = shown(self._values[table][rest[0]])
+        section = section_of(table)
+        assert section is not None
+        expected = expectation(self._fields[section][rest[0]])
+        return f"{key}: must be {expected}, got {value} ({self._origins[key]})"
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ConfigurationError(f"{path}, line {line}: not UTF-8 text, which TOML must be") from error
+    except tomllib.TOMLDecodeError as error:
+        reason, _, place = str(error).rpartition(" (at ")
+        raise ConfigurationError(f"{path}, {place.removesuffix(')')}: {reason}") from error
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    """The known words nearest to one that is not known, for the end of a message."""
+    known = list(known)
+    section, _, name = word.partition(".")
+    # The right name in the wrong section comes before a wrong name.
+    close = [key for key in known if name and key.partition(".")[2] == name]
+    close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.85)
+    close = close or difflib.get_close_matches(word, known, n=3, cutoff=0.6)
+    if close:
+        return f"did you mean {' or '.join(close)}?"
+    same_section = [key for key in known if key.startswith(f"{section}.")]
+    return f"known: {', '.join(same_section or dict.fromkeys(key.partition('.')[0] for key in known))}"

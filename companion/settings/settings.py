@@ -1,0 +1,115 @@
+"""All sections together, and the rules that bind several of them."""
+
+from __future__ import annotations
+
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from companion.settings.bus import ZenohSection
+from companion.settings.guidance import GuidanceSection
+from companion.settings.operator import LogSection, MetricsSection
+from companion.settings.perception import (
+    CameraSection,
+    DetectorSection,
+    MarkersSection,
+    PreviewSection,
+    RecordingSection,
+    SourceSection,
+    TrackerSection,
+)
+from companion.settings.section import Section
+from companion.settings.texts import ViewName
+from companion.settings.vehicle import VehicleSection
+
+
+class ViewSections(Section):
+    """A further camera or model, with a process of its own, published as views/NAME."""
+
+    source: SourceSection = SourceSection()
+    camera: CameraSection = CameraSection()
+    detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
+    markers: MarkersSection = MarkersSection()
+    recording: RecordingSection = RecordingSection()
+
+
+class Settings(Section):
+    """Everything that can be set."""
+
+    vehicle: VehicleSection = VehicleSection()
+    source: SourceSection = SourceSection()
+    camera: CameraSection = CameraSection()
+    detector: DetectorSection = DetectorSection()
+    tracker: TrackerSection = TrackerSection()
+    markers: MarkersSection = MarkersSection()
+    guidance: GuidanceSection = GuidanceSection()
+    zenoh: ZenohSection = ZenohSection()
+    recording: RecordingSection = RecordingSection()
+    preview: PreviewSection = PreviewSection()
+    metrics: MetricsSection = MetricsSection()
+    log: LogSection = LogSection()
+    views: dict[ViewName, ViewSections] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _views_fit_together(self) -> Self:
+        if self.guidance.view is not None and self.guidance.view not in self.views:
+            known = ", ".join(self.views) or "none"
+            raise ValueError(f"guidance.view: there is no view {self.guidance.view!r} (views: {known})")
+        openers: dict[str, str] = {}
+        sharers: dict[str, str] = {}
+        for key, source in self.sources().items():
+            uri = f"/dev/video{int(source.uri)}" if source.uri.isdecimal() else source.uri
+            if uri in openers and _opens_once(uri):
+                raise ValueError(
+                    f"{key}.uri and {openers[uri]}.uri are both {uri}, which can be "
+                    f'opened once: give one of them share = "NAME" and the other uri = "shm://NAME"'
+                )
+            openers[uri] = key
+            if source.share is None:
+                continue
+            if uri == f"shm://{source.share}":
+                raise ValueError(f"{key}.share: {source.share!r} is where its own frames come from")
+            if source.share in sharers:
+                raise ValueError(f"{key}.share and {sharers[source.share]}.share are both {source.share!r}")
+            sharers[source.share] = key
+        return self
+
+    @model_validator(mode="after")
+    def _films_are_files_of_their_own(self) -> Self:
+        films = [self.recording.video, *(sections.recording.video for sections in self.views.values())]
+        named = [film for film in films if film is not None]
+        if len(set(named)) < len(named):
+            raise ValueError(f"every view needs a recording.video of its own, got {', '.join(named)}")
+        return self
+
+    @model_validator(mode="after")
+    def _tracks_outlive_the_pause_between_frames(self) -> Self:
+        views: dict[str, Settings | ViewSections] = {"": self}
+        views |= {f"views.{name}.": sections for name, sections in self.views.items()}
+        for prefix, view in views.items():
+            rate_hz, end_s = view.detector.rate_hz, view.tracker.end_s
+            if view.tracker.enabled and rate_hz is not None and 1 / rate_hz >= end_s:
+                raise ValueError(
+                    f"{prefix}tracker.end_s must be longer than one period of {prefix}detector.rate_hz "
+                    f"({1 / rate_hz:.3g} s), got {end_s:g}: every track would end before the next frame"
+                )
+        return self
+
+    def sources(self) -> dict[str, SourceSection]:
+        """Key of the section → where that view's frames come from, the first view first."""
+        return {"source": self.source} | {
+            f"views.{name}.source": sections.source for name, sections in self.views.items()
+        }
+
+    def of_view(self, name: str | None) -> Settings:
+        """What the worker of one view goes by: the same, with that view's own sections. None: the first."""
+        if name is None:
+            return self.model_copy(update={"views": {}})
+        sections = self.views[name]
+        own = {section: getattr(sections, section) for section in ViewSections.model_fields}
+        return self.model_copy(update={"views": {}, **own})
+
+
+def _opens_once(uri: str) -> bool:
+    return uri == "-" or uri.startswith("/dev/")

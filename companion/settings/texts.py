@@ -1,0 +1,40 @@
+"""Texts that must have a form: names, endpoints, markers; and what each form is called for a person."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import StringConstraints
+
+# One word of a zenoh key expression: no `/`, and none of its wildcards and separators `* $ ? # @`.
+KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
+KeyWord = Annotated[str, KEY_WORD]
+HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
+# The same without a dot, as `views.NAME.source` is a key.
+VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
+ViewName = Annotated[str, VIEW_NAME]
+VehicleUrl = Annotated[
+    str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
+]
+# ID:SIZE of a marker of its own size; with @PAD, and :RIGHT:UP where it does not lie on the pad's centre.
+MARKER_TEXT = StringConstraints(pattern=r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$", max_length=80)
+ZenohEndpoint = Annotated[
+    str,
+    StringConstraints(pattern=r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$"),
+]
+
+# What a pattern means, in words, for a person whose value did not match it.
+PATTERN_MEANINGS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
+    r"^[^\s:]+:[0-9]{1,5}$": "HOST:PORT such as 127.0.0.1:9100",
+    r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
+    r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
+        "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
+    ),
+    r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$": (
+        "ID:SIZE, ID:SIZE@PAD or ID:SIZE@PAD:RIGHT:UP such as 17:0.15@4:0.75:0"
+    ),
+    r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/.+$": (
+        "a zenoh endpoint such as tcp/192.168.1.5:7447"
+    ),
+}

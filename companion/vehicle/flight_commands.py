@@ -1,0 +1,113 @@
+"""Arming, modes and take-off: asked of an autopilot, and believed when it shows them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Awaitable, Callable
+
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.heard_state import HeardState
+from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
+from companion.vehicle.state import FlightMode
+from companion.vehicle.telemetry_fold import Fields
+
+_MODE_FLAG_CUSTOM = 1
+_DO_SET_MODE = 176
+_NAV_TAKEOFF = 22
+_COMPONENT_ARM_DISARM = 400
+_SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
+
+
+class FlightCommands:
+    """What a driver asks of its autopilot. All methods raise CommandRefusedError; see Driver.
+
+    Args:
+        url: of the link, for messages. heard: what the autopilot shows.
+        command: sends one command with its parameters; the MAV_RESULT.
+        ack_is_ours: whether a COMMAND_ACK with these fields answers us.
+    """
+
+    def __init__(
+        self,
+        url: object,
+        heard: HeardState,
+        command: Callable[..., Awaitable[int]],
+        ack_is_ours: Callable[[Fields], bool],
+    ) -> None:
+        self._url, self._heard = url, heard
+        self._command, self._ack_is_ours = command, ack_is_ours
+
+    async def arm_or_disarm(self, armed: bool, system_id: int | None) -> None:
+        """Return when the vehicle shows it. `system_id`: whose."""
+        heard = self._heard
+        word = "arm" if armed else "disarm"
+        if armed and heard.two_autopilots(time.monotonic_ns()):
+            raise CommandRefusedError(
+                f"{self._url}: two autopilots answer as system {system_id}, so neither is armed; "
+                "give each an id of its own (MAV_SYS_ID)"
+            )
+        result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
+        if result != ACCEPTED:
+            if not armed:
+                reason = f"it is {heard.state.landed.replace('_', ' ')}"
+            elif heard.state.ready_to_arm:
+                reason = f"in mode {heard.state.mode}"
+            else:
+                reason = f"its pre-arm checks fail in mode {heard.state.mode}"
+            raise CommandRefusedError(f"the vehicle refused to {word} ({result_name(result)}): {reason}")
+        if not await heard.until(lambda: heard.state.armed is armed, _SHOWN_TIMEOUT_S):
+            raise CommandRefusedError(
+                f"the vehicle accepted to {word} but does not show it after {_SHOWN_TIMEOUT_S:g} s"
+            )
+
+    async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
+        """Return when the vehicle shows the mode."""
+        heard = self._heard
+        shown_mode, main, sub = heard.manners.mode_request(mode, heard.state)
+        refusals: list[int] = []
+
+        def watch(name: str, fields: Fields) -> None:
+            # PX4 >= 1.16: the first acknowledgement always accepts, the second is the Commander's.
+            if name != "COMMAND_ACK" or fields["command"] != _DO_SET_MODE or not self._ack_is_ours(fields):
+                return
+            if fields["result"] not in (ACCEPTED, IN_PROGRESS):
+                refusals.append(fields["result"])
+
+        asked_ns = time.monotonic_ns()
+        deadline = time.monotonic() + timeout_s
+
+        def shown() -> bool:
+            return heard.mode_ns > asked_ns and heard.state.mode is shown_mode
+
+        async with heard.watching(watch):
+            result = await self._command(_DO_SET_MODE, _MODE_FLAG_CUSTOM, main, sub)
+            if result != ACCEPTED:
+                refusals.append(result)
+            await heard.until(lambda: bool(refusals) or shown(), max(deadline - time.monotonic(), 0.0))
+        if refusals:
+            heard.manners.forget()
+            hint = " (is a setpoint stream running?)" if mode is FlightMode.OFFBOARD else ""
+            raise CommandRefusedError(
+                f"the vehicle refused mode {mode} ({result_name(refusals[0])}){hint}: "
+                f"it shows {heard.state.mode}"
+            )
+        if not shown():
+            heard.manners.forget()
+            raise CommandRefusedError(
+                f"the vehicle did not enter mode {mode} within {timeout_s:g} s: it shows {heard.state.mode}"
+            )
+
+    async def takeoff(self, altitude_m: float) -> None:
+        """The autopilot's own take-off, to a height above home."""
+        heard = self._heard
+        if not (math.isfinite(altitude_m) and altitude_m > 0.0):
+            raise CommandRefusedError(f"a take-off altitude must be above 0 m, got {altitude_m}")
+        await heard.until(lambda: heard.state.home_altitude_amsl_m is not None, _SHOWN_TIMEOUT_S)
+        result = await self._command(_NAV_TAKEOFF, *heard.manners.takeoff_parameters(altitude_m, heard.state))
+        if result != ACCEPTED:
+            raise CommandRefusedError(
+                f"the vehicle refused to take off ({result_name(result)}) in mode {heard.state.mode}"
+            )
+        for told, fields in heard.manners.takes_off():
+            heard.take_in(told, fields)

@@ -1,0 +1,140 @@
+"""What the autopilot's messages say, put together into one state; and whoever waits for them is told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+
+from companion.vehicle.clock_sync import ClockSync
+from companion.vehicle.manners import Manners, Px4Manners
+from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, VehicleState
+from companion.vehicle.telemetry_fold import Fields, fold
+
+logger = logging.getLogger(__name__)
+
+_BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
+# A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
+_SETBACKS_OF_TWO = 3
+_TWO_CLOCKS_S = 2.0
+_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION")
+
+
+class HeardState:
+    """One autopilot's state as it is heard. Subscribers stay when the link is opened anew.
+
+    Args:
+        url: of the link, for the log. on_two: called when two autopilots turn out to speak by turns.
+
+    Attributes:
+        state: the newest snapshot.
+        manners: the ways of the autopilot that is heard.
+        clock: how its time goes with ours.
+        mode_ns: when it last showed its mode, CLOCK_MONOTONIC.
+        restarted: set when its clock began anew; whoever has dealt with that clears it.
+    """
+
+    def __init__(self, url: object, on_two: Callable[[], None]) -> None:
+        self._url, self._on_two = url, on_two
+        self._subscribers: dict[object, Callable[[VehicleState], None]] = {}
+        self._watchers: dict[object, Callable[[str, Fields], None]] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing has been heard yet."""
+        self.state = VehicleState()
+        self.manners: Manners = Px4Manners()
+        self.clock = ClockSync()
+        self.mode_ns = 0
+        self.restarted = asyncio.Event()
+        self._boot_ms = 0
+        self._setbacks_ns: deque[int] = deque(maxlen=_SETBACKS_OF_TWO)
+        self._two_heard_ns = 0
+
+    def handle(self, name: str, fields: Fields) -> None:
+        """One message of the autopilot: into the state, and to whoever waits for it."""
+        for told, its_fields in self.manners.heard(name, fields, self.state):
+            self.take_in(told, its_fields)
+
+    def take_in(self, name: str, fields: Fields) -> None:
+        """One message in PX4's terms."""
+        now_ns = time.monotonic_ns()
+        if name == "LOCAL_POSITION_NED":
+            self._watch_clock(fields["time_boot_ms"], now_ns)
+        if name in ("HEARTBEAT", "CURRENT_MODE"):
+            self.mode_ns = now_ns
+        if name in _OF_ITS_PLACE and self.two_autopilots(now_ns):
+            return  # Nobody can tell whose it is: what is known grows stale, and what needs it ends.
+        stamp_ns = self.clock.stamp(fields["time_boot_ms"], now_ns) if "time_boot_ms" in fields else now_ns
+        state = fold(self.state, name, fields, stamp_ns)
+        changed, self.state = state is not self.state, state
+        for watcher in list(self._watchers.values()):
+            watcher(name, fields)
+        if changed:
+            for callback in list(self._subscribers.values()):
+                try:
+                    callback(state)
+                except Exception:  # a subscriber's fault must not stop the vehicle's state
+                    logger.exception("%s: a subscriber of the state failed", self._url)
+
+    def _watch_clock(self, boot_ms: int, now_ns: int) -> None:
+        """The autopilot's clock goes back: it has restarted, or another one speaks with its id by turns."""
+        if boot_ms < self._boot_ms - _BOOT_TOLERANCE_MS:
+            self._setbacks_ns.append(now_ns)
+            first_ns = self._setbacks_ns[0]
+            if len(self._setbacks_ns) == _SETBACKS_OF_TWO and now_ns - first_ns < _TWO_CLOCKS_S * 1e9:
+                if not self.two_autopilots(now_ns):
+                    self._on_two()
+                self._two_heard_ns = now_ns
+                self.restarted.clear()
+            else:
+                self.restarted.set()
+                # What held before the restart is not known to hold now, home least of all.
+                self.clock.forget()
+                self.state = replace(
+                    self.state,
+                    ready_to_arm=False,
+                    home_altitude_amsl_m=None,
+                    home_position_ned_m=None,
+                    clock=None,
+                )
+        self._boot_ms = boot_ms
+
+    def two_autopilots(self, now_ns: int) -> bool:
+        """Two of the same id were heard a moment ago: their states cannot be told apart."""
+        return self._two_heard_ns > 0 and now_ns - self._two_heard_ns < HEARTBEAT_MAX_AGE_S * 1e9
+
+    def subscribe(self, callback: Callable[[VehicleState], None]) -> Callable[[], None]:
+        """Call back with every new snapshot; returns what ends that."""
+        key = object()
+        self._subscribers[key] = callback
+        return lambda: self._subscribers.pop(key, None) and None
+
+    @contextlib.asynccontextmanager
+    async def watching(self, watcher: Callable[[str, Fields], None]) -> AsyncIterator[None]:
+        """Call back with every message for as long as this is entered."""
+        key = object()
+        self._watchers[key] = watcher
+        try:
+            yield
+        finally:
+            del self._watchers[key]
+
+    async def until(self, met: Callable[[], bool], timeout_s: float | None) -> bool:
+        """Wait until a message makes the condition true; False when it did not in time."""
+        done = asyncio.get_running_loop().create_future()
+
+        def check(_name: str, _fields: Fields) -> None:
+            if not done.done() and met():
+                done.set_result(None)
+
+        async with self.watching(check):
+            check("", {})
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(timeout_s):
+                    await done
+        return met()

@@ -1,0 +1,19 @@
+"""MAV_RESULT: how an autopilot answers a command (MAVLink common)."""
+
+from __future__ import annotations
+
+ACCEPTED, IN_PROGRESS = 0, 5
+RESULT_NAMES = {
+    0: "accepted",
+    1: "temporarily rejected",
+    2: "denied",
+    3: "unsupported",
+    4: "failed",
+    5: "in progress",
+    6: "cancelled",
+}
+
+
+def result_name(result: int) -> str:
+    """In words."""
+    return RESULT_NAMES.get(result, f"MAV_RESULT {result}")

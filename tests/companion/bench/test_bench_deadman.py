@@ -1,0 +1,55 @@
+"""How the reaction to a fault is read from the simulator's truth."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from companion.bench.deadman import deadman_table, reaction
+
+
+def flight(speeds, modes=None, start_ns=0, step_ns=20_000_000):
+    """Rows of truth, 50 a second."""
+    modes = modes or ["OFFBOARD"] * len(speeds)
+    return [
+        {"stamp_ns": start_ns + index * step_ns, "velocity_ned_mps": [0.0, speed, 0.1], "mode": mode}
+        for index, (speed, mode) in enumerate(zip(speeds, modes, strict=True))
+    ]
+
+
+@given(
+    braked=st.integers(0, 100),
+    stood=st.integers(0, 100),
+    left=st.integers(0, 100),
+    start=st.integers(0, 10**12),
+)
+def test_the_first_moment_of_each_counts(braked, stood, left, start):
+    slow, still = braked, braked + stood
+    speeds = [2.0] * (50 + slow) + [1.0] * (still - slow) + [0.1] * 10
+    modes = ["OFFBOARD"] * (50 + min(left, still)) + ["HOLD"] * (len(speeds) - 50 - min(left, still))
+    told = reaction(flight(speeds, modes, start), start + 50 * 20_000_000)
+    assert told.braking_s == pytest.approx(slow * 0.02)
+    assert told.standing_s == pytest.approx(still * 0.02)
+    assert told.failsafe_s == pytest.approx(min(left, still) * 0.02)
+
+
+def test_what_never_came_is_none_and_a_flight_without_a_beginning_is_refused():
+    rows = flight([2.0] * 100)
+    told = reaction(rows, 1_000_000_000)
+    assert (told.braking_s, told.standing_s, told.failsafe_s) == (None, None, None)
+    with pytest.raises(ValueError, match="the second before the fault"):
+        reaction(rows, 10_000_000_000)
+
+
+def test_the_table_tells_the_longest_and_how_often_it_never_came():
+    out = io.StringIO()
+    figures = {"x": {"braking_s": [0.2, 0.35], "standing_s": [None, 1.5], "failsafe_s": [None, None]}}
+    Console(file=out, width=100).print(deadman_table(figures))
+    text = out.getvalue()
+    assert "0.35" in text
+    assert "1.50 (never in 1)" in text
+    assert "never" in text

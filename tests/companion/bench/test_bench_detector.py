@@ -1,0 +1,91 @@
+"""Measuring the detector: real processes, on a network small enough for it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from companion.bench.detector import BenchError, read_result, table
+from companion.cli import app
+from vision.yolo.architecture import build, yolov8_description
+from vision.yolo.checkpoint import save_checkpoint
+
+
+@pytest.fixture
+def small_model(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    model = build(yolov8_description((0.1, 0.01, 64), ("person", "car")))
+    save_checkpoint(tmp_path / "small.pt", model, metadata={})
+    return tmp_path / "small.pt"
+
+
+def bench(model: Path, *more: str) -> str:
+    arguments = ["bench", "detector", "--model", str(model), "--runtime", "torch", "--image-size", "64"]
+    arguments += ["--frame", "64x48", "--frames", "6", "--threads", "1", *more]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_a_measurement_tells_all_its_figures_and_can_be_compared(small_model: Path, tmp_path: Path) -> None:
+    earlier = json.loads(bench(small_model, "--json", "--classes", "car"))
+    (row,) = earlier["rows"]
+    assert (row["runtime"], row["threads"], row["frames"]) == ("torch", 1, 6)
+    assert earlier["classes"] == ["car"]
+    assert earlier["frame"] == "64x48"
+    assert 0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
+    assert 0 < row["around_p50_ms"] < row["p50_ms"] + row["max_ms"]
+    assert row["frames_per_s"] > 0
+    assert row["memory_mb"] > 10
+    assert row["first_detection_s"] > 0
+    (tmp_path / "earlier.json").write_text(json.dumps(earlier))
+    heading, line = bench(small_model, "--against", str(tmp_path / "earlier.json")).splitlines()
+    assert heading.split() == [
+        "runtime", "precision", "threads", "fastest_ms", "p50_ms", "p99_ms", "around_p50_ms", "frames_per_s",
+        "memory_mb", "first_detection_s",
+    ]  # fmt: skip
+    assert f"p50 was {row['p50_ms']} ms" in line
+
+
+def test_what_was_not_measured_before_says_so() -> None:
+    names = (
+        "runtime",
+        "precision",
+        "threads",
+        "fastest_ms",
+        "p50_ms",
+        "p99_ms",
+        "around_p50_ms",
+        "frames_per_s",
+    )
+    row = dict.fromkeys([*names, "memory_mb", "first_detection_s"], 1)
+    assert table({"rows": [row]}, {"rows": []})[1].endswith("not measured before")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--model", "none.pt"], "none.pt"),
+        (["--runtime", "abacus"], "runtime must be auto, torch"),
+        (["--frame", "big"], "WIDTHxHEIGHT"),
+        (["--classes", "zebra"], "no class 'zebra'"),
+    ],
+)
+def test_what_cannot_be_measured_is_exit_code_2(
+    small_model: Path, arguments: list[str], expected: str
+) -> None:
+    common = ["bench", "detector", "--model", str(small_model), "--runtime", "torch", "--frames", "5"]
+    result = CliRunner().invoke(app, [*common, *arguments])
+    assert result.exit_code == 2
+    assert expected in result.output
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"rows": [1]}', '{"rows": [{}]}'])
+def test_a_file_that_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "r.json").write_text(text)
+    with pytest.raises(BenchError, match=r"r\.json: is no result"):
+        read_result(tmp_path / "r.json")

@@ -1,0 +1,16 @@
+"""Five built-in vehicles in formation through turns, as `companion bench flights formation` flies them."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.bench.flights import fly, summary
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_five_vehicles_fly_in_formation_through_turns_and_never_come_too_near(seed: int) -> None:
+    (result,) = fly("formation", [seed])
+    assert result.success, result.reason
+    assert result.values["min_separation_m"] >= 3.0
+    assert result.values["slot_error_p95_m"] < 4.0
+    assert summary("formation", [result])["success_rate"] == 1.0

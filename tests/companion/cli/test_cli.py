@@ -1,0 +1,217 @@
+"""The command line as a person meets it: what it prints, on which stream, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import pytest
+from command_line import companion
+from service_process import free_tcp_port
+
+from mavlink_sim.testing import free_udp_ports
+
+
+def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
+    """The one line on standard error; nothing else is said, and the exit code is 2."""
+    lines = [line for line in done.stderr.splitlines() if line.startswith("companion:")]
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert len(lines) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    return lines[0]
+
+
+def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    done = companion(
+        "detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "0",
+        "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    messages = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [message["sequence"] for message in messages] == [0, 3, 6, 9]
+    for message in messages:
+        assert set(message) == {"sequence", "captured_ns", "width", "height", "inference_ms", "detections"}
+        assert (message["width"], message["height"]) == (160, 120)
+        assert message["inference_ms"] > 0
+        for found in message["detections"]:
+            assert set(found) == {"class_id", "class_name", "confidence", "xyxy", "center"}
+            left, top, right, bottom = found["xyxy"]
+            assert 0 <= left <= right <= 160
+            assert 0 <= top <= bottom <= 120
+    assert any(message["detections"] for message in messages)
+    saved = sorted(path.name for path in (tmp_path / "saved").iterdir())
+    assert saved[:2] == ["000000.jpg", "000000_detections.jpg"]
+    assert len(saved) == 8
+    assert cv2.imread(str(tmp_path / "saved" / "000000_detections.jpg")).shape == (120, 160, 3)
+
+
+def test_detect_tells_tracks_when_asked(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    done = companion(
+        "detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "0",
+        "--json", "--limit", "2", "--track", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = [record for line in done.stdout.splitlines() for record in json.loads(line)["detections"]]
+    assert found
+    for record in found:
+        assert {"track_id", "track_score", "track_state"} < set(record)
+        assert record["track_state"] in ("none", "tentative", "confirmed")
+
+
+def test_detect_without_json_writes_a_readable_line_a_frame(
+    small_model: Path, pictures: Path, tmp_path: Path
+) -> None:
+    done = companion(
+        "detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "1", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 20
+    assert all(line.endswith("no objects detected") for line in lines)
+
+
+def test_detect_sees_only_the_classes_asked_for(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    common = ["detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "0"]
+    common += ["--json", "--limit", "3"]
+
+    def names(*more: str) -> set[str]:
+        lines = companion(*common, *more, cwd=tmp_path).stdout.splitlines()
+        return {found["class_name"] for line in lines for found in json.loads(line)["detections"]}
+
+    everything = names()
+    one = sorted(everything)[0]
+    assert names("--classes", one) == {one}
+
+
+def test_a_missing_model_is_one_line(pictures: Path, tmp_path: Path) -> None:
+    line = one_line_of_bad_input(companion("detect", pictures, "--model", "no.pt", cwd=tmp_path))
+    assert "no.pt" in line
+
+
+def test_a_truncated_checkpoint_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.pt"
+    whole = small_model.read_bytes()
+    broken.write_bytes(whole[: len(whole) // 2])
+    line = one_line_of_bad_input(companion("detect", pictures, "--model", broken, cwd=tmp_path))
+    assert "broken.pt" in line
+
+
+class _Hostile:
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.marker}",)
+
+
+def test_a_checkpoint_that_calls_the_system_is_refused_by_name_and_not_run(
+    pictures: Path, tmp_path: Path
+) -> None:
+    marker, hostile = tmp_path / "it-ran", tmp_path / "hostile.pt"
+    with zipfile.ZipFile(hostile, "w") as archive:
+        archive.writestr("hostile/data.pkl", pickle.dumps({"model": _Hostile(marker)}, protocol=2))
+        archive.writestr("hostile/version", "3\n")
+    line = one_line_of_bad_input(companion("detect", pictures, "--model", hostile, cwd=tmp_path))
+    assert "system" in line
+    assert not marker.exists()
+
+
+def test_an_unknown_class_is_one_line_with_the_nearest_names(
+    small_model: Path, pictures: Path, tmp_path: Path
+) -> None:
+    arguments = ["detect", pictures, "--model", small_model, "--classes", "persn"]
+    line = one_line_of_bad_input(companion(*arguments, cwd=tmp_path))
+    assert "'persn'" in line
+    assert "person" in line
+
+
+def test_an_unreadable_video_is_one_line(small_model: Path, tmp_path: Path) -> None:
+    video = tmp_path / "broken.mp4"
+    video.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
+    line = one_line_of_bad_input(companion("detect", video, "--model", small_model, cwd=tmp_path))
+    assert "broken.mp4" in line
+
+
+def test_a_bad_value_in_the_settings_file_is_one_line_with_key_and_range(tmp_path: Path) -> None:
+    (tmp_path / "companion.toml").write_text("[detector]\nconfidence = 1.5\n")
+    line = one_line_of_bad_input(companion("run", cwd=tmp_path))
+    assert "detector.confidence" in line
+    assert "0 to 1" in line
+
+
+def test_a_vehicle_that_never_answers_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+    port = free_udp_ports(1)[0]
+    done = companion(
+        "run", "--source", pictures, "--source-loop", "true", "--model", small_model,
+        "--vehicle-url", f"udpin://127.0.0.1:{port}", "--vehicle-connect-timeout-s", "1",
+        "--zenoh-listen", f"tcp/127.0.0.1:{free_tcp_port()}", cwd=tmp_path,
+    )  # fmt: skip
+    line = one_line_of_bad_input(done)
+    assert f"udpin://127.0.0.1:{port}" in line
+
+
+def test_a_source_that_cannot_be_opened_ends_the_service_with_one_line(
+    small_model: Path, tmp_path: Path
+) -> None:
+    done = companion(
+        "run", "--source", tmp_path / "no.mp4", "--model", small_model,
+        "--vehicle-url", f"udpin://127.0.0.1:{free_udp_ports(1)[0]}",
+        "--zenoh-listen", f"tcp/127.0.0.1:{free_tcp_port()}", cwd=tmp_path,
+    )  # fmt: skip
+    assert "no.mp4" in one_line_of_bad_input(done)
+
+
+def test_send_without_a_service_is_one_line(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+    line = one_line_of_bad_input(companion("send", "hold", "--connect", endpoint, cwd=tmp_path))
+    assert endpoint in line
+
+
+def test_config_prints_what_the_file_the_environment_and_the_flags_make_together(tmp_path: Path) -> None:
+    (tmp_path / "companion.toml").write_text('[vehicle]\nname = "alpha"\n')
+    done = companion("config", "--detector-image-size", "320", "--source", "-", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert 'name = "alpha"' in done.stdout
+    assert "image_size = 320" in done.stdout
+    assert 'uri = "-"' in done.stdout
+
+
+def test_the_version_is_told(tmp_path: Path) -> None:
+    done = companion("--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"companion {version('mavlink-companion')}\n")
+
+
+def test_every_command_tells_what_it_does(tmp_path: Path) -> None:
+    for command in ("run", "demo", "config", "send", "echo", "detect", "train", "bench"):
+        done = companion(command, "--help", cwd=tmp_path)
+        assert done.returncode == 0
+        assert len(done.stdout.splitlines()) > 4, command
+
+
+@pytest.mark.parametrize("command", ["send hold --help", "config --help"])
+def test_small_commands_do_not_load_torch(command: str, tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom companion.cli import app\n"
+        f"app({command.split()!r}, standalone_mode=False)\n"
+        "assert 'torch' not in sys.modules, 'torch was imported'"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_setpoints_are_measured_and_told_as_json(tmp_path: Path) -> None:
+    done = companion("bench", "setpoints", "--seconds", "1", "--load", "1", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    assert figures["rate_hz"] == 50.0
+    assert figures["setpoints"] > 10

@@ -1,0 +1,185 @@
+"""A fence of polygons: what it lets through, and that nothing gets over it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from companion.geometry.fence import Fence
+from companion.settings.reading import load_settings
+
+SQUARE = ((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))
+POND = ((5.0, 5.0), (10.0, 5.0), (10.0, 10.0), (5.0, 10.0))
+# A bay in the north side, its tip at the middle.
+BAY = ((-20.0, -20.0), (20.0, -20.0), (0.0, 0.0), (20.0, 20.0), (-20.0, 20.0))
+coordinate = st.floats(-30, 30)
+place = st.tuples(coordinate, coordinate)
+speed = st.tuples(st.floats(-10, 10), st.floats(-10, 10))
+
+
+def braking(left_m: float) -> float:
+    return math.sqrt(2.0 * 1.0 * max(0.0, left_m))
+
+
+@st.composite
+def stars(draw: st.DrawFn) -> tuple[tuple[float, float], ...]:
+    """Polygons whose edges do not cross: corners at growing angles about their middle."""
+    count = draw(st.integers(3, 8))
+    radii = draw(st.lists(st.floats(3, 25), min_size=count, max_size=count))
+    turn = draw(st.floats(0, math.tau))
+    return tuple(
+        (r * math.cos(turn + math.tau * i / count), r * math.sin(turn + math.tau * i / count))
+        for i, r in enumerate(radii)
+    )
+
+
+def test_inside_and_outside() -> None:
+    fence = Fence(SQUARE, (POND,))
+    assert fence.holds((0.0, 0.0))
+    assert not fence.holds((7.0, 7.0))
+    assert not fence.holds((21.0, 0.0))
+    assert Fence().holds((1e6, 0.0))
+
+
+@given(stars(), place)
+def test_inside_agrees_with_the_winding_number(polygon, here) -> None:
+    angles = [math.atan2(e - here[1], n - here[0]) for n, e in polygon]
+    winding = sum(
+        math.remainder(b - a, math.tau) for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
+    )
+    # On the line itself either is right.
+    edges = zip(polygon, polygon[1:] + polygon[:1], strict=True)
+    assume(
+        all(abs((b[0] - a[0]) * (here[1] - a[1]) - (b[1] - a[1]) * (here[0] - a[0])) > 1e-6 for a, b in edges)
+    )
+    assert Fence(polygon).holds(here) == (abs(winding) > 1.0)
+    assert Fence(exclude=(polygon,)).holds(here) == (abs(winding) < 1.0)
+
+
+@given(stars(), place, speed, st.booleans())
+def test_a_velocity_only_ever_gets_less_and_passes_again_unchanged(polygon, here, velocity, inside) -> None:
+    fence = Fence(polygon) if inside else Fence(exclude=(polygon,))
+    slowed = fence.slowed(velocity, here, braking)
+    assert math.hypot(*slowed) <= math.hypot(*velocity) + 1e-9
+    assert math.dist(fence.slowed(slowed, here, braking), slowed) < 1e-6
+
+
+@given(stars(), speed, st.booleans(), st.floats(0, math.tau))
+@settings(max_examples=60, deadline=None)
+def test_whoever_flies_what_is_left_never_gets_over_it(polygon, velocity, inside, turn) -> None:
+    fence = Fence(polygon) if inside else Fence(exclude=(polygon,))
+    here = (0.0, 0.0) if inside else (40.0 * math.cos(turn), 40.0 * math.sin(turn))
+    assume(fence.holds(here))
+    for step in range(400):
+        # Wanting to go somewhere else now and then, so that corners are come to as well.
+        angle = turn + 0.05 * step
+        wanted = (
+            velocity[0] * math.cos(angle) - velocity[1] * math.sin(angle),
+            velocity[0] * math.sin(angle) + velocity[1] * math.cos(angle),
+        )
+        north, east = fence.slowed(wanted, here, braking)
+        here = (here[0] + 0.02 * north, here[1] + 0.02 * east)
+        assert fence.holds(here)
+
+
+def edge_m(polygon, here) -> float:
+    from companion.geometry.fence import _edges, _nearest
+
+    return min(math.dist(_nearest(a, b, here), here) for a, b in _edges(polygon))
+
+
+def test_along_an_edge_and_back_from_it_nothing_is_taken() -> None:
+    fence = Fence(SQUARE)
+    assert fence.slowed((0.0, 3.0), (19.0, 0.0), braking) == (0.0, 3.0)
+    assert fence.slowed((-4.0, 1.0), (19.0, 0.0), braking) == (-4.0, 1.0)
+    north, east = fence.slowed((4.0, 1.0), (19.0, 0.0), braking)
+    assert north == pytest.approx(braking(0.5))
+    assert east == 1.0
+
+
+def test_in_the_tip_of_a_bay_it_stops() -> None:
+    north, east = Fence(BAY).slowed((3.0, 0.0), (-0.9, 0.0), braking)
+    assert 0.0 <= north < 1.0
+    assert abs(east) < 0.5
+
+
+def test_on_the_edge_itself_nothing_goes_out() -> None:
+    fence = Fence(SQUARE, (POND,))
+    assert fence.slowed((5.0, 0.0), (20.0, 0.0), braking) == pytest.approx((0.0, 0.0))
+    assert fence.slowed((-5.0, 0.0), (20.0, 0.0), braking) == (-5.0, 0.0)
+    assert fence.slowed((0.0, 4.0), (7.0, 5.0), braking) == pytest.approx((0.0, 0.0))
+
+
+def test_in_an_acute_corner_the_speed_falls_and_does_not_jump() -> None:
+    fence = Fence(((0.0, 0.0), (30.0, -17.32), (30.0, 17.32)))
+    here, before = (25.0, 0.0), (-5.0, 0.0)
+    for _ in range(1500):
+        now = fence.slowed((-5.0, 0.5), here, braking)
+        assert math.dist(now, before) < 0.7
+        before, here = now, (here[0] + 0.02 * now[0], here[1] + 0.02 * now[1])
+        assert fence.holds(here)
+    assert 0.4 < here[0] < 2.5
+
+
+def test_one_more_limit_is_kept_together_with_the_edges() -> None:
+    fence = Fence(exclude=(((40.0, -5.0), (60.0, 15.0), (60.0, -25.0)),))
+    for step in range(200):
+        angle = 0.05 * step
+        velocity = (4.0 * math.cos(angle), 4.0 * math.sin(angle))
+        north, east = fence.slowed(velocity, (38.0, -4.0), braking, also=[(1.0, 0.0, 0.3)])
+        assert north <= 0.3 + 1e-6
+        assert math.hypot(north, east) <= 4.0 + 1e-9
+
+
+def test_from_outside_the_way_back_does_not_lead_through_another_area() -> None:
+    fence = Fence(SQUARE, (POND,))
+    assert fence.clipped((30.0, 7.0), (-15.0, 7.0))[0] == pytest.approx(10.5)
+
+
+def test_who_is_outside_already_gets_no_farther() -> None:
+    fence = Fence(SQUARE)
+    assert fence.slowed((2.0, 0.5), (25.0, 0.0), braking) == pytest.approx((0.0, 0.5))
+    assert fence.slowed((-2.0, 0.5), (25.0, 0.0), braking) == (-2.0, 0.5)
+
+
+def test_a_place_beyond_an_edge_is_cut_off_before_it() -> None:
+    fence = Fence(SQUARE, (POND,))
+    assert fence.clipped((0.0, 0.0), (40.0, 0.0)) == pytest.approx((19.5, 0.0))
+    assert fence.clipped((0.0, 7.0), (15.0, 7.0)) == pytest.approx((4.5, 7.0))
+    assert fence.clipped((0.0, 0.0), (3.0, 3.0)) == (3.0, 3.0)
+    assert fence.clipped((30.0, 0.0), (40.0, 0.0)) == (30.0, 0.0)
+    assert fence.clipped((30.0, 0.0), (0.0, 0.0)) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        ("0,0 1,1", "three corners"),
+        ("0,0 10,10 10,0 0,10", "may not cross"),
+        ("0,0 0,0 10,0", "may not cross"),
+        ("0,0 10,0,5 10,10", "a corner is north,east"),
+        ("0,0 10,x 10,10", "'10,x'"),
+    ],
+)
+def test_what_is_no_area_is_told_with_its_key(corners, words, tmp_path) -> None:
+    path = tmp_path / "companion.toml"
+    for line in (f'fence_include = "{corners}"', f'fence_exclude = "{corners}"'):
+        path.write_text(f"[guidance]\n{line}\n")
+        with pytest.raises(ValueError, match=words) as caught:
+            load_settings(str(path), {}, {})
+        assert line.split(" ")[0] in str(caught.value)
+
+
+def test_settings_become_the_fence() -> None:
+    overrides = {
+        "guidance.fence_include": "-5,-5 5,-5 5,5 -5,5",
+        "guidance.fence_exclude": "3,3 4,3 4,4 | 1,1 2,1 2,2",
+    }
+    settings = load_settings("/dev/null", overrides, {})
+    fence = settings.guidance.fence()
+    assert fence.holds((0.0, 0.0))
+    assert not fence.holds((1.8, 1.2))
+    assert not fence.holds((6.0, 0.0))

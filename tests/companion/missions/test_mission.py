@@ -1,0 +1,260 @@
+"""Mission files: what is read, what is refused and in which words; and one flown by the whole service."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from command_line import companion
+from hypothesis import given
+from hypothesis import strategies as st
+from service_process import running_service
+
+from companion.guidance.sequence import ABORT, END, LAND, RTL
+from companion.missions.mission_file import (
+    MISSIONS_FOLDER,
+    MissionError,
+    describe,
+    find_mission,
+    plan_from,
+    read_mission,
+)
+from mavlink_sim.testing import running_simulator
+
+NAMES = ("person", "car", "traffic light")
+DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"
+
+
+def problems(text: str, names: tuple[str, ...] | None = NAMES) -> list[str]:
+    with pytest.raises(MissionError) as caught:
+        plan_from(text, "m.toml", names)
+    return list(caught.value.problems)
+
+
+def test_the_mission_of_the_demonstration_is_one() -> None:
+    plan = plan_from(read_mission(find_mission("demo")), "demo", NAMES)
+    assert [step.command.split()[0] for step in plan.steps] == ["takeoff", "seek", "approach", "hold", "rtl"]
+    assert [step.on_failure for step in plan.steps] == [RTL, RTL, RTL, RTL, ABORT]
+    assert [step.on_success for step in plan.steps] == [1, 2, 3, 4, END]
+
+
+@pytest.mark.parametrize("path", sorted(MISSIONS_FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_mission_that_comes_along_is_right(path: Path) -> None:
+    assert describe(plan_from(read_mission(path), str(path), NAMES))
+
+
+def test_every_mission_in_the_documents_is_right() -> None:
+    blocks = re.findall(r"^```toml\n(.*?)^```", DOCUMENT.read_text(), re.MULTILINE | re.DOTALL)
+    missions = [block for block in blocks if "[[step]]" in block]
+    assert missions
+    for text in missions:
+        assert plan_from(text, "docs/flight.md", NAMES).steps
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "m.toml: a mission has at least one [[step]]"),
+        ("step = []", "m.toml: step: List should have at least 1 item"),
+        ("[[step]]\nname = 'a'", "m.toml: step 1: do is missing"),
+        ("[[step]]\ndo =", "m.toml: no TOML: "),
+        ("nam = 'x'\n[[step]]\ndo = 'land'", "m.toml: unknown key 'nam'; did you mean name?"),
+        (
+            "[[step]]\ndo = 'land'\non_fail = 'rtl'",
+            "m.toml: step 1: unknown key 'on_fail'; did you mean on_fa",
+        ),
+        ("[[step]]\ndo = 'takeof 5'", "m.toml: step 1: unknown command 'takeof'; did you mean takeoff?"),
+        ("[[step]]\ndo = 'takeoff 500'", "m.toml: step 1: takeoff: altitude must be a number from 1 to 50 m"),
+        ("[[step]]\nname = 'find'\ndo = 'seek zebra'", "m.toml: step 1 (find): unknown class 'zebra'; there"),
+        ("[[step]]\ndo = 'hold'", "m.toml: step 1: 'hold' never ends by itself: give it timeout_s"),
+        ("[[step]]\ndo = 'mission demo'", "m.toml: step 1: a mission flies no other mission"),
+        ("[[step]]\ndo = 'land'\ntimeout_s = 0", "m.toml: step 1: timeout_s: Input should be greater than 0"),
+        ("[[step]]\ndo = 'land'\ntimeout_s = nan", "m.toml: step 1: timeout_s: "),
+        (
+            "[[step]]\ndo = 'land'\ntimeout_s = '5'",
+            "m.toml: step 1: timeout_s: Input should be a valid number",
+        ),
+        ("[[step]]\ndo = 'land'\nrepeat = 0", "m.toml: step 1: repeat: Input should be greater than or eq"),
+        ("[[step]]\ndo = 'land'\non_success = 'home'", "m.toml: step 1: on_success: unknown step 'home'; "),
+        ("[[step]]\nname = 'rtl'\ndo = 'rtl'", "m.toml: step 1 (rtl): a step cannot be called 'rtl': that"),
+        (
+            "[[step]]\nname = 'a'\ndo = 'hold 1'\n[[step]]\nname = 'a'\ndo = 'land'",
+            "m.toml: step 2 (a): the name is taken by step 1",
+        ),
+        (
+            "[[step]]\ndo = 'land'\non_success = 'end'\n[[step]]\nname = 'x'\ndo = 'land'",
+            "m.toml: step 2 (x): is never reached",
+        ),
+        (
+            "[[step]]\nname = 'a'\ndo = 'hold 1'\non_success = 'a'",
+            "m.toml: step 1 (a): a loop without exit: lead one of its branches out, or limit a step's visits",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_file_and_step(text: str, said: str) -> None:
+    [line] = problems(text)
+    assert line.startswith(said)
+    assert "\n" not in line
+
+
+def test_everything_that_is_wrong_is_told_at_once() -> None:
+    text = "[[step]]\ndo = 'fly'\n[[step]]\ndo = 'seek zebra'\non_failure = 'nowhere'\n[[step]]\ndo = 'land'"
+    assert [line.split(":")[1].strip() for line in problems(text)] == ["step 1", "step 2", "step 2"]
+
+
+@pytest.mark.parametrize(
+    "way_out",
+    ["visits = 3", "on_failure = 'rtl'", "on_failure = 'land'", "on_failure = 'end'", "on_failure = 'out'"],
+)
+def test_a_loop_with_a_way_out_is_allowed(way_out: str) -> None:
+    text = (
+        f"[[step]]\nname = 'a'\ndo = 'hold 1'\n{way_out}\n"
+        "[[step]]\ndo = 'hold 2'\non_success = 'a'\non_failure = 'continue'\n"
+        "[[step]]\nname = 'out'\ndo = 'land'\n"
+    )
+    text = text if "out'" in way_out else text.replace("on_failure = 'continue'\n[[step]]\nname = 'out'", "#")
+    text = text.replace("#\ndo = 'land'\n", "")
+    plan_from(text, "m.toml")
+
+
+def test_a_class_is_written_as_the_detector_writes_it() -> None:
+    plan = plan_from("[[step]]\ndo = 'seek Traffic_Light'", "m.toml", NAMES)
+    assert plan.steps[0].make().class_names == ("traffic light",)
+
+
+words = st.sampled_from(["continue", "end", "abort", "rtl", "land", "s0", "s1", "s2", "s3"])
+
+
+@given(st.lists(st.tuples(words, words, st.booleans()), min_size=1, max_size=4))
+def test_every_plan_that_is_taken_comes_to_an_end_whatever_its_steps_do(
+    steps: list[tuple[str, str, bool]],
+) -> None:
+    """From every step some branch leads, however long, to an end; and every step is reached."""
+    text = "".join(
+        f"[[step]]\nname = 's{index}'\ndo = 'hold 1'\non_success = '{success}'\non_failure = '{failure}'\n"
+        + ("visits = 2\n" if limited else "")
+        for index, (success, failure, limited) in enumerate(steps)
+    )
+    try:
+        plan = plan_from(text, "m.toml")
+    except MissionError:
+        return
+    reached, waiting = {0}, [0]
+    while waiting:
+        step = plan.steps[waiting.pop()]
+        fresh = {f for f in (step.on_success, step.on_failure) if isinstance(f, int)} - reached
+        reached |= fresh
+        waiting += fresh
+    assert reached == set(range(len(steps)))
+    ending = {index for index, step in enumerate(plan.steps) if step.visits is not None}
+    for _ in plan.steps:
+        ending |= {
+            index
+            for index, step in enumerate(plan.steps)
+            if {step.on_success, step.on_failure} & {END, RTL, LAND, ABORT, *ending}
+        }
+    assert ending == reached
+
+
+@given(st.text(max_size=200))
+def test_any_text_is_a_mission_or_an_error_with_the_files_name(text: str) -> None:
+    said: tuple[str, ...] = ()
+    try:
+        plan_from(text, "m.toml")
+    except MissionError as error:
+        said = error.problems
+    assert all(line.startswith("m.toml: ") for line in said)
+
+
+def test_a_mission_is_found_by_path_with_or_without_its_ending_or_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "own.toml"
+    own.write_text("[[step]]\ndo = 'land'\n")
+    assert find_mission(str(own)) == own
+    assert find_mission("own").resolve() == own
+    assert find_mission("demo") == MISSIONS_FOLDER / "demo.toml"
+    with pytest.raises(MissionError, match=r"no mission 'nowhere'.*demo"):
+        find_mission("nowhere")
+
+
+def test_a_file_that_is_none_is_told_in_plain_words(tmp_path: Path) -> None:
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(MissionError, match="cannot be read"):
+        read_mission(path)
+    path.write_bytes(b"#" * 100_001)
+    with pytest.raises(MissionError, match="at most 100000 bytes"):
+        read_mission(path)
+
+
+def test_the_command_line_checks_a_mission_and_prints_its_plan(small_model: Path, tmp_path: Path) -> None:
+    done = companion("mission", "demo", "--check", "--model", small_model, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[:2] == [
+        "mission demo: 5 steps",
+        "1. takeoff altitude=4 → find; failing → rtl",
+    ]
+    (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
+    done = companion("mission", "bad.toml", "--check", "--model", small_model, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        "companion: bad.toml: step 1 (look): unknown class 'zebra'; there are: person, car, boat\n"
+    )
+
+
+SHORT = """
+name = "up and down"
+
+[[step]]
+do = "takeoff 2.5"
+
+[[step]]
+name = "wait"
+do = "hold"
+timeout_s = 1
+
+[[step]]
+name = "look"
+do = "seek boat laps=0.25 rate=1 confidence=1"
+on_failure = "continue"
+
+[[step]]
+name = "down"
+do = "land"
+"""
+
+
+@pytest.mark.timeout(120)
+def test_a_mission_sent_to_the_service_is_flown_and_its_steps_are_told(
+    seeing: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "short.toml").write_text(SHORT)
+    flown_at = tmp_path / "service"
+    flown_at.mkdir()
+    with (
+        running_simulator(speed=2.0) as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=flown_at) as service,
+    ):
+        # The service cannot see the file: its text goes with the command.
+        done = companion("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert done.stdout.splitlines()[-1] == "done: flown, 4 steps"
+        service.wait_for_line("mission up and down: step 4 of 4: land", 5.0)
+        assert any("step 2 of 4: hold" in line for line in service.lines)
+
+        reply = service.command("mission short")
+        assert not reply["success"]
+        assert reply["reason"].startswith("no mission 'short': no such file in")
+        reply = service.command("mission broken\n[[step]]\ndo = 'seek zebra'\n")
+        assert reply["reason"].startswith("broken: step 1: unknown class 'zebra'")
+        reply = service.command("hold\n[[step]]\ndo = 'land'\n")
+        assert reply["reason"] == "hold: one command at a time; only a mission may have more lines"
+        # From the ground its first step is refused, and with it the mission.
+        reply = service.command("mission from_the_ground\n[[step]]\ndo = 'hold 3'\n")
+        assert reply["reason"].startswith("mission needs to be in the air")
+        assert reply["steps"] == []

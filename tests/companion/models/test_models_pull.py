@@ -1,0 +1,207 @@
+"""Fetching a model from a real server on this machine: interrupted, resumed, refused, forged, unreachable."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from companion.cli import app
+from companion.models.catalog import KNOWN, KnownModel, known_by_digest
+from companion.models.pull import PullError, at_address, pull
+
+CONTENT = bytes(range(256)) * 2000
+DIGEST = hashlib.sha256(CONTENT).hexdigest()
+
+
+@dataclass
+class Server:
+    """What the server has and does; `breaks` are the bytes after which each next answer stops."""
+
+    url: str = ""
+    content: bytes = CONTENT
+    ranges: bool = True
+    breaks: list[int] = field(default_factory=list)
+    asked: list[str | None] = field(default_factory=list)
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    state = Server()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            wanted = self.headers.get("Range")
+            state.asked.append(wanted)
+            if not self.path.endswith("/model.pt"):
+                self.send_error(404)
+                return
+            start = int(wanted.removeprefix("bytes=").rstrip("-")) if wanted and state.ranges else 0
+            if start >= len(state.content):
+                self.send_error(416)
+                return
+            rest = state.content[start:]
+            self.send_response(206 if start else 200)
+            if start:
+                size = len(state.content)
+                self.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
+            self.send_header("Content-Length", str(len(rest)))
+            self.end_headers()
+            if state.breaks:
+                rest = rest[: state.breaks.pop(0)]
+                self.close_connection = True
+            self.wfile.write(rest)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    listening = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=listening.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    state.url = f"http://127.0.0.1:{listening.server_port}/model.pt"
+    yield state
+    listening.shutdown()
+    listening.server_close()
+    thread.join()
+
+
+def official(server: Server, *, sha256: str | None = DIGEST, size: int | None = len(CONTENT)) -> KnownModel:
+    return KnownModel("model", server.url, size, sha256, "AGPL-3.0", "a test")
+
+
+def test_a_model_is_fetched_once_and_found_the_next_time(tmp_path: Path, server: Server) -> None:
+    seen: list[tuple[int, int | None]] = []
+    pulled = pull(official(server), tmp_path / "new", progress=lambda done, total: seen.append((done, total)))
+    assert pulled.path.read_bytes() == CONTENT
+    assert pulled.sha256 == DIGEST
+    assert pulled.fetched
+    assert seen[0] == (0, len(CONTENT))
+    assert seen[-1] == (len(CONTENT), len(CONTENT))
+    again = pull(official(server), tmp_path / "new")
+    assert not again.fetched
+    assert len(server.asked) == 1
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["model.pt"]
+
+
+def test_a_line_that_breaks_is_taken_up_where_it_broke(tmp_path: Path, server: Server) -> None:
+    server.breaks = [100_000, 1, 200_000]
+    assert pull(official(server), tmp_path).path.read_bytes() == CONTENT
+    assert server.asked == [None, "bytes=100000-", "bytes=100001-", "bytes=300001-"]
+
+
+def test_an_interrupted_fetch_goes_on_in_the_next_run(tmp_path: Path, server: Server) -> None:
+    server.breaks = [100_000, 0]
+    with pytest.raises(PullError, match=r"interrupted after 100000 of 512000 bytes .*pull again to go on"):
+        pull(official(server), tmp_path)
+    assert (tmp_path / "model.pt.partial").stat().st_size == 100_000
+    assert pull(official(server), tmp_path).fetched
+    assert server.asked[-1] == "bytes=100000-"
+
+
+def test_a_server_that_knows_no_ranges_sends_the_whole_again(tmp_path: Path, server: Server) -> None:
+    server.ranges, server.breaks = False, [100_000]
+    assert pull(official(server), tmp_path).path.read_bytes() == CONTENT
+
+
+def test_another_file_is_deleted_and_named(tmp_path: Path, server: Server) -> None:
+    server.content = bytes(len(CONTENT))
+    with pytest.raises(PullError, match=f"not the file that was meant.*expected {DIGEST}"):
+        pull(official(server), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_another_size_is_not_even_fetched(tmp_path: Path, server: Server) -> None:
+    server.content = CONTENT + b"more"
+    with pytest.raises(PullError, match="has 512004 bytes there, expected 512000"):
+        pull(official(server), tmp_path)
+
+
+def test_the_partial_of_another_file_heals(tmp_path: Path, server: Server) -> None:
+    (tmp_path / "model.pt.partial").write_bytes(bytes(600_000))
+    assert pull(official(server), tmp_path).path.read_bytes() == CONTENT
+
+
+def test_a_file_that_is_not_there_says_how_to_do_it_by_hand(tmp_path: Path, server: Server) -> None:
+    with pytest.raises(PullError, match=f"404.*put it at {tmp_path}/model.pt.*{DIGEST} and 512000 bytes"):
+        pull(at_address(official(server), server.url.replace("model.pt", "gone.pt")), tmp_path)
+
+
+def test_without_a_network_it_says_where_the_file_goes(tmp_path: Path, server: Server) -> None:
+    # A port that nobody listens on.
+    away = at_address(official(server), "http://127.0.0.1:9/model.pt")
+    with pytest.raises(
+        PullError, match=rf"cannot reach 127\.0\.0\.1 .*put it at {tmp_path}/model.pt.*{DIGEST}"
+    ):
+        pull(away, tmp_path)
+
+
+def test_a_file_put_there_by_hand_is_checked(tmp_path: Path, server: Server) -> None:
+    (tmp_path / "model.pt").write_bytes(CONTENT)
+    assert not pull(official(server), tmp_path).fetched
+    (tmp_path / "model.pt").write_bytes(b"forged")
+    with pytest.raises(PullError, match="Move it away"):
+        pull(official(server), tmp_path)
+
+
+def test_a_model_without_a_known_digest_needs_one_or_trust(tmp_path: Path, server: Server) -> None:
+    unknown = official(server, sha256=None, size=None)
+    with pytest.raises(PullError, match=r"--sha256.*--trust-first"):
+        pull(unknown, tmp_path)
+    with pytest.raises(PullError, match="64 hexadecimal digits"):
+        pull(unknown, tmp_path, sha256="abc")
+    assert pull(unknown, tmp_path / "given", sha256=DIGEST.upper()).sha256 == DIGEST
+    assert pull(unknown, tmp_path / "trusted", trust_first=True).sha256 == DIGEST
+    assert DIGEST in (tmp_path / "trusted" / "model.pt.sha256").read_text()
+
+
+def test_what_was_trusted_once_must_be_the_same_ever_after(tmp_path: Path, server: Server) -> None:
+    unknown = official(server, sha256=None, size=None)
+    pull(unknown, tmp_path, trust_first=True).path.unlink()
+    server.content = bytes(1000)
+    with pytest.raises(PullError, match="not the file that was meant"):
+        pull(unknown, tmp_path, trust_first=True)
+
+
+def test_a_digest_given_against_the_pinned_one_is_refused(tmp_path: Path, server: Server) -> None:
+    with pytest.raises(PullError, match="you gave"):
+        pull(official(server), tmp_path, sha256="0" * 64)
+
+
+@pytest.mark.parametrize("url", ["file:///etc/passwd", "ftp://127.0.0.1/model.pt"])
+def test_only_the_web_is_fetched_from(tmp_path: Path, server: Server, url: str) -> None:
+    with pytest.raises(PullError, match="only http and https"):
+        pull(at_address(official(server), url), tmp_path)
+
+
+def test_trust_without_a_digest_needs_https(tmp_path: Path, server: Server) -> None:
+    unknown = at_address(official(server, sha256=None), "http://example.invalid/model.pt")
+    with pytest.raises(PullError, match="only https"):
+        pull(unknown, tmp_path, trust_first=True)
+
+
+def test_the_command_shows_the_licence_and_how_to_do_it_offline(tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        app,
+        ["models", "pull", "yolov8n", "--folder", str(tmp_path), "--url", "http://127.0.0.1:9/yolov8n.pt"],
+    )
+    assert result.exit_code == 2
+    assert result.stderr.index("AGPL-3.0") < result.stderr.index("cannot reach")
+    assert KNOWN["yolov8n"].sha256 in result.stderr
+    result = CliRunner().invoke(app, ["models", "pull", "yolov8q"])
+    assert result.exit_code == 2
+    assert "nearest: yolov8" in result.stderr
+
+
+def test_every_pinned_model_has_a_digest_of_its_own_and_an_official_address() -> None:
+    pinned = [model for model in KNOWN.values() if model.sha256]
+    assert len({model.sha256 for model in pinned}) == len(pinned) == 20
+    for model in KNOWN.values():
+        assert model.url == f"https://github.com/ultralytics/assets/releases/download/v8.4.0/{model.file}"
+        assert model.sha256 is None or (len(model.sha256) == 64 and model.size_bytes)
+    assert known_by_digest(KNOWN["yolo11n"].sha256 or "") is KNOWN["yolo11n"]

@@ -1,0 +1,264 @@
+"""Tracks on their way from the worker to the service, and the vehicle's attitude on its way there."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.perception.keeper import PerceptionKeeper, PerceptionState
+from companion.perception.messages import Attitude, Ended, Hud, Report, packed, receive
+from companion.perception.outbox import Outbox
+from companion.perception.tracks import LiveTracks
+from companion.perception.worker import Orders
+from companion.settings import Settings
+from companion.settings.reading import load_settings
+from vision.detections import NO_TRACK, Detections
+from vision.pipeline import PerceptionResult
+from vision.rotation import matrix_from_euler, quaternion_from_euler
+from vision.tracking import Track, TrackEvent, TrackEventKind, TrackState
+
+NEW, UPDATE, LOST, END = (
+    TrackEventKind.NEW,
+    TrackEventKind.UPDATE,
+    TrackEventKind.LOST,
+    TrackEventKind.END,
+)
+DEADLINE_S = 60.0
+
+
+def event(kind: TrackEventKind, track_id: int, stamp_ns: int = 0) -> TrackEvent:
+    track = Track(track_id, 0, "car", TrackState.CONFIRMED, (0.0, 0.0, 1.0, 1.0), 0.9, 0.8, 3, 0, stamp_ns)
+    return TrackEvent(kind, stamp_ns, track)
+
+
+def result(sequence: int, *events: TrackEvent, ids: tuple[int, ...] = ()) -> PerceptionResult:
+    detections = Detections(
+        np.zeros((len(ids), 4), np.float32),
+        np.zeros(len(ids), np.float32),
+        np.zeros(len(ids), np.int64),
+        ("car",),
+        track_id=np.array(ids, np.int64),
+        track_score=np.zeros(len(ids), np.float32),
+        track_confirmed=np.zeros(len(ids), np.bool_),
+    )
+    return PerceptionResult(sequence, sequence * 1000, 0, 64, 48, detections, {}, 0, events)
+
+
+def kinds(taken: PerceptionResult) -> list[tuple[TrackEventKind, int]]:
+    return [(event.kind, event.track.track_id) for event in taken.track_events]
+
+
+def test_what_a_dead_worker_followed_has_ended_with_the_next_ones_first_result() -> None:
+    tracks = LiveTracks()
+    tracks.take(result(1, event(NEW, 1), event(NEW, 2), event(NEW, 3)))
+    tracks.take(result(2, event(UPDATE, 1), event(LOST, 2), event(END, 3)))
+    assert len(tracks) == 2
+    tracks.worker_ended()
+    assert len(tracks) == 0
+    first = tracks.take(result(9, event(NEW, 4)))
+    assert kinds(first) == [(END, 1), (END, 2), (NEW, 4)]
+    assert [event.stamp_ns for event in first.track_events[:2]] == [9000, 9000]
+    assert kinds(tracks.take(result(10))) == []
+
+
+def test_two_workers_that_die_before_a_result_lose_nothing() -> None:
+    tracks = LiveTracks()
+    tracks.take(result(1, event(NEW, 1)))
+    tracks.worker_ended()
+    tracks.worker_ended()
+    assert kinds(tracks.take(result(2))) == [(END, 1)]
+
+
+def test_the_next_worker_numbers_above_every_number_that_was_seen() -> None:
+    tracks = LiveTracks()
+    assert tracks.next_id == 1
+    tracks.take(result(1, ids=(NO_TRACK, 12, 5)))
+    assert tracks.next_id == 13
+    tracks.take(result(2, event(NEW, 30)))
+    tracks.take(result(3, event(END, 30), ids=(4,)))
+    assert tracks.next_id == 31
+
+
+def test_events_of_a_result_that_is_replaced_come_with_the_newer_one() -> None:
+    ours, theirs = socket.socketpair()
+    ours.settimeout(30)
+    with ours, theirs:
+        outbox = Outbox(theirs, on_lost=lambda: None)
+        # Larger than the socket takes, so that everything after it waits.
+        filler = Detections.empty(tuple("x" * 1000 for _ in range(2000)))
+        outbox.put_newest(Report(PerceptionResult(0, 0, 0, 64, 48, filler, {}, 0), 1, 0))
+        while outbox._newest is not None:
+            time.sleep(0.001)
+        outbox.put_newest(Report(result(1, event(NEW, 1), event(UPDATE, 2)), 2, 0))
+        outbox.put_newest(Report(result(2, event(UPDATE, 1), event(LOST, 2)), 3, 0))
+        outbox.put_newest(Report(result(3, event(UPDATE, 1), event(END, 2)), 4, 0))
+        closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", 4), 30.0))
+        closing.start()
+        first, second = receive(ours), receive(ours)
+        closing.join()
+    assert isinstance(first, Report)
+    assert isinstance(second, Report)
+    assert second.replaced == 2
+    assert kinds(second.result) == [(NEW, 1), (LOST, 2), (UPDATE, 1), (END, 2)]
+
+
+def test_the_worker_takes_attitudes_beside_other_orders() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        orders = Orders(theirs)
+        for step in range(6):
+            ours.sendall(packed(Attitude(step * 20_000_000, quaternion_from_euler(0, 0, 0.1 * step))))
+        ours.sendall(packed(Hud(("flying",), None)))
+        deadline_s = time.monotonic() + DEADLINE_S
+        while orders.hud.lines != ("flying",):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.001)
+        attitude = orders.attitudes.at(50_000_000)
+        orders.finished()
+    assert attitude is not None
+    np.testing.assert_allclose(attitude, matrix_from_euler(0, 0, 0.25), atol=1e-5)
+
+
+# --- with real workers
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import torch
+
+    from vision.yolo.architecture import build
+    from vision.yolo.checkpoint import save_checkpoint
+    from vision.yolo.description import yolov8_description
+
+    torch.manual_seed(1)
+    path = tmp_path_factory.mktemp("model") / "tiny.pt"
+    save_checkpoint(path, build(yolov8_description((0.33, 0.125, 128), ("car", "person"))), metadata={})
+    return path
+
+
+@pytest.fixture
+def settings(tmp_path: Path, model: Path) -> Settings:
+    """A still picture in which an untrained network sees the same nonsense in every frame: tracks of it."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "0.png"), np.full((48, 64, 3), 90, np.uint8))
+    values = {
+        "source.uri": str(folder),
+        "source.loop": "true",
+        "source.rate_hz": "20",
+        "detector.model": str(model),
+        "detector.image_size": "64",
+        "detector.threads": "1",
+        "detector.precision": "float32",
+        "detector.confidence": "0",
+        "tracker.high_confidence": "0",
+        "tracker.low_confidence": "0",
+        "tracker.true_score": "0",
+        "tracker.end_s": "600",
+    }
+    return load_settings(os.devnull, values, {})
+
+
+async def until(condition: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not happen in time"
+        await asyncio.sleep(0.01)
+
+
+async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_takes_other_numbers(
+    settings: Settings,
+) -> None:
+    results: list[PerceptionResult] = []
+    keeper = PerceptionKeeper(settings, on_result=results.append, on_event=lambda *_: None)
+
+    def told(kind: TrackEventKind) -> list[int]:
+        return [e.track.track_id for r in results for e in r.track_events if e.kind is kind]
+
+    def spun() -> bool:
+        """Tell the attitude of a vehicle that looks the other way at once, again and again.
+
+        Whatever the time between two frames, a step of 143 degrees between them leaves nothing in view.
+        """
+        now_ns = time.monotonic_ns()
+        yaw_rad = 2.5 * (now_ns // 500_000_000 % 2)
+        keeper.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, yaw_rad))
+        return bool(told(END))
+
+    await keeper.start()
+    try:
+        await until(lambda: len(results) >= 5)
+        assert told(NEW)
+        assert told(END) == []
+        assert keeper.status.tracks == len(told(NEW))
+        assert results[-1].timing_ms["track"] > 0
+        assert set(results[-1].detections.track_id.tolist()) >= set(told(NEW))
+
+        await until(spun)
+
+        pid = keeper.status.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        await until(lambda: keeper.status.state is PerceptionState.RESTARTING)
+        before, live = len(results), set(told(NEW)) - set(told(END))
+        await until(lambda: len(results) > before + 3)
+        after = results[before:]
+        ends = [e.track.track_id for e in after[0].track_events if e.kind is END]
+        assert sorted(ends) == sorted(live)
+        newer = [number for r in after for number in r.detections.track_id.tolist() if number != NO_TRACK]
+        assert min(newer) > max(number for r in results[:before] for number in r.detections.track_id)
+    finally:
+        await keeper.stop()
+
+
+class Turned:
+    """Stands where the process is and keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.stamps_ns: list[int] = []
+
+    def turn(self, attitude: Attitude) -> None:
+        self.stamps_ns.append(attitude.stamp_ns)
+
+
+def keeper_with(told: Turned, **overrides: str) -> PerceptionKeeper:
+    settings = load_settings(os.devnull, overrides, {})
+    keeper = PerceptionKeeper(settings, on_result=lambda _: None, on_event=lambda *_: None)
+    keeper._process = told  # type: ignore[assignment]
+    return keeper
+
+
+@pytest.mark.parametrize("rate_hz", [30, 50, 77, 250])
+def test_at_most_fifty_attitudes_a_second_go_to_the_worker_and_none_twice(rate_hz: int) -> None:
+    told = Turned()
+    keeper = keeper_with(told)
+    rng = np.random.default_rng(rate_hz)
+    for step in range(4 * rate_hz):
+        stamp_ns = round((1.0 + step / rate_hz + rng.uniform(0, 0.2) / rate_hz) * 1e9)
+        for _ in range(2):  # other telemetry comes with the same attitude
+            keeper.send_attitude(stamp_ns, (1.0, 0.0, 0.0, 0.0))
+    assert (np.diff(told.stamps_ns) > 0).all()
+    assert 0.85 * 4 * min(rate_hz, 50) <= len(told.stamps_ns) <= 4 * min(rate_hz, 50) + 2
+
+
+@pytest.mark.parametrize("key", ["tracker.enabled", "tracker.camera_motion", "detector.enabled"])
+def test_an_attitude_nobody_wants_is_not_sent(key: str) -> None:
+    told = Turned()
+    blind = {"guidance.obstacles": "off"}
+    keeper_with(told, **blind, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    assert told.stamps_ns == []
+    keeper_with(told, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    assert told.stamps_ns == [1], "obstacles need it"
+    told.stamps_ns.clear()
+    keeper_with(told).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    assert told.stamps_ns == [1]

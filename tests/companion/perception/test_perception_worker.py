@@ -1,0 +1,181 @@
+"""The worker's side of the socket: what it does when the service is slow, silent or gone."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from companion.perception.messages import (
+    Ended,
+    Heartbeat,
+    Hud,
+    LogLine,
+    Message,
+    ProtocolError,
+    Report,
+    packed,
+    read_message,
+    receive,
+)
+from companion.perception.outbox import Outbox, OutboxHandler
+from companion.perception.pulse import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Pulse
+from vision.detections import Detections
+from vision.pipeline import PerceptionResult
+
+
+def report(sequence: int) -> Report:
+    empty = Detections.empty(("car",))
+    return Report(PerceptionResult(sequence, 0, 0, 64, 48, empty, {}, 0), frames=sequence + 1, replaced=0)
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ours, theirs = socket.socketpair()
+    for end in (ours, theirs):
+        end.settimeout(30)
+    with ours, theirs:
+        yield ours, theirs
+
+
+def everything(connection: socket.socket) -> list[Message]:
+    messages = []
+    while (message := receive(connection)) is not None:
+        messages.append(message)
+        if isinstance(message, Ended):
+            break
+    return messages
+
+
+def test_a_service_that_does_not_read_never_holds_up_the_loop_and_gets_the_newest(
+    ends: tuple[socket.socket, socket.socket],
+) -> None:
+    service, worker = ends
+    outbox = Outbox(worker, on_lost=lambda: None)
+    count = 5000  # far more than the socket takes
+    for sequence in range(count):
+        outbox.put_newest(report(sequence))
+    closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", count), 30.0))
+    closing.start()
+    reports = [message for message in everything(service) if isinstance(message, Report)]
+    closing.join()
+    assert reports[-1].result.sequence == count - 1
+    assert reports[-1].replaced == count - len(reports)
+    assert reports[-1].replaced > 0
+    sequences = [message.result.sequence for message in reports]
+    assert sequences == sorted(set(sequences))
+
+
+def test_a_heartbeat_never_takes_the_place_of_a_result(ends: tuple[socket.socket, socket.socket]) -> None:
+    service, worker = ends
+    outbox = Outbox(worker, on_lost=lambda: None)
+    for _ in range(2000):
+        outbox.put_newest(report(0))
+        outbox.put_newest(Heartbeat(0))
+    outbox.put_newest(report(7))
+    outbox.put_newest(Heartbeat(9))
+    closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", 0), 30.0))
+    closing.start()
+    reports = [message for message in everything(service) if isinstance(message, Report)]
+    closing.join()
+    assert reports[-1].result.sequence == 7
+
+
+def test_the_end_is_told_last_and_lines_keep_their_order(ends: tuple[socket.socket, socket.socket]) -> None:
+    service, worker = ends
+    outbox = Outbox(worker, on_lost=lambda: None)
+    log = logging.Logger("vision.test")
+    log.addHandler(OutboxHandler(outbox))
+    log.warning("lost %s\nagain", "street.mp4")
+    log.info("second")
+    outbox.put_newest(report(3))
+    outbox.close(Ended(False, "broken", 4), 30.0)
+    first, second, *_, last = everything(service)
+    assert first == LogLine(logging.WARNING, "vision.test", "lost street.mp4 again")
+    assert second == LogLine(logging.INFO, "vision.test", "second")
+    assert last == Ended(False, "broken", 4)
+
+
+def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.socket]) -> None:
+    service, worker = ends
+    gone = threading.Event()
+    outbox = Outbox(worker, on_lost=gone.set)
+    service.close()
+    outbox.put_newest(report(0))
+    assert gone.wait(30)
+    outbox.close(Ended(True, "done", 0), 30.0)
+
+
+def test_messages_of_any_size_come_through_in_pieces(ends: tuple[socket.socket, socket.socket]) -> None:
+    service, worker = ends
+    message = Hud(("x" * 300_000,), None)
+    sending = threading.Thread(target=worker.sendall, args=(packed(message) * 2,))
+    sending.start()
+    assert receive(service) == message
+    assert receive(service) == message
+    sending.join()
+
+
+def test_what_is_no_message_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
+    service, worker = ends
+    worker.sendall(struct.pack(">I", 1 << 31))
+    with pytest.raises(ProtocolError, match="2147483648 bytes"):
+        receive(service)
+
+
+async def test_an_end_in_the_middle_of_a_message_is_an_end() -> None:
+    reader = asyncio.StreamReader()
+    reader.feed_data(packed(Hud(("a",), "car"))[:-1])
+    reader.feed_eof()
+    assert await read_message(reader) is None
+
+
+def test_a_worker_without_a_service_ends_at_once() -> None:
+    ours, theirs = socket.socketpair()
+    with theirs:
+        # The process id is not that of its parent, as when the service died in between.
+        arguments = [sys.executable, "-m", "companion.perception.worker", str(theirs.fileno()), "-1"]
+        process = subprocess.run(arguments, pass_fds=[theirs.fileno()], timeout=60, check=False)
+    ours.close()
+    assert process.returncode == 1
+
+
+def test_a_worker_that_may_still_be_loading_is_given_time() -> None:
+    pulse = Pulse(100.0, open_timeout_s=10.0)
+    assert pulse.stuck_after_s == START_S + 10.0
+    pulse.heard(105.0)
+    pulse.ready()
+    assert pulse.stuck_after_s == FIRST_RESULT_S
+    assert pulse.silent_s(107.5) == 2.5
+
+
+@pytest.mark.parametrize(
+    ("step_s", "stuck_after_s"),
+    [(0.02, SHORTEST_S), (0.15, SHORTEST_S), (0.25, 5.0), (1.0, 20.0), (4.0, LONGEST_S)],
+)
+def test_what_counts_as_stuck_follows_what_is_usual(step_s: float, stuck_after_s: float) -> None:
+    pulse = Pulse(0.0, open_timeout_s=10.0)
+    for count in range(1, 60):
+        # Signs of life between the results say nothing of how long one takes.
+        for part in range(4):
+            pulse.heard(count * 10.0 + part)
+        pulse.resulted(step_s)
+    assert pulse.stuck_after_s == pytest.approx(stuck_after_s)
+
+
+def test_silence_while_nobody_listened_is_forgiven() -> None:
+    pulse = Pulse(0.0, open_timeout_s=10.0)
+    pulse.forgive(50.0)
+    assert pulse.silent_s(51.0) == 1.0
+
+
+def test_the_service_side_brings_no_torch() -> None:
+    code = "import companion.perception.keeper, sys; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

@@ -1,0 +1,91 @@
+"""Pictures leave the perception process only while somebody looks at them."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import zenoh
+from service_process import running_service
+
+from companion.bus.client import listen
+from companion.perception.messages import Preview
+from companion.perception.preview import PreviewEncoder
+from companion.settings import PreviewSection
+from mavlink_sim.testing import running_simulator
+from vision.detections import Detections
+from vision.frame import Frame
+
+IMAGE = np.full((120, 160, 3), 90, np.uint8)
+CAR = Detections(
+    np.array([[20, 30, 90, 100]], np.float32), np.array([0.9], np.float32), np.array([0]), ("car",)
+)
+
+
+def pictures_of(settings: PreviewSection, stamps_ns: list[int], *, watched: bool = True) -> list[Preview]:
+    made: list[Preview] = []
+    delivered = threading.Semaphore(0)
+
+    def deliver(preview: Preview) -> None:
+        made.append(preview)
+        delivered.release()
+
+    encoder = PreviewEncoder(settings, deliver)
+    encoder.watched = watched
+    for sequence, stamp_ns in enumerate(stamps_ns):
+        before = encoder._due_ns
+        encoder.write(Frame(IMAGE, stamp_ns, sequence), CAR)
+        if encoder._due_ns != before:
+            assert delivered.acquire(timeout=10)
+    encoder.close()
+    return made
+
+
+def test_a_picture_shows_what_was_detected_and_says_which_frame_it_is() -> None:
+    plain, drawn = (pictures_of(PreviewSection(annotate=annotate), [5_000])[0] for annotate in (False, True))
+    assert (drawn.sequence, drawn.captured_ns) == (0, 5_000)
+    images = [cv2.imdecode(np.frombuffer(p.jpeg, np.uint8), cv2.IMREAD_COLOR) for p in (plain, drawn)]
+    assert images[0].shape == images[1].shape == (120, 160, 3)
+    assert np.abs(images[0].astype(int) - 90).max() < 10
+    assert np.abs(images[1].astype(int) - 90).max() > 60
+
+
+def test_pictures_come_no_faster_than_asked_for_and_none_while_nobody_looks() -> None:
+    stamps_ns = [number * 100_000_000 for number in range(10)]
+    assert [p.sequence for p in pictures_of(PreviewSection(rate_hz=2.5), stamps_ns)] == [0, 4, 8]
+    assert pictures_of(PreviewSection(), stamps_ns, watched=False) == []
+
+
+def test_a_subscriber_gets_pictures_and_without_one_none_are_made(seeing: list[str], tmp_path: Path) -> None:
+    statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    pictures: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+
+    def images_published() -> int:
+        while not statuses.empty():
+            statuses.get()
+        return int(statuses.get(timeout=10)["bus"]["published"]["image"])
+
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+        assert images_published() == 0
+        with session.declare_subscriber("companion/*/image", pictures.put):
+            sample = pictures.get(timeout=30)
+        image = cv2.imdecode(np.frombuffer(sample.payload.to_bytes(), np.uint8), cv2.IMREAD_COLOR)
+        assert image.shape == (120, 160, 3)
+        assert sample.encoding == zenoh.Encoding.IMAGE_JPEG
+        assert sample.attachment is not None
+        assert json.loads(sample.attachment.to_string())["view"] is None
+        # The subscriber has gone: the count comes to rest.
+        before, now = images_published(), images_published()
+        while now != before:
+            before, now = now, images_published()
+        assert now > 0

@@ -1,0 +1,143 @@
+"""Several cameras, and several models at one camera: a process each, all published, one of them steers."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import secrets
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from service_process import running_service
+
+from companion.bus.client import listen
+from companion.perception.views import threads_each
+from companion.settings import DetectorSection
+from companion.settings.reading import ConfigurationError, load_settings, to_toml
+from mavlink_sim.testing import running_simulator
+
+
+def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alone(
+    seeing: list[str], small_model: Path, tmp_path: Path
+) -> None:
+    shared = f"companion-test-{secrets.token_hex(4)}"
+    (tmp_path / "companion.toml").write_text(
+        f'[source]\nshare = "{shared}"\n'
+        f'[views.down.source]\nuri = "shm://{shared}"\n'
+        f"[views.down.detector]\nmodel = {str(small_model)!r}\nimage_size = 96\nclasses = ['boat']\n"
+    )
+    received: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
+
+    def next_of(view: str | None) -> dict[str, Any]:
+        while True:
+            key, message = received.get(timeout=30)
+            own = "" if message["view"] is None else f"views/{message['view']}/"
+            assert key == f"companion/vehicle1/{own}detections"
+            if message["view"] == view:
+                return message
+
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        listen(session, "companion/*/**/detections", lambda key, text: received.put((key, json.loads(text))))
+        statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+        first, down = next_of(None), next_of("down")
+        assert (first["width"], first["height"]) == (down["width"], down["height"]) == (160, 120)
+        status = statuses.get(timeout=10)
+        assert status["perception"]["pid"] != status["views"]["down"]["pid"]
+        assert status["targets"]["view"] is None
+
+        os.kill(status["views"]["down"]["pid"], signal.SIGKILL)
+        service.wait_for_line("view down: perception lost")
+        service.wait_for_line("view down: perception is back")
+        while not received.empty():
+            received.get()
+        next_of("down")
+        while (status := statuses.get(timeout=10))["views"]["down"]["restarts"] == 0:
+            pass
+        assert status["perception"]["restarts"] == 0
+    assert not Path("/dev/shm", shared).exists()
+
+
+def test_the_view_that_steers_is_the_one_that_is_named(
+    seeing: list[str], small_model: Path, pictures: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "companion.toml").write_text(
+        '[detector]\nenabled = false\n[guidance]\nview = "side"\n'
+        f"[views.side.source]\nuri = {str(pictures)!r}\nloop = true\n"
+        f"[views.side.detector]\nmodel = {str(small_model)!r}\nimage_size = 96\n"
+    )
+    without_model = [flag for flag in seeing if flag not in ("--model", str(small_model))]
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, without_model, cwd=tmp_path) as service,
+    ):
+        # What may be sought is what that view's model knows, and it alone has one.
+        assert "unknown class 'bicycle'" in service.command("seek bicycle")["reason"]
+        assert "in the air" in service.command("seek boat")["reason"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[views.down.detectr]\nx = 1", ["[views.down.detectr]", "did you mean detector"]),
+        ('[views."a b".source]\nuri = "x.mp4"', ["a view's name must be a word", "'a b'"]),
+        ("[views.down.detector]\nconfidence = 3", ["views.down.detector.confidence", "0 to 1", "got 3"]),
+        ("[views.down.detector]\nmodle = 3", ["views.down.detector.modle", "did you mean detector.model"]),
+        (
+            '[views.d.source]\nuri = "-"\n[views.up.source]\nuri = "-"',
+            ["views.up.source.uri", "opened once", "shm://NAME"],
+        ),
+        ('[guidance]\nview = "up"', ["guidance.view", "'up'", "views: none"]),
+        ('[views.a.source]\nuri = "shm://f"\nshare = "f"', ["views.a.source.share", "its own frames"]),
+        (
+            '[views.a.source]\nuri = "a.mp4"\nshare = "f"\n[views.b.source]\nuri = "b.mp4"\nshare = "f"',
+            ["views.b.source.share", "views.a.source.share", "'f'"],
+        ),
+        (
+            '[recording]\nvideo = "f.webm"\n[views.a.recording]\nvideo = "f.webm"',
+            ["recording.video of its own"],
+        ),
+        (
+            '[views.a.source]\nuri = "a.mp4"\n[views.a.detector]\nrate_hz = 0.5',
+            ["views.a.tracker.end_s", "views.a.detector.rate_hz", "2 s"],
+        ),
+        ("[views]\ndown = 1", ["views.down", "must hold sections", "got 1"]),
+    ],
+)
+def test_a_bad_view_is_one_line_that_names_it(text: str, words: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "companion.toml"
+    path.write_text(f'[source]\nuri = "street.mp4"\n{text}\n')
+    with pytest.raises(ConfigurationError) as caught:
+        load_settings(path, {}, {})
+    (problem,) = caught.value.problems
+    for word in words:
+        assert word in problem
+
+
+def test_views_are_printed_as_they_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "companion.toml"
+    path.write_text('[views.down.source]\nuri = "down.mp4"\n[views.up-2.source]\nuri = "up.mp4"\n')
+    settings = load_settings(path, {"views.down.detector.confidence": "0.4"}, {})
+    assert list(settings.views) == ["down", "up-2"]
+    assert settings.of_view("down").detector.confidence == 0.4
+    assert settings.of_view(None).detector.confidence == settings.detector.confidence
+    path.write_text(to_toml(settings))
+    assert load_settings(path, {}, {}) == settings
+
+
+def test_every_network_has_a_thread_and_together_they_leave_a_processor_free() -> None:
+    processors = len(os.sched_getaffinity(0))
+    asking, off = DetectorSection(), DetectorSection(enabled=False)
+    for views in range(1, 9):
+        each = threads_each([asking] * views)
+        assert each == 1 or (each > 1 and views * each < processors)
+    # What runs no network takes no thread, and what was given some is given no more.
+    assert threads_each([off, asking, off]) == threads_each([asking])
+    assert threads_each([DetectorSection(threads=processors), asking]) == 1

@@ -1,0 +1,71 @@
+"""The loop that steers turns at its rate, and at once when the steering camera has seen something."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable
+
+from companion.guidance.behaviour import Situation
+from companion.service import Service
+from companion.settings.reading import load_settings
+from vision.detections import Detections
+from vision.pipeline import PerceptionResult
+
+SLOWEST_HZ = "5"
+
+
+def result(sequence: int) -> PerceptionResult:
+    now_ns = time.monotonic_ns()
+    nothing = Detections.empty(("car",))
+    return PerceptionResult(sequence, now_ns, now_ns, 640, 480, nothing, {"total": 1.0}, dropped=0)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(60.0):
+        while not condition():
+            await asyncio.sleep(0)
+
+
+async def test_a_new_detection_is_flown_by_at_once_and_without_one_the_rate_holds() -> None:
+    settings = load_settings(os.devnull, {"guidance.rate_hz": SLOWEST_HZ}, {})
+    service = Service(settings)
+    turns: list[Situation] = []
+    hastened: list[int] = []
+    service.pilot.update = turns.append  # type: ignore[method-assign]
+    service.streamer.hasten = hastened.append  # type: ignore[method-assign]
+    steering = asyncio.create_task(service._guide())
+    try:
+        await until(lambda: len(turns) == 1)
+        for sequence in range(3):
+            service._use(service.steering, result(sequence))
+            await until(lambda: len(turns) == sequence + 2)  # noqa: B023 - awaited here
+        assert [situation.now_ns for situation in turns[1:4]] == hastened
+        await until(lambda: len(turns) == 5)
+        assert len(hastened) == 3
+        assert turns[4].now_ns - turns[3].now_ns >= 0.19e9
+    finally:
+        steering.cancel()
+        await asyncio.gather(steering, return_exceptions=True)
+
+
+async def test_what_another_camera_sees_is_not_waited_for() -> None:
+    settings = load_settings(
+        os.devnull, {"guidance.rate_hz": SLOWEST_HZ, "views.down.source.uri": "down.mp4"}, {}
+    )
+    service = Service(settings)
+    hastened: list[int] = []
+    turns: list[Situation] = []
+    service.pilot.update = turns.append  # type: ignore[method-assign]
+    service.streamer.hasten = hastened.append  # type: ignore[method-assign]
+    steering = asyncio.create_task(service._guide())
+    try:
+        await until(lambda: len(turns) == 1)
+        other = next(view for view in service.views if view is not service.steering)
+        service._use(other, result(1))
+        await until(lambda: len(turns) == 2)
+        assert hastened == []
+    finally:
+        steering.cancel()
+        await asyncio.gather(steering, return_exceptions=True)

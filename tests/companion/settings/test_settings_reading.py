@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.settings.reading import (
+    ConfigurationError,
+    Settings,
+    default_path,
+    flags,
+    load_settings,
+    to_toml,
+)
+from vision.detector import DEFAULT_MODEL
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(autouse=True)
+def _no_file_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.settings.reading.DEFAULT_PATHS", (Path("companion.toml"),))
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def problems(
+    path: Path | None = None, overrides: dict[str, str] | None = None, **environment: str
+) -> list[str]:
+    with pytest.raises(ConfigurationError) as caught:
+        load_settings(path, overrides, environment)
+    assert str(caught.value) == "\n".join(caught.value.problems)
+    return list(caught.value.problems)
+
+
+def test_without_a_file_the_defaults_are_in_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_settings(environment={}) == Settings()
+
+
+def test_the_file_in_the_working_directory_is_read_when_none_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "companion.toml", "[vehicle]\nname = 'kestrel'\n")
+    assert default_path() == Path("companion.toml")
+    assert load_settings(environment={}).vehicle.name == "kestrel"
+
+
+def test_flags_win_over_the_environment_and_the_environment_over_the_file(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "c.toml", "[detector]\nconfidence = 0.1\niou = 0.1\nthreads = 3\n[source]\nuri = 'a.mp4'\n"
+    )
+    settings = load_settings(
+        path,
+        {"detector.confidence": "0.3"},
+        {
+            "COMPANION_DETECTOR_CONFIDENCE": "0.2",
+            "COMPANION_DETECTOR_IOU": "0.2",
+            "COMPANION_TEST_DATA": "/x",
+        },
+    )
+    assert (settings.detector.confidence, settings.detector.iou, settings.detector.threads) == (0.3, 0.2, 3)
+    assert settings.source.uri == "a.mp4"
+
+
+def test_every_flag_can_be_given_its_own_default_as_text() -> None:
+    overrides = {}
+    for flag in flags():
+        value = flag.default
+        if value is None:
+            text = ""
+        elif flag.type is tuple:
+            text = ",".join(map(str, value))
+        else:
+            text = str(value).lower() if flag.type is bool else str(value)
+        overrides[flag.key] = text
+        assert isinstance(value, flag.type) or value is None
+        assert flag.help, flag.key
+        assert "\n" not in flag.help
+    assert load_settings(REPOSITORY / "systemd/companion.toml", overrides, {}) == Settings()
+
+
+def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
+    settings = load_settings(
+        REPOSITORY / "systemd/companion.toml",
+        {
+            "detector.classes": "person, 2,car",
+            "source.loop": "Yes",
+            "detector.enabled": "off",
+            "detector.threads": "none",
+            "source.width": "640",
+            "camera.distortion": "0.1,-0.2,0,0",
+            "zenoh.connect": "tcp/10.0.0.1:7447,udp/[::1]:7447",
+        },
+        {},
+    )
+    assert settings.detector.classes == ("person", 2, "car")
+    assert settings.source.loop is True
+    assert settings.detector.enabled is False
+    assert settings.detector.threads is None
+    assert settings.source.width == 640
+    assert settings.camera.distortion == (0.1, -0.2, 0.0, 0.0)
+    assert settings.zenoh.connect == ("tcp/10.0.0.1:7447", "udp/[::1]:7447")
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "expected"),
+    [
+        ("detector.confidence", "1.7", "must be a number, 0 to 1, got 1.7"),
+        ("detector.confidence", "nan", "must be a number, 0 to 1, got nan"),
+        ("detector.confidence", "high", "must be a number, 0 to 1, got 'high'"),
+        ("detector.image_size", "330", "must be a whole number, 32 to 4096, a multiple of 32, got 330"),
+        ("detector.image_size", "64.5", "must be a whole number, 32 to 4096, a multiple of 32, got '64.5'"),
+        ("tracker.lost_s", "0", "must be a number, above 0, at most 60, got 0.0"),
+        ("detector.precision", "int8", 'must be auto, float32, bfloat16 or float16, got "int8"'),
+        ("source.loop", "maybe", "must be true or false, got 'maybe'"),
+        ("source.uri", "", 'must be a text, not empty, got ""'),
+        ("source.width", "3", "must be a whole number, 16 to 16384, or unset, got 3"),
+        ("guidance.max_horizontal_speed_mps", "0", "must be a number, above 0, at most 30, got 0.0"),
+        ("camera.horizontal_fov_deg", "180", "must be a number, above 1, below 179, got 180.0"),
+        ("vehicle.name", "a/*", 'must be a word of letters, digits, `_`, `-` and `.`, got "a/*"'),
+        (
+            "vehicle.url",
+            "/dev/ttyS0",
+            "must be udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD, "
+            'got "/dev/ttyS0"',
+        ),
+        (
+            "zenoh.listen",
+            "localhost,7447",
+            "must be a list of texts, each a zenoh endpoint such as tcp/192.168.1.5:7447, "
+            'got ["localhost", "7447"]',
+        ),
+    ],
+)
+def test_a_bad_value_is_told_in_one_line_with_its_key_its_range_and_what_came(
+    key: str, text: str, expected: str
+) -> None:
+    assert problems(overrides={key: text}) == [f"{key}: {expected} (given as a flag)"]
+
+
+@pytest.mark.parametrize(
+    ("toml", "expected"),
+    [
+        ("[detector]\nconfidence = '0.5'", 'detector.confidence: must be a number, 0 to 1, got "0.5"'),
+        ("[detector]\nconfidence = true", "detector.confidence: must be a number, 0 to 1, got true"),
+        ("[detector]\nenabled = 1", "detector.enabled: must be true or false, got 1"),
+        (
+            "[detector]\nclasses = 'car'",
+            'detector.classes: must be a list of texts, got "car"',
+        ),
+        ("[detector]\nclasses = [1.5]", "detector.classes: must be a list of texts, got [1.5]"),
+        (
+            "[vehicle]\nsystem_id = {a = 1}",
+            "vehicle.system_id: must be a whole number, 1 to 255, got {'a': 1}",
+        ),
+        ("detector = 3", "detector: must be a section [detector], got 3"),
+        ("[detector]\nconfidense = 1", "unknown key detector.confidense"),
+        ("[detecter]\nconfidence = 1", "unknown section [detecter]"),
+    ],
+)
+def test_a_bad_file_names_the_key_and_the_file(tmp_path: Path, toml: str, expected: str) -> None:
+    path = written(tmp_path / "c.toml", toml)
+    (line,) = problems(path)
+    assert line.startswith(expected)
+    assert f"(in {path})" in line
+
+
+@pytest.mark.parametrize(
+    ("key", "nearest"),
+    [
+        ("detector.confidense", "did you mean detector.confidence?"),
+        ("source.confidence", "did you mean detector.confidence?"),
+        ("detector.qqqqqqqqqqqqqqqq", "known: detector.enabled, detector.model,"),
+        ("zzz", "known: vehicle, source, camera,"),
+    ],
+)
+def test_an_unknown_key_is_answered_with_the_nearest_one(key: str, nearest: str) -> None:
+    (line,) = problems(overrides={key: "1"})
+    assert line.startswith(f"unknown key {key} (given as a flag); {nearest}")
+
+
+def test_an_unknown_variable_of_a_section_of_ours_is_told() -> None:
+    (line,) = problems(COMPANION_DETECTOR_CONFIDENSE="1")
+    assert line == (
+        "unknown key detector.confidense (given as COMPANION_DETECTOR_CONFIDENSE); "
+        "did you mean detector.confidence?"
+    )
+
+
+def test_every_problem_is_told_at_once(tmp_path: Path) -> None:
+    path = written(tmp_path / "c.toml", "[detector]\niou = 2\n[zenoh]\nmod = 'peer'\n")
+    assert len(problems(path, {"log.level": "loud", "source.loop": "maybe"})) == 4
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (
+            {"guidance.min_altitude_m": "60"},
+            "guidance: min_altitude_m must be below max_altitude_m, got 60 and 50",
+        ),
+        ({"guidance.setpoint_lifetime_s": "0.04"}, "guidance: setpoint_lifetime_s must be longer than"),
+        ({"camera.fx_px": "500"}, "camera: a calibration needs all of fx_px, fy_px"),
+        ({"camera.distortion": "1,2"}, "camera: distortion must have 0, 4 or 5 numbers, got 2"),
+        ({"source.pixel_format": "bgr"}, "source: pixel_format must be a camera's four letters"),
+        ({"recording.video": "a.mp4"}, "recording: video must end in .webm, got 'a.mp4'"),
+        ({"zenoh.mode": "client"}, "zenoh: a client needs an endpoint in connect"),
+    ],
+)
+def test_keys_that_contradict_each_other_are_told(overrides: dict[str, str], line: str) -> None:
+    (problem,) = problems(overrides=overrides)
+    assert problem.startswith(line)
+    assert problem.endswith("(given as a flag)")
+
+
+@pytest.mark.parametrize("content", [b"[detector]\nconfidence = \n", b"[detector\n", b"a = b\n"])
+def test_a_syntax_error_names_the_file_and_the_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "c.toml"
+    path.write_bytes(content)
+    (line,) = problems(path)
+    assert line.startswith(f"{path}, line ")
+
+
+def test_a_file_that_ends_too_early_is_told(tmp_path: Path) -> None:
+    path = written(tmp_path / "c.toml", "[detector]\nclasses = [")
+    (line,) = problems(path)
+    assert line.startswith(f"{path}, end of document: ")
+
+
+def test_a_file_that_is_not_text_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_bytes(b"[log]\nlevel = '\xff'\n")
+    assert problems(path) == [f"{path}, line 2: not UTF-8 text, which TOML must be"]
+
+
+def test_a_named_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "none.toml"
+    assert problems(path) == [f"cannot read the settings file {path}: No such file or directory"]
+    assert problems(tmp_path) == [f"cannot read the settings file {tmp_path}: Is a directory"]
+
+
+def test_the_example_file_shows_every_key_with_its_default() -> None:
+    text = (REPOSITORY / "systemd/companion.toml").read_text(encoding="utf-8")
+    assert text == to_toml(Settings())
+    assert load_settings(REPOSITORY / "systemd/companion.toml", environment={}) == Settings()
+
+
+names = st.text(st.characters(codec="utf-8"), min_size=1)
+
+
+@given(
+    names,
+    st.lists(names | st.integers(0, 100)),
+    st.floats(0, 1),
+    st.booleans(),
+    names,
+    st.none() | st.integers(16, 16384),
+)
+def test_printed_settings_are_read_back_the_same(
+    tmp_path_factory: pytest.TempPathFactory,
+    uri: str,
+    classes: list[str | int],
+    confidence: float,
+    loop: bool,
+    model: str,
+    width: int | None,
+) -> None:
+    settings = Settings.model_validate(
+        {
+            "source": {"uri": uri, "loop": loop, "width": width},
+            "detector": {"classes": tuple(classes), "confidence": confidence, "model": model},
+            "camera": {"distortion": (1e-7, -2.5, 1e17, 0.0)},
+        }
+    )
+    text = to_toml(settings)
+    tomllib.loads(text)
+    path = tmp_path_factory.mktemp("config") / "c.toml"
+    path.write_text(text, encoding="utf-8", newline="")
+    assert load_settings(path, environment={}) == settings
+
+
+def test_the_source_section_opens_a_source_with_its_own_values() -> None:
+    opening = load_settings(None, {"source.width": "640", "source.realtime": "no"}, {}).source.opening()
+    assert (opening.width, opening.realtime, opening.loop) == (640, False, False)
+
+
+def test_the_bundled_model_has_the_name_that_the_detector_knows() -> None:
+    assert Settings().detector.model == DEFAULT_MODEL
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        Settings().detector.confidence = 0.5
+
+
+def test_the_camera_of_a_field_of_view_sees_that_from_edge_to_edge() -> None:
+    model = Settings().camera.model(640, 480)
+    assert math.degrees(2 * math.atan(320 / model.fx)) == pytest.approx(80.0)
+
+
+def test_a_calibration_is_scaled_to_the_frames_size() -> None:
+    overrides = {
+        "camera.fx_px": "500",
+        "camera.fy_px": "510",
+        "camera.cx_px": "319.5",
+        "camera.cy_px": "239.5",
+        "camera.calibrated_width": "640",
+        "camera.calibrated_height": "480",
+        "camera.mount_pitch_deg": "-30",
+    }
+    camera = load_settings(REPOSITORY / "systemd/companion.toml", overrides, {}).camera
+    assert (camera.model(640, 480).fx, camera.model(1280, 960).fx) == (500, 1000)
+    assert camera.mount().pitch_rad == pytest.approx(-math.pi / 6)

@@ -1,0 +1,180 @@
+"""Commands and parameters of both drivers, against a real socket: refused, repeated, believed when shown."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+
+import pytest
+from fake_autopilot import wait_until
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle import flight_commands
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
+from companion.vehicle.state import FlightMode
+
+pytestmark = pytest.mark.usefixtures("short_measurement")
+
+
+async def test_arming_returns_when_the_vehicle_shows_it(driver, autopilot) -> None:
+    asyncio.get_running_loop().call_later(0.5, setattr, autopilot, "base_mode", 157)
+    await driver.arm()
+    assert driver.state.armed
+    arm = next(m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 400)
+    assert (arm.param1, arm.param2) == (1.0, 0.0)
+
+
+async def test_a_refused_arming_says_why(driver, autopilot) -> None:
+    autopilot.answers["COMMAND_LONG"] = lambda m: autopilot.acknowledge(m.command, 1)
+    with pytest.raises(
+        CommandRefusedError, match=r"refused to arm \(temporarily rejected\): its pre-arm checks fail"
+    ):
+        await driver.arm()
+
+
+async def test_a_mode_is_believed_when_shown_and_not_when_acknowledged(driver, autopilot) -> None:
+    with pytest.raises(CommandRefusedError, match=r"did not enter mode mission within 0\.5 s: it shows hold"):
+        await driver.set_mode(FlightMode.MISSION, timeout_s=0.5)
+
+
+async def test_the_second_acknowledgement_refuses_at_once(driver, autopilot) -> None:
+    def twice(message) -> None:
+        autopilot.acknowledge(message.command, 0)
+        if message.command == 176:
+            autopilot.acknowledge(176, 1)
+
+    autopilot.answers["COMMAND_LONG"] = twice
+    with pytest.raises(CommandRefusedError, match=r"refused mode offboard .*setpoint stream.*shows hold"):
+        await driver.set_mode(FlightMode.OFFBOARD, timeout_s=60.0)
+
+
+async def test_a_mode_asked_for_goes_out_as_main_and_sub_mode(driver, autopilot) -> None:
+    def obey(message) -> None:
+        autopilot.acknowledge(message.command)
+        if message.command == 176:
+            autopilot.custom_mode = int(message.param2) << 16 | int(message.param3) << 24
+
+    autopilot.answers["COMMAND_LONG"] = obey
+    for mode in (FlightMode.OFFBOARD, FlightMode.LAND, FlightMode.RETURN, FlightMode.HOLD):
+        await driver.set_mode(mode)
+        assert driver.state.mode is mode
+    asked = [
+        (m.param1, m.param2, m.param3) for m in autopilot.heard_named("COMMAND_LONG") if m.command == 176
+    ]
+    assert asked == [(1, 6, 0), (1, 4, 6), (1, 4, 5), (1, 4, 3)]
+    with pytest.raises(ValueError, match="unknown is not a mode"):
+        await driver.set_mode(FlightMode.UNKNOWN)
+
+
+async def test_takeoff_goes_to_a_height_above_home(driver, autopilot) -> None:
+    asyncio.get_running_loop().call_later(0.3, autopilot.home, 488.5)
+    await driver.takeoff(4.0)
+    (message,) = [m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 22]
+    assert message.param7 == 492.5
+    assert all(math.isnan(getattr(message, f"param{number}")) for number in range(1, 7))
+
+
+async def test_takeoff_without_a_known_home_is_refused_here(driver, autopilot, monkeypatch) -> None:
+    monkeypatch.setattr(flight_commands, "_SHOWN_TIMEOUT_S", 0.2)
+    with pytest.raises(CommandRefusedError, match="needs home's altitude"):
+        await driver.takeoff(4.0)
+    with pytest.raises(CommandRefusedError, match="above 0 m"):
+        await driver.takeoff(-1.0)
+    assert not [m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 22]
+
+
+async def test_an_unanswered_command_is_sent_again_and_then_given_up(driver, autopilot) -> None:
+    autopilot.answers.clear()
+    with pytest.raises(CommandRefusedError, match="does not answer command 400"):
+        await driver.arm()
+    attempts = [m.confirmation for m in autopilot.heard_named("COMMAND_LONG") if m.command == 400]
+    assert len(attempts) >= 3
+
+
+async def test_a_command_in_progress_is_waited_for(driver, autopilot) -> None:
+    def slowly(message) -> None:
+        autopilot.acknowledge(message.command, 5)
+        asyncio.get_running_loop().call_later(1.1, autopilot.acknowledge, message.command, 0)
+
+    autopilot.answers["COMMAND_LONG"] = slowly
+    autopilot.base_mode = 157
+    await driver.arm()
+    assert len([m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 400]) == 1
+
+
+async def test_acknowledgements_for_another_component_are_not_ours(driver, autopilot) -> None:
+    def to_another(message) -> None:
+        autopilot.say(mavlink.MAVLink_command_ack_message(message.command, 2, 0, 0, 255, 190))
+        autopilot.acknowledge(message.command, 0)
+
+    autopilot.answers["COMMAND_LONG"] = to_another
+    autopilot.base_mode = 157
+    await driver.arm()
+
+
+async def test_streams_that_come_too_slowly_are_asked_for(driver, autopilot) -> None:
+    def intervals() -> dict[float, float]:
+        return {m.param1: m.param2 for m in autopilot.heard_named("COMMAND_LONG") if m.command == 511}
+
+    await wait_until(lambda: len(intervals()) >= 6, 10.0, intervals)
+    assert intervals()[31] == 20000
+    assert intervals()[CURRENT_MODE_ID] == 100000
+
+
+async def test_commands_under_way_fail_when_the_driver_is_closed(driver, autopilot) -> None:
+    autopilot.answers.clear()
+    arming = asyncio.create_task(driver.arm())
+    await wait_until(lambda: any(m.command == 400 for m in autopilot.heard_named("COMMAND_LONG")), 5.0)
+    await driver.close()
+    with pytest.raises(CommandRefusedError):
+        await arming
+
+
+@pytest.fixture
+def parameters(autopilot) -> dict[str, tuple[int, bytes]]:
+    """name → (MAV_PARAM_TYPE, the four bytes): PX4's bytewise encoding."""
+    stored = {"COM_OF_LOSS_T": (9, struct.pack("<f", 1.0)), "COM_OBL_RC_ACT": (6, struct.pack("<i", 0))}
+
+    def tell(name: str) -> None:
+        if name not in stored:
+            autopilot.say(mavlink.MAVLink_param_error_message(1, 191, name.encode(), -1, 1))
+            return
+        kind, value = stored[name]
+        payload = value + struct.pack("<HH16sB", len(stored), 0, name.encode(), kind)
+        autopilot.say_bytes(pack_frame(22, payload, system_id=1, component_id=1, sequence=0))
+
+    def take(message) -> None:
+        frame = next(raw for heard, raw in reversed(autopilot.heard) if heard is message)
+        stored[message.param_id] = (message.param_type, frame[10:14].ljust(4, b"\0"))
+        tell(message.param_id)
+
+    autopilot.answers["PARAM_REQUEST_READ"] = lambda m: tell(m.param_id)
+    autopilot.answers["PARAM_SET"] = take
+    return stored
+
+
+async def test_parameters_keep_their_type(driver, parameters) -> None:
+    assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
+    await driver.set_parameter("COM_OF_LOSS_T", 0.5)
+    await driver.set_parameter("COM_OBL_RC_ACT", 4.0)
+    assert parameters["COM_OF_LOSS_T"] == (9, struct.pack("<f", 0.5))
+    assert parameters["COM_OBL_RC_ACT"] == (6, struct.pack("<i", 4))
+    assert await driver.get_parameter("COM_OBL_RC_ACT") == 4.0
+
+
+@pytest.mark.parametrize("value", [-1, -5_000_000, 2**31 - 1])
+async def test_integers_travel_as_bytes_whatever_float_they_look_like(driver, parameters, value) -> None:
+    await driver.set_parameter("COM_OBL_RC_ACT", value)
+    assert parameters["COM_OBL_RC_ACT"] == (6, struct.pack("<i", value))
+    assert await driver.get_parameter("COM_OBL_RC_ACT") == value
+
+
+async def test_a_parameter_that_is_not_there_is_refused_by_name(driver, parameters) -> None:
+    with pytest.raises(CommandRefusedError, match="COM_NOT_THERE: there is no such parameter"):
+        await driver.get_parameter("COM_NOT_THERE")
+    with pytest.raises(CommandRefusedError, match="16 characters"):
+        await driver.get_parameter("A_NAME_LONGER_THAN_16")
+    with pytest.raises(CommandRefusedError, match=r"is an integer and cannot take 0\.5"):
+        await driver.set_parameter("COM_OBL_RC_ACT", 0.5)

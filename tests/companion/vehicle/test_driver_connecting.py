@@ -1,0 +1,165 @@
+"""How both drivers find their autopilot, and what they say where there is none."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import pytest
+from fake_autopilot import SETPOINT, FakeAutopilot, free_port, wait_until
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
+from companion.vehicle.drivers import open_driver
+from companion.vehicle.framing import CURRENT_MODE_ID
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode
+
+pytestmark = pytest.mark.usefixtures("short_measurement")
+
+
+async def test_no_autopilot_is_said_in_one_line(kind, port) -> None:
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    with pytest.raises(LinkError) as caught:
+        await driver.connect(0.3)
+    text = str(caught.value)
+    assert text.startswith(f"no autopilot answered on udpin://127.0.0.1:{port} within 0.3 s")
+    assert "\n" not in text
+    await driver.close()
+
+
+async def test_heartbeats_of_others_are_no_autopilot_but_are_named(kind, port) -> None:
+    station = FakeAutopilot(port, system_id=255, component_id=190, autopilot=8)
+    station.start()
+    try:
+        with pytest.raises(LinkError, match="heard only system/component 255/190"):
+            await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(0.5)
+    finally:
+        await station.stop()
+
+
+async def test_the_wanted_system_is_waited_for(kind, port, autopilot) -> None:
+    second = FakeAutopilot(port, system_id=7)
+    second.start()
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}", system_id=7)
+    try:
+        await driver.connect(10.0)
+        driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
+        (message,) = await second.hears(SETPOINT)
+        assert message.target_system == 7
+    finally:
+        await driver.close()
+        await second.stop()
+    with pytest.raises(LinkError, match="no autopilot of system 9 answered"):
+        await open_driver(kind, f"udpin://127.0.0.1:{port}", system_id=9).connect(0.5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "autopilot_kind", "reason"),
+    [
+        (
+            "mavsdk",
+            3,
+            'the mavsdk driver flies PX4 alone, and system 1 is ArduPilot; set vehicle.driver = "py',
+        ),
+        ("pymavlink", 0, "only PX4 and ArduPilot are flown, and system 1 is a generic autopilot"),
+    ],
+)
+async def test_an_autopilot_that_a_driver_cannot_fly_is_refused_in_one_line(
+    kind, autopilot_kind, reason, port
+) -> None:
+    other = FakeAutopilot(port, autopilot=autopilot_kind)
+    other.start()
+    try:
+        with pytest.raises(LinkError, match=reason):
+            await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
+    finally:
+        await other.stop()
+
+
+async def test_a_busy_port_is_named_with_its_likely_holder(kind, driver, port) -> None:
+    with pytest.raises(LinkError, match=rf"UDP port {port} is in use: another program .*QGroundControl"):
+        await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
+
+
+async def test_closing_twice_frees_the_port_and_the_driver_can_connect_again(kind, port, autopilot) -> None:
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    await driver.close()
+    for _ in range(3):
+        await driver.connect(10.0)
+        assert driver.state.mode is FlightMode.HOLD
+        await driver.close()
+        await driver.close()
+    driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
+    driver.send_heartbeat(SystemStatus.ACTIVE)
+    with pytest.raises(CommandRefusedError, match="not connected"):
+        await driver.arm()
+    with pytest.raises(CommandRefusedError, match="not connected"):
+        await driver.get_parameter("COM_OF_LOSS_T")
+
+
+async def test_connecting_can_be_cancelled(kind, port) -> None:
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    connecting = asyncio.create_task(driver.connect(60.0))
+    await asyncio.sleep(0)
+    connecting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await connecting
+    await driver.close()
+
+
+async def test_an_autopilot_that_restarted_is_asked_for_its_streams_anew(driver, autopilot) -> None:
+    def asked() -> int:
+        return sum(
+            m.command == 511 and m.param1 == CURRENT_MODE_ID for m in autopilot.heard_named("COMMAND_LONG")
+        )
+
+    autopilot.say(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
+    await wait_until(lambda: asked() == 1, 10.0)
+    autopilot.say(mavlink.MAVLink_local_position_ned_message(500, 0, 0, 0, 0, 0, 0))
+    await wait_until(lambda: asked() == 2, 10.0)
+
+
+async def test_two_drivers_fly_two_vehicles_at_once(kind, driver, autopilot) -> None:
+    port = free_port()
+    other = FakeAutopilot(port, system_id=2)
+    other.start()
+    second = open_driver(kind, f"udpin://127.0.0.1:{port}", own_component_id=192)
+    try:
+        await second.connect(10.0)
+        driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
+        second.send_setpoint(Setpoint.velocity((2.0, 0.0, 0.0), time.monotonic_ns()))
+        (first_heard,) = await autopilot.hears(SETPOINT)
+        (second_heard,) = await other.hears(SETPOINT)
+        assert (first_heard.vx, first_heard.get_srcComponent()) == (1.0, 191)
+        assert (second_heard.vx, second_heard.get_srcComponent()) == (2.0, 192)
+    finally:
+        await second.close()
+        await other.stop()
+
+
+async def test_a_vehicle_that_waits_to_be_spoken_to_is_spoken_to(kind, port) -> None:
+    """udpout: the vehicle listens, and answers whoever sent to it."""
+    vehicle = FakeAutopilot(port)
+    vehicle.beating = False
+    vehicle.answers["HEARTBEAT"] = lambda _: setattr(vehicle, "beating", True)
+    vehicle.start()
+    driver = open_driver(kind, f"udpout://127.0.0.1:{vehicle.socket.getsockname()[1]}")
+    try:
+        await driver.connect(10.0)
+        driver.send_setpoint(Setpoint.brake(time.monotonic_ns()))
+        await vehicle.hears(SETPOINT)
+    finally:
+        await driver.close()
+        await vehicle.stop()
+
+
+def test_a_driver_that_does_not_exist_and_bad_urls_and_ids_are_refused_when_opened() -> None:
+    with pytest.raises(ValueError, match="there is no driver 'dronekit'; there are: mavsdk, pymavlink"):
+        open_driver("dronekit", "udpin://0.0.0.0:14540")
+    with pytest.raises(ValueError, match="is not a link url"):
+        open_driver("mavsdk", "14540")
+    with pytest.raises(ValueError, match=r"system_id must be 1\.\.255, got 0"):
+        open_driver("mavsdk", "udpin://0.0.0.0:14540", system_id=0)
+    with pytest.raises(ValueError, match=r"own_component_id must be 1\.\.255"):
+        open_driver("pymavlink", "udpin://0.0.0.0:14540", own_component_id=256)

@@ -1,0 +1,168 @@
+"""Motion JPEG over HTTP from a real loopback server, and what is said where there is none."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import pytest
+from network_streams import QUICK, free_port, is_blue, jpeg, wait_for_frame
+
+from vision.sources import SourceError, SourceSettings, open_source
+
+pytestmark = pytest.mark.usefixtures("no_proxy")
+
+
+class CameraHandler(BaseHTTPRequestHandler):
+    """A web camera; what it shows, and whether it may, is its server's."""
+
+    protocol_version = "HTTP/1.0"
+    server: CameraServer
+
+    def do_GET(self) -> None:
+        server = self.server
+        if server.password and self.headers.get("Authorization") != "Basic dXNlcjpzZSBjcmV0":
+            self.send_response(401)
+            self.send_header("WWW-Authenticate", 'Basic realm="camera"')
+            self.end_headers()
+            return
+        if self.path != "/video":
+            self.send_error(404)
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", server.content_type)
+        self.end_headers()
+        with contextlib.suppress(OSError):
+            while not server.stopping.is_set():
+                picture = jpeg(server.blue)
+                # The length is wrong on purpose, as many a camera's is.
+                self.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: 1\r\n\r\n")
+                half = len(picture) // 2
+                self.wfile.write(picture[:half])
+                self.wfile.write(picture[half:] + b"\r\n")
+                server.stopping.wait(0.02)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Tests are quiet."""
+
+
+class CameraServer(ThreadingHTTPServer):
+    allow_reuse_address = True
+
+    def __init__(self, port: int = 0, *, blue: int = 200, password: bool = False) -> None:
+        super().__init__(("127.0.0.1", port), CameraHandler)
+        self.blue = blue
+        self.password = password
+        self.content_type = "multipart/x-mixed-replace; boundary=frame"
+        self.stopping = threading.Event()
+
+    @property
+    def port(self) -> int:
+        return int(self.server_address[1])
+
+
+@contextmanager
+def serving(server: CameraServer) -> Iterator[CameraServer]:
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.stopping.set()
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def test_http_motion_jpeg_is_live_and_its_server_may_stop_and_return(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("WARNING")
+    with serving(CameraServer()) as server:
+        port = server.port
+        source = open_source(f"http://127.0.0.1:{port}/video", QUICK)
+        assert source.live
+        before_ns = time.monotonic_ns()
+        first = wait_for_frame(source, is_blue(200))
+        second = wait_for_frame(source, lambda frame: frame.captured_ns > before_ns)
+        assert second.sequence > first.sequence
+    with source:
+        deadline_s = time.monotonic() + 20
+        while "lost" not in caplog.text and time.monotonic() < deadline_s:
+            source.read(0.05)
+        with serving(CameraServer(port, blue=60)):
+            wait_for_frame(source, is_blue(60))
+            assert source.statistics.reopened == 1
+            source.close()
+    lines = [record.getMessage() for record in caplog.records]
+    assert sum("lost: " in line for line in lines) == 1
+    assert sum("back after" in line for line in lines) == 1
+
+
+def test_http_close_does_not_wait_for_a_silent_server() -> None:
+    settings = SourceSettings(read_timeout_s=60.0)
+    with serving(CameraServer()) as server:
+        source = open_source(f"http://127.0.0.1:{server.port}/video", settings)
+        closed = threading.Event()
+
+        def close() -> None:
+            source.close()
+            closed.set()
+
+        server.stopping.set()
+        threading.Thread(target=close, daemon=True).start()
+        assert closed.wait(30)
+
+
+def test_http_takes_user_and_password_from_the_address_and_shows_neither(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("DEBUG")
+    with serving(CameraServer(password=True)) as server:
+        with open_source(f"http://user:se%20cret@127.0.0.1:{server.port}/video", QUICK) as source:
+            wait_for_frame(source, is_blue(200))
+            assert source.uri == f"http://user:***@127.0.0.1:{server.port}/video"
+        with pytest.raises(
+            SourceError, match=r"asks for a user and password .*HTTP 401.*USER:PASSWORD@"
+        ) as caught:
+            open_source(f"http://user:wr0ng@127.0.0.1:{server.port}/video", QUICK)
+    assert "wr0ng" not in str(caught.value)
+    assert "cret" not in caplog.text
+
+
+def test_http_with_nothing_there_says_so_at_once() -> None:
+    with serving(CameraServer()) as server, pytest.raises(SourceError, match="has nothing there"):
+        open_source(f"http://127.0.0.1:{server.port}/other", QUICK)
+
+
+def test_http_of_another_kind_goes_to_ffmpeg_and_its_failure_names_the_kind() -> None:
+    with serving(CameraServer()) as server:
+        server.content_type = "text/plain"
+        server.stopping.set()
+        with pytest.raises(SourceError, match="the server sends text/plain, and no video"):
+            open_source(
+                f"http://127.0.0.1:{server.port}/video", SourceSettings(open_timeout_s=0.5, retry_min_s=0.1)
+            )
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("http://127.0.0.1:{port}/video", "connection refused; is the server running"),
+        ("rtsp://user:secret@127.0.0.1:{port}/live", "connection refused; is the camera on"),
+    ],
+)
+def test_nobody_listening_is_one_clear_line_without_the_password(
+    address: str, words: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    uri = address.format(port=free_port(socket.SOCK_STREAM))
+    with pytest.raises(SourceError, match=words) as caught:
+        open_source(uri, SourceSettings(open_timeout_s=0.3, retry_min_s=0.05))
+    assert "secret" not in str(caught.value)
+    assert capfd.readouterr().err == ""
