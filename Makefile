@@ -20,7 +20,9 @@ endef
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
 
+# The tests start hundreds of processes; not each is to compile the sources anew.
 test: $(READY)
+	$(BIN)/python -m compileall -q companion mavlink_sim vision
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not alone"
 	$(BIN)/python -m pytest -m alone
 

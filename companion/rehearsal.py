@@ -53,7 +53,7 @@ async def simulator(
     ]
     arguments += ["--camera", camera, "--truth", str(truth_path), "--seed", str(seed)]
     # The open field of the built-in world needs no 30 m on the way home (PX4's default).
-    arguments += ["--param", "RTL_RETURN_ALT=8"]
+    arguments += ["--param", "RTL_RETURN_ALT=5"]
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,7 @@ SIMULATOR_MAY_IMPORT = {
 MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench", "models"}
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Dotted name → file, of everything that is installed."""
     found = {}
@@ -64,7 +66,8 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports_of(name: str, path: Path, *, only_top: bool = False) -> set[str]:
+@cache
+def imports_of(name: str, path: Path, *, only_top: bool = False) -> frozenset[str]:
     """Our own modules that a module imports (inside functions too, unless `only_top`)."""
     tree = ast.parse(path.read_text())
     known = modules()
@@ -76,7 +79,7 @@ def imports_of(name: str, path: Path, *, only_top: bool = False) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{name} imports relatively; write the whole name"
             found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
-    return {module for module in found if module in known and module != name}
+    return frozenset(module for module in found if module in known and module != name)
 
 
 def _top_level(tree: ast.Module) -> list[ast.stmt]:

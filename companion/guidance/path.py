@@ -104,11 +104,23 @@ class Path:
         tried = [from_m + (to_m - from_m) * step / steps for step in range(steps + 1)]
         if not self.closed:
             tried = [min(max(along, 0.0), self.length_m) for along in tried]
-        best = min(tried, key=lambda along: math.dist(self.point(along).position_ned_m, position))
+        best = min(tried, key=lambda along: math.dist(self._place(along), position))
         here = self.point(best)
         offset = [p - h for p, h in zip(position, here.position_ned_m, strict=True)]
         best += sum(o * d for o, d in zip(offset, here.direction, strict=True))
         return min(max(best, from_m), to_m)
+
+    def _place(self, along_m: float) -> Vector3:
+        """The place alone: many are tried at every turn."""
+        along_m = self._on_path(along_m)
+        index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
+        start, end = self._points[index], self._points[index + 1]
+        share = min(max((along_m - self._at[index]) / (self._at[index + 1] - self._at[index]), 0.0), 1.0)
+        return (
+            start[0] + share * (end[0] - start[0]),
+            start[1] + share * (end[1] - start[1]),
+            start[2] + share * (end[2] - start[2]),
+        )
 
     def _on_path(self, along_m: float) -> float:
         return along_m % self.length_m if self.closed else min(max(along_m, 0.0), self.length_m)

@@ -67,14 +67,14 @@ def silent(_progress):
 
 def test_a_tiny_model_overfits_eight_pictures():
     settings = replace(
-        SMALL, stages=(Stage(96, 96, 8, 180),), warmup_steps=10, learning_rate=6e-3, average_decay=0.95
+        SMALL, stages=(Stage(96, 96, 8, 110),), warmup_steps=10, learning_rate=6e-3, average_decay=0.95
     )
     seen: list[Progress] = []
     trained = train(settings, one_of_eight, seen.append)
     score = evaluate(trained.model, one_of_eight, seed=0, count=24, width=96, height=96)
     assert score.map50 > 0.9
     assert set(score.per_class) == {"red", "green"}
-    assert [progress.step for progress in seen] == list(range(1, 181))
+    assert [progress.step for progress in seen] == list(range(1, 111))
     assert seen[-1].remaining_s == 0
 
 
