@@ -60,3 +60,36 @@ def point_on_ground(
     if drop > 0.0:
         points[down] = camera_offset + directions[down] / directions[down, 2:] * drop
     return points
+
+
+def foot_of_upright(
+    camera: CameraModel,
+    mount: CameraMount,
+    ned_from_body: NDArray[np.float64],
+    top_and_foot: NDArray[Any],
+    height_m: float,
+    min_spread: float = 0.005,
+) -> NDArray[np.float64]:
+    """(3,) NED offset from the vehicle of the foot of something upright that is `height_m` tall.
+
+    Its top and its foot are in one direction and as far away: that distance is the height, divided by the
+    difference of the tangents of their elevations. What is as deep as it is tall seems taller from above, and
+    so nearer.
+
+    Args:
+        top_and_foot: (2, 2) pixels.
+        min_spread: the difference of the tangents below which the answer is NaN: it is too small to measure.
+    """
+    directions = direction_ned(camera, mount, ned_from_body, top_and_foot)
+    level = np.hypot(directions[:, 0], directions[:, 1])
+    # Nearly straight above something its height is not seen.
+    if level.min() < 0.1:
+        return np.full(3, np.nan)
+    tangents = -directions[:, 2] / level
+    spread = tangents[0] - tangents[1]
+    if not spread > min_spread:
+        return np.full(3, np.nan)
+    foot: NDArray[np.float64] = ned_from_body @ mount.position_frd_m + directions[1] / level[1] * (
+        height_m / spread
+    )
+    return foot

@@ -17,6 +17,7 @@ class RangeSource(StrEnum):
 
     DEPTH = "depth"
     GROUND_PLANE = "ground_plane"
+    KNOWN_HEIGHT = "known_height"
     NONE = "none"
 
 

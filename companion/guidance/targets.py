@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from companion.guidance.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
-from vision.geolocation import direction_ned, point_at_depth, point_on_ground
+from vision.geolocation import direction_ned, foot_of_upright, point_at_depth, point_on_ground
 from vision.rotation import matrix_from_quaternion, slerp
 from vision.tracking.association import overlaps
 
@@ -96,13 +97,15 @@ def targets_from_detections(
     camera: CameraModel,
     mount: CameraMount,
     history: StateHistory,
+    heights_m: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Target, ...]:
     """The targets of one frame, in the order of its detections.
 
     Range comes from the detection's depth where it has one (`range_m`, along the optical axis, at the box's
     centre), else from where the ray through the middle of the box's lower edge meets the ground. The ground
     is taken as flat and level with home. There is no range if the box touches the picture's lower edge, or
-    the ray points less than 2° down.
+    the ray points less than 2° down. Then the class's height in `heights_m` tells it, if the whole object is
+    in the picture.
 
     What the detector also calls something else, (nearly) as surely, is not `trusted`: a car that may be a
     truck is not flown to.
@@ -113,7 +116,15 @@ def targets_from_detections(
     pose = history.at(captured_ns)
     doubtful = _named_otherwise(detections)
     return tuple(
-        _target(detection, captured_ns, camera, mount, pose, trusted=not doubt)
+        _target(
+            detection,
+            captured_ns,
+            camera,
+            mount,
+            pose,
+            height_m=heights_m.get(detection["class_name"]),
+            trusted=not doubt,
+        )
         for detection, doubt in zip(detections, doubtful, strict=True)
     )
 
@@ -142,6 +153,7 @@ def _target(
     mount: CameraMount,
     pose: Pose,
     *,
+    height_m: float | None,
     trusted: bool,
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
@@ -159,6 +171,11 @@ def _target(
         ]
         if np.isfinite(offset).all():
             source = RangeSource.GROUND_PLANE
+    if source is RangeSource.NONE and height_m is not None and _whole(camera, top, bottom):
+        ends = np.array([[(left + right) / 2, top], [(left + right) / 2, bottom]])
+        offset = foot_of_upright(camera, mount, pose.ned_from_body, ends, height_m)
+        if np.isfinite(offset).all():
+            source = RangeSource.KNOWN_HEIGHT
     known = source is not RangeSource.NONE
     north, east, down = (
         float(origin + away) for origin, away in zip(pose.position_ned_m, offset, strict=True)
@@ -177,6 +194,11 @@ def _target(
         track_score=detection.get("track_score"),
         trusted=trusted and detection.get("track_state") in (None, TRACK_CONFIRMED),
     )
+
+
+def _whole(camera: CameraModel, top: float, bottom: float) -> bool:
+    """Neither its top nor its foot is cut off by the picture's edge."""
+    return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX
 
 
 def _newer(samples: deque[tuple[int, Quaternion]], stamp_ns: int) -> bool:

@@ -22,10 +22,14 @@ from vision.rotation import wrap_angle
 # How far an object may wander: 1 m in a second, one sigma. A walking person's pace.
 WANDER_M2_PER_S = 1.0
 # Noise of one measurement, one sigma: a few pixels and a degree of attitude across; along, depth is good to a
-# few per cent while a ground-plane range moves with every pixel of the box's lower edge.
+# few per cent while a ground-plane range moves with every pixel of the box's lower edge, and people differ.
 BEARING_SIGMA_RAD = 0.03
 ACROSS_SIGMA_M = 0.25
-ALONG_SIGMA = {RangeSource.DEPTH: (0.15, 0.03), RangeSource.GROUND_PLANE: (0.3, 0.12)}
+ALONG_SIGMA = {
+    RangeSource.DEPTH: (0.15, 0.03),
+    RangeSource.GROUND_PLANE: (0.3, 0.12),
+    RangeSource.KNOWN_HEIGHT: (0.3, 0.2),
+}
 UNKNOWN_RANGE_SIGMA_M = 1e3
 # χ² with two degrees of freedom, 99.9 %.
 GATE = 13.8

@@ -88,6 +88,7 @@ class View:
                 self.settings.camera.model(result.width, result.height),
                 self.settings.camera.mount(),
                 history,
+                self.settings.detector.heights(),
             )
             self.unplaced = ""
         except HistoryError as error:

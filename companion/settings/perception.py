@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from companion.settings.section import Section
-from companion.settings.texts import KEY_WORD, MARKER_TEXT
+from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.frame_selection import Selection
@@ -168,6 +168,8 @@ class DetectorSection(Section):
     """look at no more than so many frames a second; unset: at all that come"""
     max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
     """do not look at a frame that was captured longer ago, seconds; unset: look at all"""
+    known_heights: tuple[Annotated[str, HEIGHT_TEXT], ...] = ("person:1.7", "car:1.5", "bicycle:1.1")
+    """class:metres, how tall they stand: tells the range where neither depth nor the ground does"""
     tiles: bool = False
     """look at large frames in overlapping tiles too, for small objects; 1080p takes some 14 times as long"""
     tile_size: Annotated[int, Field(ge=64, le=4096)] = 640
@@ -175,9 +177,21 @@ class DetectorSection(Section):
     tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
     """of neighbouring tiles, share of a tile"""
 
+    @model_validator(mode="after")
+    def _heights_that_stand(self) -> Self:
+        for name, height_m in self.heights().items():
+            if not 0 < height_m <= 100:
+                raise ValueError(f"known_heights: {name} must be above 0 and at most 100 m, got {height_m:g}")
+        return self
+
     def selection(self) -> Selection:
         """Which frames are looked at."""
         return Selection(self.every, self.rate_hz, self.max_age_s)
+
+    def heights(self) -> dict[str, float]:
+        """Class name → metres."""
+        pairs = (text.rpartition(":") for text in self.known_heights)
+        return {name: float(height) for name, _, height in pairs}
 
 
 class TrackerSection(Section):

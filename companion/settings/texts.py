@@ -16,6 +16,8 @@ ViewName = Annotated[str, VIEW_NAME]
 VehicleUrl = Annotated[
     str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
 ]
+# CLASS:METRES.
+HEIGHT_TEXT = StringConstraints(pattern=r"^.+:[0-9]*\.?[0-9]+$", max_length=80)
 # ID:SIZE of a marker of its own size; with @PAD, and :RIGHT:UP where it does not lie on the pad's centre.
 MARKER_TEXT = StringConstraints(pattern=r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$", max_length=80)
 ZenohEndpoint = Annotated[
@@ -31,6 +33,7 @@ PATTERN_MEANINGS = {
     r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
     ),
+    r"^.+:[0-9]*\.?[0-9]+$": "CLASS:METRES such as person:1.7",
     r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$": (
         "ID:SIZE, ID:SIZE@PAD or ID:SIZE@PAD:RIGHT:UP such as 17:0.15@4:0.75:0"
     ),

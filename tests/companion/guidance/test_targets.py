@@ -10,6 +10,7 @@ from companion.guidance.target import RangeSource
 from companion.guidance.targets import HistoryError, StateHistory, slerp, targets_from_detections
 from companion.vehicle.state import VehicleState
 from vision.camera_model import CameraModel, CameraMount
+from vision.geolocation import foot_of_upright
 from vision.rotation import euler_from_quaternion, matrix_from_quaternion, quaternion_from_euler, wrap_angle
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80))
@@ -149,6 +150,58 @@ def test_a_point_in_space_is_found_again_from_its_depth(scene, down):
     assert target.range_m == pytest.approx(distance, abs=1e-6)
     # The bearing is that of the camera's ray; the camera sits a little before the vehicle's origin.
     assert abs(wrap_angle(target.bearing_rad - bearing)) < 0.2 / (distance - 0.2)
+
+
+@given(scene=scenes, tall_m=st.floats(0.8, 4.0))
+def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene, tall_m):
+    roll, pitch, yaw, distance, off, height, (north, east) = scene
+    attitude = quaternion_from_euler(roll, pitch, yaw)
+    position = (north, east, -height)
+    bearing = yaw + off
+    foot = (north + distance * math.cos(bearing), east + distance * math.sin(bearing), 5.0)
+    ends = [
+        optical_point(CAMERA, MOUNT, attitude, position, point)
+        for point in ((*foot[:2], foot[2] - tall_m), foot)
+    ]
+    assume(min(end[2] for end in ends) > 0.5)
+    pixels = np.array([CAMERA.project(end)[0] for end in ends])
+    found = foot_of_upright(CAMERA, MOUNT, matrix_from_quaternion(attitude), pixels, tall_m, min_spread=0.0)
+    assert np.array(position) + found == pytest.approx(foot, abs=0.02 * distance)
+
+
+def test_a_known_height_tells_the_range_where_the_ground_does_not():
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -1.5))
+    # 50 px tall before a camera that looks down by 20°, its foot near the horizon.
+    box = [300, 50, 320, 100]
+    ((without,), (known,), (cut,), (other,)) = (
+        targets_from_detections([detection(where, name=name)], T0, CAMERA, MOUNT, history, heights)
+        for where, name, heights in (
+            (box, "person", {}),
+            (box, "person", {"person": 1.7}),
+            ([300, 0, 320, 50], "person", {"person": 1.7}),
+            (box, "dog", {"person": 1.7}),
+        )
+    )
+    assert (without.range_source, cut.range_source, other.range_source) == (RangeSource.NONE,) * 3
+    assert known.range_source is RangeSource.KNOWN_HEIGHT
+    # By hand: rows of a pinhole of 381 px, elevations -20° - atan((row - 239.5) / 381).
+    top, bottom = (math.tan(math.radians(-20) - math.atan((row - 239.5) / 381.36)) for row in (50, 100))
+    assert known.range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
+
+
+def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells():
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    heights = {"car": 1.5}
+    (by_ground, by_depth) = targets_from_detections(
+        [detection((310, 300, 330, 400)), detection((10, 300, 30, 400), range_m=7.0)],
+        T0,
+        CAMERA,
+        MOUNT,
+        history,
+        heights,
+    )
+    assert by_ground.range_source is RangeSource.GROUND_PLANE
+    assert by_depth.range_source is RangeSource.DEPTH
 
 
 def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range():

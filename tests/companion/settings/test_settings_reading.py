@@ -134,6 +134,11 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
             'got "/dev/ttyS0"',
         ),
         (
+            "detector.known_heights",
+            "person=1.7",
+            'must be a list of texts, each CLASS:METRES such as person:1.7, got ["person=1.7"]',
+        ),
+        (
             "zenoh.listen",
             "localhost,7447",
             "must be a list of texts, each a zenoh endpoint such as tcp/192.168.1.5:7447, "
@@ -145,6 +150,16 @@ def test_a_bad_value_is_told_in_one_line_with_its_key_its_range_and_what_came(
     key: str, text: str, expected: str
 ) -> None:
     assert problems(overrides={key: text}) == [f"{key}: {expected} (given as a flag)"]
+
+
+def test_known_heights_are_metres_by_class_and_none_is_without_height() -> None:
+    text = "person:1.7,dining table:0.75"
+    assert load_settings(overrides={"detector.known_heights": text}, environment={}).detector.heights() == {
+        "person": 1.7,
+        "dining table": 0.75,
+    }
+    (line,) = problems(overrides={"detector.known_heights": "person:0"})
+    assert "person must be above 0 and at most 100 m, got 0" in line
 
 
 @pytest.mark.parametrize(
