@@ -10,12 +10,13 @@ failsafe may take, whatever caused it, nothing is sent until `stop()` and a new 
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import time
 from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
 
+from companion.vehicle.precise_sleep import Sleep, precise_sleep
 from companion.vehicle.setpoint import Setpoint
 
 logger = logging.getLogger(__name__)
@@ -49,13 +50,14 @@ class Streamer:
         rate_hz: float = DEFAULT_RATE_HZ,
         brake_s: float = DEFAULT_BRAKE_S,
         clock_ns: Callable[[], int] = time.monotonic_ns,
+        sleeper: Callable[[], AbstractAsyncContextManager[Sleep]] = precise_sleep,
     ) -> None:
         if not rate_hz > 2.0:
             raise ValueError(f"PX4 needs setpoints faster than 2 Hz, got rate_hz={rate_hz}")
         self.send = send
         self._period_ns = round(1e9 / rate_hz)
         self._brake_ns = round(brake_s * 1e9)
-        self._clock_ns = clock_ns
+        self._clock_ns, self._sleeper = clock_ns, sleeper
         self._newest: Setpoint | None = None
         self._state = StreamState.SILENT
         self._sent: Setpoint | None = None
@@ -113,14 +115,15 @@ class Streamer:
 
     async def run(self) -> None:
         """Tick at the rate until cancelled. Missed ticks are skipped, never sent in a burst."""
-        due_ns = self._clock_ns()
-        while True:
-            self.tick(self._clock_ns())
-            due_ns += self._period_ns
-            late_ns = self._clock_ns() - due_ns
-            if late_ns > 0:
-                due_ns += (late_ns // self._period_ns + 1) * self._period_ns
-            await asyncio.sleep((due_ns - self._clock_ns()) / 1e9)
+        async with self._sleeper() as sleep:
+            due_ns = self._clock_ns()
+            while True:
+                self.tick(self._clock_ns())
+                due_ns += self._period_ns
+                late_ns = self._clock_ns() - due_ns
+                if late_ns > 0:
+                    due_ns += (late_ns // self._period_ns + 1) * self._period_ns
+                await sleep((due_ns - self._clock_ns()) / 1e9)
 
     def _was_silent(self, now_ns: int) -> bool:
         """The stream was running and then nothing left for too long: this loop did not go round."""

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import logging
 import time
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 import pytest
@@ -190,11 +191,15 @@ def test_whatever_happens_nothing_expired_leaves_and_silence_is_final(steps, bra
 
 
 class TurnedClock:
-    """Stands in for the clock and for asyncio.sleep: time passes only by sleeping, or by a hang."""
+    """Stands in for the clock and for sleeping: time passes only by sleeping, or by a hang."""
 
     def __init__(self, turns: int) -> None:
         self.now_ns = 0
         self.turns = turns
+
+    @asynccontextmanager
+    async def sleeper(self):
+        yield self.sleep
 
     async def sleep(self, delay_s: float) -> None:
         assert delay_s >= 0.0
@@ -204,27 +209,26 @@ class TurnedClock:
         self.now_ns += round(delay_s * 1e9)
 
 
-async def run_streamer(clock: TurnedClock, send, monkeypatch, **options) -> Streamer:
-    streamer = Streamer(send, clock_ns=lambda: clock.now_ns, **options)
+async def run_streamer(clock: TurnedClock, send, **options) -> Streamer:
+    streamer = Streamer(send, clock_ns=lambda: clock.now_ns, sleeper=clock.sleeper, **options)
     streamer.submit(Setpoint.velocity((1.0, 0.0, 0.0), 0, lifetime_s=60.0))
-    monkeypatch.setattr("companion.vehicle.streamer.asyncio.sleep", clock.sleep)
     with pytest.raises(asyncio.CancelledError):
         await streamer.run()
     return streamer
 
 
-async def test_the_rate_is_kept_though_sending_takes_time(monkeypatch) -> None:
+async def test_the_rate_is_kept_though_sending_takes_time() -> None:
     clock, times = TurnedClock(turns=100), []
 
     def send(_setpoint: Setpoint) -> None:
         times.append(clock.now_ns)
         clock.now_ns += 3 * MS
 
-    await run_streamer(clock, send, monkeypatch, rate_hz=100.0)
+    await run_streamer(clock, send, rate_hz=100.0)
     assert times == [number * 10 * MS for number in range(101)]
 
 
-async def test_missed_ticks_are_skipped_and_never_made_up_for(monkeypatch) -> None:
+async def test_missed_ticks_are_skipped_and_never_made_up_for() -> None:
     clock, times = TurnedClock(turns=20), []
 
     def send(_setpoint: Setpoint) -> None:
@@ -232,7 +236,7 @@ async def test_missed_ticks_are_skipped_and_never_made_up_for(monkeypatch) -> No
         if len(times) == 5:
             clock.now_ns += 333 * MS  # the loop was held up
 
-    await run_streamer(clock, send, monkeypatch, rate_hz=100.0)
+    await run_streamer(clock, send, rate_hz=100.0)
     gaps = [after - before for before, after in itertools.pairwise(times)]
     assert gaps == [10 * MS] * 4 + [340 * MS] + [10 * MS] * 15
 
