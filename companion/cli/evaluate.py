@@ -40,7 +40,8 @@ def evaluate(
         write_sheet,
     )
     from vision.detector import Detector
-    from vision.evaluation.dataset import DatasetError, open_dataset
+    from vision.evaluation.dataset import open_dataset
+    from vision.evaluation.samples import DatasetError
     from vision.pipeline import FrameDetector
     from vision.tiling import TiledDetector
     from vision.yolo.checkpoint import CheckpointError

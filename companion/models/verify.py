@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.datasets.training_scenes import random_scene
-from vision.evaluation.dataset import image_files, read_image
+from vision.evaluation.samples import image_files, read_image
 from vision.letterbox import fit
 from vision.runtimes.contract import Precision, Runtime, RuntimeUnusableError
 from vision.runtimes.exported import KEY

@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from mavlink_sim.camera.video_outputs import NewestFrame
+from mavlink_sim.camera.newest_frame import NewestFrame
 from vision.frame import Frame
 
 logger = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ import logging
 from fractions import Fraction
 from typing import Any
 
-from mavlink_sim.camera.video_outputs import NewestFrame
+from mavlink_sim.camera.newest_frame import NewestFrame
 from vision.frame import Frame
 
 logger = logging.getLogger(__name__)

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vision.evaluation.dataset import Dataset, DatasetError, open_dataset
+from vision.evaluation.dataset import open_dataset
+from vision.evaluation.samples import Dataset, DatasetError
 
 
 def picture(path: Path, width: int = 200, height: int = 100) -> Path:

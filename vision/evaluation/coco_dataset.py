@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vision.evaluation.dataset import Dataset, DatasetError, Sample
+from vision.evaluation.samples import Dataset, DatasetError, Sample
 
 
 def find_annotations(folder: Path) -> Path | None:

@@ -1,67 +1,12 @@
-"""A labelled data set as the judge wants it, whichever format it comes in."""
+"""Opens a labelled data set, whichever format it comes in."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-
-
-class DatasetError(ValueError):
-    """A data set that cannot be used; the message names the file, the line or entry, and what is wrong."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """One image and what is in it.
-
-    Attributes:
-        image: the file.
-        boxes: (N, 4) float32 xyxy: pixels, or fractions of the image where `in_fractions`.
-        class_ids: (N,) int64.
-        in_fractions: as YOLO labels have them.
-        ignored: (N,) bool: a region that may or may not be found (COCO's `iscrowd`).
-    """
-
-    image: Path
-    boxes: NDArray[np.float32]
-    class_ids: NDArray[np.int64]
-    in_fractions: bool = False
-    ignored: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-
-    def __post_init__(self) -> None:
-        if self.ignored.shape != self.class_ids.shape:
-            object.__setattr__(self, "ignored", np.zeros(len(self.class_ids), np.bool_))
-
-    def boxes_in(self, width: int, height: int) -> NDArray[np.float32]:
-        """(N, 4) float32 xyxy in the pixels of an image of this size."""
-        if not self.in_fractions:
-            return self.boxes
-        return self.boxes * np.array([width, height, width, height], np.float32)
-
-
-@dataclass(frozen=True, slots=True)
-class Dataset:
-    """Samples in the order of their files.
-
-    Attributes:
-        root: what was opened.
-        kind: "YOLO" or "COCO".
-        class_names: id → name; None where the data set says nothing of names.
-        samples: with an image each; one without labels shows nothing of any class.
-    """
-
-    root: Path
-    kind: str
-    class_names: tuple[str, ...] | None
-    samples: tuple[Sample, ...]
+from vision.evaluation.coco_dataset import find_annotations, read_coco
+from vision.evaluation.samples import Dataset, DatasetError
+from vision.evaluation.yolo_dataset import read_yolo
 
 
 def open_dataset(path: Path, *, split: str | None = None, images: Path | None = None) -> Dataset:
@@ -76,9 +21,6 @@ def open_dataset(path: Path, *, split: str | None = None, images: Path | None = 
     Raises:
         DatasetError: nothing of the kind is there, or a label is wrong.
     """
-    from vision.evaluation.coco_dataset import find_annotations, read_coco
-    from vision.evaluation.yolo_dataset import read_yolo
-
     if not path.exists():
         raise DatasetError(
             f"{path}: no such file or folder; give a data set's folder, data.yaml or COCO JSON"
@@ -87,22 +29,3 @@ def open_dataset(path: Path, *, split: str | None = None, images: Path | None = 
     if annotations is not None:
         return read_coco(annotations, images)
     return read_yolo(path, split)
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Every image below `folder`, by name."""
-    return sorted(_images_below(folder))
-
-
-def _images_below(folder: Path) -> Iterator[Path]:
-    for where, folders, names in os.walk(folder):
-        folders.sort()
-        yield from (Path(where, name) for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES)
-
-
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 BGR, turned upright as its EXIF says; raises `DatasetError`."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DatasetError(f"{path}: cannot be read as an image; is it whole?")
-    return image.astype(np.uint8, copy=False)

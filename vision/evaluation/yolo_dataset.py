@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.evaluation.dataset import Dataset, DatasetError, Sample, image_files
+from vision.evaluation.samples import Dataset, DatasetError, Sample, image_files
 from vision.plain_yaml import PlainYamlError, load_plain_yaml
 
 _TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
