@@ -7,16 +7,14 @@ the one ground station at 14550 from 18570 + i.
 from __future__ import annotations
 
 import math
-import selectors
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from mavlink_sim.real_time import run_together
 from mavlink_sim.simulation import Simulation, SimulationOptions
 
-PACE_PERIOD_S = 5.0
 MAX_VEHICLES = 250  # system ids are 1 to 255, and a ground station needs some
 
 
@@ -115,57 +113,3 @@ class Fleet:
 
 def _named(on_event: Callable[[str], None], system_id: int) -> Callable[[str], None]:
     return lambda text: on_event(f"vehicle {system_id}: {text}")
-
-
-class _Pace:
-    """Says, every few seconds, when the machine is too slow for the speed that was asked for."""
-
-    def __init__(self, speed: float, on_event: Callable[[str], None]) -> None:
-        self._speed = speed
-        self._on_event = on_event
-        self._lost_s = 0.0
-        self._since_s = time.monotonic()
-
-    def lose(self, simulated_s: float) -> None:
-        self._lost_s += simulated_s
-
-    def tell(self) -> None:
-        passed_s = time.monotonic() - self._since_s
-        if passed_s < PACE_PERIOD_S:
-            return
-        if self._lost_s > 0.01 * self._speed * passed_s:
-            reached = self._speed - self._lost_s / passed_s
-            self._on_event(
-                f"cannot keep up: {reached:.2f} times real time in the last {passed_s:.0f} s, "
-                f"not {self._speed:g}; the machine is too busy"
-            )
-        self._lost_s = 0.0
-        self._since_s += passed_s
-
-
-def run_together(
-    simulations: Sequence[Simulation], stopped: Callable[[], bool], on_event: Callable[[str], None]
-) -> None:
-    """The loop: wait for the sockets until the next step is due, take in what came, step, send."""
-    first = simulations[0]
-    speed = first.options.speed
-    pace = _Pace(speed, on_event)
-    started_ns = time.monotonic_ns()
-    for simulation in simulations:
-        simulation.start_clock(started_ns)
-    with selectors.DefaultSelector() as selector:
-        for simulation in simulations:
-            for name, endpoint in simulation.endpoints.items():
-                selector.register(endpoint, selectors.EVENT_READ, (simulation, name))
-        while not stopped():
-            lost_s = first.backlog()
-            if lost_s > 0.0:
-                pace.lose(lost_s)
-                for simulation in simulations:
-                    simulation.let_go(lost_s)
-            pace.tell()
-            for key, _ in selector.select(first.until_next_step()):
-                simulation, name = key.data
-                simulation.receive(name)
-            for simulation in simulations:
-                simulation.advance()

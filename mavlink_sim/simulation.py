@@ -17,6 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.faults.room import fault_room
 from mavlink_sim.personality import PX4, vehicle_class
+from mavlink_sim.real_time import run_together
 from mavlink_sim.releases import NEWEST
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint
@@ -213,6 +214,11 @@ class Simulation:
         """Make `run` return soon; may be called from a signal handler."""
         self._stopped = True
 
+    @property
+    def speed(self) -> float:
+        """Simulated seconds in a second."""
+        return self.options.speed
+
     def _clock_ns(self) -> int:
         """Simulated time at this very moment, between the physics steps too."""
         return int((time.monotonic_ns() - self._started_ns) * self.options.speed)
@@ -223,8 +229,6 @@ class Simulation:
 
     def run(self) -> None:
         """Run until `stop`."""
-        from mavlink_sim.fleet import run_together  # which makes simulations itself
-
         run_together([self], lambda: self._stopped, self._on_event)
 
     def start_clock(self, now_ns: int) -> None:

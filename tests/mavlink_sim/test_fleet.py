@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim import fleet
+from mavlink_sim import real_time
 from mavlink_sim.cli import main
 from mavlink_sim.fleet import instance_options, places
 from mavlink_sim.lockstep import LockstepVehicle
@@ -146,9 +146,9 @@ def test_a_range_of_ports_is_free() -> None:
 
 def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr(fleet.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(real_time.time, "monotonic", lambda: now_s)
     told: list[str] = []
-    pace = fleet._Pace(20.0, told.append)
+    pace = real_time._Pace(20.0, told.append)
     pace.lose(25.0)
     now_s += 2.0
     pace.tell()
