@@ -106,6 +106,11 @@ def demo(
     from companion.rehearsal import RehearsalError
     from companion.vehicle.driver import LinkError
 
+    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    # What the service logs is said here with its time: once is enough.
+    service = logging.getLogger("companion.service")
+    service.propagate = False
+    service.addHandler(logging.NullHandler())
     with plain_errors(RehearsalError, LinkError, PerceptionStartError, BusError, OSError):
         summary = run_demo(output, seed=seed, limit_s=duration, say=_say_with_time())
     if not summary.success:
