@@ -19,6 +19,7 @@ from companion.guidance.envelope import Envelope, Limited, Limits
 from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
+from companion.settings.perception import DetectorSection
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
@@ -49,6 +50,7 @@ START_NS = 1_000_000_000_000
 # An envelope of setpoints is not one of gusts: by so much the truth may be beyond a limit.
 SPEED_TOLERANCE_MPS = 1.0
 PLACE_TOLERANCE_M = 0.5
+_HEIGHTS_M = DetectorSection().heights()
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +274,7 @@ class LockstepFlight:
             self._seen_ns = captured_ns
             try:
                 self._targets = targets_from_detections(
-                    detections.records(), captured_ns, sight.camera, sight.mount, self.history
+                    detections.records(), captured_ns, sight.camera, sight.mount, self.history, _HEIGHTS_M
                 )
             except HistoryError:
                 self._targets = ()  # as in the service: seen, not steered by

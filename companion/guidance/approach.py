@@ -48,7 +48,7 @@ BASE_TIMEOUT_S = 45.0
 class ApproachBehaviour(Behaviour):
     """Keeps its height, turns its nose to the object and stops `distance_m` before its nearest surface.
 
-    It begins with the object of the class nearest to the nose, among the true ones, and stays with it.
+    It begins with the true object of the class before the nose (see `Choice`) and stays with it.
     Lost, it brakes and looks for `lost_timeout_s` before it gives up.
 
     Attributes:
@@ -154,10 +154,9 @@ class ApproachBehaviour(Behaviour):
             elif situation.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
                 self._find_again(self._track, fitting, position)
             return
-        trusted = [target for target in fitting if target.trusted]
         if fitting:
-            self._doubted = not trusted
-        chosen = self._choice.take(trusted, yaw_rad, situation.now_ns)
+            self._doubted = not any(target.trusted for target in fitting)
+        chosen = self._choice.take(fitting, yaw_rad, situation.now_ns)
         if chosen is None:
             return
         if chosen.position_ned_m is None:

@@ -32,7 +32,7 @@ UNSEEN_S = 0.6
 class FollowBehaviour(Behaviour):
     """Keeps its height, looks at the object and keeps `distance_m` from its nearest surface.
 
-    It begins with the object of the class nearest to the nose, among the true ones, and stays with that one.
+    It begins with the true object of the class before the nose (see `Choice`) and stays with that one.
     Unseen, it goes on to where the object is expected to be, for `occlusion_s`; then it ends.
 
     Args:
@@ -161,10 +161,9 @@ class FollowBehaviour(Behaviour):
             if self._track.update(fitting, position):
                 self._seen_ns = self._track.captured_ns
             return
-        trusted = [target for target in fitting if target.trusted]
         if fitting:
-            self._doubted = not trusted
-        chosen = self._choice.take(trusted, yaw_rad, situation.now_ns)
+            self._doubted = not any(target.trusted for target in fitting)
+        chosen = self._choice.take(fitting, yaw_rad, situation.now_ns)
         if chosen is None:
             return
         if chosen.position_ned_m is None:

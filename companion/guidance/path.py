@@ -86,17 +86,11 @@ class Path:
 
     def point(self, along_m: float) -> PathPoint:
         """What is `along_m` from the beginning; beyond an open path's end, the end."""
-        along_m = self._on_path(along_m)
-        index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
-        start, end = self._points[index], self._points[index + 1]
-        length = self._at[index + 1] - self._at[index]
-        share = min(max((along_m - self._at[index]) / length, 0.0), 1.0)
-        north, east, down = ((b - a) / length for a, b in zip(start, end, strict=True))
-        x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+        index, share = self._part(along_m)
         before, after = self._speeds[index], self._speeds[index + 1]
         # Speeds change by acceleration, so it is their squares that lie on a line.
         speed = math.sqrt(before**2 + share * (after**2 - before**2))
-        return PathPoint((x, y, z), (north, east, down), speed)
+        return PathPoint(self._place(along_m), self._direction(along_m), speed)
 
     def nearest(self, position: Vector3, from_m: float, to_m: float) -> float:
         """How far along the nearest place to `position` is, looked for between two places."""
@@ -110,12 +104,17 @@ class Path:
         best += sum(o * d for o, d in zip(offset, here.direction, strict=True))
         return min(max(best, from_m), to_m)
 
-    def _place(self, along_m: float) -> Vector3:
-        """The place alone: many are tried at every turn."""
+    def _part(self, along_m: float) -> tuple[int, float]:
+        """Which piece of the path that is on, and which share of it lies before."""
         along_m = self._on_path(along_m)
         index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
+        share = (along_m - self._at[index]) / (self._at[index + 1] - self._at[index])
+        return index, min(max(share, 0.0), 1.0)
+
+    def _place(self, along_m: float) -> Vector3:
+        """The place alone: many are tried at every turn."""
+        index, share = self._part(along_m)
         start, end = self._points[index], self._points[index + 1]
-        share = min(max((along_m - self._at[index]) / (self._at[index + 1] - self._at[index]), 0.0), 1.0)
         return (
             start[0] + share * (end[0] - start[0]),
             start[1] + share * (end[1] - start[1]),
@@ -151,8 +150,7 @@ class Path:
         return max(SLOWEST_MPS, math.sqrt(ACCELERATION_MPS2 * 2.0 * BEND_M / turned))
 
     def _direction(self, along_m: float) -> Vector3:
-        along_m = self._on_path(along_m)
-        index = min(max(bisect_right(self._at, along_m) - 1, 0), len(self._points) - 2)
+        index, _ = self._part(along_m)
         start, end = self._points[index], self._points[index + 1]
         length = self._at[index + 1] - self._at[index]
         north, east, down = ((b - a) / length for a, b in zip(start, end, strict=True))

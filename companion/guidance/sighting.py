@@ -74,14 +74,17 @@ class Sightings:
         oldest_ns = self._newest_ns - FRAMES_WINDOW_S * 1e9
         recent = [target for target in self._seen if target.captured_ns >= oldest_ns]
         for target in sorted(seen, key=lambda target: -target.confidence):
-            agreeing = {
-                t.captured_ns
+            agreeing = [
+                t
                 for t in recent
                 if t.class_name == target.class_name and apart_rad(t, target) <= SAME_BEARING_RAD
-            }
-            if len(agreeing) < FRAMES_NEEDED:
+            ]
+            if len({t.captured_ns for t in agreeing}) < FRAMES_NEEDED:
                 continue
-            if target.trusted:
+            # Its track counts as true from some frame on, and then for good; but a rival name comes and goes.
+            first = next((index for index, t in enumerate(agreeing) if t.trusted), len(agreeing))
+            since = [t.trusted for t in agreeing[first:]]
+            if target.trusted and 2 * sum(since) > len(since):
                 return target
             self.doubted = True
         return None

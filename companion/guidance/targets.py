@@ -33,8 +33,11 @@ EDGE_PX = 2.0
 MIN_DEPRESSION_RAD = math.radians(2.0)
 # Below this height the ground plane says nothing about range.
 MIN_HEIGHT_M = 0.3
-# Boxes that overlap by so much are of one thing. A name must be surer by this than any other it is given.
-SAME_THING_IOU, CLEARLY_SURER = 0.5, 0.1
+# A range from a height needs a box so tall: one pixel more or less is a twelfth of it.
+LEAST_HEIGHT_PX = 12.0
+# Boxes that overlap by so much are of one thing; those of a rider and the bicycle do not. A name must be
+# surer by this than any other it is given.
+SAME_THING_IOU, CLEARLY_SURER = 0.7, 0.1
 
 
 class HistoryError(LookupError):
@@ -171,7 +174,7 @@ def _target(
         ]
         if np.isfinite(offset).all():
             source = RangeSource.GROUND_PLANE
-    if source is RangeSource.NONE and height_m is not None and _whole(camera, top, bottom):
+    if source is RangeSource.NONE and height_m is not None and _measurable(camera, top, bottom):
         ends = np.array([[(left + right) / 2, top], [(left + right) / 2, bottom]])
         offset = foot_of_upright(camera, mount, pose.ned_from_body, ends, height_m)
         if np.isfinite(offset).all():
@@ -196,9 +199,9 @@ def _target(
     )
 
 
-def _whole(camera: CameraModel, top: float, bottom: float) -> bool:
-    """Neither its top nor its foot is cut off by the picture's edge."""
-    return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX
+def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:
+    """Tall enough, and neither its top nor its foot is cut off by the picture's edge."""
+    return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX and bottom - top >= LEAST_HEIGHT_PX
 
 
 def _newer(samples: deque[tuple[int, Quaternion]], stamp_ns: int) -> bool:

@@ -179,6 +179,8 @@ class DetectorSection(Section):
 
     @model_validator(mode="after")
     def _heights_that_stand(self) -> Self:
+        if len(self.heights()) < len(self.known_heights):
+            raise ValueError(f"known_heights: a class is given twice in {', '.join(self.known_heights)}")
         for name, height_m in self.heights().items():
             if not 0 < height_m <= 100:
                 raise ValueError(f"known_heights: {name} must be above 0 and at most 100 m, got {height_m:g}")

@@ -43,8 +43,6 @@ _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
 _FRAME_LOCAL_NED = 1
-
-
 _TIMESYNC_ID = 111
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
@@ -103,7 +101,7 @@ class AutopilotDriver(ABC):
 
     @abstractmethod
     def _take_frames(self, frames: list[Frame]) -> None:
-        """Decode frames of the chosen system; call `_handle` with what they say."""
+        """Decode frames of the chosen system; call `_heard.handle` with what they say."""
 
     @abstractmethod
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:

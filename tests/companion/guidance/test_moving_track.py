@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -106,6 +107,71 @@ def test_an_identity_that_was_away_is_not_believed_far_from_where_it_is_expected
     road.see(1.3)
     road.see(0.5, id1=(0.5, -3.9))
     assert road.off_m < 0.5
+
+
+def test_a_few_missed_frames_of_one_that_comes_back_where_it_was_expected_are_no_doubt(road: Road) -> None:
+    road.see(0.4)
+    road.see(0.4, id1=(0.0, 0.0))
+    # It turns aside, and its like comes to where it would have been.
+    for step in range(12):
+        road.see(FRAME_S, id1=(0.0, 0.02 * step**2), id9=(0.0, -0.3))
+    assert road.track.track_id == 1
+
+
+def test_its_own_identity_is_taken_again_without_a_range_and_in_doubt(road: Road) -> None:
+    road.see(0.7)
+    for doubted in (False, True):
+        road.seconds += FRAME_S
+        target = seen(road.car, road.vehicle, road.seconds, 1)
+        target = (
+            replace(target, trusted=False)
+            if doubted
+            else replace(target, position_ned_m=None, range_m=math.nan, range_source=RangeSource.NONE)
+        )
+        assert road.track.update([target], road.vehicle)
+
+
+def test_a_slow_detector_is_no_absence() -> None:
+    road = Road()
+    for _ in range(12):
+        road.see(FRAME_S, id1=(0.0, 0.0), id2=(0.0, 4.0))
+        road.seconds += 0.6
+    for _ in range(6):
+        road.see(FRAME_S, id1=(0.0, 0.0), id3=(0.5, 1.0))
+        road.seconds += 0.6
+        assert road.off_m < 0.7
+    assert road.track.track_id == 1
+
+
+def test_a_range_that_comes_from_elsewhere_may_be_off_by_more(road: Road) -> None:
+    taken = 0
+    for _ in range(10):
+        road.seconds += FRAME_S
+        nearer = seen((road.car[0] - 2.0, 0.0), road.vehicle, road.seconds, 1)
+        taken += road.track.update([replace(nearer, range_source=RangeSource.KNOWN_HEIGHT)], road.vehicle)
+    assert taken >= 7
+    assert road.off_m == pytest.approx(2.0, abs=0.7)
+
+
+def test_what_is_true_now_and_then_is_not_chosen() -> None:
+    vehicle = (0.0, 0.0, -4.0)
+
+    def chosen(doubts: str) -> Target | None:
+        choice, found = Choice(), None
+        for frame, doubt in enumerate(doubts):
+            target = replace(seen((20.0, 0.0), vehicle, frame * FRAME_S, 3), trusted=doubt != "?")
+            found = choice.take([target], 0.0, round(frame * FRAME_S * 1e9))
+        return found
+
+    assert chosen("?????.?????????") is None
+    assert chosen("??.........") is not None
+    assert chosen("??..?......") is not None
+
+
+def test_without_ranges_the_one_nearest_to_the_nose_is_meant() -> None:
+    aside = Target("car", 0.9, 1, math.radians(9.5), -0.3, track_id=None)
+    ahead = replace(aside, bearing_rad=math.radians(0.2))
+    assert Choice().take([aside, ahead], 0.0, 1) is ahead
 
 
 def test_of_those_before_the_nose_the_nearest_is_meant() -> None:

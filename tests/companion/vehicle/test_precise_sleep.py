@@ -41,8 +41,15 @@ async def test_others_run_meanwhile_and_a_hang_does_not_cost_the_next_one() -> N
     counting.cancel()
 
 
+def timers() -> int:
+    """How many timer files this process has open."""
+    links = (os.path.join("/proc/self/fd", name) for name in os.listdir("/proc/self/fd"))
+    return sum(os.readlink(link) == "anon_inode:[timerfd]" for link in links if os.path.lexists(link))
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs Linux's /proc")
 async def test_cancelled_or_not_its_file_is_closed() -> None:
-    before = set(os.listdir("/proc/self/fd"))
+    before = timers()
 
     async def use() -> None:
         async with precise_sleep() as sleep:
@@ -50,8 +57,45 @@ async def test_cancelled_or_not_its_file_is_closed() -> None:
 
     task = asyncio.create_task(use())
     await asyncio.sleep(0)
-    assert set(os.listdir("/proc/self/fd")) > before
+    assert timers() == before + 1
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    assert set(os.listdir("/proc/self/fd")) == before
+    assert timers() == before
+
+
+async def test_it_is_for_one_task_at_a_time() -> None:
+    async with precise_sleep() as sleep:
+        first = asyncio.ensure_future(sleep(30))
+        await asyncio.sleep(0)
+        with pytest.raises(RuntimeError, match="one task at a time"):
+            await sleep(0.001)
+        first.cancel()
+
+
+async def test_a_sleep_cancelled_as_it_ends_leaves_the_next_one_its_time(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with precise_sleep() as sleep, asyncio.timeout(20):
+        first = asyncio.ensure_future(sleep(0.005))
+        await asyncio.sleep(0)
+        time.sleep(0.02)  # noqa: ASYNC251  (it rings while the loop hangs)
+        first.cancel()
+        started = time.monotonic()
+        second = asyncio.ensure_future(sleep(0.05))
+        await asyncio.gather(first, return_exceptions=True)
+        await second
+        assert time.monotonic() - started >= 0.05
+    assert not caplog.records
+
+
+async def test_without_such_a_timer_the_loops_own_is_used_and_said(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class NoTimers:
+        def __init__(self, *_: object, **__: object) -> None: ...
+
+    monkeypatch.setattr("companion.vehicle.precise_sleep.ctypes.CDLL", NoTimers)
+    async with precise_sleep() as sleep:
+        await sleep(0.001)
+    assert "no timerfd" in caplog.text
