@@ -155,3 +155,15 @@ def test_no_module_imports_itself_in_a_circle() -> None:
 
     for name in graph:
         visit(name, ())
+
+
+@pytest.mark.parametrize("package", ["companion", "vision", "mavlink_sim"])
+def test_every_room_stands_in_the_document(package: str) -> None:
+    document = (ROOT / "docs" / "architecture.md").read_text()
+    names = {
+        f"`{path.name}`" if path.suffix == ".py" else f"`{path.name}/`"
+        for path in (ROOT / package).iterdir()
+        if (path.suffix == ".py" and not path.name.startswith("__")) or (path / "__init__.py").is_file()
+    }
+    assert names
+    assert not sorted(name for name in names if name not in document)

@@ -37,7 +37,7 @@ from companion.perception.keeper import PerceptionKeeper, PerceptionStartError
 from companion.perception.messages import Preview
 from companion.perception.views import View, open_views
 from companion.perception.views_markers import MarkerWatch
-from companion.service.commands import Commands
+from companion.service.command_desk import CommandDesk
 from companion.service.event import Event
 from companion.service.parts import battery_minimum_of, driver_of, limits_of, obstacle_rules_of
 from companion.service.status import status_message
@@ -95,7 +95,7 @@ class Service:
         self._obstacles: ObstacleSectors | None = None
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
-        self._commands = Commands(self.pilot, self.steering, self._event)
+        self._commands = CommandDesk(self.pilot, self.steering, self._event)
         self.poses = PoseSharing(settings.vehicle.name, self._event)
         self.markers = MarkerWatch(self.views)
         self._landing_target_ns = 0

@@ -20,7 +20,7 @@ from companion.missions.mission_file import MissionError, mission_behaviour
 from companion.perception.views import View
 
 
-class Commands:
+class CommandDesk:
     """The one place where commands are taken.
 
     Args:
