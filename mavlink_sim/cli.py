@@ -25,6 +25,7 @@ from mavlink_sim.wire.signing import ALWAYS, key_of
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
 MAX_WIND_MPS = 8.0
+MAX_GUSTS_MPS = 4.0  # two standard deviations of it are that wind
 
 # click's UsageError, by way of its public subclass: some versions of typer carry a click of their own
 _USAGE_ERROR: Any = typer.BadParameter.__base__
@@ -82,6 +83,12 @@ def simulate(
     system_id: Annotated[int, typer.Option(help="MAVLink system id, 1 to 255.")] = 1,
     seed: Annotated[int, typer.Option(help="Of the wind, the gusts and the world.")] = 0,
     wind: Annotated[float, typer.Option(help="Steady wind in m/s; the seed chooses its direction.")] = 0.0,
+    gusts: Annotated[
+        float | None,
+        typer.Option(
+            help="Gusts in m/s, standard deviation per axis; 0: none; default: 0.6 and 15 % of --wind."
+        ),
+    ] = None,
     camera: Annotated[
         str | None, typer.Option(help="Render a camera into this shared memory; read it as shm://NAME.")
     ] = None,
@@ -159,6 +166,8 @@ def simulate(
         _check(name, port, 0 if name.endswith("bind") else 1, 65535)
     _check("system-id", system_id, 1, 255)
     _check("wind", wind, 0.0, MAX_WIND_MPS)
+    if gusts is not None:
+        _check("gusts", gusts, 0.0, MAX_GUSTS_MPS)
     if camera_rate is not None:
         _check("camera-rate", camera_rate, 1.0, 120.0)
     if STANDARD_OUTPUT in (camera_output or []):
@@ -186,6 +195,7 @@ def simulate(
         system_id=system_id,
         seed=seed,
         wind_mps=wind,
+        gusts_mps=gusts,
         camera=camera,
         camera_rate_hz=camera_rate,
         camera_outputs=tuple(camera_output or ()),

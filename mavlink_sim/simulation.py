@@ -47,6 +47,7 @@ class SimulationOptions:
         onboard_port, gcs_port: UDP ports the vehicle sends to at first.
         onboard_bind, gcs_bind: UDP ports it binds; 0 chooses free ones.
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
+        gusts_mps: standard deviation of the gusts per axis; None for the usual ones, 0 for none.
         world_seed: chooses them instead, the same for all vehicles of a fleet; None: `seed`.
         camera: name of the shared-memory segment the camera's frames go to; None for no shared memory.
         camera_outputs: further addresses the frames go to (`video_outputs`).
@@ -77,6 +78,7 @@ class SimulationOptions:
     seed: int = 0
     world_seed: int | None = None
     wind_mps: float = 0.0
+    gusts_mps: float | None = None
     camera: str | None = None
     camera_rate_hz: float | None = None
     camera_outputs: tuple[str, ...] = ()
@@ -119,6 +121,7 @@ class Simulation:
             seed=options.seed,
             air_seed=options.world_seed,
             wind_mps=options.wind_mps,
+            gusts_mps=options.gusts_mps,
             parameters=options.parameters,
             ready_after_s=options.ready_after_s,
             px4=options.px4,
