@@ -18,13 +18,14 @@ from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.personality import AUTOPILOTS, PX4
 from mavlink_sim.px4.parameters import UnknownParameterError
-from mavlink_sim.releases import NEWEST
+from mavlink_sim.releases import NEWEST, RELEASES
 from mavlink_sim.simulation import SimulationOptions
 from mavlink_sim.wire.endpoint import PortInUseError
 from mavlink_sim.wire.signing import ALWAYS, key_of
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
 MAX_WIND_MPS = 8.0
+DEFAULT_SPACING_M = 5.0
 MAX_GUSTS_MPS = 4.0  # two standard deviations of it are that wind
 
 # click's UsageError, by way of its public subclass: some versions of typer carry a click of their own
@@ -62,6 +63,15 @@ def _say_version(wanted: bool) -> None:
 
         _say(f"mavlink-sim {version('mavlink-companion')}")
         raise typer.Exit
+
+
+def _refuse_without_camera(given: dict[str, float | None]) -> None:
+    for name, value in given.items():
+        if value is not None:
+            _fail(
+                f"--{name} {value:g}: there is no camera; add --camera NAME or --camera-output ADDRESS, "
+                "or leave it out"
+            )
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:
@@ -115,7 +125,9 @@ def simulate(
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
     ] = 3.0,
     autopilot: Annotated[str, typer.Option(help="Whose manners it has: px4 or ardupilot (Copter).")] = PX4,
-    px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
+    px4: Annotated[
+        str | None, typer.Option(help=f"PX4 release to be like: {', '.join(RELEASES)}; default: {NEWEST}.")
+    ] = None,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     noise: Annotated[
         str, typer.Option(help="Sensors and estimates that err as a real vehicle's do: on or off.")
@@ -123,8 +135,12 @@ def simulate(
     vehicles: Annotated[
         int, typer.Option(help="A fleet of so many: system ids and ports count up from those given.")
     ] = 1,
-    spacing: Annotated[float, typer.Option(help="Metres between the vehicles of a fleet, on a grid.")] = 5.0,
-    camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
+    spacing: Annotated[
+        float | None, typer.Option(help="Metres between the vehicles of a fleet, on a grid; default: 5.")
+    ] = None,
+    camera_vehicle: Annotated[
+        int | None, typer.Option(help="Which vehicle of a fleet bears the camera; default: the first.")
+    ] = None,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a parameter of the autopilot, NAME=VALUE; may be repeated.")
     ] = None,
@@ -174,7 +190,8 @@ def simulate(
         sys.stdout = sys.stderr  # the pictures have standard output to themselves
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
-    _check("spacing", spacing, 0.5, 1000.0)
+    if spacing is not None:
+        _check("spacing", spacing, 0.5, 1000.0)
     if noise not in ("on", "off"):
         _fail(f"--noise {noise!r}: expected on or off")
     parameters = _parameters(param or [])
@@ -215,8 +232,23 @@ def simulate(
         console=console,
         control=control,
     )
+    if not options.shows_world:
+        _refuse_without_camera({"camera-rate": camera_rate, "camera-vehicle": camera_vehicle})
+        if scene is not None and truth is None:
+            _fail(
+                f"--scene {scene}: nobody sees it; add --camera NAME, --camera-output ADDRESS "
+                "or --truth PATH, or leave it out"
+            )
+    if spacing is not None and vehicles == 1:
+        _fail(f"--spacing {spacing:g}: there is one vehicle; add --vehicles N, or leave it out")
     try:
-        fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)
+        members = instance_options(
+            options,
+            vehicles,
+            DEFAULT_SPACING_M if spacing is None else spacing,
+            1 if camera_vehicle is None else camera_vehicle,
+        )
+        fleet = Fleet(members, on_event=_say)
     except PortInUseError as error:
         _fail(str(error))
     except UnknownParameterError as error:

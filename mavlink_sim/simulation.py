@@ -17,7 +17,6 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.faults.room import fault_room
 from mavlink_sim.personality import PX4, vehicle_class
-from mavlink_sim.releases import NEWEST
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.streams import GCS_RATES_HZ
@@ -57,7 +56,7 @@ class SimulationOptions:
         record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
         autopilot: whose manners it has, `personality.AUTOPILOTS`.
-        px4: the release of PX4 to be like, where they differ.
+        px4: the release of PX4 to be like, where they differ; None: the newest.
         speed: simulated seconds per real second.
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
@@ -88,7 +87,7 @@ class SimulationOptions:
     record: Path | None = None
     ready_after_s: float = 3.0
     autopilot: str = PX4
-    px4: str = NEWEST
+    px4: str | None = None
     speed: float = 1.0
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
