@@ -216,6 +216,24 @@ def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tm
         link.close()
 
 
+def test_ctrl_c_right_after_the_start_with_a_camera_is_quiet(tmp_path: Path) -> None:
+    name = f"camera-{tmp_path.parent.name}-{tmp_path.name}-{os.getpid()}"
+    ports = [str(port) for port in free_udp_ports(2)]
+    ends = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", ports[0], "--gcs-port", ports[1]]
+    with subprocess.Popen(
+        [sys.executable, "-m", "mavlink_sim", *ends, "--camera", name, "--no-console"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to every process
+        assert process.stdout.read() == "stopped\n"
+    assert process.returncode == 0
+
+
 # ---- the endpoint itself
 
 
