@@ -1,4 +1,4 @@
-"""`mavlink-sim bench`: how fast this machine flies, in lockstep and as a fleet.
+"""`mavlink-sim bench`: how fast this machine flies, in lockstep and as a fleet, and how fast it draws.
 
 Everything is measured in processor time of one core, so that what else the machine does hardly matters.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,9 +17,14 @@ from mavlink_sim.testing import free_udp_ports
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
+if TYPE_CHECKING:
+    from vision.camera_model import CameraModel
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 FLEET_STEP_S = 0.004
+SLICES = 5  # the best slice counts: what was disturbed does not
+LENS = (-0.12, 0.03, 0.0005, -0.0003)  # k1, k2, p1, p2 of a cheap wide lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +44,21 @@ class LockstepFigures:
     both_bytes: float
 
 
+@dataclass(frozen=True, slots=True)
+class CameraFigures:
+    """Frames a second of one core, 640x480, colour and metric depth, from a vehicle that flies and turns.
+
+    Attributes:
+        plain: a pinhole camera over the demonstration's world, which `--camera` shows without a scene.
+        distorted: the same through a lens with radial and tangential distortion.
+        busy: a pinhole camera over the scene `village`, whose objects are more, and move.
+    """
+
+    plain: float
+    distorted: float
+    busy: float
+
+
 def airborne(links: dict[str, dict[str, float]], seed: int = 1) -> LockstepVehicle:
     """A vehicle that follows setpoints of 20 Hz in OFFBOARD."""
     vehicle = LockstepVehicle(links, seed=seed)
@@ -56,10 +76,10 @@ def airborne(links: dict[str, dict[str, float]], seed: int = 1) -> LockstepVehic
 def _times_real_time(links: dict[str, dict[str, float]], seconds: float, packed: bool) -> float:
     vehicle = airborne(links)
     best = math.inf
-    slices = 5  # the best slice: what was disturbed does not count
-    for _ in range(slices):
+    steps = max(round(seconds / SLICES / 0.1), 1)
+    for _ in range(SLICES):
         started = time.process_time()
-        for _ in range(round(seconds / slices / 0.1)):
+        for _ in range(steps):
             vehicle.step(0.1)
             for link in links:
                 if packed:
@@ -67,7 +87,7 @@ def _times_real_time(links: dict[str, dict[str, float]], seconds: float, packed:
                 else:
                     vehicle.receive(link)
         best = min(best, time.process_time() - started)
-    return seconds / slices / best
+    return steps * 0.1 / best
 
 
 def measure_lockstep(seconds: float = 20.0) -> LockstepFigures:
@@ -100,7 +120,7 @@ def measure_fleet(vehicles: int = 20, seconds: float = 3.0) -> float:
             for link in simulation.vehicle.links:
                 simulation.vehicle.outgoing(link)
         best = math.inf
-        for _ in range(round(seconds)):
+        for _ in range(max(round(seconds), 1)):
             started = time.process_time()
             for _ in range(round(1.0 / FLEET_STEP_S)):
                 for simulation in fleet:
@@ -110,6 +130,49 @@ def measure_fleet(vehicles: int = 20, seconds: float = 3.0) -> float:
         return best
 
 
+def measure_camera(frames: int = 100) -> CameraFigures:
+    """Draw so many frames in each way, but no fewer than one a slice."""
+    import cv2  # the other figures need no OpenCV
+
+    from mavlink_sim.camera.renderer import DEFAULT_CAMERA
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        distorted = replace(DEFAULT_CAMERA, distortion=LENS)
+        return CameraFigures(
+            _frames_a_second(None, DEFAULT_CAMERA, frames),
+            _frames_a_second(None, distorted, frames),
+            _frames_a_second("village", DEFAULT_CAMERA, frames),
+        )
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _frames_a_second(scene: str | None, model: CameraModel, frames: int) -> float:
+    from mavlink_sim.camera.scene import CameraSettings
+    from mavlink_sim.camera.scene_file import scene_or_demo
+    from mavlink_sim.camera.simulated_camera import SimulatedCamera
+    from vision.rotation import matrix_from_quaternion, quaternion_from_euler
+
+    camera = SimulatedCamera(replace(scene_or_demo(scene, 0), camera=CameraSettings(model)))
+
+    def draw(number: int) -> None:
+        time_s = number / 30.0
+        attitude = matrix_from_quaternion(quaternion_from_euler(0.05, -0.05, 0.2 * time_s))
+        camera.capture((2.0 * time_s, 0.0, -5.0), attitude, round(time_s * 1e9), time_s)
+
+    draw(0)  # the ground is painted
+    count = max(frames // SLICES, 1)
+    best = math.inf
+    for part in range(SLICES):
+        started = time.process_time()
+        for number in range(part * count, (part + 1) * count):
+            draw(number + 1)
+        best = min(best, time.process_time() - started)
+    return count / best
+
+
 @app.command()
 def bench(
     vehicles: Annotated[int, typer.Option(min=1, max=250, help="Size of the fleet.")] = 20,
@@ -117,7 +180,7 @@ def bench(
         float, typer.Option(min=1.0, max=600.0, help="Simulated seconds of each flight.")
     ] = 20.0,
 ) -> None:
-    """Print how many times faster than real time one core flies a vehicle, and what a fleet costs."""
+    """Print how fast one core flies a vehicle and draws a camera's frames, and what a fleet costs."""
     figures = measure_lockstep(seconds)
     print(f"lockstep, physics and autopilot:       {figures.quiet:6.0f} times real time")
     print(f"lockstep, onboard link, messages:      {figures.onboard:6.0f} times real time")
@@ -128,6 +191,10 @@ def bench(
         f"fleet of {vehicles} on UDP, all streams: {100 * share:.0f} % of one core in real time, "
         f"{100 * share / vehicles:.1f} % a vehicle"
     )
+    drawn = measure_camera()
+    print(f"camera, 640x480, colour and depth:     {drawn.plain:6.0f} frames a second")
+    print(f"camera, the same through a lens:       {drawn.distorted:6.0f} frames a second")
+    print(f"camera, scene village:                 {drawn.busy:6.0f} frames a second")
 
 
 if __name__ == "__main__":

@@ -18,13 +18,15 @@ from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.personality import AUTOPILOTS, PX4
 from mavlink_sim.px4.parameters import UnknownParameterError
-from mavlink_sim.releases import NEWEST
+from mavlink_sim.releases import NEWEST, RELEASES
 from mavlink_sim.simulation import SimulationOptions
 from mavlink_sim.wire.endpoint import PortInUseError
 from mavlink_sim.wire.signing import ALWAYS, key_of
 
 # Tilted by 45 degrees, the airframe (SIH's, with its large drag) holds against little more than this.
 MAX_WIND_MPS = 8.0
+DEFAULT_SPACING_M = 5.0
+MAX_GUSTS_MPS = 4.0  # two standard deviations of it are that wind
 
 # click's UsageError, by way of its public subclass: some versions of typer carry a click of their own
 _USAGE_ERROR: Any = typer.BadParameter.__base__
@@ -63,6 +65,15 @@ def _say_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _refuse_without_camera(given: dict[str, float | None]) -> None:
+    for name, value in given.items():
+        if value is not None:
+            _fail(
+                f"--{name} {value:g}: there is no camera; add --camera NAME or --camera-output ADDRESS, "
+                "or leave it out"
+            )
+
+
 def _check(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         _fail(f"--{name} {value:g}: expected {low:g} to {high:g}")
@@ -82,6 +93,12 @@ def simulate(
     system_id: Annotated[int, typer.Option(help="MAVLink system id, 1 to 255.")] = 1,
     seed: Annotated[int, typer.Option(help="Of the wind, the gusts and the world.")] = 0,
     wind: Annotated[float, typer.Option(help="Steady wind in m/s; the seed chooses its direction.")] = 0.0,
+    gusts: Annotated[
+        float | None,
+        typer.Option(
+            help="Gusts in m/s, standard deviation per axis; 0: none; default: 0.6 and 15 % of --wind."
+        ),
+    ] = None,
     camera: Annotated[
         str | None, typer.Option(help="Render a camera into this shared memory; read it as shm://NAME.")
     ] = None,
@@ -108,7 +125,9 @@ def simulate(
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
     ] = 3.0,
     autopilot: Annotated[str, typer.Option(help="Whose manners it has: px4 or ardupilot (Copter).")] = PX4,
-    px4: Annotated[str, typer.Option(help="PX4 release to be like: 1.14, 1.15, 1.16 or 1.17.")] = NEWEST,
+    px4: Annotated[
+        str | None, typer.Option(help=f"PX4 release to be like: {', '.join(RELEASES)}; default: {NEWEST}.")
+    ] = None,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     noise: Annotated[
         str, typer.Option(help="Sensors and estimates that err as a real vehicle's do: on or off.")
@@ -116,8 +135,12 @@ def simulate(
     vehicles: Annotated[
         int, typer.Option(help="A fleet of so many: system ids and ports count up from those given.")
     ] = 1,
-    spacing: Annotated[float, typer.Option(help="Metres between the vehicles of a fleet, on a grid.")] = 5.0,
-    camera_vehicle: Annotated[int, typer.Option(help="Which vehicle of a fleet bears the camera.")] = 1,
+    spacing: Annotated[
+        float | None, typer.Option(help="Metres between the vehicles of a fleet, on a grid; default: 5.")
+    ] = None,
+    camera_vehicle: Annotated[
+        int | None, typer.Option(help="Which vehicle of a fleet bears the camera; default: the first.")
+    ] = None,
     param: Annotated[
         list[str] | None, typer.Option(help="Set a parameter of the autopilot, NAME=VALUE; may be repeated.")
     ] = None,
@@ -159,13 +182,16 @@ def simulate(
         _check(name, port, 0 if name.endswith("bind") else 1, 65535)
     _check("system-id", system_id, 1, 255)
     _check("wind", wind, 0.0, MAX_WIND_MPS)
+    if gusts is not None:
+        _check("gusts", gusts, 0.0, MAX_GUSTS_MPS)
     if camera_rate is not None:
         _check("camera-rate", camera_rate, 1.0, 120.0)
     if STANDARD_OUTPUT in (camera_output or []):
         sys.stdout = sys.stderr  # the pictures have standard output to themselves
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
-    _check("spacing", spacing, 0.5, 1000.0)
+    if spacing is not None:
+        _check("spacing", spacing, 0.5, 1000.0)
     if noise not in ("on", "off"):
         _fail(f"--noise {noise!r}: expected on or off")
     parameters = _parameters(param or [])
@@ -186,6 +212,7 @@ def simulate(
         system_id=system_id,
         seed=seed,
         wind_mps=wind,
+        gusts_mps=gusts,
         camera=camera,
         camera_rate_hz=camera_rate,
         camera_outputs=tuple(camera_output or ()),
@@ -205,8 +232,23 @@ def simulate(
         console=console,
         control=control,
     )
+    if not options.shows_world:
+        _refuse_without_camera({"camera-rate": camera_rate, "camera-vehicle": camera_vehicle})
+        if scene is not None and truth is None:
+            _fail(
+                f"--scene {scene}: nobody sees it; add --camera NAME, --camera-output ADDRESS "
+                "or --truth PATH, or leave it out"
+            )
+    if spacing is not None and vehicles == 1:
+        _fail(f"--spacing {spacing:g}: there is one vehicle; add --vehicles N, or leave it out")
     try:
-        fleet = Fleet(instance_options(options, vehicles, spacing, camera_vehicle), on_event=_say)
+        members = instance_options(
+            options,
+            vehicles,
+            DEFAULT_SPACING_M if spacing is None else spacing,
+            1 if camera_vehicle is None else camera_vehicle,
+        )
+        fleet = Fleet(members, on_event=_say)
     except PortInUseError as error:
         _fail(str(error))
     except UnknownParameterError as error:

@@ -56,7 +56,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers",
         "vehicle(**options): options of the `vehicle` fixture: those of the command mavlink-sim, "
-        "with underscores (wind=5, speed=4, seed=1…), and parameters={NAME: value}",
+        "with underscores (wind=5, gusts=0, speed=4, seed=1…), and parameters={NAME: value}",
     )
 
 

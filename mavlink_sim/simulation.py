@@ -18,7 +18,6 @@ from typing import IO, TYPE_CHECKING, Any
 from mavlink_sim.faults.room import fault_room
 from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.real_time import run_together
-from mavlink_sim.releases import NEWEST
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.streams import GCS_RATES_HZ
@@ -48,6 +47,7 @@ class SimulationOptions:
         onboard_port, gcs_port: UDP ports the vehicle sends to at first.
         onboard_bind, gcs_bind: UDP ports it binds; 0 chooses free ones.
         wind_mps: steady wind; seed chooses its direction, the gusts and the world.
+        gusts_mps: standard deviation of the gusts per axis; None for the usual ones, 0 for none.
         world_seed: chooses them instead, the same for all vehicles of a fleet; None: `seed`.
         camera: name of the shared-memory segment the camera's frames go to; None for no shared memory.
         camera_outputs: further addresses the frames go to (`video_outputs`).
@@ -57,7 +57,7 @@ class SimulationOptions:
         record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
         autopilot: whose manners it has, `personality.AUTOPILOTS`.
-        px4: the release of PX4 to be like, where they differ.
+        px4: the release of PX4 to be like, where they differ; None: the newest.
         speed: simulated seconds per real second.
         noise: whether sensors and estimates err as a real vehicle's do.
         start_ned_m: north and east of SIH's home, where it starts and its local frame begins.
@@ -78,6 +78,7 @@ class SimulationOptions:
     seed: int = 0
     world_seed: int | None = None
     wind_mps: float = 0.0
+    gusts_mps: float | None = None
     camera: str | None = None
     camera_rate_hz: float | None = None
     camera_outputs: tuple[str, ...] = ()
@@ -87,7 +88,7 @@ class SimulationOptions:
     record: Path | None = None
     ready_after_s: float = 3.0
     autopilot: str = PX4
-    px4: str = NEWEST
+    px4: str | None = None
     speed: float = 1.0
     noise: bool = True
     start_ned_m: tuple[float, float] = (0.0, 0.0)
@@ -120,6 +121,7 @@ class Simulation:
             seed=options.seed,
             air_seed=options.world_seed,
             wind_mps=options.wind_mps,
+            gusts_mps=options.gusts_mps,
             parameters=options.parameters,
             ready_after_s=options.ready_after_s,
             px4=options.px4,

@@ -218,8 +218,8 @@ def running_simulator(
         faults: each as `mavlink-sim --fault` takes it; `RunningSimulator.fault` brings more while it flies.
         timeout_s: for the ready line.
         options: the other options of `mavlink-sim`, with underscores (`seed=1`, `speed=4.0`, `camera="name"`,
-            `truth=path`, `wind=3.0`, `system_id=2`, `vehicles=3`); True for an option without a value, None
-            for none.
+            `truth=path`, `wind=3.0`, `gusts=0.0`, `system_id=2`, `vehicles=3`); True for an option without a
+            value, None for none.
     """
     count = int(options.get("vehicles") or 1)  # type: ignore[arg-type]
     ports = free_udp_ports(2)
@@ -232,6 +232,8 @@ def running_simulator(
         "gcs_bind": gcs_bind,
         **options,
     }
+    if isinstance(options.get("noise"), bool):  # the one option whose value is a word for yes or no
+        arguments["noise"] = "on" if options["noise"] else "off"
     command = [sys.executable, "-m", "mavlink_sim"]
     for name, value in arguments.items():
         if value is None or value is False:

@@ -64,7 +64,7 @@ class Vehicle:
         parameters: PX4 parameters that differ from `parameters.txt`.
         gimbal: with a two-axis gimbal and its parameters.
         ready_after_s: how long after boot the estimator allows arming.
-        px4: the release of PX4 to be like, where they differ (`releases.RELEASES`).
+        px4: the release of PX4 to be like, where they differ (`releases.RELEASES`); None: the newest.
         start_ned_m: where it starts, north and east of SIH's home; its local NED frame begins there.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
@@ -96,12 +96,12 @@ class Vehicle:
         parameters: Mapping[str, float] | None = None,
         gimbal: bool = False,
         ready_after_s: float = 3.0,
-        px4: str = NEWEST,
+        px4: str | None = None,
         start_ned_m: tuple[float, float] = (0.0, 0.0),
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
-        self.release = release_named(px4)
+        self.release = release_named(NEWEST if px4 is None else px4)
         self.parameters = self.parameters_class(parameters, gimbal)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:

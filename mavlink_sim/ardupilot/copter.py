@@ -22,7 +22,7 @@ class CopterVehicle(Vehicle):
         own_intervals: by link, the messages whose interval was set one by one.
 
     Raises:
-        ValueError: a gimbal was asked for.
+        ValueError: a gimbal or a release of PX4 was asked for.
     """
 
     autopilot_class = CopterAutopilot
@@ -32,6 +32,8 @@ class CopterVehicle(Vehicle):
     def __init__(self, **options: Any) -> None:
         if options.get("gimbal"):
             raise ValueError("an ArduPilot vehicle has no gimbal here: leave it out, or fly a PX4")
+        if options.get("px4") is not None:
+            raise ValueError(f"PX4 {options['px4']} means nothing to an ArduPilot vehicle: leave --px4 out")
         self.own_intervals: dict[str, set[str]] = {}
         super().__init__(**options)
 

@@ -20,6 +20,7 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from types import FrameType
 
 import cv2
 import numpy as np
@@ -55,10 +56,13 @@ def run_camera(
     ground has been painted and the first frame can be drawn without delay.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
+    signal.signal(signal.SIGTERM, _end)  # or by this, for painting the ground does not look at the pipe
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     cv2.setNumThreads(1)
     model, mount = scene.camera.model, scene.camera.mount
     SimulatedCamera(scene).capture((0.0, 0.0, -2.0), np.eye(3), 0)
     camera = SimulatedCamera(scene)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # from here on outputs have to be closed: the pipe it is
     with ExitStack() as resources:
         sinks = [open_output(address, model.width, model.height, rate_hz) for address in outputs]
         for sink in sinks:
@@ -104,6 +108,10 @@ def run_camera(
             taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned)
             if taken is not None:
                 on_the_way.append(taken)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(0)
 
 
 def _newest(poses: Connection, timeout_s: float | None) -> bytes | None:
@@ -168,7 +176,12 @@ class CameraProcess:
 
     def start(self) -> None:
         """Start the process; returns at once. Its first frame comes when the ground is painted (seconds)."""
-        self._process.start()
+        # Ctrl-C reaches every process of a terminal; the new one must not complain before it can ignore that
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self._receiving.close()
 
     @property
@@ -221,12 +234,14 @@ class CameraProcess:
                 logger.error("the camera process is gone (exit code %s)", self._process.exitcode)
 
     def stop(self, timeout_s: float = 5.0) -> None:
-        """Close the pipe and wait for the process to end; kill it if it does not."""
+        """Close the pipe and wait for the process to end, also while it starts; kill it if it does not."""
         for connection in (self._sending, self._receiving):
             with contextlib.suppress(OSError):
                 connection.close()
         if self._process.pid is None:
             return
+        if not self.ready:
+            self._process.terminate()
         self._process.join(timeout_s)
         if self._process.is_alive():
             logger.warning("the camera process did not end in %.1f s; killing it", timeout_s)

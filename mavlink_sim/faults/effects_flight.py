@@ -23,6 +23,8 @@ DEAD_RECKONING_S = 5.0  # EKF2_NOAID_TOUT
 REACQUISITION_S = 1.0  # from the first fix to a position that is fused again
 DEAD_RECKONING_BIAS_MPS2 = 0.03  # of an accelerometer, after PX4 learnt most of it
 GUST_S = 4.0
+# Between PX4's default thresholds (BAT_LOW_THR 0.15, BAT_CRIT_THR 0.07, BAT_EMERGEN_THR 0.05).
+CHARGE_OF_WARNING = {"low": 0.14, "critical": 0.065, "emergency": 0.04}
 WARNING, INFO = 4, 6  # MAV_SEVERITY
 
 # Commands that are a request for a mode; DO_SET_MODE (176) names it in its parameters.
@@ -150,9 +152,14 @@ def _attributes(value: object) -> list[object]:
 
 
 def battery(vehicle: Vehicle, one: ActiveFault) -> None:
-    """So much charge is left, and goes on being used while armed."""
+    """So much charge is left: a number goes on being used while armed, a warning's name holds at it.
+
+    It is checked even where CBRK_SUPPLY_CHK switches that off, as it does by default.
+    """
     cells = vehicle.autopilot.supervision.battery
-    cells.forced_charge = one.fault.values["remaining"]
+    remaining = one.fault.values["remaining"]
+    cells.forced_charge_holds = remaining in CHARGE_OF_WARNING
+    cells.forced_charge = CHARGE_OF_WARNING.get(remaining, remaining)
     cells.settle()
 
     def undo() -> None:

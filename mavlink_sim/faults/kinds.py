@@ -22,10 +22,9 @@ if TYPE_CHECKING:
 Effect = Callable[["Vehicle", "ActiveFault"], None]
 
 
-def _battery(text: str) -> float:
-    words = {"low": 0.14, "critical": 0.065, "emergency": 0.04}
-    if text.lower() in words:
-        return words[text.lower()]
+def _battery(text: str) -> float | str:
+    if text.lower() in flight.CHARGE_OF_WARNING:
+        return text.lower()
     try:
         return number(0.0, 1.0)(text)
     except ValueError:
@@ -154,7 +153,7 @@ _TABLE: tuple[tuple[Kind, Effect], ...] = (
         Kind(
             "battery",
             "so much is left",
-            (Field("remaining", _battery, REQUIRED, "0 to 1, or low, critical…"),),
+            (Field("remaining", _battery, REQUIRED, "0 to 1, or low, critical, emergency"),),
         ),
         flight.battery,
     ),

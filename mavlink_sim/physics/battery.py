@@ -41,7 +41,9 @@ class Battery:
         remaining: what the autopilot believes of it, 0..1.
         volts: under load, of all cells. current_a: as measured, -1 without a sensor.
         discharged_mah: used since the start.
-        forced_charge: a fault: the true charge is this, whatever was used; None without one.
+        forced_charge: a fault: the true charge is this, whatever was used; None without one. While there is
+            one, warnings count whatever CBRK_SUPPLY_CHK is.
+        forced_charge_holds: it stays what it is, instead of being used on.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -49,6 +51,7 @@ class Battery:
         self._revision = -1
         self.charge = 1.0
         self.forced_charge: float | None = None
+        self.forced_charge_holds = False
         self.current_a = SIMULATED_CURRENT_A
         self.discharged_mah = 0.0
         self._load()
@@ -90,12 +93,16 @@ class Battery:
 
     @property
     def checked_warning(self) -> BatteryWarning:
-        """The warning that arming checks and failsafes act on: none while CBRK_SUPPLY_CHK is 894281."""
+        """The warning that arming checks and failsafes act on: none while the battery is not checked."""
         return self.warning if self.is_checked and self.connected else BatteryWarning.NONE
 
     @property
     def is_checked(self) -> bool:
-        return int(self._parameters.number("CBRK_SUPPLY_CHK")) != SUPPLY_CHECK_OFF
+        """Not while CBRK_SUPPLY_CHK is 894281, as in SIH; a fault of the battery is checked all the same."""
+        return (
+            self.forced_charge is not None
+            or int(self._parameters.number("CBRK_SUPPLY_CHK")) != SUPPLY_CHECK_OFF
+        )
 
     @property
     def charge_state(self) -> int:
@@ -126,8 +133,8 @@ class Battery:
         else:
             self.current_a = SIMULATED_CURRENT_A
             self.charge = max(self.charge - dt_s / self._drain_s, self._lowest) if armed else 1.0
-            if self.forced_charge is not None and armed:
-                self.forced_charge = max(self.forced_charge - dt_s / self._drain_s, 0.0)
+            if armed:
+                self._use_forced(dt_s / self._drain_s)
         cell = self._cell_under_no_load()
         load_a = max(self.current_a, 0.0)
         self.volts = self._cells * (cell - load_a * self._resistance_ohm)
@@ -151,11 +158,14 @@ class Battery:
         self.current_a = AVIONICS_CURRENT_A + motors
         used = self.current_a * dt_s / 3.6 / self._capacity_mah
         self.charge = max(self.charge - used, 0.0)
-        if self.forced_charge is not None:
-            self.forced_charge = max(self.forced_charge - used, 0.0)
+        self._use_forced(used)
         if armed:
             blend = min(1.0, dt_s / CURRENT_AVERAGE_S)
             self._average_current_a += (self.current_a - self._average_current_a) * blend
+
+    def _use_forced(self, used: float) -> None:
+        if self.forced_charge is not None and not self.forced_charge_holds:
+            self.forced_charge = max(self.forced_charge - used, 0.0)
 
     def _voltage_charge(self) -> float:
         span = max(self._charged_v - self._empty_v, 0.01)

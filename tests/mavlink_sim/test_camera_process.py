@@ -104,6 +104,31 @@ def test_stopping_ends_the_process_and_removes_the_memory(camera: CameraProcess)
     assert not segment_path(camera.shared_name).exists()
 
 
+def _ignores_interrupts(pid: int) -> bool:
+    """Whether the camera's own code runs already: what it does first is to ignore SIGINT."""
+    with open(f"/proc/{pid}/status", encoding="ascii") as status:
+        ignored = next(line for line in status if line.startswith("SigIgn"))
+    return bool(int(ignored.split()[1], 16) >> (signal.SIGINT - 1) & 1)
+
+
+@pytest.mark.parametrize("painting", [False, True], ids=["while it is imported", "while it paints"])
+def test_a_camera_that_is_still_starting_ends_at_once_and_without_a_word(
+    name: str, painting: bool, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    vast = World((), Ground(("meadow", "grass", "rows"), 0, 2048, 0.05))  # seconds of painting
+    camera = CameraProcess(vast, CAMERA, CameraMount(), 60.0, name)
+    camera.start()
+    assert camera.pid is not None
+    if painting:
+        until(lambda: _ignores_interrupts(camera.pid), "the camera's own code")
+    os.kill(camera.pid, signal.SIGINT)  # Ctrl-C reaches it as well
+    camera.stop()
+    assert not camera.alive
+    assert not camera.ready  # it did not go on until then
+    assert not segment_path(name).exists()
+    assert (caplog.text, capfd.readouterr().err) == ("", "")
+
+
 def test_poses_to_a_dead_or_hung_camera_do_not_block(camera: CameraProcess) -> None:
     first_frame(camera, (0.0, 0.0, -2.0), 0.0)
     assert camera.pid is not None

@@ -244,13 +244,50 @@ def test_a_battery_has_what_it_is_given_and_is_used_up(cockpit) -> None:
 
 
 def test_a_battery_that_fails_brings_the_vehicle_down(make_cockpit) -> None:
-    cockpit = make_cockpit(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
+    cockpit = make_cockpit(parameters={"COM_FAIL_ACT_T": 0})
     cockpit.take_off(5.0)
     begin(cockpit, "battery emergency")
     cockpit.fly(0.1)
     assert cockpit.mode == "LAND"
     assert "failsafe: battery emergency, LAND" in cockpit.events
     assert cockpit.heartbeat().system_status == 5
+
+
+@pytest.mark.parametrize(
+    ("warning", "percent", "charge_state", "text", "mode"),
+    [
+        ("low", 14, 2, "Low battery\t", "HOLD"),
+        ("critical", 7, 3, "Critical battery\t", "RTL"),
+        ("emergency", 4, 4, "Emergency battery level\t", "LAND"),
+    ],
+)
+def test_a_battery_warning_holds_and_has_its_failsafe_by_default(
+    cockpit, warning, percent, charge_state, text, mode
+) -> None:
+    cockpit.heartbeats.append(("gcs", (245, 190), 6))  # texts go to a ground station that speaks
+    cockpit.take_off(30.0)
+    begin(cockpit, f"battery {warning}")
+    cockpit.fly(12.0)  # an unhurried client's time to see it
+    assert text in cockpit.texts()
+    assert newest(cockpit, "SYS_STATUS").battery_remaining == percent
+    assert newest(cockpit, "BATTERY_STATUS").charge_state == charge_state
+    warnings = [line for line in cockpit.events if line.startswith("battery")]
+    assert warnings == [f"battery {warning}: {percent}%"]  # and no worse one after it
+    assert cockpit.mode == mode
+
+
+def test_after_a_battery_fault_the_breaker_counts_again(cockpit) -> None:
+    cockpit.wait_ready()
+    begin(cockpit, "battery critical")
+    cockpit.fly(0.1)
+    assert cockpit.command(400, 1) == [1]
+    cockpit.vehicle.faults.end()
+    cockpit.fly(0.1)
+    assert cockpit.command(400, 1) == [0]
+    cockpit.vehicle.autopilot.supervision.battery.charge = 0.04
+    cockpit.fly(0.1)
+    assert cockpit.vehicle.parameters.number("CBRK_SUPPLY_CHK") == 894281
+    assert not cockpit.vehicle.autopilot.supervision.battery.is_checked
 
 
 def test_of_two_failsafes_the_worse_one_is_flown(make_cockpit, velocity_setpoint) -> None:

@@ -4,23 +4,43 @@ import itertools
 
 import pytest
 
-from mavlink_sim.fuzz import Fuzzer, fuzz_in_lockstep, fuzz_over_sockets
-from mavlink_sim.services.microservices import HANDLERS
+from mavlink_sim.fuzz import Fuzzer, SocketReport, Target, fuzz_in_lockstep, fuzz_over_sockets
 from mavlink_sim.wire.messages import parser
 
+TARGETS = [Target(), Target(gimbal=True), Target("ardupilot"), Target(signed=True)]
+NAMES = ["px4", "gimbal", "ardupilot", "signed"]
 
+
+@pytest.mark.parametrize("target", TARGETS, ids=NAMES)
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_vehicle_in_lockstep_bears_mutated_mavlink(seed: int) -> None:
-    report = fuzz_in_lockstep(seed, 1500)
-    assert report.messages > 800
+def test_a_vehicle_in_lockstep_bears_mutated_mavlink(seed: int, target: Target) -> None:
+    report = fuzz_in_lockstep(seed, 1500, target)
+    assert report.messages > (300 if target.signed else 800)
+    assert (report.refused > 300) is target.signed
     assert report.simulated_s == pytest.approx(6.0)
 
 
-def test_a_running_vehicle_answers_its_client_through_a_flood() -> None:
-    report = fuzz_over_sockets(seed=4, seconds=4.0)
+@pytest.mark.alone
+@pytest.mark.parametrize(
+    "target",
+    [Target(), Target("ardupilot"), Target(gimbal=True, signed=True)],
+    ids=["px4", "ardupilot", "gimbal and signed"],
+)
+def test_a_running_vehicle_answers_its_client_through_a_flood_and_keeps_its_time(target: Target) -> None:
+    report = fuzz_over_sockets(seed=4, seconds=8.0, target=target)  # it judges its pace every 5 s
     assert report.datagrams > 400
     assert report.answers > 0
+    assert report.kept_up, report.said
+    assert report.boot_s > 0.98 * report.wall_s
     assert report.load < 0.9  # of one processor's time: it never works its loop full
+
+
+def test_a_vehicle_that_was_slowed_is_found_out() -> None:
+    report = SocketReport(seed=1)
+    assert report.kept_up
+    report.said["cannot keep up"] += 1
+    assert not report.kept_up
+    assert "COULD NOT KEEP UP" in report.text()
 
 
 def test_the_same_seed_throws_the_same_bytes() -> None:
@@ -29,8 +49,9 @@ def test_the_same_seed_throws_the_same_bytes() -> None:
     assert one != list(itertools.islice(Fuzzer(10).datagrams(), 500))
 
 
-def test_most_frames_are_whole_and_every_handler_is_met() -> None:
-    fuzzer = Fuzzer(5)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_most_frames_are_whole_and_every_handler_is_met(autopilot: str) -> None:
+    fuzzer = Fuzzer(5, Target(autopilot))
     reader = parser()
     met: set[str] = set()
     for datagram in itertools.islice(fuzzer.datagrams(), 6000):
@@ -44,4 +65,4 @@ def test_most_frames_are_whole_and_every_handler_is_met() -> None:
         "old version",
         "burst",
     }
-    assert set(HANDLERS) - {"SETUP_SIGNING"} <= met
+    assert set(Target(autopilot).handlers) - {"SETUP_SIGNING"} <= met

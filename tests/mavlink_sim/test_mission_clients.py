@@ -13,6 +13,7 @@ from mavsdk.asyncio.plugins.action import ActionAsync
 from mavsdk.asyncio.plugins.geofence import GeofenceAsync
 from mavsdk.asyncio.plugins.mission import MissionAsync
 from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
+from mavsdk.asyncio.plugins.offboard import OffboardAsync, VelocityNedYaw
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.plugins.geofence.geofence import Circle, FenceType, GeofenceData, Point, Polygon
 from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
@@ -37,12 +38,15 @@ async def wait_for(updates: Any, condition: Callable[[Any], bool]) -> Any:
 
 
 @asynccontextmanager
-async def flown_by_mavsdk(speed: float = 1.0) -> AsyncIterator[tuple[RunningSimulator, Any]]:
-    """A vehicle in its process and MAVSDK's view of it, ready to arm."""
+async def flown_by_mavsdk(
+    speed: float = 1.0, of_ground_station: bool = False
+) -> AsyncIterator[tuple[RunningSimulator, Any]]:
+    """A vehicle in its process and MAVSDK's view of it, ready to arm, on the onboard link or the other."""
     with running_simulator(speed=speed, parameters={"RTL_RETURN_ALT": 5.0}) as simulator:
         configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
         async with Mavsdk(configuration) as mavsdk:
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.onboard_port}")
+            port = simulator.gcs_port if of_ground_station else simulator.onboard_port
+            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
             system = await mavsdk.first_autopilot(20.0)
             assert system is not None
             await wait_for(TelemetryAsync(system).subscribe_health(), lambda health: health.is_armable)
@@ -152,3 +156,41 @@ async def test_mavsdk_sets_and_clears_a_geofence() -> None:
 
         await fence.clear_geofence()
         assert not (await fence.download_geofence()).circles
+
+
+async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> None:
+    # in real time: texts go to a ground station whose heartbeat comes often enough
+    async with flown_by_mavsdk(1.0, of_ground_station=True) as (simulator, system):
+        fence, telemetry = GeofenceAsync(system), TelemetryAsync(system)
+        action, offboard = ActionAsync(system), OffboardAsync(system)
+        texts: list[str] = []
+
+        async def listen() -> None:
+            async for status in telemetry.subscribe_status_text():
+                texts.append(status.text)
+
+        def told(words: str) -> bool:
+            return any(words in text for text in texts)
+
+        listening = asyncio.create_task(listen())
+        await fence.upload_geofence(GeofenceData([], [Circle(Point(*place(0, 0)), 8.0, FenceType.INCLUSION)]))
+        await action.arm()
+        await action.takeoff()
+        await asyncio.to_thread(simulator.wait_for_event, "mode HOLD", LIMIT_S)
+        await offboard.set_velocity_ned(VelocityNedYaw(3.0, 0.0, 0.0, 0.0))
+        await offboard.start()
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
+        assert not told("Geofence")
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
+        outside = await wait_for(telemetry.subscribe_position_velocity_ned(), lambda _: True)
+        assert outside.position.north_m > 7.0
+        async with asyncio.timeout(LIMIT_S):
+            while not told("Geofence: approaching or outside geofence") or not told("Failsafe activated"):
+                await asyncio.sleep(0.05)
+        assert "failsafe: geofence breached, HOLD" in simulator.events
+        stopped = await wait_for(
+            telemetry.subscribe_position_velocity_ned(), lambda seen: abs(seen.velocity.north_m_s) < 0.3
+        )
+        assert stopped.position.north_m < 20.0
+        assert not await offboard.is_active()
+        listening.cancel()

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from mavlink_sim import LockstepVehicle
 from mavlink_sim.releases import RELEASES, release_named
 from mavlink_sim.wire.messages import dialect
 
@@ -51,3 +52,8 @@ def test_the_version_that_is_reported_is_the_releases(make_cockpit: Any, release
 def test_a_release_that_is_not_known_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"'2\.0'.*1\.14, 1\.15, 1\.16, 1\.17"):
         release_named("2.0")
+
+
+def test_an_ardupilot_vehicle_in_lockstep_has_no_release_of_px4() -> None:
+    with pytest.raises(ValueError, match=r"PX4 1\.14 means nothing to an ArduPilot"):
+        LockstepVehicle(autopilot="ardupilot", px4="1.14")

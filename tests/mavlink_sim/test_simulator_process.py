@@ -1,6 +1,7 @@
 """`mavlink-sim` as a process: its options, its ports, its words, its end."""
 
 import json
+import math
 import os
 import signal
 import socket
@@ -39,9 +40,17 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         (["--bogus"], ["--bogus"]),
         (["--camera", "a/b"], ["'a/b'"]),
         (["--wind", "-3"], ["--wind", "0 to 8"]),
+        (["--gusts", "-1"], ["--gusts", "0 to 4"]),
+        (["--gusts", "nan"], ["--gusts", "0 to 4"]),
         (["--onboard-port", "0"], ["--onboard-port", "1 to 65535"]),
         (["--gcs-bind", "70000"], ["--gcs-bind", "0 to 65535"]),
         (["--system-id", "256"], ["--system-id", "1 to 255"]),
+        (["--autopilot", "ardupilot", "--px4", "1.14"], ["1.14", "ArduPilot", "--px4"]),
+        (["--autopilot", "ardupilot", "--gimbal"], ["ArduPilot", "gimbal"]),
+        (["--camera-rate", "10"], ["--camera-rate 10", "no camera", "--camera NAME"]),
+        (["--camera-vehicle", "1"], ["--camera-vehicle 1", "no camera"]),
+        (["--scene", "village"], ["--scene village", "nobody sees it", "--camera NAME"]),
+        (["--spacing", "7"], ["--spacing 7", "one vehicle", "--vehicles N"]),
         (["--host", "not.a.host.invalid"], ["not.a.host.invalid"]),
         (["--truth", "/nonexistent/folder/truth.jsonl"], ["truth.jsonl"]),
     ],
@@ -86,6 +95,27 @@ def test_a_taken_port_gives_one_clear_line_and_code_two() -> None:
 def test_the_version_is_told() -> None:
     finished = run("--version")
     assert (finished.returncode, finished.stdout) == (0, f"mavlink-sim {version('mavlink-companion')}\n")
+
+
+def wander_m(truth: Path, **options: float | str) -> float:
+    """How far a vehicle that holds its position gets from where it began to, horizontally, within 10 s."""
+    with running_simulator(truth=truth, speed=10.0, ready_after=0.0, **options) as simulator:
+        link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
+        link.wait_heartbeat(timeout=20)
+        link.mav.command_long_send(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+        link.mav.command_long_send(1, 1, 22, 0, *([math.nan] * 7))
+        simulator.wait_for_event("mode HOLD", 60.0)
+        held_ms = link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms
+        while link.recv_match(type="ATTITUDE", blocking=True, timeout=20).time_boot_ms < held_ms + 12_000:
+            pass
+        link.close()
+    places = [json.loads(line)["position_ned_m"] for line in truth.read_text().splitlines()[-200:]]
+    return max(math.dist(place[:2], places[0][:2]) for place in places)
+
+
+def test_without_wind_gusts_and_noise_the_air_is_still(tmp_path: Path) -> None:
+    assert wander_m(tmp_path / "still.jsonl", wind=0, gusts=0, noise=False) < 0.001
+    assert wander_m(tmp_path / "usual.jsonl", noise="off") > 0.05
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -184,6 +214,24 @@ def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tm
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         assert link.wait_heartbeat(timeout=20) is not None
         link.close()
+
+
+def test_ctrl_c_right_after_the_start_with_a_camera_is_quiet(tmp_path: Path) -> None:
+    name = f"camera-{tmp_path.parent.name}-{tmp_path.name}-{os.getpid()}"
+    ports = [str(port) for port in free_udp_ports(2)]
+    ends = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", ports[0], "--gcs-port", ports[1]]
+    with subprocess.Popen(
+        [sys.executable, "-m", "mavlink_sim", *ends, "--camera", name, "--no-console"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to every process
+        assert process.stdout.read() == "stopped\n"
+    assert process.returncode == 0
 
 
 # ---- the endpoint itself
