@@ -83,8 +83,10 @@ def test_set_message_interval__accepted_and_honoured_100000_us_gives_9_8_hz(read
     assert ready.command(511, 30, 100_000) == [ACCEPTED]
     ready.fly(1.0)
     ready.forget()
-    ready.fly(10.0)
-    assert len(ready.received("ATTITUDE")) / 10.0 == pytest.approx(9.9, abs=0.2)
+    ready.fly(20.0)
+    assert len(ready.received("ATTITUDE")) / 20.0 == pytest.approx(9.8, abs=0.1)
+    # by the same clock as the streams that PX4 is configured to send every 100 ms
+    assert len(ready.received("ATTITUDE")) == pytest.approx(len(ready.received("VFR_HUD")), abs=1)
     assert ready.command(511, 30, -1) == [ACCEPTED]
     ready.forget()
     ready.fly(2.0)
@@ -104,7 +106,32 @@ def test_get_message_interval__message_interval_and_accepted(ready: Any) -> None
     assert ready.command(510, 30) == [ACCEPTED]
     assert kinds_in_order(ready, "MESSAGE_INTERVAL", "COMMAND_ACK") == ["MESSAGE_INTERVAL", "COMMAND_ACK"]
     (interval,) = ready.received("MESSAGE_INTERVAL")
-    assert (interval.message_id, interval.interval_us) == (30, round(1e6 / 98.5))
+    assert (interval.message_id, interval.interval_us) == (30, 10_000)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message_id", "interval_us"),
+    [
+        ("ATTITUDE", 30, 10_000),
+        ("ATTITUDE_QUATERNION", 31, 20_000),
+        ("LOCAL_POSITION_NED", 32, 33_333),
+        ("VFR_HUD", 74, 100_000),
+        ("GPS_RAW_INT", 24, 125_000),
+        ("SYS_STATUS", 1, 200_000),
+    ],
+)
+def test_source_to_ask_for_the_interval_that_is_configured_changes_no_rate(
+    ready: Any, kind: str, message_id: int, interval_us: int
+) -> None:
+    ready.command(510, message_id)
+    assert ready.received("MESSAGE_INTERVAL")[0].interval_us == interval_us
+    rates = []
+    for _ in range(2):
+        ready.forget()
+        ready.fly(10.0)
+        rates.append(len(ready.received(kind)) / 10.0)
+        ready.command(511, message_id, interval_us)
+    assert rates[0] == pytest.approx(rates[1], rel=0.01, abs=0.1)
 
 
 def test_request_data_stream__ignored(ready: Any) -> None:
