@@ -76,8 +76,8 @@ class LockstepVehicle:
 
     Args:
         links: its connections by name, each with the rates of its streams in Hz; None is one link "onboard"
-            with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends answers
-            alone, which is the fastest.
+            with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends
+            answers alone (and what is told once: the origin, parameters set at the start), the fastest.
         autopilot: whose manners it has, "px4" or "ardupilot" (`personality`); the latter's streams are asked
             for by messages, whatever `links` says.
         options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`…

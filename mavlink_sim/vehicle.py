@@ -33,8 +33,9 @@ from mavlink_sim.services.vehicle_files import vehicle_files
 from mavlink_sim.shared_air import SharedAir
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 from mavlink_sim.wire.messages import Outgoing, dialect, link_node_status
-from mavlink_sim.wire.signing import Signing, Streams, timestamp_now
-from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ
+from mavlink_sim.wire.signing import Signing, timestamp_now
+from mavlink_sim.wire.signing import Streams as SigningStreams
+from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_CLOCK_RATE, Streams
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
 BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12
@@ -83,6 +84,8 @@ class Vehicle:
     parameters_class: type[Parameters] = Parameters
     handlers: Mapping[str, Callable[[Any, Link, Any], None]] = HANDLERS
     modes: type[Enum] = Mode
+    # of the clock by which the interval of a SET_MESSAGE_INTERVAL is counted
+    stream_clock_rate = PX4_CLOCK_RATE
 
     def __init__(
         self,
@@ -116,7 +119,7 @@ class Vehicle:
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.files = vehicle_files(self.parameters)
-        self._signing_streams: Streams = {}
+        self._signing_streams: SigningStreams = {}
         self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
         self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self.faults.elapsed_us * 1000
         self.start_ned_m = start_ned_m
@@ -126,6 +129,7 @@ class Vehicle:
         self._leftover_s = 0.0
         self._wind_revision = -1
         self._boot()
+        self._tell_parameters()
         self.gimbal_manager = GimbalManager(self) if gimbal else None
 
     def _boot(self) -> None:
@@ -143,7 +147,6 @@ class Vehicle:
         self._origin_told = False
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._later_count = itertools.count()
-        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
 
     # ---- what is known of it ----------------------------------------------------------------------------
 
@@ -207,7 +210,9 @@ class Vehicle:
         equipment = {name: rates[rates_hz is not None] for name, rates in EQUIPMENT_RATES_HZ.items()}
         rates = equipment | (ONBOARD_RATES_HZ if rates_hz is None else rates_hz)
         # links start out of step, so that they do not all send everything in the same millisecond
-        link = self.links[name] = Link(name, self.system_id, rates, 0.0017 * len(self.links))
+        link = self.links[name] = Link(
+            name, self.system_id, Streams(rates, 0.0017 * len(self.links), self.stream_clock_rate)
+        )
         link.gate = self.faults.gate
         link.tells_parameter_errors = self.release.has_parameter_errors
         link.signing = Signing(
@@ -277,8 +282,8 @@ class Vehicle:
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
 
     def _tell_parameters(self) -> None:
-        """What differs from the defaults is told to everyone shortly after the start."""
-        parameter_protocol.tell_everyone(self, [item.name for item in self.parameters.customised()])
+        """What the first start sets; at a reboot it is stored, and PX4 tells only what is not."""
+        parameter_protocol.tell_what_the_start_set(self)
 
     def companion_heard(self) -> None:
         """An onboard controller's heartbeat arrived."""

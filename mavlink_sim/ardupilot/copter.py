@@ -38,6 +38,7 @@ class CopterVehicle(Vehicle):
         super().__init__(**options)
 
     modes = CopterMode
+    stream_clock_rate = 1.0
 
     def mode_parameters(self, mode: CopterMode) -> tuple[float, float]:
         return mode.custom_mode, 0.0

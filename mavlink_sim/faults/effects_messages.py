@@ -140,8 +140,7 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
     )
     codecs = {}
     for name, link in vehicle.links.items():
-        intervals = {stream: link.streams.interval_us(stream) for stream in ONBOARD_RATES_HZ}
-        other.add_link(name, {stream: 1e6 / us if us > 0 else 0.0 for stream, us in intervals.items()})
+        other.add_link(name, {stream: link.streams.rate_hz(stream) for stream in ONBOARD_RATES_HZ})
         codecs[name] = parser(system)
 
     def speak(dt_s: float) -> None:

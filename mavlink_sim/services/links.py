@@ -22,9 +22,9 @@ STATUS_TEXT_LENGTH = 50
 class Link:
     """One connection: its streams, its outbox, and the components heard on it."""
 
-    def __init__(self, name: str, system_id: int, rates_hz: dict[str, float], phase_s: float) -> None:
+    def __init__(self, name: str, system_id: int, streams: Streams) -> None:
         self.name = name
-        self.streams = Streams(rates_hz, phase_s)
+        self.streams = streams
         self.outbox: deque[Outgoing] = deque()
         self.components: set[tuple[int, int]] = set()
         self.ground_station_seen_s = -math.inf

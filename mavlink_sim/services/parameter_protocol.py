@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.px4.parameters import (
     HASH_CHECK,
-    HASH_CHECK_INDEX,
     INT32,
+    NO_INDEX,
     REAL32,
+    SET_AT_START,
+    SET_BY_BAROMETER,
     UINT32,
     Parameter,
     Parameters,
@@ -28,7 +30,9 @@ logger = logging.getLogger(__name__)
 FIRST_ANSWER_S = 0.01
 LIST_RATE_HZ = 1000.0
 SECOND_ECHO_S = 0.015
-TOLD_AT_START_S = 0.98
+# Measured: when PX4 told what its start script had set, and what comparing barometer and GPS had.
+TOLD_AT_START_S = 0.976
+BAROMETER_TOLD_S = 5.349
 DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 READ_ONLY = 5
 TYPE_UNSUPPORTED = 6
@@ -107,6 +111,17 @@ def tell_everyone(vehicle: Vehicle, names: Iterable[str]) -> None:
             _send(link, vehicle.parameters, vehicle.parameters[name])
 
 
+def tell_what_the_start_set(vehicle: Vehicle) -> None:
+    """Tell everyone, unasked, what a first start sets, and what else differs from the defaults."""
+
+    def tell_start() -> None:
+        customised = (item.name for item in vehicle.parameters.customised())
+        tell_everyone(vehicle, sorted({*SET_AT_START, *customised}))
+
+    vehicle.after(TOLD_AT_START_S, tell_start)
+    vehicle.after(BAROMETER_TOLD_S, lambda: tell_everyone(vehicle, [SET_BY_BAROMETER]))
+
+
 def reset(vehicle: Vehicle, action: float) -> int:
     """PREFLIGHT_STORAGE (245), its MAV_RESULT: 2 and 4 reset the parameters; 0, 1 and 3 have nothing to do.
 
@@ -139,7 +154,7 @@ def _send(link: Link, parameters: Parameters, parameter: Parameter) -> None:
 def _send_hash(link: Link, parameters: Parameters) -> None:
     link.send(
         dialect.MAVLink_param_value_message(
-            HASH_CHECK.encode(), parameters.hash_wire_value(), UINT32, len(parameters), HASH_CHECK_INDEX
+            HASH_CHECK.encode(), parameters.hash_wire_value(), UINT32, len(parameters), NO_INDEX
         )
     )
 

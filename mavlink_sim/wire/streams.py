@@ -1,6 +1,8 @@
 """How often each kind of link gets each message.
 
-`ONBOARD_RATES_HZ` were measured on a PX4's onboard link, `GCS_RATES_HZ` on its ground station's.
+`ONBOARD_RATES_HZ` were measured on a PX4's onboard link, `GCS_RATES_HZ` on its ground station's. By that
+PX4's own stamps they are the even rates that it is configured for (100, 50, 30, 10, 8, 5 Hz): its clock ran
+1.5 to 1.8 % slower than that of its listener. An interval that is asked for is counted by the same clock.
 """
 
 from __future__ import annotations
@@ -8,6 +10,10 @@ from __future__ import annotations
 import heapq
 
 NEVER_US = 2**63
+# PX4's clock by its listener's: 98.5 Hz came of 100, 9.8 Hz of an interval of 100 ms.
+PX4_CLOCK_RATE = 0.985
+# By the measured rate the interval that PX4 is configured for, where the two differ.
+_CONFIGURED_US = {98.5: 10_000, 49.0: 20_000, 29.5: 33_333, 9.85: 100_000, 7.9: 125_000, 4.95: 200_000}
 
 ONBOARD_RATES_HZ: dict[str, float] = {
     "HEARTBEAT": 1.0,
@@ -91,17 +97,24 @@ class Streams:
     """The schedule of one link. Intervals are microseconds; a stream that is off has interval -1.
 
     `next_us` is when something is due again: before that, `due` need not be asked.
+
+    Args:
+        rates_hz: of each stream, as it arrives. phase_s: when the schedule begins.
+        clock_rate: of the clock by which an interval that is asked for is counted.
     """
 
-    def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0) -> None:
+    def __init__(self, rates_hz: dict[str, float], phase_s: float = 0.0, clock_rate: float = 1.0) -> None:
+        self._clock_rate = clock_rate
+        self._rates_hz = rates_hz
+        self._asked_us: dict[str, int] = {}
         self._default_us = {name: _interval_us(rate) for name, rate in rates_hz.items()}
-        self._interval_us = dict(self._default_us)
+        self._period_us = dict(self._default_us)  # as it arrives
         self._order = {name: place for place, name in enumerate(rates_hz)}
         # a heap of (due, place in the table, name): few of the streams are due at any one time
         self._due = [
-            (int(phase_s * 1e6) + interval, self._order[name], name)
-            for name, interval in self._interval_us.items()
-            if interval > 0
+            (int(phase_s * 1e6) + period, self._order[name], name)
+            for name, period in self._period_us.items()
+            if period > 0
         ]
         heapq.heapify(self._due)
         self.next_us = self._due[0][0] if self._due else NEVER_US
@@ -111,24 +124,37 @@ class Streams:
         return name in self._default_us
 
     def interval_us(self, name: str) -> int:
-        return self._interval_us.get(name, -1)
+        """The interval that was asked for or is configured."""
+        if name in self._asked_us:
+            return self._asked_us[name]
+        rate = self._rates_hz.get(name, 0.0)
+        return _CONFIGURED_US.get(rate, _interval_us(rate))
+
+    def rate_hz(self, name: str) -> float:
+        """How often it comes; 0 if it is off."""
+        period = self._period_us.get(name, -1)
+        return 1e6 / period if period > 0 else 0.0
 
     def set_interval(self, name: str, interval_us: int, now_us: int) -> None:
         """-1 switches off, 0 restores the default."""
-        interval = self._default_us[name] if interval_us == 0 else max(interval_us, -1)
-        self._interval_us[name] = interval
+        if interval_us == 0:
+            self._asked_us.pop(name, None)
+            period = self._default_us[name]
+        else:
+            self._asked_us[name] = max(interval_us, -1)
+            period = round(interval_us / self._clock_rate) if interval_us > 0 else -1
+        self._period_us[name] = period
         self._due = [entry for entry in self._due if entry[2] != name]
-        if interval > 0:
-            self._due.append((now_us + interval, self._order[name], name))
+        if period > 0:
+            self._due.append((now_us + period, self._order[name], name))
         heapq.heapify(self._due)
         self.next_us = self._due[0][0] if self._due else NEVER_US
 
     def restart(self, now_us: int) -> None:
         """The default rates again, as after a reboot."""
-        self._interval_us = dict(self._default_us)
-        self._due = [
-            (now_us + us, self._order[name], name) for name, us in self._interval_us.items() if us > 0
-        ]
+        self._asked_us.clear()
+        self._period_us = dict(self._default_us)
+        self._due = [(now_us + us, self._order[name], name) for name, us in self._period_us.items() if us > 0]
         heapq.heapify(self._due)
         self.next_us = self._due[0][0] if self._due else NEVER_US
 
@@ -140,9 +166,9 @@ class Streams:
         heap = self._due
         while heap[0][0] <= now_us:
             due, place, name = heap[0]
-            interval = self._interval_us[name]
-            following = due + interval
-            heapq.heapreplace(heap, (following if following > now_us else now_us + interval, place, name))
+            period = self._period_us[name]
+            following = due + period
+            heapq.heapreplace(heap, (following if following > now_us else now_us + period, place, name))
             names.append(name)
         self.next_us = heap[0][0]
         return names

@@ -40,7 +40,7 @@ def holding(seconds: float, **options: Any) -> tuple[dict[str, list[Any]], list[
 
 def test_a_held_position_is_told_as_the_real_vehicle_told_it() -> None:
     spreads, farthest = [], []
-    for seed in range(3):
+    for seed in range(6):
         told, _, _ = holding(40.0, seed=seed)
         places = [(one.x, one.y, one.z) for one in told["LOCAL_POSITION_NED"]]
         spreads.append([statistics.pstdev(axis) for axis in zip(*places, strict=True)])
@@ -49,7 +49,9 @@ def test_a_held_position_is_told_as_the_real_vehicle_told_it() -> None:
     assert 0.15 < north < 0.37  # measured 0.26
     assert 0.15 < east < 0.37  # 0.25
     assert 0.05 < down < 0.14  # 0.09
-    assert max(farthest) < 1.2
+    # measured 0.55 in one run of 40 s; of the vehicle's runs one in six reaches 0.83
+    assert statistics.median(farthest) < 0.7
+    assert max(farthest) < 0.9
 
 
 def test_the_truth_is_another_place_than_what_is_told_and_not_far_from_it() -> None:
@@ -61,7 +63,7 @@ def test_the_truth_is_another_place_than_what_is_told_and_not_far_from_it() -> N
         errors.append(math.dist((one.x, one.y, one.z), then.position_ned_m))
     assert len(errors) > 30
     assert 0.05 < statistics.mean(errors) < 0.6
-    assert max(errors) < 1.2
+    assert max(errors) < 0.7
     assert math.dist(vehicle.vehicle.estimate.position, vehicle.truth.position_ned_m) > 0.0
 
 

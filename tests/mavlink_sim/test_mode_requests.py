@@ -7,6 +7,7 @@ import pytest
 from mavlink_sim.wire.messages import dialect
 
 ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
+FOLLOW, PRECISION_LAND, ORBIT = (4, 8), (4, 9), (3, 1)
 
 
 @pytest.mark.parametrize(("main", "sub"), ALL_MODES)
@@ -14,6 +15,23 @@ def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Any, main: int, sub:
     cockpit.fly(0.1)
     assert cockpit.set_mode(main, sub) == [0, 0]
     assert cockpit.heartbeat().custom_mode == main << 16 | sub << 24
+
+
+@pytest.mark.parametrize(
+    ("request_of", "shown", "base_mode"),
+    [
+        pytest.param(FOLLOW, 0x08040000, 17, id="FOLLOW"),
+        pytest.param(PRECISION_LAND, 0x09040000, 29, id="PRECLAND"),
+        pytest.param(ORBIT, 0x00030000, 81, id="ORBIT, which shows as POSCTL"),
+    ],
+)
+def test_a_disarmed_vehicle_takes_follow_precision_landing_and_orbit_too(
+    cockpit: Any, request_of: tuple[int, int], shown: int, base_mode: int
+) -> None:
+    cockpit.wait_ready()
+    assert cockpit.set_mode(*request_of) == [0, 0]
+    beat = cockpit.heartbeat()
+    assert (beat.custom_mode, beat.base_mode) == (shown, base_mode)
 
 
 def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(cockpit: Any) -> None:

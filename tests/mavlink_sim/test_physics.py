@@ -71,7 +71,7 @@ def test_no_velocity_setpoint_is_over_the_limit(values: list[float]) -> None:
 
 def test_a_held_position_wanders_as_the_real_vehicle_did() -> None:
     spreads, farthest = [], []
-    for seed in range(4):
+    for seed in range(6):
         airframe, controller = hovering(seed=seed, gusts_mps=0.6)
         setpoint = TrajectorySetpoint(position=(0.0, 0.0, -5.0), yaw_rad=0.0)
         fly(airframe, controller, setpoint, 10.0)
@@ -79,10 +79,12 @@ def test_a_held_position_wanders_as_the_real_vehicle_did() -> None:
         spreads.append([statistics.pstdev(axis) for axis in zip(*track, strict=True)])
         farthest.append(max(math.hypot(x, y) for x, y, _ in track))
     north, east, down = (statistics.mean(axis) for axis in zip(*spreads, strict=True))
-    assert 0.12 < north < 0.35
-    assert 0.12 < east < 0.35
-    assert 0.03 < down < 0.15
-    assert max(farthest) < 1.2
+    assert 0.15 < north < 0.35  # measured 0.26
+    assert 0.15 < east < 0.35  # 0.25
+    assert 0.05 < down < 0.14  # 0.09
+    # measured 0.55 in one run of 40 s; of the vehicle's runs one in six reaches 0.84
+    assert statistics.median(farthest) < 0.7
+    assert max(farthest) < 0.9
 
 
 def test_a_steady_wind_is_held_against_with_a_tilt() -> None:

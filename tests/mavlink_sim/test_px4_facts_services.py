@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from plan_client import upload, waypoint
 
 from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
 from mavlink_sim.wire.messages import dialect, parser
@@ -82,8 +83,10 @@ def test_set_message_interval__accepted_and_honoured_100000_us_gives_9_8_hz(read
     assert ready.command(511, 30, 100_000) == [ACCEPTED]
     ready.fly(1.0)
     ready.forget()
-    ready.fly(10.0)
-    assert len(ready.received("ATTITUDE")) / 10.0 == pytest.approx(9.9, abs=0.2)
+    ready.fly(20.0)
+    assert len(ready.received("ATTITUDE")) / 20.0 == pytest.approx(9.8, abs=0.1)
+    # by the same clock as the streams that PX4 is configured to send every 100 ms
+    assert len(ready.received("ATTITUDE")) == pytest.approx(len(ready.received("VFR_HUD")), abs=1)
     assert ready.command(511, 30, -1) == [ACCEPTED]
     ready.forget()
     ready.fly(2.0)
@@ -103,7 +106,32 @@ def test_get_message_interval__message_interval_and_accepted(ready: Any) -> None
     assert ready.command(510, 30) == [ACCEPTED]
     assert kinds_in_order(ready, "MESSAGE_INTERVAL", "COMMAND_ACK") == ["MESSAGE_INTERVAL", "COMMAND_ACK"]
     (interval,) = ready.received("MESSAGE_INTERVAL")
-    assert (interval.message_id, interval.interval_us) == (30, round(1e6 / 98.5))
+    assert (interval.message_id, interval.interval_us) == (30, 10_000)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message_id", "interval_us"),
+    [
+        ("ATTITUDE", 30, 10_000),
+        ("ATTITUDE_QUATERNION", 31, 20_000),
+        ("LOCAL_POSITION_NED", 32, 33_333),
+        ("VFR_HUD", 74, 100_000),
+        ("GPS_RAW_INT", 24, 125_000),
+        ("SYS_STATUS", 1, 200_000),
+    ],
+)
+def test_source_to_ask_for_the_interval_that_is_configured_changes_no_rate(
+    ready: Any, kind: str, message_id: int, interval_us: int
+) -> None:
+    ready.command(510, message_id)
+    assert ready.received("MESSAGE_INTERVAL")[0].interval_us == interval_us
+    rates = []
+    for _ in range(2):
+        ready.forget()
+        ready.fly(10.0)
+        rates.append(len(ready.received(kind)) / 10.0)
+        ready.command(511, message_id, interval_us)
+    assert rates[0] == pytest.approx(rates[1], rel=0.01, abs=0.1)
 
 
 def test_request_data_stream__ignored(ready: Any) -> None:
@@ -248,6 +276,32 @@ def test_hash_check__is_reproduced_from_the_887_recorded_parameters() -> None:
     assert parameter_hash(parameters) == told == 0x6AF5A894
 
 
+def test_hash_check__the_vehicle_itself_answers_what_px4_answered(ready: Any) -> None:
+    (answer,) = read(ready, b"_HASH_CHECK")
+    assert struct.unpack("<I", struct.pack("<f", answer.param_value))[0] == 0x6AF5A894
+    assert (answer.param_type, answer.param_index, answer.param_count) == (5, 65535, 887)
+
+
+def test_request_list__887_parameters_604_real32_283_int32_888_messages_in_0_89_s(ready: Any) -> None:
+    ready.send(dialect.MAVLink_param_request_list_message(1, 1))
+    ready.fly(2.0)
+    stamped = [
+        (time, item.message)
+        for time, item in ready.inbox["onboard"]
+        if item.message.get_type() == "PARAM_VALUE"
+    ]
+    assert len(stamped) == 888
+    assert stamped[-1][0] - stamped[0][0] == pytest.approx(0.89, abs=0.02)
+    assert {message.param_count for _, message in stamped} == {887}
+    kinds = [message.param_type for _, message in stamped[1:]]
+    assert (kinds.count(REAL32), kinds.count(INT32)) == (604, 283)
+
+
+def test_names_types_and_values_are_those_recorded(ready: Any) -> None:
+    _, parameters = recorded_parameters()
+    assert list(ready.vehicle.parameters) == parameters
+
+
 def test_source_hash_check__volatile_parameters_do_not_count(cockpit: Any) -> None:
     told, parameters = recorded_parameters()
     changed = [
@@ -326,6 +380,16 @@ def test_unknown__param_error_345_1_does_not_exist(ready: Any) -> None:
         assert (error.target_system, error.target_component) == (1, 191)
 
 
+def test_a_parameter_of_missions_is_listed_once_a_mission_was_checked(ready: Any) -> None:
+    (unlisted,) = read(ready, b"MIS_DIST_1WP")
+    assert (unlisted.param_value, unlisted.param_index, unlisted.param_count) == (10_000.0, 65535, 887)
+    assert upload(ready, [waypoint(10.0, 0.0, 5.0)]) == 0
+    (listed,) = read(ready, b"MIS_DIST_1WP")
+    assert listed.param_count == 889
+    (by_index,) = read(ready, b"", listed.param_index)
+    assert name_of(by_index) == "MIS_DIST_1WP"
+
+
 def test_set__param_value_twice_at_0_and_10_to_20_ms(ready: Any) -> None:
     started = ready.now_s
     write(ready, b"MIS_TAKEOFF_ALT", 4.0, REAL32)
@@ -378,11 +442,48 @@ def test_a_set_takes_effect_at_once(ready: Any) -> None:
     assert ready.height_m == pytest.approx(6.0, abs=0.7)
 
 
-def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_defaults(make_cockpit: Any) -> None:
+# 0.98 s after boot, and the last after 5.35 s
+UNASKED = (
+    *("CAL_ACC0_ID", "CAL_ACC1_ID", "CAL_ACC2_ID", "CAL_BARO0_ID", "CAL_BARO0_PRIO"),
+    *("CAL_GYRO0_ID", "CAL_GYRO1_ID", "CAL_GYRO2_ID"),
+    *("CAL_MAG0_ID", "CAL_MAG0_PRIO", "CAL_MAG1_ID", "CAL_MAG1_PRIO"),
+    *("CBRK_SUPPLY_CHK", "COM_RCL_EXCEPT", "COM_RC_IN_MODE", "SDLOG_BACKEND", "SENS_BOARD_X_OFF"),
+    *("SENS_DPRES_OFF", "SYS_AUTOCONFIG", "SYS_AUTOSTART", "CAL_BARO0_OFF"),
+)
+
+
+def unasked(cockpit: Any, link: str = "onboard") -> list[tuple[float, str]]:
+    return [
+        (stamp, name_of(item.message))
+        for stamp, item in cockpit.inbox[link]
+        if item.message.get_type() == "PARAM_VALUE"
+    ]
+
+
+def test_a_few_param_values_arrive_unasked__20_after_1_s_and_the_barometers_after_5_s(cockpit: Any) -> None:
+    cockpit.fly(10.0)
+    told = unasked(cockpit)
+    assert tuple(name for _, name in told) == UNASKED
+    assert [stamp for stamp, _ in told] == pytest.approx([0.976] * 20 + [5.349], abs=0.005)
+
+
+def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_defaults_too(
+    make_cockpit: Any,
+) -> None:
     cockpit = make_cockpit(parameters={"COM_OF_LOSS_T": 0.5})
     cockpit.fly(2.0)
     for link in ("onboard", "gcs"):
-        assert [name_of(message) for message in cockpit.received("PARAM_VALUE", link)] == ["COM_OF_LOSS_T"]
+        names = [name for _, name in unasked(cockpit, link)]
+        assert names == sorted({*UNASKED, "COM_OF_LOSS_T"} - {"CAL_BARO0_OFF"})
+
+
+def test_source_at_a_reboot_the_parameters_are_stored_and_none_is_told(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(parameters={"COM_OF_LOSS_T": 0.5})
+    cockpit.fly(6.0)
+    cockpit.forget()
+    cockpit.vehicle.reboot()
+    cockpit.fly(6.0)
+    assert unasked(cockpit) == []
 
 
 @pytest.mark.parametrize(

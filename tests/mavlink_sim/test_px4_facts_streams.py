@@ -32,14 +32,18 @@ def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockp
     assert names(alone) == names(heard)
 
 
-def test_the_onboard_link_carries_about_29_kilobytes_a_second_in_flight(make_cockpit: Any) -> None:
-    cockpit = make_cockpit(gusts_mps=None)
-    cockpit.take_off()
+@pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])
+def test_the_onboard_link_carries_29_kilobytes_a_second(make_cockpit: Any, flying: bool) -> None:
+    """Of whole frames with their signatures, as in the recorded flight: 28.7 kB/s before arming."""
+    cockpit = make_cockpit(noise=True, gusts_mps=None)
+    if flying:
+        cockpit.take_off()
+    cockpit.fly(6.0)  # until the last PARAM_VALUE that comes unasked
     cockpit.forget()
-    cockpit.fly(10.0)
+    cockpit.fly(20.0)
     codec = parser()
-    size = sum(len(item.pack(codec)) + SIGNATURE_BYTES for _, item in cockpit.inbox["onboard"]) / 10.0
-    assert size == pytest.approx(29_000, rel=0.15)
+    size = sum(len(item.pack(codec)) + SIGNATURE_BYTES for _, item in cockpit.inbox["onboard"]) / 20.0
+    assert size == pytest.approx(29_000, rel=0.05)
 
 
 def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(cockpit: Any) -> None:

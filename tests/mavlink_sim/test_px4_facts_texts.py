@@ -47,6 +47,22 @@ def test_a_flight_by_command_is_told_in_px4s_words(heard: Any) -> None:
     ]
 
 
+def test_a_return_is_told_in_px4s_words_all_as_information(heard: Any) -> None:
+    heard.take_off(4.0)
+    heard.fly(4.0)
+    heard.forget()
+    heard.command(20)
+    heard.until(lambda: not heard.armed)
+    heard.fly(0.1)
+    assert said(heard) == [
+        (INFO, "Returning to launch\t"),
+        (INFO, "RTL: start return at 493 m (4 m above destination)\t"),
+        (INFO, "RTL: land at destination\t"),
+        (INFO, "Landing detected\t"),
+        (INFO, "Disarmed by landing\t"),
+    ]
+
+
 def test_disarming_is_told_with_its_reason(heard: Any) -> None:
     heard.wait_ready()
     heard.command(400, 1)
