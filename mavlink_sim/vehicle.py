@@ -129,7 +129,6 @@ class Vehicle:
         self._leftover_s = 0.0
         self._wind_revision = -1
         self._boot()
-        self._tell_parameters()
         self.gimbal_manager = GimbalManager(self) if gimbal else None
 
     def _boot(self) -> None:
@@ -147,6 +146,7 @@ class Vehicle:
         self._origin_told = False
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._later_count = itertools.count()
+        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
 
     # ---- what is known of it ----------------------------------------------------------------------------
 
@@ -282,8 +282,8 @@ class Vehicle:
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
 
     def _tell_parameters(self) -> None:
-        """What the first start sets; at a reboot it is stored, and PX4 tells only what is not."""
-        parameter_protocol.tell_what_the_start_set(self)
+        """What differs from the defaults is told to everyone shortly after the start."""
+        parameter_protocol.tell_everyone(self, [item.name for item in self.parameters.customised()])
 
     def companion_heard(self) -> None:
         """An onboard controller's heartbeat arrived."""

@@ -24,16 +24,6 @@ _FILE = "parameters.txt"
 _MISSION_FILE = "parameters_mission.txt"
 _GIMBAL_FILE = "parameters_gimbal.txt"
 _TYPES = {"INT32": INT32, "REAL32": REAL32}
-# Set by PX4's start script and its simulated sensors at the first start: every client is told so.
-SET_AT_START = (
-    *("CAL_ACC0_ID", "CAL_ACC1_ID", "CAL_ACC2_ID", "CAL_BARO0_ID", "CAL_BARO0_PRIO"),
-    *("CAL_GYRO0_ID", "CAL_GYRO1_ID", "CAL_GYRO2_ID"),
-    *("CAL_MAG0_ID", "CAL_MAG0_PRIO", "CAL_MAG1_ID", "CAL_MAG1_PRIO"),
-    *("CBRK_SUPPLY_CHK", "COM_RCL_EXCEPT", "COM_RC_IN_MODE", "SDLOG_BACKEND", "SENS_BOARD_X_OFF"),
-    *("SENS_DPRES_OFF", "SYS_AUTOCONFIG", "SYS_AUTOSTART"),
-)
-# Set once the barometer has been compared with GPS.
-SET_BY_BAROMETER = "CAL_BARO0_OFF"
 # PX4's `volatile` parameters: the vehicle itself changes them, so they are no part of _HASH_CHECK.
 _VOLATILE = re.compile(
     r"CAL_ACC\d_[XYZ](OFF|SCALE)|CAL_GYRO\d_[XYZ]OFF|CAL_BARO\d_OFF"

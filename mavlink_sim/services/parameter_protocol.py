@@ -12,8 +12,6 @@ from mavlink_sim.px4.parameters import (
     INT32,
     NO_INDEX,
     REAL32,
-    SET_AT_START,
-    SET_BY_BAROMETER,
     UINT32,
     Parameter,
     Parameters,
@@ -30,9 +28,7 @@ logger = logging.getLogger(__name__)
 FIRST_ANSWER_S = 0.01
 LIST_RATE_HZ = 1000.0
 SECOND_ECHO_S = 0.015
-# Measured: when PX4 told what its start script had set, and what comparing barometer and GPS had.
-TOLD_AT_START_S = 0.976
-BAROMETER_TOLD_S = 5.349
+TOLD_AT_START_S = 0.98
 DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 READ_ONLY = 5
 TYPE_UNSUPPORTED = 6
@@ -109,17 +105,6 @@ def tell_everyone(vehicle: Vehicle, names: Iterable[str]) -> None:
     for name in names:
         for link in vehicle.links.values():
             _send(link, vehicle.parameters, vehicle.parameters[name])
-
-
-def tell_what_the_start_set(vehicle: Vehicle) -> None:
-    """Tell everyone, unasked, what a first start sets, and what else differs from the defaults."""
-
-    def tell_start() -> None:
-        customised = (item.name for item in vehicle.parameters.customised())
-        tell_everyone(vehicle, sorted({*SET_AT_START, *customised}))
-
-    vehicle.after(TOLD_AT_START_S, tell_start)
-    vehicle.after(BAROMETER_TOLD_S, lambda: tell_everyone(vehicle, [SET_BY_BAROMETER]))
 
 
 def reset(vehicle: Vehicle, action: float) -> int:

@@ -42,7 +42,7 @@ def write(cockpit: Any, name: str, value: float, kind: int) -> list[Any]:
 
 
 def test_the_list_is_alphabetical_and_begins_with_the_hash(cockpit: Any) -> None:
-    cockpit.fly(1.0)  # until what the start has set was told
+    cockpit.fly(0.1)
     cockpit.forget()
     cockpit.send(dialect.MAVLink_param_request_list_message(1, 1))
     started = cockpit.now_s
@@ -124,7 +124,7 @@ def test_the_hash_changes_with_a_value_and_comes_back_with_it(cockpit: Any) -> N
 
 
 def test_a_client_with_the_right_hash_stops_the_list(cockpit: Any) -> None:
-    cockpit.fly(1.0)  # until what the start has set was told
+    cockpit.fly(0.1)
     cockpit.send(dialect.MAVLink_param_request_list_message(1, 1))
     cockpit.fly(0.05)
     write(cockpit, "_HASH_CHECK", 0.0, 5)

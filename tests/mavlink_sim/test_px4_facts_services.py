@@ -442,48 +442,11 @@ def test_a_set_takes_effect_at_once(ready: Any) -> None:
     assert ready.height_m == pytest.approx(6.0, abs=0.7)
 
 
-# 0.98 s after boot, and the last after 5.35 s
-UNASKED = (
-    *("CAL_ACC0_ID", "CAL_ACC1_ID", "CAL_ACC2_ID", "CAL_BARO0_ID", "CAL_BARO0_PRIO"),
-    *("CAL_GYRO0_ID", "CAL_GYRO1_ID", "CAL_GYRO2_ID"),
-    *("CAL_MAG0_ID", "CAL_MAG0_PRIO", "CAL_MAG1_ID", "CAL_MAG1_PRIO"),
-    *("CBRK_SUPPLY_CHK", "COM_RCL_EXCEPT", "COM_RC_IN_MODE", "SDLOG_BACKEND", "SENS_BOARD_X_OFF"),
-    *("SENS_DPRES_OFF", "SYS_AUTOCONFIG", "SYS_AUTOSTART", "CAL_BARO0_OFF"),
-)
-
-
-def unasked(cockpit: Any, link: str = "onboard") -> list[tuple[float, str]]:
-    return [
-        (stamp, name_of(item.message))
-        for stamp, item in cockpit.inbox[link]
-        if item.message.get_type() == "PARAM_VALUE"
-    ]
-
-
-def test_a_few_param_values_arrive_unasked__20_after_1_s_and_the_barometers_after_5_s(cockpit: Any) -> None:
-    cockpit.fly(10.0)
-    told = unasked(cockpit)
-    assert tuple(name for _, name in told) == UNASKED
-    assert [stamp for stamp, _ in told] == pytest.approx([0.976] * 20 + [5.349], abs=0.005)
-
-
-def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_defaults_too(
-    make_cockpit: Any,
-) -> None:
+def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_defaults(make_cockpit: Any) -> None:
     cockpit = make_cockpit(parameters={"COM_OF_LOSS_T": 0.5})
     cockpit.fly(2.0)
     for link in ("onboard", "gcs"):
-        names = [name for _, name in unasked(cockpit, link)]
-        assert names == sorted({*UNASKED, "COM_OF_LOSS_T"} - {"CAL_BARO0_OFF"})
-
-
-def test_source_at_a_reboot_the_parameters_are_stored_and_none_is_told(make_cockpit: Any) -> None:
-    cockpit = make_cockpit(parameters={"COM_OF_LOSS_T": 0.5})
-    cockpit.fly(6.0)
-    cockpit.forget()
-    cockpit.vehicle.reboot()
-    cockpit.fly(6.0)
-    assert unasked(cockpit) == []
+        assert [name_of(message) for message in cockpit.received("PARAM_VALUE", link)] == ["COM_OF_LOSS_T"]
 
 
 @pytest.mark.parametrize(
