@@ -29,7 +29,7 @@ def begin(cockpit: Any, line: str) -> int:
 
 
 def test_of_a_vehicle_with_heartbeats_only_answers_still_come(cockpit) -> None:
-    cockpit.fly(6.0)  # until the last PARAM_VALUE that comes unasked
+    cockpit.fly(6.0)  # what a start alone sends is over
     begin(cockpit, "heartbeat_only link=onboard")
     cockpit.forget()
     cockpit.send(dialect.MAVLink_timesync_message(0, 5))

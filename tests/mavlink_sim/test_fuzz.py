@@ -21,13 +21,10 @@ def test_a_vehicle_in_lockstep_bears_mutated_mavlink(seed: int, target: Target) 
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize(
-    "target",
-    [Target(), Target("ardupilot"), Target(gimbal=True, signed=True)],
-    ids=["px4", "ardupilot", "gimbal and signed"],
-)
-def test_a_running_vehicle_answers_its_client_through_a_flood_and_keeps_its_time(target: Target) -> None:
-    report = fuzz_over_sockets(seed=4, seconds=8.0, target=target)  # it judges its pace every 5 s
+def test_a_running_vehicle_answers_its_client_through_a_flood_and_keeps_its_time() -> None:
+    report = fuzz_over_sockets(
+        seed=4, seconds=6.0, target=Target(gimbal=True)
+    )  # it judges its pace every 5 s
     assert report.datagrams > 400
     assert report.answers > 0
     assert report.kept_up, report.said

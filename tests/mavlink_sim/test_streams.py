@@ -48,7 +48,7 @@ MEASURED_GCS_HZ = {
 
 @pytest.fixture
 def settled(cockpit: Any) -> Any:
-    cockpit.fly(6.0)  # until the last PARAM_VALUE that comes unasked
+    cockpit.fly(6.0)  # what a start alone sends is over
     return cockpit
 
 
