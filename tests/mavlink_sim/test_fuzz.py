@@ -24,8 +24,8 @@ def test_a_running_vehicle_answers_its_client_through_a_flood() -> None:
     report = fuzz_over_sockets(seed=4, seconds=4.0, target=Target(gimbal=True))
     assert report.datagrams > 200
     assert report.answers > 0
-    # Of one processor's time, whatever else this machine does: it never works its loop full. That it keeps its
-    # time as well, `python -m mavlink_sim.fuzz` tells on a machine of its own.
+    # Of one processor's time, whatever else this machine does: it never works its loop full. That it keeps
+    # its time as well, `python -m mavlink_sim.fuzz` tells on a machine of its own.
     assert report.load < 0.9
 
 
