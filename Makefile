@@ -6,8 +6,8 @@ TORCH_INDEX ?=
 # Gigabytes of CUDA come only when asked for: ALLOW_CUDA=1.
 ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-# Flights in real time mostly wait: two tests more at once than there are cores.
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)
+# Flights in real time mostly wait: one test more at once than there are cores.
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
