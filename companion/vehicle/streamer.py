@@ -18,6 +18,7 @@ from enum import StrEnum
 
 from companion.vehicle.precise_sleep import Sleep, precise_sleep
 from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.short_turns import take_short_turns
 
 logger = logging.getLogger(__name__)
 
@@ -115,6 +116,7 @@ class Streamer:
 
     async def run(self) -> None:
         """Tick at the rate until cancelled. Missed ticks are skipped, never sent in a burst."""
+        take_short_turns()
         async with self._sleeper() as sleep:
             due_ns = self._clock_ns()
             while True:
