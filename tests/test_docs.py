@@ -13,6 +13,7 @@ import typer
 from companion.cli import app as companion_app
 from companion.guidance import grammar
 from companion.guidance.commands import COMMANDS
+from mavlink_sim.bench import app as bench_app
 from mavlink_sim.cli import app as simulator_app
 from mavlink_sim.datasets.cli import app as dataset_app
 
@@ -23,6 +24,7 @@ DOCUMENTS = [
     ROOT / "systemd" / "companion.service",
 ]
 APPS = {"companion": companion_app, "mavlink-sim": simulator_app}
+SIMULATOR_SUBCOMMANDS = {"dataset": dataset_app, "bench": bench_app}
 
 
 def shell_lines(document: Path) -> Iterator[str]:
@@ -53,8 +55,8 @@ OURS = [
 def test_every_command_in_the_documents_is_one_that_exists(words: list[str]) -> None:
     command = typer.main.get_command(APPS[words[0]])
     arguments = words[1:]
-    if words[:2] == ["mavlink-sim", "dataset"]:
-        command, arguments = typer.main.get_command(dataset_app), words[2:]
+    if words[0] == "mavlink-sim" and len(words) > 1 and words[1] in SIMULATOR_SUBCOMMANDS:
+        command, arguments = typer.main.get_command(SIMULATOR_SUBCOMMANDS[words[1]]), words[2:]
     context = command.make_context(words[0], list(arguments), resilient_parsing=False)
     # A group hands what is left to its command; that one must take it all.
     while hasattr(command, "resolve_command"):
