@@ -16,7 +16,7 @@ from mavlink_sim.datasets.training_scenes import (
 
 @pytest.fixture(scope="module")
 def scenes() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    return list(render_dataset(12, 7, 256, 256))
+    return list(render_dataset(24, 7, 256, 256))
 
 
 def test_a_scene_follows_from_its_generator_alone() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
+
 from companion.bench.flights import fly, summary
 
 
-def test_five_vehicles_fly_in_formation_through_turns_and_never_come_too_near() -> None:
-    (result,) = fly("formation", [0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_five_vehicles_fly_in_formation_through_turns_and_never_come_too_near(seed: int) -> None:
+    (result,) = fly("formation", [seed])
     assert result.success, result.reason
     assert result.values["min_separation_m"] >= 3.0
     assert result.values["slot_error_p95_m"] < 4.0

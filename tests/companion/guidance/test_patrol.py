@@ -80,7 +80,7 @@ def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way():
 def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity):
     car = SeenObject("car", 12.0, 5.0, track_id=7 if with_identity else None)
     outcome, notes, _ = flown(
-        PatrolBehaviour(ROUND, ["car"], laps=1.5, wait_s=1.0, again_s=600.0), [car], 400
+        PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=600.0), [car], 400
     )
     assert outcome is not None
     assert outcome.success, outcome.reason
