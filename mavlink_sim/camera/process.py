@@ -20,7 +20,6 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from types import FrameType
 
 import cv2
 import numpy as np
@@ -56,7 +55,7 @@ def run_camera(
     ground has been painted and the first frame can be drawn without delay.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
-    signal.signal(signal.SIGTERM, _end)  # or by this, for painting the ground does not look at the pipe
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: painting does not look at the pipe
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     cv2.setNumThreads(1)
     model, mount = scene.camera.model, scene.camera.mount
@@ -108,10 +107,6 @@ def run_camera(
             taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned)
             if taken is not None:
                 on_the_way.append(taken)
-
-
-def _end(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(0)
 
 
 def _newest(poses: Connection, timeout_s: float | None) -> bytes | None:
