@@ -20,11 +20,12 @@ endef
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
 
-# The tests start hundreds of processes; not each is to compile the sources anew.
+# The tests start hundreds of processes, in workers that all read all tests: not each is to compile them anew.
+# So bytecode is kept, whatever the environment says, and what runs alone comes first and leaves it.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	$(BIN)/python -m compileall -q companion mavlink_sim vision
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not alone"
 	$(BIN)/python -m pytest -m alone
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not alone"
 
 lint: $(READY)
 	$(BIN)/ruff check .

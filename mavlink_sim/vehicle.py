@@ -120,10 +120,10 @@ class Vehicle:
         self.links: dict[str, Link] = {}
         self.files = vehicle_files(self.parameters)
         self._signing_streams: SigningStreams = {}
-        self.clock_ns: Callable[[], int] = lambda: self._boot_us * 1000
-        self.utc_ns: Callable[[], int] = lambda: BOOT_UTC_NS + self.faults.elapsed_us * 1000
+        self.clock_ns: Callable[[], int] = self._simulated_clock_ns
+        self.utc_ns: Callable[[], int] = self._simulated_utc_ns
         self.start_ned_m = start_ned_m
-        self._on_event = on_event or (lambda text: None)
+        self._on_event = on_event or _tell_nobody
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
         self._leftover_s = 0.0
@@ -144,7 +144,7 @@ class Vehicle:
         self._companion_seen_s: float | None = None
         self._companion_lost = False
         self._origin_told = False
-        self._later: list[tuple[float, int, Callable[[], None]]] = []
+        self._later: list[tuple[float, int, Callable[[], object]]] = []
         self._later_count = itertools.count()
         self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
 
@@ -197,7 +197,16 @@ class Vehicle:
 
     def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
         """The mode to be in, NAV_TAKEOFF's altitude for a height above home, and whether it is over."""
-        return None, self.home_altitude_m + height_m, lambda: self.autopilot.mode is Mode.HOLD
+        return None, self.home_altitude_m + height_m, self._holds
+
+    def _holds(self) -> bool:
+        return self.autopilot.mode is Mode.HOLD
+
+    def _simulated_clock_ns(self) -> int:
+        return self._boot_us * 1000
+
+    def _simulated_utc_ns(self) -> int:
+        return BOOT_UTC_NS + self.faults.elapsed_us * 1000
 
     def next_ping(self) -> int:
         """The sequence number of the next PING of its own."""
@@ -218,10 +227,13 @@ class Vehicle:
         link.signing = Signing(
             link_id=len(self.links) - 1,
             streams=self._signing_streams,
-            policy=lambda: int(self.parameters.number("MAV_SIGN_CFG")),
+            policy=self._signing_policy,
             is_usb=name == "gcs",  # the ground station's link stands for the USB port
         )
         return link
+
+    def _signing_policy(self) -> int:
+        return int(self.parameters.number("MAV_SIGN_CFG"))
 
     def sign_everything(self, key: bytes, timestamp: int | None = None) -> None:
         """Give every link a signing key; `timestamp` counts 10 us since 2015, None for now."""
@@ -277,7 +289,7 @@ class Vehicle:
             self._step()
         self.estimate.look()
 
-    def after(self, delay_s: float, action: Callable[[], None]) -> None:
+    def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Do something in a later step."""
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
 
@@ -401,3 +413,7 @@ class Vehicle:
                 link.send(
                     dialect.MAVLink_command_long_message(self.system_id, 0, command, confirmation, *values)
                 )
+
+
+def _tell_nobody(text: str) -> None:
+    """What happens without a listener."""

@@ -335,9 +335,7 @@ class CopterAutopilot(Autopilot):
         if mode is CopterMode.GUIDED:
             self.task = Guided(airframe, parameters)
         elif by_sticks is not None:
-            self.task = manual_flight.task_of(
-                by_sticks, airframe, parameters, lambda: self.supervision.sticks
-            )
+            self.task = manual_flight.task_of(by_sticks, airframe, parameters, self.supervision.read_sticks)
         elif mode is CopterMode.LAND:
             self.task = self.landing_task() if self.position_valid else self._descent()
         elif mode is CopterMode.RTL:
@@ -348,7 +346,7 @@ class CopterAutopilot(Autopilot):
     def landing_task(self, place: Vector | None = None) -> Land:
         """The descent, here or at a place."""
         return Land(
-            self._airframe, self._parameters, lambda: self.navigator.target, lambda: self.now_s, place
+            self._airframe, self._parameters, self.navigator.newest_target, self.navigator.time_s, place
         )
 
     def _descent(self) -> Descend:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.ardupilot import streams
@@ -61,7 +62,7 @@ def handle(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     """COMMAND_LONG or COMMAND_INT: carried out a moment later, then acknowledged to who sent it."""
     command = command_of(message)
     frame = int(getattr(message, "frame", GLOBAL_RELATIVE_ALT))
-    vehicle.after(ANSWER_DELAY_S, lambda: _answer(vehicle, link, message, command, frame))
+    vehicle.after(ANSWER_DELAY_S, partial(_answer, vehicle, link, message, command, frame))
 
 
 def _answer(vehicle: CopterVehicle, link: Link, message: Any, command: Command, frame: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, cast
 
 from mavlink_sim.ardupilot import services, streams, telemetry
@@ -45,12 +46,11 @@ class CopterVehicle(Vehicle):
 
     def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
         """In GUIDED, to a height that is one above home."""
+        return "GUIDED", height_m, self._flies_guided
 
-        def is_over() -> bool:
-            copter = self.copter
-            return not copter.landed and copter.guided is not None and not copter.guided.is_taking_off
-
-        return "GUIDED", height_m, is_over
+    def _flies_guided(self) -> bool:
+        copter = self.copter
+        return not copter.landed and copter.guided is not None and not copter.guided.is_taking_off
 
     @property
     def copter(self) -> CopterAutopilot:
@@ -93,11 +93,7 @@ class CopterVehicle(Vehicle):
 
     def send_soon(self, link: Link, name: str) -> None:
         """In the next step: after the acknowledgement that is sent now."""
-
-        def send() -> None:
-            self.send_built(link, name)
-
-        self.after(0.0, send)
+        self.after(0.0, partial(self.send_built, link, name))
 
     def _boot(self) -> None:
         super()._boot()

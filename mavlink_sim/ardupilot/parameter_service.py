@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.ardupilot import streams
@@ -40,7 +41,7 @@ def request_read(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     parameters = vehicle.parameters
     parameter = parameters.at(index) if index >= 0 else parameters.get(_text_of(message.param_id))
     if parameter is not None:
-        vehicle.after(0.0, lambda: _tell(vehicle, link, parameter, index if index >= 0 else NO_INDEX))
+        vehicle.after(0.0, partial(_tell, vehicle, link, parameter, index if index >= 0 else NO_INDEX))
 
 
 def set_parameter(vehicle: CopterVehicle, link: Link, message: Any) -> None:

@@ -515,7 +515,7 @@ class Autopilot:
             self.task = Orbit(airframe, parameters)
         elif self.mode in MANUAL_MODES:
             self.task = manual_flight.task_of(
-                self.mode, airframe, parameters, lambda: self.supervision.sticks, self.stick_guard
+                self.mode, airframe, parameters, self.supervision.read_sticks, self.stick_guard
             )
         elif self.mode is Mode.TAKEOFF:
             self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())

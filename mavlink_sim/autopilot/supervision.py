@@ -94,6 +94,10 @@ class Supervision:
         """Of the chosen source; centred without one."""
         return self.manual_control.sticks
 
+    def read_sticks(self) -> Sticks:
+        """The same, for a task that asks anew at each step."""
+        return self.sticks
+
     @property
     def pilot_has_sticks(self) -> bool:
         return self.pilot_attached or self.manual_control.valid

@@ -7,6 +7,7 @@ level follows the area of a pixel's footprint on the ground.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -80,6 +81,14 @@ class Buffers:
         rng = np.random.default_rng(3)
         # Half an octave of fixed dither hides the lines at which the mip level changes.
         self.dither = np.exp2(rng.uniform(-DITHER, DITHER, shape)).astype(np.float32)
+
+    def band(self, rows: slice) -> Buffers:
+        """Those of some rows of the image: the same memory."""
+        part = copy.copy(self)
+        for name, whole in vars(self).items():
+            if name != "columns":
+                setattr(part, name, whole[rows])
+        return part
 
 
 def ground_atlas(ground: Ground) -> MipAtlas:
@@ -185,15 +194,30 @@ def _pad(colours: Plane, north: Plane, east: Plane) -> Plane:
 
 def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane) -> Image:
     """(H, W, 3) ground, not yet in haze; where the sky is, anything. Fills `inverse_depth` (0 = sky)."""
-    ground = world.ground
-    atlas = ground_atlas(ground)
-    height_m = max(float(-view.eye[2]), 1e-3)
-    down = view.ned_from_pixel[2]
     # 1/depth of the ground, negative above the horizon.
-    _linear(down / height_m, buffers, inverse_depth)
-    np.maximum(inverse_depth, NEAREST_INVERSE, out=buffers.work)
-    np.divide(1.0, buffers.work, out=buffers.depth)
+    _linear(view.ned_from_pixel[2] / _height_m(view), buffers, inverse_depth)
+    # It is linear along a row, so a row's ends tell whether there is any ground in it.
+    rows = np.flatnonzero(np.maximum(inverse_depth[:, 0], inverse_depth[:, -1]) > NEAREST_INVERSE)
+    image = np.empty((view.height, view.width, 3), np.uint8)
+    if len(rows):
+        band = slice(int(rows[0]), int(rows[-1]) + 1)
+        _draw_band(world.ground, view, buffers.band(band), inverse_depth[band], image[band])
+    np.copyto(inverse_depth, 0.0, where=inverse_depth <= NEAREST_INVERSE)
+    return image
+
+
+def _height_m(view: View) -> float:
+    return max(float(-view.eye[2]), 1e-3)
+
+
+def _draw_band(ground: Ground, view: View, buffers: Buffers, inverse_depth: Plane, image: Image) -> None:
+    """The rows of the picture in which there is ground, into `image`."""
+    atlas = ground_atlas(ground)
+    height_m = _height_m(view)
+    down = view.ned_from_pixel[2]
     depth = buffers.depth
+    np.maximum(inverse_depth, NEAREST_INVERSE, out=buffers.work)
+    np.divide(1.0, buffers.work, out=depth)
 
     period = atlas.size * ground.texel_m
     c, s = math.cos(ground.yaw_rad) / period, math.sin(ground.yaw_rad) / period
@@ -228,19 +252,17 @@ def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane
     scale *= 0.5
     buffers.map_y *= scale
     buffers.map_y += np.float32(GUTTER - 0.5)
-    image = np.asarray(cv2.remap(atlas.pixels, buffers.map_x, buffers.map_y, cv2.INTER_LINEAR), np.uint8)
+    cv2.remap(atlas.pixels, buffers.map_x, buffers.map_y, cv2.INTER_LINEAR, dst=image)
     _add_detail(view, height_m, buffers, image)
     if ground.gain != (1.0, 1.0, 1.0):
         steps = np.arange(256, dtype=np.float32)[:, None] * _colour(*ground.gain)
-        image = np.asarray(cv2.LUT(image, np.clip(steps, 0, 255).astype(np.uint8)[None]), np.uint8)
-    np.copyto(inverse_depth, 0.0, where=inverse_depth <= NEAREST_INVERSE)
-    return image
+        cv2.LUT(image, np.clip(steps, 0, 255).astype(np.uint8)[None], dst=image)
 
 
-def _linear(row: Matrix, buffers: Buffers, out: Plane, top: int = 0) -> None:
+def _linear(row: Matrix, buffers: Buffers, out: Plane) -> None:
     """out[v, u] = row · (u, v, 1)."""
-    down = buffers.rows[top : top + out.shape[0]] * np.float32(row[1]) + np.float32(row[2])
-    np.add(buffers.columns[:, : out.shape[1]] * np.float32(row[0]), down, out=out)
+    down = buffers.rows * np.float32(row[1]) + np.float32(row[2])
+    np.add(buffers.columns * np.float32(row[0]), down, out=out)
 
 
 def _fraction(row: Matrix, start: float, buffers: Buffers, out: Plane) -> None:
@@ -259,15 +281,14 @@ def _add_detail(view: View, height_m: float, buffers: Buffers, image: Image) -> 
     near_rows = np.flatnonzero(buffers.depth.min(axis=1) < DETAIL_REACH_M)
     if not len(near_rows):
         return
-    top, bottom = int(near_rows[0]), int(near_rows[-1]) + 1
+    near = slice(int(near_rows[0]), int(near_rows[-1]) + 1)
+    buffers = buffers.band(near)
     tile = detail_tile()
     side = tile.shape[0]
-    depth = buffers.depth[top:bottom]
-    map_x, map_y = buffers.map_x[top:bottom], buffers.map_y[top:bottom]
-    work = buffers.work[top:bottom]
+    depth, map_x, map_y, work = buffers.depth, buffers.map_x, buffers.map_y, buffers.work
     for axis, out in ((0, map_y), (1, map_x)):
         row = view.ned_from_pixel[axis] * (100.0 / side)
-        _linear(row, buffers, out, top)
+        _linear(row, buffers, out)
         out *= depth
         out += np.float32((view.eye[axis] * 100.0 / side) % 1.0)
         np.floor(out, out=work)
@@ -276,11 +297,10 @@ def _add_detail(view: View, height_m: float, buffers: Buffers, image: Image) -> 
     detail = cv2.remap(tile, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     # Fades out towards the reach: beyond it the detail is finer than a pixel.
     share = np.clip(1.4 - depth * np.float32(1.4 / DETAIL_REACH_M), 0.0, 1.0, out=work)
-    rest = np.subtract(1.0, share, out=buffers.weight[top:bottom])
-    flat = buffers.flat[top:bottom]
-    flat[:] = 128
-    faded = cv2.blendLinear(detail, flat, share, rest)
-    part = image[top:bottom]
+    rest = np.subtract(1.0, share, out=buffers.weight)
+    buffers.flat[:] = 128
+    faded = cv2.blendLinear(detail, buffers.flat, share, rest)
+    part = image[near]
     cv2.multiply(part, faded, dst=part, scale=1 / 128)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -97,11 +98,12 @@ class Lens:
                 "use weaker coefficients or a longer focal length"
             )
         self.drawn = CameraModel(width, height, camera.fx, camera.fy, camera.cx + left, camera.cy + top)
-        self._still_map = (
-            self._x * np.float32(camera.fx) + np.float32(self.drawn.cx),
-            self._y * np.float32(camera.fy) + np.float32(self.drawn.cy),
-        )
-        self._still_index = self._nearest(*self._still_map)
+        still_x = self._x * np.float32(camera.fx) + np.float32(self.drawn.cx)
+        still_y = self._y * np.float32(camera.fy) + np.float32(self.drawn.cy)
+        # OpenCV's own fixed-point form: a lens that does not move looks up twice as fast
+        self._still_map: tuple[NDArray[Any], NDArray[Any]] = cv2.convertMaps(still_x, still_y, cv2.CV_16SC2)
+        self._still_index = self._nearest(still_x, still_y)
+        self._still_seen = self._seen(self._still_index)
 
     def expose(
         self, image: Image, inverse_depth: Plane, labels: NDArray[np.int32], motion: CameraMotion
@@ -113,13 +115,14 @@ class Lens:
             exposure, of the nearest pixel; and which pixels of the pinhole picture were seen.
         """
         shutter = self.shutter
-        index, (map_x, map_y) = self._still_index, self._still_map
+        index, seen, (map_x, map_y) = self._still_index, self._still_seen, self._still_map
         times = [0.0]
         if not motion.still:
             still_inverse = inverse_depth.reshape(-1).take(index)
             if shutter.readout_s > 0.0:
                 map_x, map_y = self._moved(motion, 0.0, still_inverse)
                 index = self._nearest(map_x, map_y)
+                seen = self._seen(index)
             if shutter.exposure_s > 0.0:
                 times = self._exposures(motion, still_inverse)
         if len(times) == 1:
@@ -129,16 +132,14 @@ class Lens:
             for time_s in times:
                 cv2.accumulate(_look_up(image, *self._moved(motion, time_s, still_inverse)), total)
             exposed = np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / len(times)), np.uint8)
-        seen = np.zeros(image.shape[0] * image.shape[1], np.uint8)
-        seen[index] = 1
+        return exposed, inverse_depth.reshape(-1).take(index), labels.reshape(-1).take(index), seen
+
+    def _seen(self, index: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which pixels of the pinhole picture the camera looks at."""
+        seen = np.zeros((self.drawn.height, self.drawn.width), np.uint8)
+        seen.reshape(-1)[index] = 1
         # A pixel of the camera may cover several of the pinhole picture.
-        spread = cv2.dilate(seen.reshape(image.shape[:2]), np.ones((3, 3), np.uint8))
-        return (
-            exposed,
-            inverse_depth.reshape(-1).take(index),
-            labels.reshape(-1).take(index),
-            np.asarray(spread, np.bool_),
-        )
+        return np.asarray(cv2.dilate(seen, np.ones((3, 3), np.uint8)), np.bool_)
 
     def _nearest(self, map_x: Plane, map_y: Plane) -> NDArray[np.intp]:
         """(H, W) flat indices of the nearest pixels of the pinhole picture, at its rim if beyond it."""
@@ -178,7 +179,7 @@ class Lens:
         return [half * (2 * (number + 0.5) / count - 1.0) for number in range(count)]
 
 
-def _look_up(image: Image, map_x: Plane, map_y: Plane) -> Image:
+def _look_up(image: Image, map_x: NDArray[Any], map_y: NDArray[Any]) -> Image:
     looked = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(looked, np.uint8)
 

@@ -70,6 +70,15 @@ class Rendered:
     eye_ned_m: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """The pixels with objects, row by row: the object's number in the order drawn, column, row; (N,) each."""
+
+    numbers: NDArray[np.int32]
+    columns: NDArray[np.intp]
+    rows: NDArray[np.intp]
+
+
 _STILL = CameraMotion()
 
 
@@ -153,8 +162,9 @@ class Renderer:
             ]
         else:
             image, inverse_depth, exposed, inside = self._lens.expose(image, inverse_depth, labels, motion)
+            found = _found(exposed)
             objects = [
-                _visible_through_lens(placed, sighting, number, labels, exposed, inside, view)
+                _visible_through_lens(placed, sighting, number, labels, found, inside, view)
                 for placed, sighting, number in sightings
             ]
         if self.effects is not None:
@@ -330,25 +340,30 @@ def _visible(
     )
 
 
+def _found(exposed: NDArray[np.int32]) -> _Found:
+    """The pixels of an exposed picture in which there is any object."""
+    where = np.flatnonzero(exposed)
+    rows, columns = np.divmod(where, exposed.shape[1])
+    return _Found(exposed.reshape(-1)[where] >> FACE_BITS, columns, rows)
+
+
 def _visible_through_lens(
     placed: PlacedObject,
     sighting: Sighting,
     number: int,
     labels: NDArray[np.int32],
-    exposed: NDArray[np.int32],
+    found: _Found,
     inside: NDArray[np.bool_],
     view: View,
 ) -> VisibleObject | None:
     """The box in the exposed picture; the fraction in the drawn one, where a pixel is a pixel everywhere."""
-    own = (exposed >> FACE_BITS) == number
-    rows = np.flatnonzero(own.any(axis=1))
+    own = found.numbers == number
+    columns, rows = found.columns[own], found.rows[own]
     if not len(rows):
         return None
-    columns = np.flatnonzero(own[rows[0] : rows[-1] + 1].any(axis=0))
-    edges = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-    xyxy = (float(edges[0]), float(edges[1]), float(edges[2]), float(edges[3]))
+    xyxy = (float(columns.min()), float(rows[0]), float(columns.max() + 1), float(rows[-1] + 1))
     drawn = (slice(sighting.top, sighting.bottom), slice(sighting.left, sighting.right))
     seen = ((labels[drawn] >> FACE_BITS) == number) & inside[drawn]
     fraction = float(np.count_nonzero(seen)) / len(sighting.pixels) * sighting.inside_share
     range_m = range_to(placed.item, (view.eye[0], view.eye[1]))
-    return VisibleObject(placed.item, xyxy, min(1.0, fraction), int(np.count_nonzero(own)), range_m)
+    return VisibleObject(placed.item, xyxy, min(1.0, fraction), len(rows), range_m)

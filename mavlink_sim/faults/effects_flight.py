@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from functools import partial
 from typing import TYPE_CHECKING
 
 from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
@@ -64,22 +65,24 @@ def gps_loss(vehicle: Vehicle, one: ActiveFault) -> None:
             estimate.count_reset(2)
             estimate.position_valid = vehicle.autopilot.position_valid = False
 
-    def fuse_again() -> None:
-        estimate.set_error(one.number, None)
-        if estimate.fix_lost:
-            return
-        if estimate.held_xy_m is not None:
-            estimate.held_xy_m = None
-            estimate.position_valid = vehicle.autopilot.position_valid = True
-        _jumped(vehicle, 2)
-        vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
-
     def undo() -> None:
         estimate.fix_lost -= 1
-        vehicle.after(REACQUISITION_S, fuse_again)
+        vehicle.after(REACQUISITION_S, partial(_fuse_again, vehicle, one.number))
 
     one.each_step = each_step
     one.undo.append(undo)
+
+
+def _fuse_again(vehicle: Vehicle, number: int) -> None:
+    estimate = vehicle.estimate
+    estimate.set_error(number, None)
+    if estimate.fix_lost:
+        return
+    if estimate.held_xy_m is not None:
+        estimate.held_xy_m = None
+        estimate.position_valid = vehicle.autopilot.position_valid = True
+    _jumped(vehicle, 2)
+    vehicle.autopilot.texts.append(Text(INFO, "GNSS data fusion started\t"))
 
 
 def gps_drift(vehicle: Vehicle, one: ActiveFault) -> None:
@@ -174,7 +177,7 @@ def motor_failure(vehicle: Vehicle, one: ActiveFault) -> None:
     motor = one.fault.values["motor"]
     vehicle.airframe.fail_motor(motor - 1)
 
-    one.undo.append(lambda: vehicle.airframe.fail_motor(motor - 1, 1.0))
+    one.undo.append(partial(vehicle.airframe.fail_motor, motor - 1, 1.0))
 
 
 # ---- air
@@ -184,7 +187,7 @@ def wind(vehicle: Vehicle, one: ActiveFault) -> None:
     """So much more wind."""
     values = one.fault.values
     vehicle.faults.winds[one.number] = _blowing(values["speed"], _direction(values["from"], one.seed))
-    one.undo.append(lambda: _calm(vehicle, one))
+    one.undo.append(partial(_calm, vehicle, one))
 
 
 def gust(vehicle: Vehicle, one: ActiveFault) -> None:
@@ -201,7 +204,7 @@ def gust(vehicle: Vehicle, one: ActiveFault) -> None:
         vehicle.faults.winds[one.number] = _blowing(values["speed"] * (1.0 - math.cos(phase)) / 2.0, angle)
 
     one.each_step = each_step
-    one.undo.append(lambda: _calm(vehicle, one))
+    one.undo.append(partial(_calm, vehicle, one))
 
 
 def _direction(degrees: float | None, seed: int) -> float:
@@ -269,7 +272,7 @@ def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:
         return TEMPORARILY_REJECTED
 
     vehicle.faults.refusals[one.number] = refusal
-    one.undo.append(lambda: vehicle.faults.refusals.pop(one.number))
+    one.undo.append(partial(vehicle.faults.refusals.pop, one.number))
 
 
 def reboot(vehicle: Vehicle, one: ActiveFault) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from mavlink_sim.faults.grammar import FaultError
@@ -49,7 +50,7 @@ def _impair(vehicle: Vehicle, one: ActiveFault, make: Callable[[str], Impairment
     for seed, channel in _channels(vehicle, one):
         impairment = make(seed)
         channel.impair(impairment)
-        one.undo.append(lambda channel=channel, impairment=impairment: channel.mend(impairment))  # type: ignore[misc]
+        one.undo.append(partial(channel.mend, impairment))
 
 
 def link_loss(vehicle: Vehicle, one: ActiveFault) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import struct
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.faults.effects_link import chosen_links
@@ -64,7 +65,7 @@ def lost_ack(vehicle: Vehicle, one: ActiveFault) -> None:
         left -= 1
         if left > 0:
             return message
-        vehicle.after(0.0, lambda: vehicle.faults.finish(one.number))
+        vehicle.after(0.0, partial(vehicle.faults.finish, one.number))
         return None if left == 0 else message
 
     _gated(vehicle, one, gate)
@@ -72,7 +73,7 @@ def lost_ack(vehicle: Vehicle, one: ActiveFault) -> None:
 
 def _gated(vehicle: Vehicle, one: ActiveFault, gate: Any) -> None:
     vehicle.faults.gates[one.number] = gate
-    one.undo.append(lambda: vehicle.faults.gates.pop(one.number))
+    one.undo.append(partial(vehicle.faults.gates.pop, one.number))
 
 
 def time_jump(vehicle: Vehicle, one: ActiveFault) -> None:
@@ -128,6 +129,8 @@ class _Spoken:
         return self._system
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
         return getattr(self._message, name)
 
 
@@ -154,7 +157,7 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
 
     vehicle.faults.second[one.number] = other
     one.each_step, one.apart = speak, True
-    one.undo.append(lambda: vehicle.faults.second.pop(one.number))
+    one.undo.append(partial(vehicle.faults.second.pop, one.number))
 
 
 def stall(vehicle: Vehicle, one: ActiveFault) -> None:

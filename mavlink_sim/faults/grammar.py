@@ -13,6 +13,7 @@ import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 
@@ -155,44 +156,44 @@ def _shown(value: Any) -> str:
 
 def number(low: float, high: float, unit: str = "") -> Callable[[str], float]:
     """A finite number within limits."""
+    return partial(_number, low, high, unit)
 
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high or math.isinf(value):
-            raise ValueError(f"a number, {low:g} to {high:g}{f' {unit}' if unit else ''}")
-        return value
 
-    return read
+def _number(low: float, high: float, unit: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high or math.isinf(value):
+        raise ValueError(f"a number, {low:g} to {high:g}{f' {unit}' if unit else ''}")
+    return value
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
     """A whole number within limits."""
+    return partial(_whole, low, high)
 
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise ValueError(f"a whole number, {low} to {high}")
-        return value
 
-    return read
+def _whole(low: int, high: int, text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = low - 1
+    if not low <= value <= high:
+        raise ValueError(f"a whole number, {low} to {high}")
+    return value
 
 
 def choice(*words: str) -> Callable[[str], str]:
     """One of some words, in any case."""
+    return partial(_choice, words)
 
-    def read(text: str) -> str:
-        for word in words:
-            if word.lower() == text.lower():
-                return word
-        raise ValueError(f"one of {', '.join(words)}")
 
-    return read
+def _choice(words: tuple[str, ...], text: str) -> str:
+    for word in words:
+        if word.lower() == text.lower():
+            return word
+    raise ValueError(f"one of {', '.join(words)}")
 
 
 probability = number(0.0, 1.0)

@@ -76,7 +76,7 @@ class PrecisionLanding(flight.TrajectoryTask):
         self._precision = precision
         self._newest = newest
         self._now_s = now_s
-        self._on_phase = on_phase or (lambda text: None)
+        self._on_phase = on_phase
         self._trajectory = flight.Trajectory(airframe, parameters)
         self.goal: Vector = self._trajectory.stopping_point() if place is None else place
         self._land: flight.Land | None = None
@@ -158,7 +158,8 @@ class PrecisionLanding(flight.TrajectoryTask):
         self.phase = phase
         self._phase_since_s = self._now_s()
         self._arrived_s = None
-        self._on_phase(f"precision landing: {phase.value}")
+        if self._on_phase is not None:
+            self._on_phase(f"precision landing: {phase.value}")
 
     def _approach_target(self) -> None:
         self._enter(Phase.APPROACH)

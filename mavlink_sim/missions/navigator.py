@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flight import tasks as flight
@@ -263,11 +264,17 @@ class Navigator:
             self._airframe,
             self._parameters,
             precision,
-            lambda: self.target,
-            lambda: self.now_s,
+            self.newest_target,
+            self.time_s,
             place,
             self._on_event,
         )
+
+    def newest_target(self) -> LandingTarget | None:
+        return self.target
+
+    def time_s(self) -> float:
+        return self.now_s
 
     def return_task(self) -> flight.Task:
         """The task of RTL, by RTL_TYPE and RTL_PLD_MD; says where it leads."""
@@ -292,15 +299,13 @@ class Navigator:
 
     def _return_landing(self) -> Callable[[Vector], flight.TrajectoryTask]:
         """Makes the task of RTL's last descent."""
-        mode = int(self._parameters.number("RTL_PLD_MD"))
+        return partial(self._descent, int(self._parameters.number("RTL_PLD_MD")))
 
-        def landing(place: Vector) -> flight.TrajectoryTask:
-            if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
-                return flight.Land(self._airframe, self._parameters, place)
-            z = self._airframe.position[2]
-            return self.precision_landing(Precision(mode), (place[0], place[1], z))
-
-        return landing
+    def _descent(self, mode: int, place: Vector) -> flight.TrajectoryTask:
+        if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
+            return flight.Land(self._airframe, self._parameters, place)
+        z = self._airframe.position[2]
+        return self.precision_landing(Precision(mode), (place[0], place[1], z))
 
     def guard_sticks(self, acceleration: Plane, velocity: Plane) -> Plane:
         """What collision prevention leaves of the sticks' acceleration, m/s² (north, east)."""

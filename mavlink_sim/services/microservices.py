@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.autopilot.commander import ACCEPTED
@@ -55,7 +56,7 @@ def _command(vehicle: Vehicle, link: Link, message: Any) -> None:
     if command.identifier in commands.ANSWERED_BY_RECEIVER:
         _execute(vehicle, link, message, command)
     else:
-        vehicle.after(COMMANDER_DELAY_S, lambda: _execute(vehicle, link, message, command))
+        vehicle.after(COMMANDER_DELAY_S, partial(_execute, vehicle, link, message, command))
 
 
 def _execute(vehicle: Vehicle, link: Link, message: Any, command: commands.Command) -> None:
@@ -86,7 +87,7 @@ def _set_mode(vehicle: Vehicle, link: Link, message: Any) -> None:
         0.0,
     )
     command = commands.Command(commands.DO_SET_MODE, values, message.get_srcComponent())
-    vehicle.after(COMMANDER_DELAY_S, lambda: _execute(vehicle, link, message, command))
+    vehicle.after(COMMANDER_DELAY_S, partial(_execute, vehicle, link, message, command))
 
 
 def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:

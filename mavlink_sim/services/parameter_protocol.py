@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.px4.parameters import (
@@ -41,7 +42,7 @@ UNSUPPORTED = 3
 
 def request_list(vehicle: Vehicle, link: Link, message: Any) -> None:
     """PARAM_REQUEST_LIST: the hash, then every parameter at about a thousand a second."""
-    vehicle.after(FIRST_ANSWER_S, lambda: _begin_list(vehicle, link))
+    vehicle.after(FIRST_ANSWER_S, partial(_begin_list, vehicle, link))
 
 
 def _begin_list(vehicle: Vehicle, link: Link) -> None:
@@ -97,7 +98,7 @@ def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
         logger.info("PARAM_SET refused, the old value stands: %s", error)
     _send(link, vehicle.parameters, parameter)
     if parameter.value != before:
-        vehicle.after(SECOND_ECHO_S, lambda: tell_everyone(vehicle, [name]))
+        vehicle.after(SECOND_ECHO_S, partial(tell_everyone, vehicle, [name]))
 
 
 def tell_everyone(vehicle: Vehicle, names: Iterable[str]) -> None:

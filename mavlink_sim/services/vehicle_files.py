@@ -11,7 +11,7 @@ import json
 import lzma
 import struct
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
@@ -38,18 +38,26 @@ _PACK_INT32, _PACK_FLOAT = 3, 4
 def vehicle_files(parameters: Parameters) -> FileSystem:
     """The files of a new vehicle; those made of the parameters follow them."""
     files = FileSystem()
-    files.provide("parameters.bson", lambda: bson(parameters.customised()))
-    files.provide("parameters_backup.bson", lambda: bson(parameters.customised()))
-    files.provide(GENERAL, lambda: _compressed(general_metadata()))
-    files.provide(PARAMETERS, lambda: _compressed(parameter_metadata()))
-    files.provide(EVENTS, lambda: _compressed(event_metadata()))
+    files.provide("parameters.bson", partial(_customised, parameters))
+    files.provide("parameters_backup.bson", partial(_customised, parameters))
+    files.provide(GENERAL, partial(_compressed_from, general_metadata))
+    files.provide(PARAMETERS, partial(_compressed_from, parameter_metadata))
+    files.provide(EVENTS, partial(_compressed_from, event_metadata))
     files.make_directory("log")
     return files
 
 
+def _customised(parameters: Parameters) -> bytes:
+    return bson(parameters.customised())
+
+
+def _compressed_from(metadata: Callable[[], bytes]) -> bytes:
+    return _compressed(metadata())
+
+
 def offer_packed_parameters(files: FileSystem, parameters: Parameters) -> None:
     """Add `@PARAM/param.pck`, which ArduPilot has and ground stations written for it ask for."""
-    files.provide("@PARAM/param.pck", lambda: packed_parameters(parameters))
+    files.provide("@PARAM/param.pck", partial(packed_parameters, parameters))
 
 
 def bson(parameters: Iterable[Parameter]) -> bytes:

@@ -158,8 +158,16 @@ def protocol_version() -> Any:
     )
 
 
+class _Codec(dialect.MAVLink):  # type: ignore[misc]
+    """One that can be copied: compiled structures cannot be, and are alike in all of them."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = {name: value for name, value in vars(self).items() if not isinstance(value, struct.Struct)}
+        return _Codec, (None,), state
+
+
 def parser(system: int = 1, component: int = 1) -> Any:
     """A pymavlink codec: reads a stream of bytes without raising on garbage, numbers what it packs."""
-    codec = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+    codec = _Codec(None, srcSystem=system, srcComponent=component)
     codec.robust_parsing = True
     return codec

@@ -84,6 +84,9 @@ class Form:
         self.low, self.high = self.identifier & 0xFF, self.identifier >> 8
         self.crc_extra = bytes([message_class.crc_extra])
 
+    def __reduce__(self) -> tuple[type[Form], tuple[Any]]:
+        return Form, (self._class,)
+
     def unpacked(self, payload: bytes) -> Any:
         """The pymavlink message of a payload."""
         values = list(self._class.unpacker.unpack(payload))

@@ -243,3 +243,64 @@ def test_a_vehicle_without_links_refuses_faults_of_links() -> None:
 
 def client_reads(data: bytes) -> list[Any]:
     return [message for message in parser().parse_buffer(data) if message.get_type() != "BAD_DATA"]
+
+
+# ---- copies
+
+
+def everything_told(vehicle: LockstepVehicle) -> tuple[Any, ...]:
+    return vehicle.truth, *(vehicle.receive_bytes(link) for link in vehicle.newest)
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "options"),
+    [("px4", {"gimbal": True, "air_seed": 2}), ("px4", {"px4": "1.14"}), ("ardupilot", {})],
+)
+def test_a_copy_flies_on_as_the_first_does_to_the_last_byte(autopilot: str, options: dict[str, Any]) -> None:
+    first = LockstepVehicle(
+        {"onboard": ONBOARD_RATES_HZ, "gcs": GCS_RATES_HZ},
+        autopilot=autopilot,
+        seed=4,
+        wind_mps=3.0,
+        **options,
+    )
+    first.take_off(4.0)
+    first.repeat(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 1.0)
+    first.vehicle.faults.begin("gps_loss for=0.5")
+    first.vehicle.faults.begin("wind 4 at=60")
+    first.step(0.7)
+    # in the middle of things: a fix that comes back, a command that is not carried out yet, half a message
+    half = dialect.MAVLink_command_long_message(1, 1, 512, 0, 242, 0, 0, 0, 0, 0, 0).pack(parser())
+    first.send_bytes(half[:9])
+    first.send(dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, math.nan, 0, 0, 0))
+    second = first.copy()
+    for vehicle in (first, second):
+        vehicle.send_bytes(half[9:])
+        vehicle.step(6.0)
+    assert everything_told(first) == everything_told(second)
+    assert first.events == second.events
+    assert any("mode LAND" in event for event in second.events)
+
+
+def test_what_is_done_to_a_copy_does_nothing_to_the_first() -> None:
+    first, alike = LockstepVehicle(seed=4), LockstepVehicle(seed=4)
+    for vehicle in (first, alike):
+        vehicle.take_off(3.0)
+    second = first.copy()
+    second.vehicle.faults.begin("motor_failure 1")
+    second.vehicle.parameters.set("MPC_XY_P", 0.1)
+    second.step(2.0)
+    assert abs(second.truth.roll_rad) > 0.3
+    for vehicle in (first, alike):
+        vehicle.step(2.0)
+    assert everything_told(first) == everything_told(alike)
+    assert first.events == alike.events
+
+
+def test_a_vehicle_with_a_fault_on_it_is_not_copied_and_says_which() -> None:
+    vehicle = LockstepVehicle({"onboard": {}})
+    vehicle.vehicle.faults.begin("gust 6")
+    with pytest.raises(ValueError, match="gust is on this vehicle; end it first"):
+        vehicle.copy()
+    vehicle.vehicle.faults.end()
+    vehicle.copy().step(1.0)
