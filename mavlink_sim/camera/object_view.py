@@ -6,8 +6,9 @@ number. The reciprocal of a plane's depth is linear in the pixel, so depth is ex
 
 from __future__ import annotations
 
+import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -81,6 +82,22 @@ class PlacedObject:
         self.normals_ned = self.shape.normals @ self.ned_from_object.T
         self.lit = self._lit()
         self._shadow: tuple[NDArray[np.float64], list[int]] | None = None
+
+    def moved(self, item: WorldObject) -> PlacedObject | None:
+        """The same thing at another place: what light and shadow it has stays. None if more has changed."""
+        if replace(self.item, position_ned_m=item.position_ned_m) != item:
+            return None
+        twin = copy.copy(self)
+        twin.item = item
+        twin.origin = np.array(item.position_ned_m, np.float64)
+        shift = twin.origin - self.origin
+        twin.middle = self.middle + shift
+        if self._shadow is not None and shift[2] == 0.0:
+            corners, first = self._shadow
+            twin._shadow = (corners + shift, first)
+        else:
+            twin._shadow = None
+        return twin
 
     def _lit(self) -> Plane:
         """(F, 3) faces' colours under sun and sky, without mirroring."""

@@ -126,7 +126,14 @@ class Renderer:
         ) == len(self._placed):
             return
         self.world = replace(self.world, objects=tuple(objects))
-        self._placed = [known.get(item) or PlacedObject(item, light, sky) for item in objects]
+        former = {placed.item.identifier: placed for placed in self._placed}
+        placed_now = []
+        for item in objects:
+            placed = known.get(item)
+            if placed is None and item.identifier in former:
+                placed = former[item.identifier].moved(item)
+            placed_now.append(placed or PlacedObject(item, light, sky))
+        self._placed = placed_now
         self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
         self._radii = np.array([placed.radius_m for placed in self._placed])
         self._shadow_middles = self._shadow_radii = None

@@ -243,6 +243,22 @@ def test_what_a_renderer_drew_before_does_not_show() -> None:
     assert first.image is not again.image
 
 
+def test_what_moves_is_drawn_as_if_it_had_always_been_there() -> None:
+    parked = thing(0, "truck", 14.0, 1.0)
+    ways = [(8.0, -1.0, 0.0, 0.4), (9.5, 0.5, 0.0, 0.4), (9.5, 0.5, -1.5, 0.4), (9.5, 0.5, 0.0, -1.0)]
+    renderer = Renderer(world_of(parked, thing(1, "person", 7.0, 0.0, 0.4)), CAMERA, DEFAULT_MOUNT)
+    renderer.render((0.0, 0.0, -3.0), LEVEL)
+    for north, east, down, yaw in ways:
+        objects = (parked, WorldObject(1, "person", (north, east, down), yaw, 1.0, 0))
+        renderer.place(objects)
+        moved = renderer.render((0.0, 0.0, -3.0), LEVEL)
+        fresh = Renderer(world_of(*objects), CAMERA, DEFAULT_MOUNT).render((0.0, 0.0, -3.0), LEVEL)
+        assert np.array_equal(moved.image, fresh.image)
+        assert np.array_equal(moved.depth_m, fresh.depth_m, equal_nan=True)
+        assert [item.xyxy for item in moved.objects] == [item.xyxy for item in fresh.objects]
+        assert seen(moved, 1).world_object.position_ned_m == (north, east, down)
+
+
 def test_a_landed_camera_still_sees() -> None:
     rendered = Renderer(world_of(), CAMERA, DEFAULT_MOUNT).render((0.0, 0.0, 0.3), LEVEL)
     assert 0.0 < np.nanmin(rendered.depth_m) < 0.5
