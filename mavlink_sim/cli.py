@@ -106,8 +106,15 @@ def simulate(
         float | None, typer.Option(help="Frames per second of the camera; default: the scene's, else 30.")
     ] = None,
     scene: Annotated[
-        str | None, typer.Option(help="World and camera from this TOML file, or an example's name.")
+        str | None,
+        typer.Option(help="World, obstacles and camera from this TOML file, or an example's name."),
     ] = None,
+    obstacle_sensor: Annotated[
+        bool,
+        typer.Option(
+            "--obstacle-sensor", help="With a range sensor all around, for collision prevention (CP_DIST)."
+        ),
+    ] = False,
     camera_output: Annotated[
         list[str] | None,
         typer.Option(help="Frames here too: pipe:PATH, pipe:-, http://HOST:PORT, rtp://HOST:PORT; repeat."),
@@ -218,6 +225,7 @@ def simulate(
         camera_outputs=tuple(camera_output or ()),
         camera_truth=camera_truth,
         scene=scene,
+        obstacle_sensor=obstacle_sensor,
         truth=truth,
         record=record,
         ready_after_s=ready_after,
@@ -234,11 +242,8 @@ def simulate(
     )
     if not options.shows_world:
         _refuse_without_camera({"camera-rate": camera_rate, "camera-vehicle": camera_vehicle})
-        if scene is not None and truth is None:
-            _fail(
-                f"--scene {scene}: nobody sees it; add --camera NAME, --camera-output ADDRESS "
-                "or --truth PATH, or leave it out"
-            )
+    if obstacle_sensor and scene is None:
+        _fail("--obstacle-sensor: there is nothing to measure; add --scene FILE, or leave it out")
     if spacing is not None and vehicles == 1:
         _fail(f"--spacing {spacing:g}: there is one vehicle; add --vehicles N, or leave it out")
     try:

@@ -17,13 +17,16 @@ import pickle
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.lockstep_wire import LockstepWire
 from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import Outgoing, dialect
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
+
+if TYPE_CHECKING:
+    from mavlink_sim.physics.collisions import Collision
 
 COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
 ANSWER_LIMIT_S = 1.0
@@ -50,7 +53,9 @@ class Truth:
         time_s: since boot. position_ned_m, velocity_ned_mps: local NED, its origin at the start.
         quaternion: `ned_from_body` (w, x, y, z). roll_rad, pitch_rad, yaw_rad: the same.
         rates_radps: body FRD.
-        mode: PX4's name of the flight mode. on_ground: touching it. landed: as the land detector has it.
+        mode: PX4's name of the flight mode. on_ground: touching it, or on top of something.
+        landed: as the land detector has it.
+        collisions: how often it met something of the scene. collision: the newest; None before the first.
     """
 
     time_s: float
@@ -66,6 +71,8 @@ class Truth:
     landed: bool
     on_ground: bool
     crashed: bool
+    collisions: int = 0
+    collision: Collision | None = None
 
     @property
     def height_m(self) -> float:
@@ -81,7 +88,8 @@ class LockstepVehicle:
             answers alone (and what is told once: the origin, parameters set at the start), the fastest.
         autopilot: whose manners it has, "px4" or "ardupilot" (`personality`); the latter's streams are asked
             for by messages, whatever `links` says.
-        options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`…
+        options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`,
+            `scene` (a scene file, an example's name, a `Scene` or a `World`), `obstacle_sensor`…
 
     Attributes:
         vehicle: the vehicle itself, with everything that is inside (`airframe`, `autopilot`, `parameters`).
@@ -346,6 +354,7 @@ class LockstepVehicle:
     def truth(self) -> Truth:
         """What is really so now."""
         airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
+        around = self.vehicle.surroundings
         return Truth(
             self.now_s,
             airframe.position,
@@ -360,6 +369,8 @@ class LockstepVehicle:
             autopilot.landed,
             airframe.on_ground,
             airframe.crashed,
+            0 if around is None else around.airframe.collisions,
+            None if around is None else around.airframe.last_collision,
         )
 
 

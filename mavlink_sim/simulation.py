@@ -52,7 +52,9 @@ class SimulationOptions:
         camera: name of the shared-memory segment the camera's frames go to; None for no shared memory.
         camera_outputs: further addresses the frames go to (`video_outputs`).
         camera_truth: file for what is in each frame, one JSON object a line.
-        scene: a scene file, or the name of an example (`scene_file.load_scene`); None for the demo world.
+        scene: a scene file, or the name of an example (`scene_file.load_scene`), whose things are in the
+            vehicle's way; None for the demo world, which is there to be looked at alone.
+        obstacle_sensor: with a range sensor for collision prevention that looks around it; needs a scene.
         truth: file for the truth, one JSON object a line; None for none.
         record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
@@ -84,6 +86,7 @@ class SimulationOptions:
     camera_outputs: tuple[str, ...] = ()
     camera_truth: Path | None = None
     scene: str | None = None
+    obstacle_sensor: bool = False
     truth: Path | None = None
     record: Path | None = None
     ready_after_s: float = 3.0
@@ -111,11 +114,13 @@ class Simulation:
     Raises (when made):
         PortInUseError: a port to bind is taken.
         FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
+        SceneError: the scene cannot be used. ValueError: a vehicle that cannot be, or not there.
         OSError: the truth file or the record cannot be written.
     """
 
     def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
         self.options = options
+        self._scene = self._loaded_scene()
         self.vehicle = vehicle_class(options.autopilot)(
             system_id=options.system_id,
             seed=options.seed,
@@ -127,6 +132,8 @@ class Simulation:
             px4=options.px4,
             noise=options.noise,
             start_ned_m=options.start_ned_m,
+            scene=None if options.scene is None else self._scene,
+            obstacle_sensor=options.obstacle_sensor,
             gimbal=options.gimbal,
             on_event=on_event,
         )
@@ -142,7 +149,6 @@ class Simulation:
         self._camera_seen = False
         self._camera_rate_hz = 30.0
         self._next_camera_check_s = 0.0
-        self._scene: Scene | None = None
         self._truth: IO[str] | None = None
         self._resources = ExitStack()
         try:
@@ -167,8 +173,8 @@ class Simulation:
             )
             if options.truth is not None:
                 self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
-            if options.shows_world or options.truth is not None or options.scene is not None:
-                self._open_world()
+            if self._scene is not None and options.shows_world:
+                self._open_camera(self._scene)
         except BaseException:
             self._resources.close()
             raise
@@ -178,23 +184,27 @@ class Simulation:
         self._resources.callback(endpoint.close)
         return endpoint
 
-    def _open_world(self) -> None:
-        # imported here: a vehicle without camera or truth needs neither the renderer nor its start-up time
+    def _loaded_scene(self) -> Scene | None:
+        """What the camera sees and the truth tells of; None if nobody looks and nothing was asked for."""
+        options = self.options
+        if not options.shows_world and options.truth is None and options.scene is None:
+            return None
+        # imported here: a vehicle that is alone needs neither the renderer nor its start-up time
         from mavlink_sim.camera.scene_file import scene_or_demo
 
-        options = self.options
-        self._scene = scene_or_demo(
+        return scene_or_demo(
             options.scene, options.seed if options.world_seed is None else options.world_seed
         )
-        if not options.shows_world:
-            return
+
+    def _open_camera(self, scene: Scene) -> None:
         from mavlink_sim.camera.process import CameraProcess
 
+        options = self.options
         if options.camera is not None:
             segment_path(options.camera)  # raises for a name that cannot be
-        self._camera_rate_hz = options.camera_rate_hz or self._scene.camera.rate_hz
+        self._camera_rate_hz = options.camera_rate_hz or scene.camera.rate_hz
         self._camera = CameraProcess(
-            self._scene,
+            scene,
             rate_hz=self._camera_rate_hz,
             shared_name=options.camera,
             outputs=options.camera_outputs,
@@ -321,8 +331,9 @@ class Simulation:
         return None if gimbal is None else euler_from_quaternion(gimbal.body_quaternion)
 
     def truth(self) -> dict[str, Any]:
-        """What is really so now: pose, mode, and the range to every object of the world."""
+        """What is really so now: pose, mode, what it ran into, and the range to every object of the world."""
         airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
+        surroundings = self.vehicle.surroundings
         return {
             "stamp_ns": time.monotonic_ns(),
             "position_ned_m": [round(value, 4) for value in airframe.position],
@@ -331,6 +342,7 @@ class Simulation:
             "mode": autopilot.mode.name,
             "armed": autopilot.armed,
             "landed": autopilot.landed,
+            **({} if surroundings is None else surroundings.truth()),
             "objects": []
             if self._scene is None
             else _object_truth(self._scene.world_at(self._simulated_s), self._place_in_world),

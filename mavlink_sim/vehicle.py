@@ -12,7 +12,8 @@ import math
 import random
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.faults.schedule import Faults
@@ -37,6 +38,12 @@ from mavlink_sim.wire.signing import Signing, timestamp_now
 from mavlink_sim.wire.signing import Streams as SigningStreams
 from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_CLOCK_RATE, Streams
 
+if TYPE_CHECKING:
+    from mavlink_sim.camera.scene import Scene
+    from mavlink_sim.physics.collisions import Collision
+    from mavlink_sim.surroundings import Surroundings
+    from mavlink_sim.world.world import World
+
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
 BOOT_UTC_NS = 1_773_273_600 * 10**9  # 2026-03-12
 STEP_S = 0.004
@@ -47,6 +54,7 @@ CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
 # The air is never still: with these gusts a held position wanders as measured (std 0.26/0.25/0.09 m).
 BACKGROUND_GUSTS_MPS = 0.6
 GUST_SHARE_OF_WIND = 0.15
+OBSTACLE_SENSOR_PERIOD_S = 0.1
 MAX_WIND_MPS = 40.0  # a hurricane; a client may set any number
 # Measured: "Connection to mission computer lost" comes 7 s after the last heartbeat; COM_OBC_LOSS_T is 5 s.
 COMPANION_LOSS_MARGIN_S = 2.0
@@ -67,10 +75,18 @@ class Vehicle:
         ready_after_s: how long after boot the estimator allows arming.
         px4: the release of PX4 to be like, where they differ (`releases.RELEASES`); None: the newest.
         start_ned_m: where it starts, north and east of SIH's home; its local NED frame begins there.
+        scene: what stands around and is in its way: a `Scene`, a `World`, a scene file or an example's name,
+            with its origin at SIH's home and its time that of the faults. None: nothing but level ground.
+        obstacle_sensor: with a range sensor that looks around it for collision prevention; needs a scene.
         on_event: called with one readable line per event ("armed", "mode HOLD", "landed"…).
 
+    Raises:
+        ValueError: something of the scene stands where it starts, or a sensor without a scene was asked for.
+        SceneError: the scene cannot be used.
+
     Attributes:
-        airframe: the motion (truth). estimate: what the vehicle knows of it. faults: what goes wrong.
+        airframe: the motion (truth). surroundings: the scene, None without one.
+        estimate: what the vehicle knows of it. faults: what goes wrong.
         autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
@@ -101,6 +117,8 @@ class Vehicle:
         ready_after_s: float = 3.0,
         px4: str | None = None,
         start_ned_m: tuple[float, float] = (0.0, 0.0),
+        scene: Scene | World | str | Path | None = None,
+        obstacle_sensor: bool = False,
         on_event: Callable[[str], None] | None = None,
     ) -> None:
         self.system_id = system_id
@@ -113,7 +131,26 @@ class Vehicle:
             self.parameters.set("SIH_WIND_E", wind_mps * math.sin(direction))
         if gusts_mps is None:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
-        self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        if obstacle_sensor and scene is None:
+            raise ValueError("an obstacle sensor has nothing to measure without a scene: give it one")
+        self.surroundings: Surroundings | None = None
+        self._obstacle_sensor = obstacle_sensor
+        if scene is None:
+            self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
+        else:
+            # imported here: without a scene neither the shapes nor their libraries are needed
+            from mavlink_sim.surroundings import Surroundings
+
+            self.surroundings = Surroundings(
+                scene,
+                seed=seed,
+                gusts_mps=gusts_mps,
+                noise=noise,
+                start_ned_m=start_ned_m,
+                clock=lambda: self.faults.now_s,
+            )
+            self.airframe = self.surroundings.airframe
+            self.surroundings.airframe.on_collision = self._collided
         self.airframe.on_touch = self._touched
         self._air = None if air_seed is None else SharedAir(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
@@ -147,6 +184,8 @@ class Vehicle:
         self._later: list[tuple[float, int, Callable[[], object]]] = []
         self._later_count = itertools.count()
         self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
+        if self._obstacle_sensor:
+            self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
 
     # ---- what is known of it ----------------------------------------------------------------------------
 
@@ -311,6 +350,20 @@ class Vehicle:
             self._on_event(f"crashed at {down_mps:.1f} m/s")
         elif down_mps > HARD_LANDING_MPS:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
+
+    def _collided(self, collision: Collision) -> None:
+        """The airframe met something of the scene."""
+        self._on_event(str(collision))
+
+    def _look_around(self) -> None:
+        """What the obstacle sensor measures goes into the map of collision prevention."""
+        assert self.surroundings is not None
+        self.estimate.look()
+        autopilot = self.autopilot
+        self.surroundings.sense_obstacles(
+            autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s
+        )
+        self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
 
     def reboot(self) -> None:
         """Power was lost for a moment: the motors are off, and time since boot begins anew.

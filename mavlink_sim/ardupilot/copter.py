@@ -17,13 +17,13 @@ from mavlink_sim.wire.announcements import Text
 
 
 class CopterVehicle(Vehicle):
-    """See `Vehicle`, with Copter's parameters; there is no gimbal and no choice of a PX4 release.
+    """See `Vehicle`, with Copter's parameters, without gimbal, obstacle sensor or a choice of PX4's release.
 
     Attributes:
         own_intervals: by link, the messages whose interval was set one by one.
 
     Raises:
-        ValueError: a gimbal or a release of PX4 was asked for.
+        ValueError: a gimbal, an obstacle sensor or a release of PX4 was asked for.
     """
 
     autopilot_class = CopterAutopilot
@@ -35,6 +35,10 @@ class CopterVehicle(Vehicle):
             raise ValueError("an ArduPilot vehicle has no gimbal here: leave it out, or fly a PX4")
         if options.get("px4") is not None:
             raise ValueError(f"PX4 {options['px4']} means nothing to an ArduPilot vehicle: leave --px4 out")
+        if options.get("obstacle_sensor"):
+            raise ValueError(
+                "an ArduPilot vehicle has no collision prevention here: leave --obstacle-sensor out"
+            )
         self.own_intervals: dict[str, set[str]] = {}
         super().__init__(**options)
 

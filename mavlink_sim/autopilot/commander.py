@@ -425,7 +425,7 @@ class Autopilot:
     def _detect_landing(self, setpoint: flight.Setpoint) -> None:
         airframe = self._airframe
         if self.landed:
-            if -airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
+            if airframe.floor_down_m - airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
                 self.landed = False
                 self._has_flown = True
                 self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)

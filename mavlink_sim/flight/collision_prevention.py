@@ -47,6 +47,8 @@ class ObstacleMap:
     Attributes:
         distances_cm: UNKNOWN_CM where nothing is known.
         stamp_s: when the newest message came, seconds since boot.
+        used_s: when collision prevention looked at it last; PX4 publishes the map then, and then alone.
+        min_distance_cm, max_distance_cm: the widest range of any sensor so far.
         activated_s: when collision prevention was first asked for.
     """
 
@@ -56,7 +58,9 @@ class ObstacleMap:
         self.stamps_s = [-math.inf] * SECTORS
         self.covered = [False] * SECTORS
         self.min_distance_cm = UNKNOWN_CM
+        self.max_distance_cm = 0
         self.stamp_s = -math.inf
+        self.used_s = -math.inf
         self.activated_s: float | None = None
 
     def add(
@@ -86,6 +90,7 @@ class ObstacleMap:
             return
         self.stamp_s = now_s
         self.min_distance_cm = min(self.min_distance_cm, min_distance_cm)
+        self.max_distance_cm = max(self.max_distance_cm, max_distance_cm)
         shift = offset_deg - (0.0 if frame == FRAME_BODY_FRD else math.degrees(yaw_rad))
         count = min(len(distances_cm), SECTORS, math.ceil(360.0 / increment_deg))
         for index in range(count):
@@ -146,6 +151,7 @@ def limited_acceleration(
         return Limited(acceleration)
     if obstacles.activated_s is None:
         obstacles.activated_s = now_s
+    obstacles.used_s = now_s
     obstacles.forget_stale(now_s)
     if not obstacles.has_data(now_s):
         silent_s = now_s - max(obstacles.stamp_s, obstacles.activated_s)

@@ -68,6 +68,7 @@ class Multirotor:
         crashed: it hit the ground too hard or upside down: the rotors are broken.
         touchdown_mps: the downward speed of the last contact with the ground.
         on_touch: called with that speed at every contact.
+        floor_down_m: NED z of what it stands on or stood on last; the ground's, unless there are obstacles.
         wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
     """
 
@@ -94,6 +95,8 @@ class Multirotor:
         "velocity",
         "wind",
     )
+
+    floor_down_m = 0.0
 
     def __init__(self, seed: int = 0, wind: Vector = _STILL, gusts_mps: float = 0.0) -> None:
         self.position: Vector = _STILL

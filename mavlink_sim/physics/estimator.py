@@ -237,6 +237,15 @@ class Estimate(Multirotor):
         """Nothing: the attitude is the airframe's own."""
 
     @property
+    def floor_down_m(self) -> float:
+        """NED z of what the airframe stands on or stood on last."""
+        return self.truth.floor_down_m
+
+    @floor_down_m.setter
+    def floor_down_m(self, value: float) -> None:
+        """Nothing: it is the airframe that stands."""
+
+    @property
     def roll_rad(self) -> float:
         a, b, c = self.attitude_error
         _, _, _, _, _, _, x, y, z = self.truth.matrix

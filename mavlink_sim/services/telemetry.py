@@ -55,6 +55,7 @@ BUILDERS: dict[str, Builder] = {
     "TIME_ESTIMATE_TO_TARGET": telemetry_of_system.time_estimate,
     "CURRENT_EVENT_SEQUENCE": telemetry_of_system.current_event_sequence,
     "GPS_GLOBAL_ORIGIN": telemetry_of_system.gps_global_origin,
+    "OBSTACLE_DISTANCE": telemetry_of_motion.obstacle_distance,
 }
 # Built on request alone.
 REQUESTED: dict[str, Builder] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from mavlink_sim.flight import collision_prevention
 from mavlink_sim.physics.airframe import MAX_THRUST_MPS2
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.wire import packing
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
 
 _NAN = math.nan
+# It works at the rate of the position control.
+OBSTACLE_MAP_AGE_S = 0.05
 
 
 def attitude(vehicle: Vehicle) -> Any:
@@ -106,8 +109,29 @@ def altitude(vehicle: Vehicle) -> Any:
 def distance_sensor(vehicle: Vehicle) -> Any:
     frame = vehicle.estimate
     slant = -vehicle.airframe.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
+    if vehicle.surroundings is not None:
+        slant = min(slant, vehicle.surroundings.range_below_m())
     return packing.distance_sensor(
         vehicle.boot_ms, 0, 10000, min(round(max(slant, 0.0) * 100), 65534), 0, 0, 25, 0
+    )
+
+
+def obstacle_distance(vehicle: Vehicle) -> Any:
+    """The map of collision prevention, from whatever sensors; while that is at work, as PX4 publishes it."""
+    found = vehicle.autopilot.navigator.obstacles
+    if vehicle.autopilot.now_s - found.used_s > OBSTACLE_MAP_AGE_S:
+        return None
+    stamp_us = round(found.stamp_s * 1e6) if math.isfinite(found.stamp_s) else 0
+    return dialect.MAVLink_obstacle_distance_message(
+        stamp_us,
+        0,  # MAV_DISTANCE_SENSOR_LASER, whatever measured
+        found.distances_cm.copy(),
+        0,  # the increment is in increment_f
+        found.min_distance_cm,
+        found.max_distance_cm,
+        collision_prevention.SECTOR_DEG,
+        0.0,
+        collision_prevention.FRAME_BODY_FRD,
     )
 
 

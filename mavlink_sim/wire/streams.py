@@ -50,6 +50,7 @@ ONBOARD_RATES_HZ: dict[str, float] = {
     "TIME_ESTIMATE_TO_TARGET": 0.5,
     "CURRENT_EVENT_SEQUENCE": 0.3,
     "GPS_GLOBAL_ORIGIN": 0.0,  # on change alone
+    "OBSTACLE_DISTANCE": 0.0,  # to a ground station alone, unless it is asked for
 }
 GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "HEARTBEAT": 1.0,
@@ -82,6 +83,7 @@ GCS_RATES_HZ: dict[str, float] = dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | {
     "CURRENT_EVENT_SEQUENCE": 0.3,
     "PING": 0.1,
     "VIBRATION": 0.1,
+    "OBSTACLE_DISTANCE": 1.0,  # as configured in PX4; sent while collision prevention works
 }
 
 # What comes on top with a remote control or a gimbal, by PX4's source: (onboard link, any other link).

@@ -1,0 +1,249 @@
+"""An airframe among obstacles: it cannot pass through them, breaks on them, and stands on them.
+
+It counts as an upright ellipsoid of its propellers' reach and a flat body's height; hitting something takes
+its speed, not its attitude. Where there is no scene there is the plain `Multirotor`, and nothing of this.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavlink_sim.physics.airframe import (
+    BOUNCE_MPS,
+    CRASH_MPS,
+    HARD_LANDING_MPS,
+    MAX_STANDING_TILT_COSINE,
+    RESTITUTION,
+    Multirotor,
+    Vector,
+)
+from mavlink_sim.world.obstacles import Gap, Obstacle, Obstacles
+
+RADIUS_M = 0.3
+HALF_HEIGHT_M = 0.12
+# Propeller guards slide along a wall; legs hold on a roof as on the ground.
+SLIDING_FRICTION = 0.3
+# It stands on what slopes by up to 37 degrees.
+STANDING_COSINE = 0.8
+SUPPORT_M = 0.01
+# Away from a thing for so long, it hits it anew.
+NEW_CONTACT_S = 0.5
+TOUCH_M = 1e-9
+
+_STILL: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Collision:
+    """One meeting with an obstacle, when it began.
+
+    Attributes:
+        time_s: the scene's time.
+        identifier, name: of the obstacle ("wall-2").
+        speed_mps: at which they met, along the surface's normal.
+        standing: on top of it: the airframe came to stand there, or bounced.
+        crashed: this broke the rotors.
+    """
+
+    time_s: float
+    identifier: int
+    name: str
+    speed_mps: float
+    standing: bool
+    crashed: bool
+
+    def __str__(self) -> str:
+        if self.crashed:
+            return f"crashed into {self.name} at {self.speed_mps:.1f} m/s"
+        if self.standing and self.speed_mps <= HARD_LANDING_MPS:
+            return f"touched down on {self.name}"
+        return f"hit {self.name} at {self.speed_mps:.1f} m/s"
+
+
+class CollidingMultirotor(Multirotor):
+    """A `Multirotor` among obstacles.
+
+    Args:
+        seed, gusts_mps: as `Multirotor`'s.
+        obstacles: made for RADIUS_M and HALF_HEIGHT_M.
+        start_ned_m: north and east of the world's origin, where the airframe's own frame begins.
+        clock: the scene's time in seconds.
+
+    Attributes:
+        floor_down_m: NED z of what it stands on, or stood on last.
+        collisions: how many there were. last_collision: the newest.
+        on_collision: called with each.
+
+    Raises:
+        ValueError: something stands where it starts.
+    """
+
+    __slots__ = (
+        "_clock",
+        "_contacts",
+        "_looked_at",
+        "_obstacles",
+        "_room_m",
+        "_start",
+        "_support",
+        "collisions",
+        "floor_down_m",
+        "last_collision",
+        "on_collision",
+    )
+
+    def __init__(
+        self,
+        seed: int,
+        gusts_mps: float,
+        obstacles: Obstacles,
+        start_ned_m: tuple[float, float],
+        clock: Callable[[], float],
+    ) -> None:
+        super().__init__(seed, gusts_mps=gusts_mps)
+        self._obstacles = obstacles
+        self._start = start_ned_m
+        self._clock = clock
+        self._contacts: dict[int, float] = {}
+        self._support: Obstacle | None = None
+        self.floor_down_m = 0.0
+        self.collisions = 0
+        self.last_collision: Collision | None = None
+        self.on_collision: Callable[[Collision], None] | None = None
+        gap = obstacles.nearest(self.centre_ned_m, 0.0)
+        if gap.obstacle is not None and gap.clear_m < 0.0:
+            north, east = start_ned_m
+            raise ValueError(
+                f"the vehicle starts at north {north:g} m, east {east:g} m, where the scene's "
+                f"{gap.obstacle.name} stands: one of them must go elsewhere"
+            )
+        # nothing is near before it has moved so far from here, less what moves by itself
+        self._looked_at = self.position
+        self._room_m = gap.clear_m
+
+    @property
+    def centre_ned_m(self) -> Vector:
+        """The middle of its body in the world's frame; its position is where its legs end."""
+        x, y, z = self.position
+        return (x + self._start[0], y + self._start[1], z - HALF_HEIGHT_M)
+
+    # ---- time -------------------------------------------------------------------------------------------
+
+    def advance(self, dt_s: float) -> None:
+        super().advance(dt_s)
+        x, y, z = self.position
+        fx, fy, fz = self._looked_at
+        x, y, z = x - fx, y - fy, z - fz
+        room = self._room_m = self._room_m - self._obstacles.top_speed_mps * dt_s
+        if room < 0.0 or x * x + y * y + z * z > room * room:
+            self._look_around(dt_s)
+
+    def _look_around(self, dt_s: float) -> None:
+        """Meet what is touched, and find out how far the next thing is."""
+        now_s = self._clock()
+        self._keep_standing(now_s)
+        known = self._resting_on
+        met = False
+        # in a corner it meets one after the other
+        while (gap := self._obstacles.nearest(self.centre_ned_m, now_s, known)).clear_m < -TOUCH_M:
+            assert gap.obstacle is not None
+            self._meet(gap, gap.obstacle, now_s, dt_s)
+            known = [*known, gap.obstacle]
+            met = True
+        self._looked_at = self.position
+        self._room_m = 0.0 if met else max(gap.clear_m, 0.0)
+
+    # ---- contact ----------------------------------------------------------------------------------------
+
+    def _meet(self, gap: Gap, obstacle: Obstacle, now_s: float, dt_s: float) -> None:
+        """Get out of it, and bounce off, slide along it or stand on it."""
+        px, py, pz = gap.push_ned_m
+        x, y, z = self.position
+        self.position = (x + px, y + py, min(z + pz, 0.0))
+        nx, ny, nz = gap.normal_ned
+        ux, uy, uz = obstacle.velocity_at(now_s)
+        vx, vy, vz = self.velocity
+        rx, ry, rz = vx - ux, vy - uy, vz - uz
+        into = -(rx * nx + ry * ny + rz * nz)
+        if into < 0.0:
+            return
+        back = RESTITUTION * into if into > BOUNCE_MPS else 0.0
+        tx, ty, tz = rx + into * nx, ry + into * ny, rz + into * nz
+        sliding = math.sqrt(tx * tx + ty * ty + tz * tz)
+        keep = 1.0 - min(SLIDING_FRICTION * (into + back) / sliding, 1.0) if sliding > 0.0 else 0.0
+        after = (ux + keep * tx + back * nx, uy + keep * ty + back * ny, uz + keep * tz + back * nz)
+        self.velocity = after
+        if not back:  # it leans on it: what would accelerate it is held
+            ax, ay, az = self.acceleration
+            self.acceleration = (
+                ax + (after[0] - vx) / dt_s,
+                ay + (after[1] - vy) / dt_s,
+                az + (after[2] - vz) / dt_s,
+            )
+        standing = -nz > STANDING_COSINE
+        was_crashed = self.crashed
+        if into > CRASH_MPS or (standing and self.matrix[8] < MAX_STANDING_TILT_COSINE):
+            self.crashed = True
+        if standing:
+            self.touchdown_mps = into
+            if not back:
+                self.on_ground = True
+                self._support = obstacle
+                self.floor_down_m = self.position[2]
+        self._tell(obstacle, now_s, into, standing, self.crashed and not was_crashed)
+
+    def _tell(
+        self, obstacle: Obstacle, now_s: float, speed_mps: float, standing: bool, crashed: bool
+    ) -> None:
+        before_s = self._contacts.get(obstacle.identifier, -math.inf)
+        self._contacts[obstacle.identifier] = now_s
+        if crashed or now_s - before_s > NEW_CONTACT_S:
+            self.collisions += 1
+            collision = Collision(now_s, obstacle.identifier, obstacle.name, speed_mps, standing, crashed)
+            self.last_collision = collision
+            if self.on_collision is not None:
+                self.on_collision(collision)
+
+    # ---- standing on something --------------------------------------------------------------------------
+
+    @property
+    def _resting_on(self) -> list[Obstacle]:
+        """What it stands on, if neither moves: that need not be looked at again."""
+        support = self._support
+        if support is None or support.moves or not self.on_ground or self.velocity != _STILL:
+            return []
+        return [support]
+
+    def _touch(self, down_mps: float, tilt_cosine: float) -> float:
+        self._support = None
+        self.floor_down_m = 0.0
+        return super()._touch(down_mps, tilt_cosine)
+
+    def _keep_standing(self, now_s: float) -> None:
+        """It falls when what it stood on is no longer below it."""
+        if self._support is None:
+            return
+        if self.on_ground:
+            self._support.place(now_s)
+            x, y, z = self.centre_ned_m
+            gap = self._obstacles.gap_to(self._support, (x, y, z + SUPPORT_M))
+            if gap.clear_m <= 0.0 and -gap.normal_ned[2] > STANDING_COSINE:
+                return
+            self.on_ground = False
+        self._support = None
+
+    def _stand(self, dt_s: float, lift: float) -> None:
+        if self._support is None:
+            super()._stand(dt_s, lift)
+            return
+        ux, uy, uz = self._support.velocity_at(self._clock())
+        vx, vy, _ = self.velocity
+        self.velocity = (vx - ux, vy - uy, 0.0)
+        super()._stand(dt_s, lift)
+        vx, vy, _ = self.velocity
+        x, y, _ = self.position
+        self.floor_down_m += uz * dt_s
+        self.position = (x + ux * dt_s, y + uy * dt_s, self.floor_down_m)
+        self.velocity = (vx + ux, vy + uy, uz)

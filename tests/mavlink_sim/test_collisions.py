@@ -1,0 +1,333 @@
+"""What a scene's things do to a vehicle that meets them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path as FilePath
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavlink_sim.camera.scene import Path, Scene
+from mavlink_sim.cli import main
+from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.physics.airframe import CRASH_MPS, Multirotor
+from mavlink_sim.physics.collisions import (
+    HALF_HEIGHT_M,
+    RADIUS_M,
+    CollidingMultirotor,
+    Collision,
+)
+from mavlink_sim.simulation import Simulation, SimulationOptions
+from mavlink_sim.vehicle import STEP_S
+from mavlink_sim.wire.messages import dialect
+from mavlink_sim.world.obstacles import Obstacles
+from mavlink_sim.world.plates import Print
+from mavlink_sim.world.world import World, WorldObject
+
+WALL = WorldObject(2, "wall", (8.0, 0.0, 0.0), math.pi, size_m=(8.0, 0.3, 5.0))
+BLOCK = WorldObject(5, "box", (4.0, 0.0, 0.0), size_m=(2.0, 2.0, 1.5))
+FACE_M = 8.0 - 0.18  # the coping stands out a little
+VELOCITY_ALONE = 3527
+
+
+def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Any:
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, VELOCITY_ALONE, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0
+    )
+
+
+def place(north: float, east: float, down: float) -> Any:
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 3576, north, east, down, 0, 0, 0, 0, 0, 0, 0, 0
+    )
+
+
+def flying(*things: WorldObject, height_m: float = 2.0, **options: Any) -> LockstepVehicle:
+    vehicle = LockstepVehicle({"onboard": {}}, **{"scene": World(things), "gusts_mps": 0.0, **options})
+    vehicle.take_off(height_m)
+    return vehicle
+
+
+def steer(vehicle: LockstepVehicle, setpoint: Any, seconds: float) -> None:
+    repeated = vehicle.repeat(setpoint, 20.0)
+    vehicle.step(0.1)
+    if vehicle.truth.mode != "OFFBOARD" and vehicle.truth.armed:
+        vehicle.set_mode("OFFBOARD")
+    vehicle.step(seconds)
+    repeated.stop()
+
+
+def airframe(
+    *things: WorldObject, paths: dict[int, Path] | None = None, start: tuple[float, float] = (0.0, 0.0)
+) -> tuple[CollidingMultirotor, list[float]]:
+    """One among things, without a vehicle, and the scene's clock."""
+    clock = [0.0]
+    obstacles = Obstacles(things, paths or {}, RADIUS_M, HALF_HEIGHT_M)
+    return CollidingMultirotor(0, 0.0, obstacles, start, lambda: clock[0]), clock
+
+
+def throw(body: Multirotor, position: tuple[float, float, float], speed: tuple[float, float, float]) -> None:
+    body.on_ground = False
+    body.position, body.velocity = position, speed
+
+
+def let_pass(body: Multirotor, clock: list[float], seconds: float) -> None:
+    for _ in range(round(seconds / STEP_S)):
+        clock[0] += STEP_S
+        body.advance(STEP_S)
+
+
+def test_a_wall_stops_a_vehicle_and_leaves_it_flying() -> None:
+    vehicle = flying(WALL)
+    steer(vehicle, velocity(2.0), 8.0)
+    truth = vehicle.truth
+    assert truth.position_ned_m[0] == pytest.approx(FACE_M - RADIUS_M, abs=0.05)
+    assert not truth.crashed
+    assert truth.armed
+    assert truth.collisions == 1
+    assert isinstance(truth.collision, Collision)
+    assert (truth.collision.name, truth.collision.identifier) == ("wall-2", 2)
+    assert 1.0 < truth.collision.speed_mps < 2.2
+    assert vehicle.events[-1] == f"hit wall-2 at {truth.collision.speed_mps:.1f} m/s"
+    steer(vehicle, velocity(-2.0), 7.0)  # and it can leave
+    assert vehicle.truth.position_ned_m[0] < 4.0
+
+
+def test_without_a_scene_there_is_nothing_of_this_and_the_flight_is_the_same_to_the_bit() -> None:
+    plain = flying(scene=None, seed=4, gusts_mps=None)
+    among = flying(WorldObject(0, "wall", (500.0, 0.0, 0.0)), seed=4, gusts_mps=None)
+    assert type(plain.vehicle.airframe) is Multirotor
+    assert plain.vehicle.surroundings is None
+    for vehicle in (plain, among):
+        steer(vehicle, velocity(2.0, 1.0), 5.0)
+        vehicle.land()
+    assert plain.truth == among.truth
+    assert plain.events == among.events
+
+
+def test_the_same_seed_gives_the_same_collisions() -> None:
+    truths = []
+    for _ in range(2):
+        vehicle = flying(WALL, seed=9, gusts_mps=0.8, wind_mps=2.0)
+        steer(vehicle, velocity(3.0), 5.0)
+        truths.append((vehicle.truth, vehicle.events))
+    assert truths[0] == truths[1]
+    assert truths[0][0].collisions > 0
+
+
+def test_too_fast_it_breaks_and_falls() -> None:
+    vehicle = flying(WALL, height_m=3.0)
+    steer(vehicle, velocity(9.0), 4.0)
+    crash = next(event for event in vehicle.events if event.startswith("crashed into"))
+    assert crash.startswith("crashed into wall-2 at ")
+    assert float(crash.split()[-2]) > CRASH_MPS
+    truth = vehicle.truth
+    assert truth.crashed
+    assert truth.on_ground
+    assert truth.position_ned_m[0] < FACE_M - RADIUS_M + 0.05
+    assert truth.collision is not None
+    assert truth.collision.crashed
+
+
+def test_a_bounce_takes_speed_and_friction_slows_along_the_wall() -> None:
+    body, clock = airframe(WALL)
+    throw(body, (FACE_M - RADIUS_M - 0.05, 0.0, -2.0), (3.0, 2.0, 0.0))
+    let_pass(body, clock, 0.05)
+    north, east, _ = body.velocity
+    assert -1.0 < north < -0.5  # a quarter of it
+    assert 0.5 < east < 1.5
+    assert body.collisions == 1
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.floats(-math.pi, math.pi),
+    st.floats(0.5, 20.0),
+    st.floats(-3.0, 3.0),
+    st.floats(-math.pi, math.pi),
+    st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)),
+)
+def test_nobody_leaves_a_walled_yard(
+    heading: float, speed: float, climb: float, yaw: float, start: tuple[float, float]
+) -> None:
+    sides = [
+        WorldObject(
+            index,
+            "box",
+            (2.0 * math.cos(angle), 2.0 * math.sin(angle), 0.0),
+            angle,
+            size_m=(0.2, 6.0, 40.0),
+        )
+        for index, angle in enumerate(yaw + side * math.pi / 2 for side in range(4))
+    ]
+    body, clock = airframe(*sides)
+    throw(body, (*start, -5.0), (speed * math.cos(heading), speed * math.sin(heading), climb))
+    body.thrust_mps2 = 0.0
+    for _ in range(300):
+        let_pass(body, clock, STEP_S)
+        # push on, whatever was taken
+        vx, vy, vz = body.velocity
+        body.velocity = (vx + 0.1 * math.cos(heading), vy + 0.1 * math.sin(heading), vz)
+        north, east, _ = body.position
+        along = max(
+            abs(north * math.cos(yaw) + east * math.sin(yaw)),
+            abs(east * math.cos(yaw) - north * math.sin(yaw)),
+        )
+        assert along < 2.0 - 0.1 - RADIUS_M + 0.1
+    assert body.collisions >= 1 or speed < 3.0
+
+
+def test_it_lands_on_a_roof_stands_and_takes_off_again() -> None:
+    vehicle = flying(BLOCK, height_m=4.0)
+    steer(vehicle, place(4.0, 0.0, -4.0), 7.0)
+    vehicle.land()
+    truth = vehicle.truth
+    landing = vehicle.events.index("touched down on box-5")
+    assert vehicle.events[landing + 1 : landing + 3] == ["landed", "disarmed (after landing)"]
+    said = len(vehicle.events)
+    assert truth.on_ground
+    assert truth.landed
+    assert truth.position_ned_m[2] == pytest.approx(-1.5, abs=1e-6)
+    vehicle.step(20.0)
+    assert vehicle.truth.position_ned_m == truth.position_ned_m
+    assert len(vehicle.events) == said
+    vehicle.set_mode("HOLD")
+    vehicle.take_off(4.0)
+    assert vehicle.events[-4:] == ["armed", "mode TAKEOFF", "takeoff", "mode HOLD"]
+    assert vehicle.truth.position_ned_m[2] < -3.0
+    steer(vehicle, place(0.0, 4.0, -4.0), 7.0)
+    vehicle.land()
+    assert vehicle.truth.position_ned_m[2] == 0.0
+    assert vehicle.truth.collisions == 1
+
+
+def test_a_roof_breaks_it_as_the_ground_does() -> None:
+    body, clock = airframe(BLOCK)
+    throw(body, (4.0, 0.0, -6.0), (0.0, 0.0, 0.0))
+    let_pass(body, clock, 4.0)  # its motors stand still
+    assert body.crashed
+    assert body.on_ground
+    assert body.position[2] == pytest.approx(-1.5, abs=1e-6)
+    assert body.last_collision is not None
+    told: list[Collision] = []
+    body, clock = airframe(BLOCK)
+    body.on_collision = told.append
+    throw(body, (4.0, 0.0, -1.5 - 0.5), (0.0, 0.0, 0.0))
+    let_pass(body, clock, 3.0)
+    assert not body.crashed
+    assert str(told[0]).startswith("hit box-5 at 2.")  # a hard landing
+    assert told[0].standing
+
+
+def test_over_the_edge_it_falls() -> None:
+    body, clock = airframe(BLOCK)
+    throw(body, (4.0, 0.0, -1.5), (0.0, 0.0, 0.2))
+    let_pass(body, clock, 0.5)
+    assert body.on_ground
+    body.velocity = (0.0, 6.0, 0.0)
+    let_pass(body, clock, 4.0)
+    assert body.position[1] > 1.0
+    assert body.position[2] == 0.0
+    assert body.floor_down_m == 0.0
+
+
+def test_what_comes_along_pushes_and_hits() -> None:
+    path = Path(((10.0, 0.0, 0.0), (-5.0, 0.0, 0.0)), 3.0, "once", fixed_yaw_rad=0.0)
+    body, clock = airframe(WorldObject(1, "box", (10.0, 0.0, 0.0), size_m=(1, 2, 2)), paths={1: path})
+    told: list[Collision] = []
+    body.on_collision = told.append
+    let_pass(body, clock, 2.9)
+    assert body.position == (0.0, 0.0, 0.0)
+    assert not told
+    let_pass(body, clock, 3.0)
+    assert body.position[0] < -5.0
+    assert told[0].speed_mps == pytest.approx(3.0, abs=0.01)
+    assert not body.crashed
+
+
+def test_it_rides_on_what_it_stands_on() -> None:
+    path = Path(((4.0, 0.0, 0.0), (4.0, 9.0, 0.0)), 1.5, "once", fixed_yaw_rad=0.0)
+    body, clock = airframe(BLOCK, paths={5: path})
+    throw(body, (4.0, 0.0, -1.55), (0.0, 0.0, 0.0))
+    let_pass(body, clock, 4.0)
+    assert body.on_ground
+    _, box_east, _ = path.pose_at(clock[0])[0]
+    assert body.position[1] == pytest.approx(box_east, abs=0.4)  # it slid until it had the speed
+    assert body.velocity[1] == pytest.approx(1.5, abs=0.01)
+
+
+def test_a_vehicle_that_starts_elsewhere_meets_things_where_they_are() -> None:
+    body, clock = airframe(WALL, start=(5.0, 0.0))
+    throw(body, (0.0, 0.0, -4.0), (5.0, 0.0, 0.0))
+    let_pass(body, clock, 0.8)
+    assert body.collisions == 1
+    assert body.position[0] < FACE_M - 5.0 - RADIUS_M + 0.01
+
+
+def test_a_vehicle_cannot_start_in_something() -> None:
+    with pytest.raises(ValueError, match=r"north 4 m, east 0 m, where the scene's box-5 stands"):
+        LockstepVehicle(scene=World((BLOCK,)), start_ned_m=(4.0, 0.0))
+    flat = WorldObject(0, "plate", (0.0, 0.0, 0.0), printed=Print("4X4_50", 1, 1.0))
+    assert LockstepVehicle(scene=World((flat,))).truth.collisions == 0
+
+
+def test_a_fleet_that_would_start_in_something_is_refused_in_one_line(
+    tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "block.toml"
+    scene.write_text('[[objects]]\nclass = "box"\nplace_m = [0, 5]\n', "utf-8")
+    words = ["--scene", str(scene), "--vehicles", "2", "--onboard-bind", "0", "--gcs-bind", "0"]
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == (
+        "mavlink-sim: the vehicle starts at north 0 m, east 5 m, where the scene's box-0 stands: "
+        "one of them must go elsewhere"
+    )
+
+
+@pytest.mark.parametrize("name", ["village", "marker_landing", "obstacle_course"])
+def test_the_examples_can_be_flown_in(name: str) -> None:
+    vehicle = flying(scene=name, height_m=5.0)
+    vehicle.step(5.0)
+    assert vehicle.truth.collisions == 0
+    assert not vehicle.truth.crashed
+
+
+def test_the_scene_of_a_simulation_is_in_the_way_and_the_truth_tells_of_it(tmp_path: FilePath) -> None:
+    scene = tmp_path / "block.toml"
+    scene.write_text('[[objects]]\nclass = "box"\nplace_m = [4, 0]\nsize_m = [2, 2, 1.5]\n', "utf-8")
+    events: list[str] = []
+    options = SimulationOptions(onboard_bind=0, gcs_bind=0, scene=str(scene), start_ned_m=(1.0, 0.0))
+    with Simulation(options, events.append) as simulation:
+        truth = simulation.truth()
+        assert (truth["crashed"], truth["collisions"], truth["last_collision"]) == (False, 0, None)
+        throw(simulation.vehicle.airframe, (1.0, 0.0, -0.8), (3.0, 0.0, 0.0))
+        simulation.vehicle.step(0.4)
+        truth = simulation.truth()
+    assert truth["collisions"] == 1
+    assert truth["last_collision"]["object"] == "box-0"
+    assert truth["last_collision"]["identifier"] == 0
+    assert truth["last_collision"]["speed_mps"] == pytest.approx(2.5, abs=0.5)
+    assert not truth["last_collision"]["crashed"]
+    assert truth["objects"][0]["range_m"] == pytest.approx(RADIUS_M, abs=0.25)
+    assert any(event.startswith("hit box-0 at ") for event in events)
+
+
+def test_the_demo_world_is_there_to_be_looked_at_alone(tmp_path: FilePath) -> None:
+    options = SimulationOptions(onboard_bind=0, gcs_bind=0, truth=tmp_path / "truth.jsonl")
+    with Simulation(options, lambda text: None) as simulation:
+        assert simulation.truth()["objects"]
+        assert simulation.vehicle.surroundings is None
+
+
+def test_a_scene_may_be_given_as_what_it_is() -> None:
+    scene = Scene(World((WALL,)))
+    for form in (scene, scene.world, "obstacle_course"):
+        vehicle = LockstepVehicle(scene=form)
+        assert vehicle.vehicle.surroundings is not None
