@@ -147,7 +147,7 @@ class Vehicle:
                 gusts_mps=gusts_mps,
                 noise=noise,
                 start_ned_m=start_ned_m,
-                clock=lambda: self.faults.now_s,
+                clock=self._scene_time_s,
             )
             self.airframe = self.surroundings.airframe
             self.surroundings.airframe.on_collision = self._collided
@@ -240,6 +240,9 @@ class Vehicle:
 
     def _holds(self) -> bool:
         return self.autopilot.mode is Mode.HOLD
+
+    def _scene_time_s(self) -> float:
+        return self.faults.now_s
 
     def _simulated_clock_ns(self) -> int:
         return self._boot_us * 1000

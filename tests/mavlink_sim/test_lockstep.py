@@ -254,7 +254,11 @@ def everything_told(vehicle: LockstepVehicle) -> tuple[Any, ...]:
 
 @pytest.mark.parametrize(
     ("autopilot", "options"),
-    [("px4", {"gimbal": True, "air_seed": 2}), ("px4", {"px4": "1.14"}), ("ardupilot", {})],
+    [
+        ("px4", {"gimbal": True, "air_seed": 2}),
+        ("px4", {"px4": "1.14", "scene": "village", "obstacle_sensor": True}),
+        ("ardupilot", {}),
+    ],
 )
 def test_a_copy_flies_on_as_the_first_does_to_the_last_byte(autopilot: str, options: dict[str, Any]) -> None:
     first = LockstepVehicle(
