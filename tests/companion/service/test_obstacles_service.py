@@ -1,0 +1,118 @@
+"""The whole service before a wall: rendered depth, zenoh, MAVLink, and a wall that can be flown into."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from service_process import running_service
+
+from mavlink_sim.testing import running_simulator
+
+WALL_NORTH_M, THICKNESS_M, MARGIN_M = 12.0, 0.4, 2.0
+# As for `companion bench flights obstacles`: in gusts it is blown a little into the margin.
+ALLOWED_M = 1.0
+SCENE = f"""
+name = "wall"
+[ground]
+kinds = ["gravel"]
+tile_texels = 256
+texel_m = 0.05
+[[objects]]
+class = "wall"
+place_m = [{WALL_NORTH_M}, 0.0]
+yaw_deg = 180
+size_m = [30.0, {THICKNESS_M}, 6.0]
+[camera]
+width = 320
+height = 240
+horizontal_fov_deg = 80
+rate_hz = 10
+[camera.mount]
+pitch_deg = 0
+"""
+
+
+class Truth:
+    """The simulator's truth file, read as it grows."""
+
+    def __init__(self, path: Path) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._file, self._rest = path.open(), ""
+
+    def wait_for(self, condition: Any, timeout_s: float = 30.0) -> dict[str, Any]:
+        """The first new row that meets the condition."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            *lines, self._rest = (self._rest + self._file.read()).split("\n")
+            for row in map(json.loads, lines):
+                self.rows.append(row)
+                if condition(row):
+                    return row
+            time.sleep(0.02)
+        raise TimeoutError(f"never true; the last row: {self.rows[-1:]}")
+
+
+def camera_pid(simulator_pid: int) -> int:
+    """Of the process that draws the pictures: the simulator's youngest child."""
+    children = Path(f"/proc/{simulator_pid}/task/{simulator_pid}/children").read_text().split()
+    return max(map(int, children))
+
+
+def test_a_wall_is_not_flown_into_and_when_depth_stops_coming_it_brakes(tmp_path: Path) -> None:
+    scene, path = tmp_path / "wall.toml", tmp_path / "truth.jsonl"
+    scene.write_text(SCENE)
+    camera = f"wall-{uuid.uuid4().hex[:8]}"
+    flags = [
+        "--source-uri", f"shm://{camera}", "--detector-enabled", "false",
+        "--camera-horizontal-fov-deg", "80", "--camera-mount-pitch-deg", "0",
+        "--guidance-obstacles", "required", "--guidance-obstacle-margin-m", f"{MARGIN_M}",
+    ]  # fmt: skip
+    with (
+        running_simulator(scene=scene, camera=camera, truth=path, seed=2) as simulator,
+        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
+    ):
+        simulator.wait_for_event("camera")
+        while not (lifted := service.command("takeoff 2.5"))["success"]:
+            assert "needs depth" in lifted["reason"], lifted  # until the first picture
+        truth = Truth(path)
+
+        def north_m(row: dict[str, Any]) -> float:
+            return float(row["position_ned_m"][0])
+
+        def north_mps(row: dict[str, Any]) -> float:
+            return float(row["velocity_ned_mps"][0])
+
+        with ThreadPoolExecutor(2) as people:
+            there = people.submit(service.command, "goto north=40 east=0 speed=3", 90.0)
+            truth.wait_for(lambda row: north_mps(row) > 1.5)
+            stands = truth.wait_for(lambda row: north_m(row) > 8.0 and abs(north_mps(row)) < 0.3)
+            truth.wait_for(lambda row: row["stamp_ns"] > stands["stamp_ns"] + 3e9)
+            assert WALL_NORTH_M - THICKNESS_M / 2 - max(map(north_m, truth.rows)) >= MARGIN_M - ALLOWED_M
+            assert truth.rows[-1]["collisions"] == 0
+            assert truth.rows[-1]["mode"] == "OFFBOARD"
+            assert not there.done()  # it waits for its way to be free
+
+            # Away from the wall it may fly; then the pictures stop.
+            back = people.submit(service.command, "goto north=-150 east=0 speed=3", 90.0)
+            truth.wait_for(lambda row: north_mps(row) < -1.5)
+            assert not there.result(10.0)["success"]
+            os.kill(camera_pid(simulator.pid), signal.SIGSTOP)
+            dark_ns = time.monotonic_ns()
+            try:
+                braked = truth.wait_for(lambda row: row["stamp_ns"] > dark_ns and abs(north_mps(row)) < 0.4)
+                assert north_m(braked) > -50.0  # far from where it was sent
+                assert braked["mode"] == "OFFBOARD"
+                assert not back.done()
+                service.wait_for_line("no depth to fly by")
+            finally:
+                os.kill(camera_pid(simulator.pid), signal.SIGCONT)
+            truth.wait_for(lambda row: row["stamp_ns"] > braked["stamp_ns"] and north_mps(row) < -1.0)
+            assert service.command("hold")["success"]
+            assert not back.result(10.0)["success"]
