@@ -52,11 +52,13 @@ class CameraFigures:
         plain: a pinhole camera over the demonstration's world, which `--camera` shows without a scene.
         distorted: the same through a lens with radial and tangential distortion.
         busy: a pinhole camera over the scene `village`, whose objects are more, and move.
+        crowded: as `plain`, with the 19 other vehicles of a fleet in view, flying.
     """
 
     plain: float
     distorted: float
     busy: float
+    crowded: float
 
 
 def airborne(links: dict[str, dict[str, float]], seed: int = 1) -> LockstepVehicle:
@@ -144,23 +146,32 @@ def measure_camera(frames: int = 100) -> CameraFigures:
             _frames_a_second(None, DEFAULT_CAMERA, frames),
             _frames_a_second(None, distorted, frames),
             _frames_a_second("village", DEFAULT_CAMERA, frames),
+            _frames_a_second(None, DEFAULT_CAMERA, frames, others=19),
         )
     finally:
         cv2.setNumThreads(threads)
 
 
-def _frames_a_second(scene: str | None, model: CameraModel, frames: int) -> float:
+def _frames_a_second(scene: str | None, model: CameraModel, frames: int, others: int = 0) -> float:
     from mavlink_sim.camera.scene import CameraSettings
     from mavlink_sim.camera.scene_file import scene_or_demo
     from mavlink_sim.camera.simulated_camera import SimulatedCamera
+    from mavlink_sim.world.aircraft import Aircraft
     from vision.rotation import matrix_from_quaternion, quaternion_from_euler
 
     camera = SimulatedCamera(replace(scene_or_demo(scene, 0), camera=CameraSettings(model)))
 
     def draw(number: int) -> None:
         time_s = number / 30.0
-        attitude = matrix_from_quaternion(quaternion_from_euler(0.05, -0.05, 0.2 * time_s))
-        camera.capture((2.0 * time_s, 0.0, -5.0), attitude, round(time_s * 1e9), time_s)
+        yaw_rad, north_m = 0.2 * time_s, 2.0 * time_s
+        attitude = matrix_from_quaternion(quaternion_from_euler(0.05, -0.05, yaw_rad))
+        fleet = []
+        for index in range(others):  # rows of five before it, which turn as it turns
+            ahead_m, right_m = 8.0 + 3.0 * (index // 5), 2.0 * (index % 5 - 2)
+            north = north_m + ahead_m * math.cos(yaw_rad) - right_m * math.sin(yaw_rad)
+            east = ahead_m * math.sin(yaw_rad) + right_m * math.cos(yaw_rad)
+            fleet.append(Aircraft(2 + index, (north, east, -3.0), 0.05, -0.05, yaw_rad))
+        camera.capture((north_m, 0.0, -5.0), attitude, round(time_s * 1e9), time_s, others=fleet)
 
     draw(0)  # the ground is painted
     count = max(frames // SLICES, 1)
@@ -195,6 +206,7 @@ def bench(
     print(f"camera, 640x480, colour and depth:     {drawn.plain:6.0f} frames a second")
     print(f"camera, the same through a lens:       {drawn.distorted:6.0f} frames a second")
     print(f"camera, scene village:                 {drawn.busy:6.0f} frames a second")
+    print(f"camera, a fleet of 20 in view:         {drawn.crowded:6.0f} frames a second")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from mavlink_sim.flock import Flock
 from mavlink_sim.real_time import run_together
 from mavlink_sim.simulation import Simulation, SimulationOptions
 
@@ -75,7 +76,9 @@ def _numbered(path: Path | None, system_id: int) -> Path | None:
 
 
 class Fleet:
-    """Vehicles on one clock, in real time. Use as a context manager; `run` returns after `stop`.
+    """Vehicles on one clock, in real time, which see one another.
+
+    Use as a context manager; `run` returns after `stop`.
 
     Raises (when made): what `Simulation` raises.
     """
@@ -85,10 +88,11 @@ class Fleet:
         self._stopped = False
         self._on_event = on_event
         self.simulations: list[Simulation] = []
+        flock = Flock(len(options))
         try:
             for one in options:
                 told = on_event if len(options) == 1 else _named(on_event, one.system_id)
-                self.simulations.append(self._resources.enter_context(Simulation(one, told)))
+                self.simulations.append(self._resources.enter_context(Simulation(one, told, flock)))
         except BaseException:
             self._resources.close()
             raise

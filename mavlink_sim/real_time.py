@@ -37,7 +37,11 @@ class Paced(Protocol):
 
     def receive(self, name: str) -> None: ...
 
-    def advance(self) -> None: ...
+    def advance(self, now_ns: int) -> bool:
+        """Take the steps that are due at a monotonic moment; whether there were any."""
+
+    def show(self, now_ns: int) -> None:
+        """Let those who look on see where it is at that moment."""
 
 
 class _Pace:
@@ -90,5 +94,11 @@ def run_together(
             for key, _ in selector.select(first.until_next_step()):
                 simulation, name = key.data
                 simulation.receive(name)
+            # one moment for all, so that whoever looks on sees all of them at one simulated time
+            now_ns = time.monotonic_ns()
+            stepped = False
             for simulation in simulations:
-                simulation.advance()
+                stepped |= simulation.advance(now_ns)
+            if stepped:
+                for simulation in simulations:
+                    simulation.show(now_ns)

@@ -6,37 +6,31 @@ Rendering happens in a process of its own and is never waited for.
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.faults.room import fault_room
+from mavlink_sim.flock import Flock
 from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.real_time import run_together
+from mavlink_sim.spectators import Spectators, camera_turn_rad, loaded_scene
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.streams import GCS_RATES_HZ
 from mavlink_sim.wire.traffic_log import recording
-from vision.rotation import euler_from_quaternion
-from vision.shared_frame import segment_path
 
 if TYPE_CHECKING:
-    from mavlink_sim.camera.process import CameraProcess
-    from mavlink_sim.camera.scene import Scene
     from mavlink_sim.physics.airframe import Vector
-    from mavlink_sim.world.world import World
 
 logger = logging.getLogger(__name__)
 
-TRUTH_RATE_HZ = 20.0
 # After a stall longer than this the simulation does not race to catch up, it lets the time go.
 MAX_BACKLOG_S = 0.25
-CAMERA_CHECK_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -111,6 +105,9 @@ class SimulationOptions:
 class Simulation:
     """One vehicle running in real time. Use as a context manager; `run` returns after `stop`.
 
+    Args:
+        flock: among whom it flies, seeing and seen; None: it is alone.
+
     Raises (when made):
         PortInUseError: a port to bind is taken.
         FaultError: a fault that cannot be. ControlError: the control endpoint cannot be opened.
@@ -118,9 +115,11 @@ class Simulation:
         OSError: the truth file or the record cannot be written.
     """
 
-    def __init__(self, options: SimulationOptions, on_event: Callable[[str], None]) -> None:
+    def __init__(
+        self, options: SimulationOptions, on_event: Callable[[str], None], flock: Flock | None = None
+    ) -> None:
         self.options = options
-        self._scene = self._loaded_scene()
+        scene = loaded_scene(options)
         self.vehicle = vehicle_class(options.autopilot)(
             system_id=options.system_id,
             seed=options.seed,
@@ -132,7 +131,7 @@ class Simulation:
             px4=options.px4,
             noise=options.noise,
             start_ned_m=options.start_ned_m,
-            scene=None if options.scene is None else self._scene,
+            scene=None if options.scene is None else scene,
             obstacle_sensor=options.obstacle_sensor,
             gimbal=options.gimbal,
             on_event=on_event,
@@ -142,14 +141,7 @@ class Simulation:
         self._stopped = False
         self._started_ns = time.monotonic_ns()
         self._simulated_s = 0.0
-        self._next_truth_s = 0.0
-        self._next_frame_s = 0.0
         self._on_event = on_event
-        self._camera: CameraProcess | None = None
-        self._camera_seen = False
-        self._camera_rate_hz = 30.0
-        self._next_camera_check_s = 0.0
-        self._truth: IO[str] | None = None
         self._resources = ExitStack()
         try:
             self.endpoints = {
@@ -171,10 +163,9 @@ class Simulation:
             self._faults = self._resources.enter_context(
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )
-            if options.truth is not None:
-                self._truth = self._resources.enter_context(options.truth.open("w", encoding="utf-8"))
-            if self._scene is not None and options.shows_world:
-                self._open_camera(self._scene)
+            flock = Flock(1) if flock is None else flock
+            flock.join(self.vehicle)
+            self._spectators = Spectators(self.vehicle, scene, flock, options, on_event, self._resources)
         except BaseException:
             self._resources.close()
             raise
@@ -183,35 +174,6 @@ class Simulation:
         endpoint = UdpEndpoint(self.options.host, bind, port, self.options.system_id)
         self._resources.callback(endpoint.close)
         return endpoint
-
-    def _loaded_scene(self) -> Scene | None:
-        """What the camera sees and the truth tells of; None if nobody looks and nothing was asked for."""
-        options = self.options
-        if not options.shows_world and options.truth is None and options.scene is None:
-            return None
-        # imported here: a vehicle that is alone needs neither the renderer nor its start-up time
-        from mavlink_sim.camera.scene_file import scene_or_demo
-
-        return scene_or_demo(
-            options.scene, options.seed if options.world_seed is None else options.world_seed
-        )
-
-    def _open_camera(self, scene: Scene) -> None:
-        from mavlink_sim.camera.process import CameraProcess
-
-        options = self.options
-        if options.camera is not None:
-            segment_path(options.camera)  # raises for a name that cannot be
-        self._camera_rate_hz = options.camera_rate_hz or scene.camera.rate_hz
-        self._camera = CameraProcess(
-            scene,
-            rate_hz=self._camera_rate_hz,
-            shared_name=options.camera,
-            outputs=options.camera_outputs,
-            truth=options.camera_truth,
-        )
-        self._resources.callback(self._camera.stop)
-        self._camera.start()
 
     def __enter__(self) -> Simulation:
         return self
@@ -231,9 +193,10 @@ class Simulation:
         """Simulated seconds in a second."""
         return self.options.speed
 
-    def _clock_ns(self) -> int:
-        """Simulated time at this very moment, between the physics steps too."""
-        return int((time.monotonic_ns() - self._started_ns) * self.options.speed)
+    def _clock_ns(self, now_ns: int | None = None) -> int:
+        """Simulated time at a moment, by default this very one, between the physics steps too."""
+        now_ns = time.monotonic_ns() if now_ns is None else now_ns
+        return int((now_ns - self._started_ns) * self.options.speed)
 
     def _boot_clock_ns(self) -> int:
         """The same since the vehicle's boot, without the time that it stood still."""
@@ -273,9 +236,13 @@ class Simulation:
             if outgoing:
                 endpoint.send(outgoing)
 
-    def advance(self) -> None:
-        """The physics steps that are due; at most a few, so that the sockets are never left waiting long."""
-        due = self._clock_ns() / 1e9 - self._simulated_s
+    def advance(self, now_ns: int) -> bool:
+        """The physics steps that are due at a moment (monotonic); whether there were any.
+
+        At most a few, so that the sockets are never left waiting long. Vehicles on one clock that are told
+        of the same moments are always at the same simulated time.
+        """
+        due = self._clock_ns(now_ns) / 1e9 - self._simulated_s
         steps = min(int(due / STEP_S), max(4, int(4 * self.options.speed)))
         for _ in range(steps):
             self.vehicle.step(STEP_S)
@@ -284,80 +251,18 @@ class Simulation:
                 self.receive(name)
         if steps:
             self.flush()
-            self._show()
         self._faults.poll()
+        return steps > 0
 
-    def _show(self) -> None:
-        """The pose to the camera and the truth to its file, each at its rate."""
-        camera = self._camera
-        if camera is not None and self._simulated_s >= self._next_frame_s:
-            period_s = self.options.speed / self._camera_rate_hz  # the rate is one of real time
-            self._next_frame_s = max(self._next_frame_s + period_s, self._simulated_s)
-            camera.send_pose(
-                self._place_in_world,
-                self.vehicle.quaternion,
-                time.monotonic_ns(),
-                self._simulated_s,
-                self.camera_turn_rad,
-            )
-            if self._simulated_s >= self._next_camera_check_s:
-                self._next_camera_check_s = self._simulated_s + CAMERA_CHECK_S
-                self._check_camera(camera)
-        if self._truth is not None and self._simulated_s >= self._next_truth_s:
-            self._next_truth_s += 1.0 / TRUTH_RATE_HZ
-            self._truth.write(json.dumps(self.truth()) + "\n")
-            self._truth.flush()
-
-    def _check_camera(self, camera: CameraProcess) -> None:
-        """Say when the camera begins and when it is lost; the vehicle flies on without it."""
-        if not camera.alive:
-            self._camera = None
-            self._on_event(f"camera {camera.name} is lost: its process ended")
-        elif not self._camera_seen and camera.ready:
-            self._camera_seen = True
-            self._on_event(f"camera {camera.name} is on")
-
-    @property
-    def _place_in_world(self) -> Vector:
-        """The true position from where the world begins, which is the first vehicle's start."""
-        north, east, down = self.vehicle.airframe.position
-        start_north, start_east = self.options.start_ned_m
-        return (start_north + north, start_east + east, down)
+    def show(self, now_ns: int) -> None:
+        """The pose to the camera and the truth to its file, each at its rate, stamped with the moment."""
+        self._spectators.show(self._simulated_s, now_ns)
 
     @property
     def camera_turn_rad(self) -> Vector | None:
         """Roll, pitch, yaw from the body to a camera on the gimbal; None for one that sits on the body."""
-        gimbal = self.vehicle.gimbal
-        return None if gimbal is None else euler_from_quaternion(gimbal.body_quaternion)
+        return camera_turn_rad(self.vehicle)
 
     def truth(self) -> dict[str, Any]:
-        """What is really so now: pose, mode, what it ran into, and the range to every object of the world."""
-        airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
-        surroundings = self.vehicle.surroundings
-        return {
-            "stamp_ns": time.monotonic_ns(),
-            "position_ned_m": [round(value, 4) for value in airframe.position],
-            "velocity_ned_mps": [round(value, 4) for value in airframe.velocity],
-            "yaw_rad": round(airframe.yaw_rad, 5),
-            "mode": autopilot.mode.name,
-            "armed": autopilot.armed,
-            "landed": autopilot.landed,
-            **({} if surroundings is None else surroundings.truth()),
-            "objects": []
-            if self._scene is None
-            else _object_truth(self._scene.world_at(self._simulated_s), self._place_in_world),
-        }
-
-
-def _object_truth(world: World, position_ned_m: Vector) -> list[dict[str, Any]]:
-    from mavlink_sim.world.world import range_to
-
-    return [
-        {
-            "identifier": thing.identifier,
-            "class_name": thing.class_name,
-            "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
-            "range_m": round(float(range_to(thing, position_ned_m)), 3),
-        }
-        for thing in world.objects
-    ]
+        """What is really so now: pose, mode, and the range to every object of the world, the others too."""
+        return self._spectators.truth(self._simulated_s, time.monotonic_ns())

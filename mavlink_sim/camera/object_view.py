@@ -22,6 +22,7 @@ from mavlink_sim.world.plates import printed_side, reflectance
 from mavlink_sim.world.shapes import Shape
 from mavlink_sim.world.textures import Plane, fractal_noise
 from mavlink_sim.world.world import Light, Sky, WorldObject
+from vision.rotation import matrix_from_euler
 
 NEAR_M = 0.05
 FAR_PX = 30000.0
@@ -72,10 +73,12 @@ class PlacedObject:
         self.shape: Shape = item.shape
         if len(self.shape.normals) >= 1 << FACE_BITS:
             raise ValueError(f"a {item.class_name} has {len(self.shape.normals)} faces, too many to draw")
-        c, s = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
-        self.ned_from_object = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        self.ned_from_object = matrix_from_euler(item.roll_rad, item.pitch_rad, item.yaw_rad)
         self.origin = np.array(item.position_ned_m, np.float64)
         low, high = self.shape.low, self.shape.high
+        if item.leans:  # about its middle: one that lies on its back still lies on the ground, not in it
+            pivot = np.array([0.0, 0.0, (low[2] + high[2]) / 2 * item.scale])
+            self.origin += pivot - self.ned_from_object @ pivot
         self.middle = self.origin + self.ned_from_object @ ((low + high) / 2) * item.scale
         self.radius_m = float(np.linalg.norm(high - low)) / 2 * item.scale
         self.sun = np.array(light.towards_sun_ned)
@@ -114,11 +117,18 @@ class PlacedObject:
     def shadow(self) -> tuple[NDArray[np.float64], list[int]]:
         """Outlines of the solids' shadows on the ground: (P, 3) NED corners, where each begins."""
         if self._shadow is None:
-            outlines = self.shape.shadow(self.sun @ self.ned_from_object)
+            turn, scale = self.ned_from_object, self.item.scale
+            base = float(self.origin[2])
+            if self.item.leans:  # along NED's axes: those of the object do not lie on the ground
+                outlines, lowest = self.shape.leaning_shadow(self.sun, turn)
+                base += lowest * scale
+                turn = np.eye(3)
+            else:
+                outlines = self.shape.shadow(self.sun @ turn)
             flat = np.concatenate(outlines).astype(np.float64)
-            turned = flat @ self.ned_from_object[:2, :2].T * self.item.scale + self.origin[:2]
-            if self.origin[2] < 0.0:  # in the air: its shadow falls farther from the sun
-                turned += self.sun[:2] * (self.origin[2] / max(-float(self.sun[2]), 0.05))
+            turned = flat @ turn[:2, :2].T * scale + self.origin[:2]
+            if base < 0.0:  # in the air: its shadow falls farther from the sun
+                turned += self.sun[:2] * (base / max(-float(self.sun[2]), 0.05))
             first = np.cumsum([0] + [len(outline) for outline in outlines]).tolist()
             self._shadow = (np.column_stack([turned, np.zeros(len(turned))]), first)
         return self._shadow
@@ -222,6 +232,23 @@ class PlacedObject:
         colours = self.lit.copy()
         colours[glossy] += ((scene - colours[glossy]) * share + glint).astype(np.float32)
         return colours
+
+
+def within_view(
+    placed: list[PlacedObject], middles: NDArray[np.float64], radii: NDArray[np.float64], view: View
+) -> list[PlacedObject]:
+    """Those whose bounding sphere, (N, 3) and (N,) NED, is not certainly outside the image."""
+    if not placed:
+        return []
+    seen = (middles - view.eye) @ view.pixel_from_ned.T
+    depth = seen[:, 2]
+    near = np.maximum(depth - radii, 1e-3)
+    reach = 2.0 * view.focal_px * radii / near
+    safe = np.maximum(depth, 1e-3)
+    across = np.abs(seen[:, 0] / safe - view.width / 2) < view.width / 2 + reach
+    along = np.abs(seen[:, 1] / safe - view.height / 2) < view.height / 2 + reach
+    kept = (depth > NEAR_M - radii) & ((depth <= 1.5 * radii) | (across & along))
+    return [placed[index] for index in np.flatnonzero(kept)]
 
 
 def _clipped(

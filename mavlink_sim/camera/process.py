@@ -26,17 +26,20 @@ import numpy as np
 
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
 from mavlink_sim.camera.scene import CameraSettings, Scene
+from mavlink_sim.camera.shared_poses import SharedPoses
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, truth_line
 from mavlink_sim.camera.video_outputs import check_output, open_output
+from mavlink_sim.world.aircraft import Aircraft
 from mavlink_sim.world.world import World
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 
 logger = logging.getLogger(__name__)
 
-POSE = struct.Struct("=3d4dqd3d")
+POSE = struct.Struct("=3d4dqd3dq")
 """Position NED in metres, quaternion (w, x, y, z) of `ned_from_body`, CLOCK_MONOTONIC nanoseconds, the
-scene's time in seconds, and the camera's roll, pitch, yaw on the body (not numbers: as it is mounted)."""
+scene's time in seconds, the camera's roll, pitch, yaw on the body (not numbers: as it is mounted), and the
+number of the other aircraft's poses (-1: there are none)."""
 EARLY_SHARE = 0.3
 """A pose that comes this share of a period early is drawn at once: the poses' own rhythm jitters."""
 
@@ -48,11 +51,13 @@ def run_camera(
     truth: Path | None,
     poses: Connection,
     ready: Event,
+    shared_poses: SharedPoses | None = None,
 ) -> None:
     """Draw a frame for the newest pose, at most `rate_hz` times a second, until `poses` closes.
 
     The frames' `captured_ns` is the stamp of the pose that they were drawn from. The outputs open when the
-    ground has been painted and the first frame can be drawn without delay.
+    ground has been painted and the first frame can be drawn without delay. `shared_poses` holds the poses of
+    the other aircraft; None if there are none.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: painting does not look at the pipe
@@ -98,13 +103,18 @@ def run_camera(
                     time.sleep(wait_s if arrival_s is None else min(wait_s, arrival_s))
                 if poses.poll(0.0):
                     continue
+            *values, stamp_ns, time_s, roll, pitch, yaw, number = POSE.unpack(latest)
+            others: tuple[Aircraft, ...] | None = ()
+            if shared_poses is not None and number >= 0:
+                others = shared_poses.read(number)
+            if others is None:
+                continue  # so old that they were written over: a newer pose is on its way
             due_s = max(due_s + period_s, time.monotonic())
-            *values, stamp_ns, time_s, roll, pitch, yaw = POSE.unpack(latest)
             turned = mount
             if not math.isnan(roll):
                 turned = replace(mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
             attitude = matrix_from_quaternion((values[3], values[4], values[5], values[6]))
-            taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned)
+            taken = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned, others=others)
             if taken is not None:
                 on_the_way.append(taken)
 
@@ -131,6 +141,7 @@ class CameraProcess:
         shared_name: of the shared memory for colour and depth; None for none.
         outputs: further addresses of `video_outputs`.
         truth: a file for what is really in each frame, a line of JSON each.
+        most_others: how many other aircraft there can be to see.
 
     Raises:
         ValueError: a rate or an address that cannot be, or no output at all.
@@ -145,6 +156,7 @@ class CameraProcess:
         shared_name: str | None = "mavlink-sim-camera",
         outputs: Sequence[str] = (),
         truth: Path | None = None,
+        most_others: int = 0,
     ) -> None:
         if not rate_hz > 0.0:
             raise ValueError(f"the camera's rate must be positive, got {rate_hz} Hz")
@@ -159,9 +171,10 @@ class CameraProcess:
         # A camera that hangs must not hang the vehicle: a full pipe drops the pose instead.
         os.set_blocking(self._sending.fileno(), False)
         self._ready = context.Event()
+        self._shared_poses = SharedPoses(context, most_others) if most_others > 0 else None
         self._process = context.Process(
             target=run_camera,
-            args=(scene, rate_hz, addresses, truth, self._receiving, self._ready),
+            args=(scene, rate_hz, addresses, truth, self._receiving, self._ready, self._shared_poses),
             name="mavlink-sim camera",
             daemon=True,
         )
@@ -201,24 +214,37 @@ class CameraProcess:
         stamp_ns: int,
         time_s: float | None = None,
         camera_rpy_rad: tuple[float, float, float] | None = None,
+        others: Sequence[Aircraft] = (),
     ) -> None:
-        """Hand over the vehicle's pose; never blocks.
+        """Hand over the vehicle's pose, and those of the others that can be seen; never blocks.
 
         Args:
             quaternion: (w, x, y, z) of `ned_from_body`.
             stamp_ns: CLOCK_MONOTONIC when the vehicle was there.
             time_s: the scene's time, which moves its objects; by default the stamp in seconds.
             camera_rpy_rad: a gimbal's roll, pitch, yaw from the body; None leaves the camera as mounted.
+            others: the other aircraft at the moment of the stamp.
+
+        Raises:
+            ValueError: there are more others than `most_others`.
         """
+        number = -1
+        if self._shared_poses is not None:
+            number = self._shared_poses.write(others)
+        elif others:
+            raise ValueError(f"{len(others)} other aircraft: this camera was made for none")
         pose = POSE.pack(
             *(float(value) for value in position_ned_m),
             *quaternion,
             stamp_ns,
             stamp_ns / 1e9 if time_s is None else time_s,
             *(camera_rpy_rad or (math.nan,) * 3),
+            number,
         )
         try:
             self._sending.send_bytes(pose)
+            if self._shared_poses is not None:
+                self._shared_poses.keep()
         except BlockingIOError:
             self.dropped_poses += 1
             if self.dropped_poses == 1:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.ground_view import Buffers, View, add_haze, draw_ground, draw_sky
 from mavlink_sim.camera.image_effects import ImageEffects, apply_effects
 from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
-from mavlink_sim.camera.object_view import FACE_BITS, FAR_PX, NEAR_M, SUBPIXEL_BITS, PlacedObject, Sighting
-from mavlink_sim.world.painting_order import clip_polygon
+from mavlink_sim.camera.object_view import FACE_BITS, PlacedObject, Sighting, within_view
+from mavlink_sim.camera.shadow_view import Shadows
 from mavlink_sim.world.textures import Image, Plane
 from mavlink_sim.world.world import World, WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
@@ -29,8 +28,6 @@ DEFAULT_MOUNT = CameraMount(forward_m=0.12, pitch_rad=math.radians(-20.0))
 
 LOWEST_EYE_M = 0.05
 """A landed vehicle's camera would touch the ground; the picture is taken from no lower than this."""
-MAX_SHADOW_SOLIDS_AT_PX = 14.0
-"""A shadow smaller than this is drawn as one outline, not one for each solid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,8 +110,7 @@ class Renderer:
         self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
         self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
         self._radii = np.array([placed.radius_m for placed in self._placed])
-        self._shadow_middles: NDArray[np.float64] | None = None
-        self._shadow_radii: NDArray[np.float64] | None = None
+        self._shadows = Shadows(self._placed)
         self._rng = rng or np.random.default_rng(0)
 
     def place(self, objects: Sequence[WorldObject]) -> None:
@@ -136,7 +132,7 @@ class Renderer:
         self._placed = placed_now
         self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
         self._radii = np.array([placed.radius_m for placed in self._placed])
-        self._shadow_middles = self._shadow_radii = None
+        self._shadows = Shadows(self._placed)
 
     def render(
         self,
@@ -155,9 +151,9 @@ class Renderer:
         buffers, world = self._buffers, self.world
         inverse_depth = np.empty((view.height, view.width), np.float32)
         image = draw_ground(world, view, buffers, inverse_depth)
-        self._cast_shadows(view, image)
+        self._shadows.cast(view, world.light.shadow, image)
         labels = np.zeros((view.height, view.width), np.int32)
-        seen = _within_view(self._placed, self._middles, self._radii, view)
+        seen = within_view(self._placed, self._middles, self._radii, view)
         sightings = self._draw_objects(seen, view, image, inverse_depth, labels)
         add_haze(world.sky, inverse_depth, buffers, image)
         draw_sky(world.sky, world.light, view, inverse_depth, image)
@@ -202,40 +198,6 @@ class Renderer:
             height=self._drawn.height,
         )
 
-    def _cast_shadows(self, view: View, image: Image) -> None:
-        """Darken the ground where an object keeps the sun off."""
-        darkness = self.world.light.shadow
-        if darkness <= 0.0:
-            return
-        if self._shadow_middles is None or self._shadow_radii is None:
-            spans = [(placed.shadow[0].min(axis=0), placed.shadow[0].max(axis=0)) for placed in self._placed]
-            self._shadow_middles = np.array([(low + high) / 2 for low, high in spans]).reshape(-1, 3)
-            self._shadow_radii = np.array([float(np.linalg.norm(high - low)) / 2 for low, high in spans])
-        mask: Image | None = None
-        left, top, right, bottom = view.width, view.height, 0, 0
-        for placed in _within_view(self._placed, self._shadow_middles, self._shadow_radii, view):
-            outlines = _shadows_in_view(placed, view)
-            if not outlines:
-                continue
-            if mask is None:
-                mask = np.zeros((view.height, view.width), np.uint8)
-            for outline in outlines:
-                low, high = outline.min(axis=0), outline.max(axis=0)
-                if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
-                    continue
-                left, top = min(left, int(low[0])), min(top, int(low[1]))
-                right, bottom = max(right, int(high[0])), max(bottom, int(high[1]))
-                fixed = np.rint(np.clip(outline, -FAR_PX, FAR_PX) * (1 << SUBPIXEL_BITS)).astype(np.int32)
-                cv2.fillConvexPoly(mask, fixed, 255, cv2.LINE_8, SUBPIXEL_BITS)
-        left, top = max(left - 4, 0), max(top - 4, 0)
-        right, bottom = min(right + 5, view.width), min(bottom + 5, view.height)
-        if mask is None or right <= left or bottom <= top:
-            return
-        soft = cv2.blur(mask[top:bottom, left:right], (5, 5))
-        factor = cv2.cvtColor(255 - cv2.convertScaleAbs(soft, alpha=darkness), cv2.COLOR_GRAY2BGR)
-        part = image[top:bottom, left:right]
-        cv2.multiply(part, factor, dst=part, scale=1 / 255)
-
     @staticmethod
     def _draw_objects(
         seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane, labels: NDArray[np.int32]
@@ -258,50 +220,6 @@ class Renderer:
             flat_image[pixels] = np.clip(sighting.colours[nearer], 0, 255).astype(np.uint8)
             sightings.append((placed, sighting, number))
         return sightings
-
-
-def _within_view(
-    placed: list[PlacedObject], middles: NDArray[np.float64], radii: NDArray[np.float64], view: View
-) -> list[PlacedObject]:
-    """Those whose bounding sphere is not certainly outside the image."""
-    if not placed:
-        return []
-    seen = (middles - view.eye) @ view.pixel_from_ned.T
-    depth = seen[:, 2]
-    near = np.maximum(depth - radii, 1e-3)
-    reach = 2.0 * view.focal_px * radii / near
-    safe = np.maximum(depth, 1e-3)
-    across = np.abs(seen[:, 0] / safe - view.width / 2) < view.width / 2 + reach
-    along = np.abs(seen[:, 1] / safe - view.height / 2) < view.height / 2 + reach
-    kept = (depth > NEAR_M - radii) & ((depth <= 1.5 * radii) | (across & along))
-    return [placed[index] for index in np.flatnonzero(kept)]
-
-
-def _shadows_in_view(placed: PlacedObject, view: View) -> list[NDArray[np.float64]]:
-    """Projected shadow outlines (K, 2), cut at the near plane; one for all where it is small anyway."""
-    corners, first = placed.shadow
-    projected = (corners - view.eye) @ view.pixel_from_ned.T
-    depth = projected[:, 2]
-    if float(depth.max()) < NEAR_M:
-        return []
-    whole = float(depth.min()) >= NEAR_M
-    if whole:
-        points = projected[:, :2] / projected[:, 2:]
-        low, high = points.min(axis=0), points.max(axis=0)
-        if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
-            return []
-        if float((high - low).max()) < MAX_SHADOW_SOLIDS_AT_PX:
-            return [cv2.convexHull(points.astype(np.float32)).reshape(-1, 2).astype(np.float64)]
-        return [points[start:end] for start, end in pairwise(first)]
-    forward = np.array([0.0, 0.0, 1.0])
-    cut: list[NDArray[np.float64]] = []
-    for start, end in pairwise(first):
-        piece = projected[start:end]
-        nearest = float(piece[:, 2].min())
-        kept = piece if nearest >= NEAR_M else clip_polygon(piece, forward, NEAR_M)
-        if len(kept) >= 3:
-            cut.append(kept[:, :2] / kept[:, 2:])
-    return cut
 
 
 def _soften_edges(

@@ -14,6 +14,7 @@ from mavlink_sim.camera.depth_camera import measured_depth
 from mavlink_sim.camera.lens import CameraMotion
 from mavlink_sim.camera.renderer import Rendered, Renderer
 from mavlink_sim.camera.scene import Scene
+from mavlink_sim.world.aircraft import Aircraft, aircraft_objects, identifier_offset
 from vision.camera_model import CameraMount
 from vision.frame import Frame
 
@@ -57,6 +58,8 @@ class SimulatedCamera:
             rng=self._noise,
             shutter=settings.shutter,
         )
+        self._identifier_offset = identifier_offset(scene.world)
+        self._others_shown = False
         self._sequence = -1
         self._last: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
 
@@ -68,6 +71,7 @@ class SimulatedCamera:
         time_s: float | None = None,
         mount: CameraMount | None = None,
         motion: CameraMotion | None = None,
+        others: Sequence[Aircraft] = (),
     ) -> Captured | None:
         """The frame at a pose, or None if it is one of those that get lost.
 
@@ -78,6 +82,7 @@ class SimulatedCamera:
             time_s: the scene's time, which says where moving objects are; by default the stamp in seconds.
             mount: where a camera on a gimbal looks now.
             motion: of the camera; by default what lies between this call's pose and the last one's.
+            others: the other aircraft as they are at that moment; this one does not see itself.
         """
         settings = self.settings
         time_s = stamp_ns / 1e9 if time_s is None else time_s
@@ -90,8 +95,10 @@ class SimulatedCamera:
             return None
         if motion is None:
             motion = CameraMotion() if last is None else _motion_between(last, self._last)
-        if self.scene.paths:
-            self._renderer.place(self.scene.objects_at(time_s))
+        if self.scene.paths or others or self._others_shown:
+            self._others_shown = bool(others)
+            aircraft = aircraft_objects(others, self._identifier_offset)
+            self._renderer.place(self.scene.objects_at(time_s) + aircraft)
         rendered = self._renderer.render(position_ned_m, ned_from_body, used, motion)
         depth = rendered.depth_m
         if settings.depth is not None:
@@ -142,6 +149,10 @@ def frame_truth(captured: Captured) -> dict[str, Any]:
             "position_ned_m": [round(value, 3) for value in item.position_ned_m],
             "yaw_rad": round(item.yaw_rad, 4),
         }
+        if item.system_id is not None:
+            entry["system_id"] = item.system_id
+            entry["roll_rad"] = round(item.roll_rad, 4)
+            entry["pitch_rad"] = round(item.pitch_rad, 4)
         if item.printed is not None:
             entry["marker"] = {
                 "dictionary": item.printed.dictionary,

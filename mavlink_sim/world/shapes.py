@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.world import clutter, creatures, vehicles
 from mavlink_sim.world.painting_order import PaintingTree, painting_tree
-from mavlink_sim.world.solids import Body, Points, Triple, ground_shadow
+from mavlink_sim.world.solids import Body, Points, Triple, ground_shadows
 from mavlink_sim.world.structures import DEFAULT_SIZES_M, SIZED_BUILDERS, check_size
 
 CLASS_NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair")
@@ -50,6 +51,8 @@ DEFAULT_VARIANTS = 6
 GLOSS = {"glass": 0.75, "paint": 0.3, "roof": 0.3, "hub": 0.4, "trim": 0.4, "headlight": 0.6, "panel": 0.7}
 """How much of the sky a slot's surface mirrors at a grazing look; the rest is matt."""
 
+_UPWARDS = np.array([1.0, 1.0, -1.0])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
@@ -65,7 +68,8 @@ class Shape:
         slot_of: (F,) index into `slots`.
         shade: (F,) brightness of each face.
         gloss: (F,) 0..1.
-        solids: corners (K, 3) of each convex solid.
+        solids: (S, 3) corners of the convex solids, one solid after another.
+        solid_first: where each solid's corners begin, and where the last one's end.
         low, high: (3,) the bounding box.
     """
 
@@ -79,14 +83,26 @@ class Shape:
     slot_of: NDArray[np.int64]
     shade: Points
     gloss: Points
-    solids: tuple[Points, ...]
+    solids: Points
+    solid_first: tuple[int, ...]
     low: Points
     high: Points
 
     def shadow(self, sun: Points) -> list[NDArray[np.float32]]:
         """Outlines (K, 2) on the ground of each solid's shadow; `sun` (3,) towards the sun, shape's frame."""
-        upwards = np.array([1.0, 1.0, -1.0])
-        return [ground_shadow(solid * upwards, sun * upwards) for solid in self.solids]
+        return ground_shadows(self.solids * _UPWARDS, self.solid_first, sun * _UPWARDS)
+
+    def leaning_shadow(self, sun: Points, turn: Points) -> tuple[list[NDArray[np.float32]], float]:
+        """The same of a shape that leans, its lowest point on the ground, and how far that lies below z = 0.
+
+        Args:
+            sun: (3,) towards the sun, in the frame of the outlines.
+            turn: (3, 3) from the shape's frame to that of the outlines.
+        """
+        corners = self.solids @ turn.T
+        lowest = float(corners[:, 2].max())
+        corners[:, 2] -= lowest
+        return ground_shadows(corners * _UPWARDS, self.solid_first, sun * _UPWARDS), lowest
 
 
 def variant_of(class_name: str, appearance: int) -> int:
@@ -119,6 +135,7 @@ def shape_of(class_name: str, variant: int, size_m: Triple | None = None) -> Sha
         for face in (*solid.faces, *solid.decals):
             # Mirroring z turns the winding round.
             face.points = (face.points * (1.0, 1.0, -1.0))[::-1]
+    solids = [solid.corners for solid in body.solids]
     faces = [face for solid in body.solids for face in (*solid.faces, *solid.decals)]
     planes = [face.plane() for face in faces]
     corners = np.concatenate([face.points for face in faces])
@@ -136,7 +153,8 @@ def shape_of(class_name: str, variant: int, size_m: Triple | None = None) -> Sha
         slot_of=np.array([slots.index(face.slot) for face in faces]),
         shade=np.array([face.shade for face in faces]),
         gloss=np.array([GLOSS.get(face.slot, 0.0) for face in faces]),
-        solids=tuple(solid.corners for solid in body.solids),
+        solids=np.concatenate(solids),
+        solid_first=tuple(accumulate(map(len, solids), initial=0)),
         low=corners.min(axis=0),
         high=corners.max(axis=0),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -292,14 +293,22 @@ def inset(side: Points, left: float, right: float, low: float, high: float) -> P
     return np.array([at(left, low), at(right, low), at(right, high), at(left, high)])
 
 
-def ground_shadow(solid: Points, sun: Points) -> NDArray[np.float32]:
-    """(K, 2) convex outline on the ground (x, y) of a solid's shadow.
+def ground_shadows(corners: Points, first: Sequence[int], sun: Points) -> list[NDArray[np.float32]]:
+    """(K, 2) convex outlines on the ground (x, y) of solids' shadows.
 
     Args:
-        solid: (N, 3) corners in a frame with z up and the ground at z = 0.
+        corners: (N, 3) of one solid after another, in a frame with z up and the ground at z = 0.
+        first: where each solid's corners begin, and where the last one's end.
         sun: (3,) direction towards the sun in the same frame, above the horizon.
     """
-    reach = np.maximum(solid[:, 2], 0.0) / max(float(sun[2]), 0.05)
-    fallen = (solid[:, :2] - sun[:2] * reach[:, None]).astype(np.float32)
-    outline = cv2.convexHull(fallen)
-    return np.asarray(outline, np.float32).reshape(-1, 2)
+    reach = np.maximum(corners[:, 2], 0.0) / max(float(sun[2]), 0.05)
+    fallen = (corners[:, :2] - sun[:2] * reach[:, None]).astype(np.float32)
+    return [
+        np.asarray(cv2.convexHull(fallen[start:end]), np.float32).reshape(-1, 2)
+        for start, end in pairwise(first)
+    ]
+
+
+def ground_shadow(solid: Points, sun: Points) -> NDArray[np.float32]:
+    """The same of one solid (N, 3)."""
+    return ground_shadows(solid, (0, len(solid)), sun)[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -20,6 +21,15 @@ Vector = tuple[float, float, float]
 
 
 OBJECT_NAMES = CLASS_NAMES + CLUTTER_NAMES + STRUCTURE_NAMES
+
+
+@lru_cache(maxsize=1024)
+def _footprint(
+    class_name: str, variant: int, size_m: Vector | None, scale: float
+) -> tuple[float, float, float, float]:
+    shape = shape_of(class_name, variant, size_m)
+    low, high = shape.low * scale, shape.high * scale
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +46,8 @@ class WorldObject:
         appearance: seed of its variant (size, pose) and colours.
         size_m: length, width and height of one of `structures.STRUCTURE_NAMES`; None for its usual size.
         printed: what a plate shows.
+        roll_rad, pitch_rad: how it leans, about the middle of its height; the footprint does not change.
+        system_id: of a vehicle that flies in this world; None for everything else.
     """
 
     identifier: int
@@ -46,6 +58,9 @@ class WorldObject:
     appearance: int = 0
     size_m: Vector | None = None
     printed: Print | None = None
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    system_id: int | None = None
 
     def __post_init__(self) -> None:
         if self.class_name not in OBJECT_NAMES:
@@ -73,9 +88,13 @@ class WorldObject:
     @property
     def footprint_m(self) -> tuple[float, float, float, float]:
         """(rear, front, left, right) edges of its footprint in its own frame, x forward, y right."""
-        shape = self.shape
-        low, high = shape.low * self.scale, shape.high * self.scale
-        return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+        size_m = self.size_m if self.printed is None else self.printed.board_size_m
+        return _footprint(self.class_name, variant_of(self.class_name, self.appearance), size_m, self.scale)
+
+    @property
+    def leans(self) -> bool:
+        """Whether it does not stand level."""
+        return self.roll_rad != 0.0 or self.pitch_rad != 0.0
 
     @property
     def height_m(self) -> float:
