@@ -90,6 +90,7 @@ class Pilot:
         self._engaging_since_ns = 0
         self._sent_before_engaging = 0
         self._position_lost_ns: int | None = None
+        self._blind = False
         self.asked: Setpoint | None = None
         self.sent: Setpoint | None = None
         self.limited_by: tuple[str, ...] = ()
@@ -192,7 +193,7 @@ class Pilot:
 
     def _begin(self, behaviour: Behaviour, future: asyncio.Future[Outcome] | None) -> None:
         self._behaviour, self._future = behaviour, future
-        self._activated, self._position_lost_ns = False, None
+        self._activated, self._position_lost_ns, self._blind = False, None, False
 
     def _run(self, behaviour: Behaviour, situation: Situation) -> None:
         """One step of the behaviour, and what follows from it."""
@@ -223,7 +224,9 @@ class Pilot:
             case Setpoint() if self._phase is _Phase.OFFBOARD:
                 # How long a setpoint counts is the operator's setting, whatever its behaviour wrote.
                 deadline_ns = situation.now_ns + round(self._lifetime_s * 1e9)
-                if (blind := self._obstacles.blind(situation)) is not None:
+                blind = self._obstacles.blind(situation)
+                self._tell_blindness(behaviour, blind)
+                if blind is not None:
                     self._brake(situation)
                     self.asked, self.limited_by = replace(step, deadline_ns=deadline_ns), (blind,)
                     return
@@ -240,6 +243,15 @@ class Pilot:
                 self._streamer.submit(self.sent)
             case Setpoint() if self._phase is not _Phase.ENGAGING:
                 self._start_engaging(situation)
+
+    def _tell_blindness(self, behaviour: Behaviour, blind: str | None) -> None:
+        """Say once that the vehicle brakes for want of depth, and once that it flies on."""
+        if (blind is not None) is not self._blind:
+            self._blind = blind is not None
+            if blind is None:
+                self._tell(PilotEventKind.NOTED, behaviour, "depth is back")
+            else:
+                self._tell(PilotEventKind.BLIND, behaviour, f"braking: {blind}")
 
     def _conclude(self, outcome: Outcome, situation: Situation) -> None:
         """It ended by itself: hold where setpoints are flown, else leave it to the autopilot."""

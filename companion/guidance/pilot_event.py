@@ -17,6 +17,7 @@ class PilotEventKind(StrEnum):
     ENDED = "ended"
     REFUSED = "refused"
     LOST = "lost"  # command was taken from us
+    BLIND = "blind"  # it brakes for want of depth
     BATTERY = "battery"  # too little charge to fly on, or none is told
 
 

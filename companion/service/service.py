@@ -395,7 +395,7 @@ class Service:
         )
 
     def _pilot_event(self, event: PilotEvent) -> None:
-        lost = event.kind in (PilotEventKind.LOST, PilotEventKind.BATTERY)
+        lost = event.kind in (PilotEventKind.LOST, PilotEventKind.BATTERY, PilotEventKind.BLIND)
         # What is refused or ended is told with the command's own outcome.
         if event.kind not in (PilotEventKind.REFUSED, PilotEventKind.ENDED, PilotEventKind.STARTED):
             self._event("warning" if lost else "info", event.message)

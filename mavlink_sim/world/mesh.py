@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,8 +103,8 @@ def mesh_of(
 def _faces(shape: Shape) -> list[Points]:
     """The corners (K, 3) of each face of each solid, without the decals."""
     found = []
-    for faces, corners in zip(shape.faces_of, shape.solids, strict=True):
-        left = len(corners)
+    for faces, (begin, end) in zip(shape.faces_of, pairwise(shape.solid_first), strict=True):
+        left = end - begin
         for face in faces:  # decals come last
             if left == 0:
                 break

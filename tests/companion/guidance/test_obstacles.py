@@ -18,6 +18,7 @@ from companion.guidance.obstacles import (
     obstacles_message,
     speed_towards,
 )
+from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.refusal import refusal
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
@@ -110,6 +111,14 @@ async def test_the_pilot_sends_a_brake_while_depth_is_missing():
     await cockpit.turn(0.1)
     assert cockpit.pilot.sent.velocity_ned_mps == (0.0, 0.0, 0.0)
     assert cockpit.pilot.limited_by == ("no depth to fly by: none came yet",)
+    cockpit.pilot._obstacles = ObstacleRules("auto")
+    await cockpit.turn(1.0)
+    assert math.hypot(*cockpit.pilot.sent.velocity_ned_mps) > 0.5
+    told = [(event.kind, event.message) for event in cockpit.events][-2:]
+    assert told == [
+        (PilotEventKind.BLIND, "braking: no depth to fly by: none came yet"),
+        (PilotEventKind.NOTED, "depth is back"),
+    ]
 
 
 def test_what_has_left_the_picture_is_remembered_where_it_stands():
