@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.gimbal_sight import NO_GIMBAL, GimbalSight
 from companion.guidance.marker_target import NO_MARKERS, MarkerSight
 from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.target import Target
+from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3, VehicleState
@@ -45,6 +47,7 @@ class Situation:
         neighbourhood: the other vehicles; None: nobody listens for them.
         min_separation_m: what is kept to each of them.
         markers: what is seen of markers, or why none can be.
+        gimbal: how the gimbal stands to what flies; where it looks is in `state`.
     """
 
     now_ns: int
@@ -57,6 +60,12 @@ class Situation:
     markers: MarkerSight = NO_MARKERS
     neighbourhood: Neighbourhood | None = None
     min_separation_m: float = 3.0
+    gimbal: GimbalSight = NO_GIMBAL
+
+    def why_blind(self, usually: str) -> str:
+        """Why nothing that is seen can be steered by, in words; `usually` where it is not the gimbal."""
+        why = self.gimbal.undirected
+        return f"where the camera looks is not known ({why})" if why else usually
 
     @property
     def neighbours(self) -> tuple[Neighbour, ...]:
@@ -97,6 +106,8 @@ class Behaviour(ABC):
     class_names: tuple[str, ...] = ()
     # Vehicles whose poses must be fresh, where it requires NEIGHBOURS.
     neighbour_names: tuple[str, ...] = ()
+    # Above the horizon, radians; what the gimbal must reach, where it requires GIMBAL.
+    gimbal_pitches_rad: tuple[float, ...] = ()
 
     def goals(self, situation: Situation) -> tuple[Vector3, ...]:
         """Where it would fly to if it began now, local NED metres, as far as that is known before."""
@@ -128,6 +139,11 @@ class Behaviour(ABC):
     @property
     def landing_target(self) -> LandingTarget | None:
         """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
+        return None
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        """Where the gimbal is to look now; None: it is nothing to this behaviour, or no more."""
         return None
 
     @property

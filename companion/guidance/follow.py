@@ -174,7 +174,7 @@ class FollowBehaviour(Behaviour):
 
     def _lost(self, situation: Situation) -> str:
         if not situation.perception_fresh:
-            why = "nothing comes from the detector"
+            why = situation.why_blind("nothing comes from the detector")
         elif self._track is not None:
             north, east = self._track.velocity
             moving = (
