@@ -56,7 +56,9 @@ class ApproachBehaviour(Behaviour):
     """
 
     name = "approach"
-    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+    requirements = frozenset(
+        {Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
+    )
 
     def __init__(
         self,

@@ -10,6 +10,7 @@ from enum import StrEnum
 from companion.guidance.gimbal_sight import NO_GIMBAL, GimbalSight
 from companion.guidance.marker_target import NO_MARKERS, MarkerSight
 from companion.guidance.neighbours import Neighbour, Neighbourhood
+from companion.guidance.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
@@ -26,7 +27,7 @@ class Requirement(StrEnum):
     ON_GROUND = "on_ground"
     PERCEPTION = "perception"  # a perception worker that delivers
     BATTERY = "battery"  # more charge than guidance.min_battery_percent
-    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, or a class of known size
+    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, the ground in the picture, or classes of known height
     MARKER = "marker"  # perception that looks for markers
     GIMBAL = "gimbal"  # one that answers
     NEIGHBOURS = "neighbours"  # other vehicles whose poses are fresh
@@ -48,6 +49,7 @@ class Situation:
         min_separation_m: what is kept to each of them.
         markers: what is seen of markers, or why none can be.
         gimbal: how the gimbal stands to what flies; where it looks is in `state`.
+        ranging: what there is to tell how far away something is.
     """
 
     now_ns: int
@@ -61,6 +63,7 @@ class Situation:
     neighbourhood: Neighbourhood | None = None
     min_separation_m: float = 3.0
     gimbal: GimbalSight = NO_GIMBAL
+    ranging: RangeMeans = ALL_MEANS
 
     def why_blind(self, usually: str) -> str:
         """Why nothing that is seen can be steered by, in words; `usually` where it is not the gimbal."""

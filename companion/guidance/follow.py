@@ -45,7 +45,13 @@ class FollowBehaviour(Behaviour):
 
     name = "follow"
     requirements = frozenset(
-        {Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION, Requirement.BATTERY}
+        {
+            Requirement.POSITION,
+            Requirement.IN_AIR,
+            Requirement.PERCEPTION,
+            Requirement.DEPTH_OR_SIZE,
+            Requirement.BATTERY,
+        }
     )
 
     def __init__(

@@ -185,6 +185,10 @@ class GimbalHand:
                 await self._driver.point_gimbal(request.aim)
         except (CommandRefusedError, LinkError) as error:
             refused = str(error)
+        except Exception as error:
+            # Unanswered, nothing more would ever be asked.
+            logger.exception("the gimbal's manager could not be asked")
+            refused = f"{type(error).__name__}: {error}"
         self._control.answered(time.monotonic_ns(), refused)
 
     def _judge(self, errand: _Errand, now_ns: int, state: VehicleState) -> None:

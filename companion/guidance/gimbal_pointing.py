@@ -23,7 +23,8 @@ class PointGimbalBehaviour(HoldBehaviour):
         self.gimbal_pitches_rad = (aim.pitch_rad,)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
-        if situation.gimbal.problem:
+        # At the first turn it is still told of what came before.
+        if situation.gimbal.problem and situation.now_ns > self._since_ns:
             return Outcome(False, f"gimbal: {situation.gimbal.problem}")
         state, gimbal = situation.state, situation.state.gimbal
         off_rad = None if gimbal is None else gimbal.off_rad(self._aim, state.yaw_rad or 0.0)

@@ -60,6 +60,8 @@ class PatrolBehaviour(Behaviour):
         confidence: float = 0.4,
     ) -> None:
         self.class_names = tuple(class_names)
+        if approach_m is not None:
+            self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
         self._way = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
         self._sightings = Sightings(class_names, confidence)
         self._speed_mps, self._confidence = speed_mps, confidence

@@ -57,6 +57,9 @@ def refusal(
                 missing += missing_gimbal(state, now_ns, situation.gimbal, behaviour.gimbal_pitches_rad)
                 if Requirement.PERCEPTION in behaviour.requirements and not situation.gimbal.carries_camera:
                     missing.append("the camera on the gimbal (camera.gimbal is not set)")
+            case Requirement.DEPTH_OR_SIZE:
+                if (why := situation.ranging.missing(behaviour.class_names)) is not None:
+                    missing.append(why)
             case Requirement.NEIGHBOURS:
                 missing += missing_neighbours(situation.neighbourhood, behaviour.neighbour_names)
             case Requirement.MARKER if (what := situation.markers.unavailable(PERCEPTION_GAP_S)) is not None:

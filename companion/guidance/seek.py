@@ -47,6 +47,7 @@ class SeekBehaviour(Behaviour):
         self._sweep = sweep
         self._vain = ""
         self._vain_until_ns: float = 0
+        self._begun_ns = 0
         if sweep is not None:
             self.requirements = SeekBehaviour.requirements | {Requirement.GIMBAL}
             self.gimbal_pitches_rad = (0.0, sweep.end_rad)
@@ -69,7 +70,7 @@ class SeekBehaviour(Behaviour):
         self._turned_rad = 0.0
         self._sightings.reset(situation.now_ns)
         self._gaze = self._blind_since_ns = None
-        self._vain = ""
+        self._vain, self._begun_ns = "", situation.now_ns
         if self._sweep is not None:
             self._sweep.begin(_gimbal_pitch(situation))
         limit_s = SLOWEST_TURN * self._laps * math.tau / self._rate_radps + 2 * FACING_TIMEOUT_S
@@ -125,7 +126,8 @@ class SeekBehaviour(Behaviour):
 
     def _hindered(self, sweep: GimbalSweep, situation: Situation) -> str | None:
         """Why the gimbal does not do what is asked, in words; None: it does."""
-        if situation.gimbal.problem:
+        # At the first turn it is still told of what came before.
+        if situation.gimbal.problem and situation.now_ns > self._begun_ns:
             return f"seek lost the gimbal: {situation.gimbal.problem}"
         return None if self._vain else sweep.stuck(_gimbal_pitch(situation))
 

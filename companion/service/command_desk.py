@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -67,7 +66,7 @@ class CommandDesk:
     def _behaviour_for(self, command: Command, enclosed: str) -> Behaviour:
         """Raises GrammarError or MissionError with what is wrong, a line for each."""
         camera = self._steering.settings.camera
-        footprint = Footprint(math.radians(camera.horizontal_fov_deg), -self._camera_pitch_rad())
+        footprint = Footprint(camera.field_rad, -self._camera_pitch_rad())
         if isinstance(command, Mission):
             names = self._steering.class_names
             return mission_behaviour(command, enclosed, names, self._pilot.refusal_of, footprint)

@@ -154,6 +154,7 @@ class Service:
                 await self._until_stopped(tasks)
             finally:
                 await self._leave()
+                await self.gimbal.close()
         finally:
             self._notifier.stopping()
             unsubscribe()
@@ -213,7 +214,6 @@ class Service:
         self._ending = True
         flying = self.streamer.state is not StreamState.SILENT
         self.pilot.close("the service ends")
-        await self.gimbal.close()
         if not flying or not self.driver.state.connected(time.monotonic_ns()):
             return
         try:
@@ -336,6 +336,7 @@ class Service:
             min_separation_m=self.settings.guidance.min_separation_m,
             markers=self.markers.sight(now_ns, self.settings.guidance.perception_max_age_s),
             gimbal=gimbal,
+            ranging=self.steering.ranging(self._camera_pitch()),
         )
 
     def _camera_pitch(self) -> float:

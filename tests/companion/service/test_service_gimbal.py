@@ -156,3 +156,14 @@ def test_the_tracker_is_told_where_a_camera_on_a_gimbal_looked() -> None:
     ahead = view.ned_from_optical @ np.array([0.0, 0.0, 1.0])
     assert math.asin(ahead[2]) == pytest.approx(0.7)
     assert math.atan2(ahead[1], ahead[0]) == pytest.approx(1.0)
+
+
+def test_a_camera_that_looks_up_tells_no_range_by_the_ground() -> None:
+    for pitch_deg, ground in (("45", False), ("0", True)):
+        service, now_ns = service_of(camera__mount_pitch_deg=pitch_deg), time.monotonic_ns()
+        take(service, state_at(now_ns, None))
+        assert service._situation(now_ns).ranging.ground, "nothing was seen yet: nothing is known to miss"
+        service.steering._take(seen(now_ns))
+        ranging = service._situation(now_ns).ranging
+        assert (ranging.depth, ranging.ground) == (False, ground)
+        assert "car" in ranging.classes
