@@ -135,6 +135,13 @@ class CameraSection(Section):
         )
         return calibrated.scaled(width, height)
 
+    @property
+    def field_rad(self) -> float:
+        """What is seen from the left edge to the right, radians: by the calibration where there is one."""
+        if self.fx_px is None or self.calibrated_width is None:
+            return math.radians(self.horizontal_fov_deg)
+        return 2 * math.atan(self.calibrated_width / 2 / self.fx_px)
+
     def mount(self) -> CameraMount:
         """How the camera sits on the body."""
         return CameraMount(

@@ -129,6 +129,14 @@ def test_a_gimbal_that_another_takes_ends_the_seek_and_says_who() -> None:
     assert outcome == Outcome(False, "seek lost the gimbal: 245/190 has taken control of it")
 
 
+def test_what_somebody_before_lost_is_no_loss_of_this_one() -> None:
+    """A step of a mission begins in the turn in which the one before ended."""
+    before = replace(CARRIED, problem="245/190 has taken control of it")
+    for behaviour in (seek(), PointGimbalBehaviour(GimbalAim(-0.5))):
+        outcome = fly(behaviour, [before, CARRIED], limit_s=3.0)
+        assert outcome is None or outcome.success
+
+
 def test_a_gimbal_that_does_not_follow_ends_the_seek() -> None:
     outcome = fly(seek(), [CARRIED], follows=False)
     assert outcome is not None

@@ -16,7 +16,9 @@ from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment, S
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search_pattern import Footprint
+from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.target import Target
+from companion.missions.mission_file import plan_from
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import Quaternion
 
@@ -97,6 +99,19 @@ def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing
     assert thing.range_m(seen[-1].position_ned_m, 0.0) < PLACE_BOUND_M
     # Nobody holds it any more.
     flight.move_gimbal_on()
+    assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
+
+
+def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there():
+    table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
+    mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
+    flight = LockstepFlight(seed=5, height_m=HEIGHT_M, gimbal=True)
+    log = flight.fly(mission, 20.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    assert [step.reason for step in mission.records] == ["the gimbal looks 50° down", "held for 1 s"]
+    assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)
+    # The next step wants nothing of it, so it has been given back.
     assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
 
 
