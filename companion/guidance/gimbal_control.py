@@ -80,12 +80,16 @@ class GimbalControl:
         if owner is not self._owner:
             self._owner, self.problem, self.pointed = owner, "", None
         if self.held and (why := self._taken_over(now_ns, gimbal)) is not None:
-            self.held, self.problem = False, why
+            self.held = False
+            if self._doubted_ns is None:  # else it was told already, of whose errand it was
+                self.problem = why
         if self._asked is not None:
             return None
         if aim is None or self.problem:
             return self._ask(GimbalRequest(GimbalAsk.GIVE_BACK)) if self._ours(now_ns, gimbal) else None
         if not self.held or self._doubted_ns is not None:
+            if self._unsure(now_ns, gimbal):
+                return None
             if (who := self.elsewhere(gimbal)) is not None:
                 self.problem = f"{address_text(who)} has control of it"
                 return None
@@ -140,13 +144,17 @@ class GimbalControl:
         """
         if not self.held or self._doubted_ns is None:
             return self.held
-        if gimbal is not None and gimbal.status_ns > self._doubted_ns:
-            self.held = gimbal.primary_control == self._own
-        elif now_ns - self._doubted_ns <= SHOWN_WITHIN_S * 1e9:
+        if self._unsure(now_ns, gimbal):
             return False
-        else:
-            self.held = False
+        shown = gimbal is not None and gimbal.status_ns > self._doubted_ns
+        self.held = shown and gimbal is not None and gimbal.primary_control == self._own
         return self.held
+
+    def _unsure(self, now_ns: int, gimbal: GimbalState | None) -> bool:
+        """Refused, and the manager has not shown since whose it is: it may be another's by now."""
+        if self._doubted_ns is None or (gimbal is not None and gimbal.status_ns > self._doubted_ns):
+            return False
+        return now_ns - self._doubted_ns <= SHOWN_WITHIN_S * 1e9
 
 
 def _same(aim: GimbalAim, other: GimbalAim | None) -> bool:

@@ -145,7 +145,22 @@ def test_after_a_denial_another_errand_takes_it_anew() -> None:
     bench.held()
     assert bench.turn(LEVEL) == point(LEVEL)
     bench.answer("denied")
-    assert bench.turn(DOWN, object()) == TAKE
+    another = object()
+    assert bench.turn(DOWN, another) is None, "whose it is now is not known yet"
+    bench.shows(NOBODY)
+    assert bench.turn(DOWN, another) == TAKE
+
+
+def test_after_a_denial_it_is_not_taken_from_who_turns_out_to_have_it() -> None:
+    bench = Bench()
+    bench.held()
+    assert bench.turn(LEVEL) == point(LEVEL)
+    bench.answer("denied")
+    another = object()
+    assert bench.turn(DOWN, another) is None
+    bench.shows(STATION)
+    assert bench.turn(DOWN, another) is None
+    assert bench.control.problem == "245/190 has control of it"
 
 
 def test_a_gimbal_that_tells_nothing_is_taken_and_pointed_all_the_same() -> None:
