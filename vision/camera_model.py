@@ -7,7 +7,7 @@ Distortion is the Brown–Conrady model in OpenCV's order (k1, k2, p1, p2, k3).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -110,6 +110,9 @@ class CameraMount:
 
     Attributes:
         levelled: a gimbal holds it: roll and pitch count from the horizon, yaw from where the nose points.
+        on_gimbal: a gimbal turns it: roll, pitch and yaw count from the gimbal's own frame (FRD, x along its
+            axis), and where it looks is known for a moment alone, see `held`.
+        ned_from_gimbal: (3, 3) rotation of that moment, gimbal FRD to NED; None: not told.
     """
 
     forward_m: float = 0.0
@@ -119,6 +122,12 @@ class CameraMount:
     pitch_rad: float = 0.0
     yaw_rad: float = 0.0
     levelled: bool = False
+    on_gimbal: bool = False
+    ned_from_gimbal: NDArray[np.float64] | None = field(default=None, compare=False)
+
+    def held(self, ned_from_gimbal: NDArray[np.float64]) -> CameraMount:
+        """A camera on a gimbal as it looked at one moment, given the gimbal's (3, 3) attitude then."""
+        return replace(self, ned_from_gimbal=ned_from_gimbal)
 
     @property
     def position_frd_m(self) -> NDArray[np.float64]:
@@ -127,15 +136,32 @@ class CameraMount:
 
     @property
     def body_from_optical(self) -> NDArray[np.float64]:
-        """(3, 3) rotation from the optical frame to the body frame (FRD), for a levelled one a level body."""
+        """(3, 3) rotation from the optical frame to the body frame (FRD), for a levelled one a level body.
+
+        Raises ValueError for a camera on a gimbal: it has no fixed one.
+        """
+        if self.on_gimbal:
+            raise ValueError("a camera on a gimbal does not look one way of the body: ask ned_from_optical")
+        return self._parent_from_optical
+
+    @property
+    def _parent_from_optical(self) -> NDArray[np.float64]:
+        """(3, 3) rotation from the optical frame to that of what the camera is screwed to."""
         turned: NDArray[np.float64] = (
             matrix_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad) @ BODY_FROM_OPTICAL
         )
         return turned
 
     def ned_from_optical(self, ned_from_body: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(3, 3) rotation from the optical frame to NED, for the body's (3, 3) attitude."""
+        """(3, 3) rotation from the optical frame to NED, for the body's (3, 3) attitude.
+
+        Raises ValueError for a camera on a gimbal whose attitude was not told (`held`).
+        """
+        if self.on_gimbal:
+            if self.ned_from_gimbal is None:
+                raise ValueError("where a camera on a gimbal looks needs the gimbal's attitude: use `held`")
+            return self.ned_from_gimbal @ self._parent_from_optical
         if self.levelled:
             heading_rad = math.atan2(float(ned_from_body[1, 0]), float(ned_from_body[0, 0]))
             ned_from_body = matrix_from_euler(0.0, 0.0, heading_rad)
-        return ned_from_body @ self.body_from_optical
+        return ned_from_body @ self._parent_from_optical

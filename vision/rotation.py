@@ -71,6 +71,13 @@ def euler_from_quaternion(quaternion: tuple[float, float, float, float]) -> tupl
     )
 
 
+def turned_about_down(yaw_rad: float, quaternion: Quaternion) -> Quaternion:
+    """The (w, x, y, z) attitude, turned by a yaw about the parent frame's own down axis."""
+    c, s = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    w, x, y, z = quaternion
+    return (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
+
+
 def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
     """Between two attitudes along the shorter way (Shoemake 1985); a fraction above 1 goes on turning.
 

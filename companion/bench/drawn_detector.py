@@ -87,6 +87,8 @@ class DrawnDetector:
 
     Args:
         with_depth: detections have a range, as with a depth camera.
+        gimbal: tells the true attitude of the camera's gimbal, (w, x, y, z), its FRD to NED; for a mount on
+            one.
     """
 
     def __init__(
@@ -98,7 +100,9 @@ class DrawnDetector:
         seed: int = 0,
         with_depth: bool = False,
         faults: Faults | None = None,
+        gimbal: Callable[[], Quaternion] | None = None,
     ) -> None:
+        self._gimbal = gimbal
         self._things, self._camera, self._mount = tuple(things), camera, mount
         self._with_depth, self._faults = with_depth, faults or Faults()
         self._rng = np.random.default_rng((seed, 71))
@@ -108,7 +112,10 @@ class DrawnDetector:
         """What is seen from a true pose (attitude: body FRD to NED)."""
         ned_from_body = matrix_from_quaternion(attitude)
         eye = np.asarray(position_ned_m) + ned_from_body @ self._mount.position_frd_m
-        optical_from_ned = self._mount.ned_from_optical(ned_from_body).T
+        mount = self._mount
+        if self._gimbal is not None:
+            mount = mount.held(matrix_from_quaternion(self._gimbal()))
+        optical_from_ned = mount.ned_from_optical(ned_from_body).T
         rng, faults = self._rng, self._faults
         boxes: list[NDArray[np.float64]] = []
         confidences, classes, ranges = [], [], []

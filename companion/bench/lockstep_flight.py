@@ -16,14 +16,18 @@ from typing import Any
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
 from companion.guidance.envelope import Envelope, Limited, Limits
+from companion.guidance.gimbal_control import GimbalAsk, GimbalControl, GimbalRequest
+from companion.guidance.gimbal_sight import GimbalSight
 from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.target import Target
-from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
+from companion.guidance.targets import HistoryError, StateHistory, mount_at, targets_from_detections
 from companion.settings.perception import DetectorSection
+from companion.vehicle.gimbal import GimbalAim
+from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
-from mavlink_sim.lockstep import LockstepVehicle, Truth
+from mavlink_sim.lockstep import COMPANION, LockstepVehicle, Truth
 from mavlink_sim.wire.messages import dialect
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
@@ -41,6 +45,8 @@ RATES_HZ = {
     "CURRENT_MODE": 10.0,
     "HOME_POSITION": 0.5,
 }
+# The same where there is a gimbal (`gimbal_commands`).
+GIMBAL_RATES_HZ = {"GIMBAL_DEVICE_ATTITUDE_STATUS": 50.0, "GIMBAL_MANAGER_STATUS": 5.0}
 TICK_S = 0.01
 WARM_UP_S = 1.5
 GUIDANCE_TICKS = 5  # 20 Hz, the default of guidance.rate_hz
@@ -51,6 +57,8 @@ START_NS = 1_000_000_000_000
 SPEED_TOLERANCE_MPS = 1.0
 PLACE_TOLERANCE_M = 0.5
 _HEIGHTS_M = DetectorSection().heights()
+_GIMBAL_MANAGER_INFORMATION_ID = 280
+_GIMBAL_COMMANDS = (PITCHYAW, CONFIGURE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +117,7 @@ class LockstepFlight:
         height_m: above home, where the behaviour begins.
         sight: what it sees with; None: nothing.
         wind_mps, seed: of the vehicle; the direction of the wind follows from the seed.
-        options: further ones of `LockstepVehicle`.
+        options: further ones of `LockstepVehicle`; with `gimbal` it is moved as the service does.
 
     Raises:
         NotReachedError, CommandRefusedError: the vehicle did not take off.
@@ -125,7 +133,10 @@ class LockstepFlight:
         limits: Limits | None = None,
         **options: Any,
     ) -> None:
-        self.vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, wind_mps=wind_mps, **options)
+        gimbal = bool(options.get("gimbal", False))
+        rates_hz = RATES_HZ | GIMBAL_RATES_HZ if gimbal else RATES_HZ
+        self.vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
+        self.gimbal = GimbalControl(COMPANION) if gimbal else None
         self.limits = limits or Limits()
         self.state = VehicleState()
         self.history = StateHistory()
@@ -136,6 +147,8 @@ class LockstepFlight:
         self._late: deque[tuple[int, int, Detections]] = deque()
         self._targets: tuple[Target, ...] = ()
         self._seen_ns: int | None = None
+        if gimbal:
+            self.vehicle.command(dialect.MAV_CMD_REQUEST_MESSAGE, _GIMBAL_MANAGER_INFORMATION_ID)
         self.vehicle.take_off(height_m)
         still = Setpoint.brake(self.now_ns)
         self._stream = self.vehicle.repeat(setpoint_message(still), SETPOINT_RATE_HZ)
@@ -199,6 +212,7 @@ class LockstepFlight:
                     behaviour.on_activate(situation)
                     activated = True
                 step = behaviour.update(dt_s, situation)
+                self._move_gimbal(now_ns, behaviour, isinstance(step, Outcome))
                 if isinstance(step, Outcome):
                     log.outcome = step
                     break
@@ -222,6 +236,12 @@ class LockstepFlight:
             ticks += 1
         return log
 
+    def move_gimbal_on(self, seconds: float = 1.0) -> None:
+        """Nothing flies any more: what was taken is given back."""
+        for _ in range(round(seconds / TICK_S)):
+            self._ask_gimbal(self.now_ns, None, None)
+            self._pass_tick()
+
     def _watch(self, seconds: float) -> None:
         """Perception is at work before a command comes: stand still and let it see."""
         for _ in range(round(seconds / TICK_S)):
@@ -239,13 +259,36 @@ class LockstepFlight:
     def _situation(self, now_ns: int) -> Situation:
         age_s = None if self._seen_ns is None else (now_ns - self._seen_ns) / 1e9
         fresh = age_s is not None and age_s <= PERCEPTION_MAX_AGE_S
-        return Situation(now_ns, self.state, self._targets if fresh else (), age_s, fresh)
+        carried = self._sight is not None and self._sight.mount.on_gimbal
+        problem = "" if self.gimbal is None else self.gimbal.problem
+        return Situation(
+            now_ns,
+            self.state,
+            self._targets if fresh else (),
+            age_s,
+            fresh,
+            gimbal=GimbalSight(carried, problem=problem),
+        )
+
+    def _move_gimbal(self, now_ns: int, behaviour: Behaviour, ended: bool) -> None:
+        """As `GimbalHand` does, without waiting."""
+        flown = None if ended else behaviour.flown
+        self._ask_gimbal(now_ns, None if flown is None else flown.gimbal_aim, flown)
+
+    def _ask_gimbal(self, now_ns: int, aim: GimbalAim | None, owner: object | None) -> None:
+        if self.gimbal is None:
+            return
+        request = self.gimbal.update(now_ns, self.state.gimbal, aim, owner)
+        if request is not None:
+            self.vehicle.send(gimbal_message(request))
 
     def _take(self) -> None:
         """Messages into the state, as the driver does."""
         now_ns = self.now_ns
         for message in self.vehicle.receive():
             name = message.get_type()
+            if name == "COMMAND_ACK" and message.command in _GIMBAL_COMMANDS and self.gimbal is not None:
+                self.gimbal.answered(now_ns, None if message.result == 0 else f"result {message.result}")
             if name in FOLDED_MESSAGES:
                 self.state = fold(self.state, name, message.to_dict(), now_ns)
         self.history.add(self.state)
@@ -264,12 +307,7 @@ class LockstepFlight:
         while sight is not None and self._late and self._late[0][0] <= self.now_ns:
             _, captured_ns, detections = self._late.popleft()
             if self._tracker is not None:
-                ned_from_body = self._attitudes.at(captured_ns)
-                view = (
-                    None
-                    if ned_from_body is None
-                    else CameraView(sight.camera, sight.mount.ned_from_optical(ned_from_body))
-                )
+                view = self._view(sight, captured_ns)
                 detections = self._tracker.update(detections, captured_ns, view).detections
             self._seen_ns = captured_ns
             try:
@@ -278,6 +316,16 @@ class LockstepFlight:
                 )
             except HistoryError:
                 self._targets = ()  # as in the service: seen, not steered by
+
+    def _view(self, sight: Sight, captured_ns: int) -> CameraView | None:
+        ned_from_body = self._attitudes.at(captured_ns)
+        if ned_from_body is None:
+            return None
+        try:
+            mount = mount_at(sight.mount, self.history, captured_ns)
+        except HistoryError:
+            return None
+        return CameraView(sight.camera, mount.ned_from_optical(ned_from_body))
 
     def _judge(self, moment: Moment, log: FlightLog) -> None:
         """Against the limits: what was sent, exactly; what was flown, by the truth, within the tolerances."""
@@ -321,3 +369,13 @@ def setpoint_message(setpoint: Setpoint) -> object:
         setpoint.yaw_rad or 0.0,
         setpoint.yaw_rate_radps or 0.0,
     )
+
+
+def gimbal_message(request: GimbalRequest) -> object:
+    """What is asked of a gimbal's manager, as the drivers send it."""
+    if request.aim is not None:
+        pitch, yaw = math.degrees(request.aim.pitch_rad), math.degrees(request.aim.yaw_rad)
+        values = (pitch, yaw, math.nan, math.nan, FOLLOWING_NOSE, 0.0, 0.0)
+        return dialect.MAVLink_command_long_message(1, 1, PITCHYAW, 0, *values)
+    who = (RELEASE, RELEASE) if request.ask is GimbalAsk.GIVE_BACK else COMPANION
+    return dialect.MAVLink_command_long_message(1, 1, CONFIGURE, 0, *who, UNCHANGED, UNCHANGED, 0.0, 0.0, 0.0)

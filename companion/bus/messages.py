@@ -10,6 +10,7 @@ from typing import Any
 
 from companion.bus.topics import NO_OBJECTS
 from companion.vehicle.clock_sync import ClockOffset
+from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
@@ -106,6 +107,18 @@ def vehicle_message(state: VehicleState, now_ns: int) -> dict[str, Any]:
         "longitude_deg": _finite(state.longitude_deg),
         "altitude_amsl_m": _finite(state.altitude_amsl_m),
         "battery_fraction": state.battery_fraction,
+        "gimbal": None if state.gimbal is None else _gimbal(state.gimbal, now_ns),
+    }
+
+
+def _gimbal(gimbal: GimbalState, now_ns: int) -> dict[str, Any]:
+    """Where the gimbal looks: radians; `attitude_wxyz` its FRD to NED, or to NED turned to the heading."""
+    return {
+        "attitude_age_s": _age_s(gimbal.attitude_ns, now_ns),
+        "attitude_wxyz": _rounded(gimbal.attitude, 5),
+        "yaw_from": gimbal.yaw_frame.value,
+        "pitch_rad": None if gimbal.pitch_rad is None else round(gimbal.pitch_rad, 4),
+        "primary_control": gimbal.primary_control,
     }
 
 

@@ -56,7 +56,9 @@ class ApproachBehaviour(Behaviour):
     """
 
     name = "approach"
-    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+    requirements = frozenset(
+        {Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
+    )
 
     def __init__(
         self,
@@ -215,7 +217,7 @@ class ApproachBehaviour(Behaviour):
         self._anchor_rad = None
         if unseen_s > self._lost_timeout_s:
             if not situation.perception_fresh:
-                why = "nothing comes from the detector"
+                why = situation.why_blind("nothing comes from the detector")
             elif self._doubted:
                 why = DOUBTED
             elif self._track is None:

@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.gimbal_sight import NO_GIMBAL, GimbalSight
 from companion.guidance.marker_target import NO_MARKERS, MarkerSight
 from companion.guidance.neighbours import Neighbour, Neighbourhood
+from companion.guidance.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.target import Target
+from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3, VehicleState
@@ -24,7 +27,7 @@ class Requirement(StrEnum):
     ON_GROUND = "on_ground"
     PERCEPTION = "perception"  # a perception worker that delivers
     BATTERY = "battery"  # more charge than guidance.min_battery_percent
-    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, or a class of known size
+    DEPTH_OR_SIZE = "depth_or_size"  # a range: depth, the ground in the picture, or classes of known height
     MARKER = "marker"  # perception that looks for markers
     GIMBAL = "gimbal"  # one that answers
     NEIGHBOURS = "neighbours"  # other vehicles whose poses are fresh
@@ -45,6 +48,8 @@ class Situation:
         neighbourhood: the other vehicles; None: nobody listens for them.
         min_separation_m: what is kept to each of them.
         markers: what is seen of markers, or why none can be.
+        gimbal: how the gimbal stands to what flies; where it looks is in `state`.
+        ranging: what there is to tell how far away something is.
     """
 
     now_ns: int
@@ -57,6 +62,13 @@ class Situation:
     markers: MarkerSight = NO_MARKERS
     neighbourhood: Neighbourhood | None = None
     min_separation_m: float = 3.0
+    gimbal: GimbalSight = NO_GIMBAL
+    ranging: RangeMeans = ALL_MEANS
+
+    def why_blind(self, usually: str) -> str:
+        """Why nothing that is seen can be steered by, in words; `usually` where it is not the gimbal."""
+        why = self.gimbal.undirected
+        return f"where the camera looks is not known ({why})" if why else usually
 
     @property
     def neighbours(self) -> tuple[Neighbour, ...]:
@@ -97,6 +109,8 @@ class Behaviour(ABC):
     class_names: tuple[str, ...] = ()
     # Vehicles whose poses must be fresh, where it requires NEIGHBOURS.
     neighbour_names: tuple[str, ...] = ()
+    # Above the horizon, radians; what the gimbal must reach, where it requires GIMBAL.
+    gimbal_pitches_rad: tuple[float, ...] = ()
 
     def goals(self, situation: Situation) -> tuple[Vector3, ...]:
         """Where it would fly to if it began now, local NED metres, as far as that is known before."""
@@ -128,6 +142,11 @@ class Behaviour(ABC):
     @property
     def landing_target(self) -> LandingTarget | None:
         """What the autopilot is to be told of a target that it lands on by itself; None: nothing."""
+        return None
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        """Where the gimbal is to look now; None: it is nothing to this behaviour, or no more."""
         return None
 
     @property

@@ -15,7 +15,15 @@ from companion.guidance.commands_of_flight import (
     Stop,
     Takeoff,
 )
-from companion.guidance.commands_of_sight import Approach, Follow, LandOnMarker, Orbit, Patrol, Seek
+from companion.guidance.commands_of_sight import (
+    Approach,
+    Follow,
+    Gimbal,
+    LandOnMarker,
+    Orbit,
+    Patrol,
+    Seek,
+)
 
 __all__ = [
     "COMMANDS",
@@ -25,6 +33,7 @@ __all__ = [
     "Follow",
     "FollowPath",
     "Formation",
+    "Gimbal",
     "Goto",
     "Hold",
     "Land",
@@ -57,5 +66,6 @@ COMMANDS: dict[str, type[Command]] = {
         Mission,
         Formation,
         LandOnMarker,
+        Gimbal,
     )
 }

@@ -9,9 +9,12 @@ from typing import Annotated, ClassVar
 from companion.geometry.points import points_from
 from companion.guidance.arguments import Choice, ClassName, ClassNames, GrammarError, Number, Points, names_in
 from companion.guidance.command import Command
+from companion.vehicle.gimbal import GimbalAim
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0
+# A shorter way up and down shows nothing that a camera at rest does not.
+LEAST_SWEEP_DEG = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +72,24 @@ class Seek(Command):
         float | None, Number("spacing", "m", 1.0, 200.0, "between strips; else what the camera sees")
     ] = None
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
+    sweep_deg: Annotated[
+        float | None,
+        Number("sweep", "deg", -90.0, 90.0, "gimbal up and down between level and this; below is negative"),
+    ] = None
+    sweep_rate_dps: Annotated[
+        float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower, the turn is slower too")
+    ] = 20.0
 
     def __post_init__(self) -> None:
         super(Seek, self).__post_init__()
+        if self.sweep_deg is not None and abs(self.sweep_deg) < LEAST_SWEEP_DEG:
+            raise GrammarError(
+                f"seek: sweep must be {LEAST_SWEEP_DEG:g} deg or more from level, got {self.sweep_deg:g}"
+            )
+        if self.sweep_deg is not None and self.pattern != "turn":
+            raise GrammarError(f"seek: pattern={self.pattern} takes no sweep")
+        if self.sweep_deg is None and self.sweep_rate_dps != 20.0:
+            raise GrammarError("seek: sweep_rate needs sweep")
         given = {
             "radius": self.radius_m,
             "width": self.width_m,
@@ -207,3 +225,21 @@ class LandOnMarker(Command):
                 raise GrammarError(f"land-on-marker: {key} must be a whole number, got {value:g}")
         if self.method == "autopilot" and self.pad == "moving":
             raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
+
+
+@dataclass(frozen=True, slots=True)
+class Gimbal(Command):
+    word: ClassVar[str] = "gimbal"
+    meaning: ClassVar[str] = "point the gimbal, whatever flies; alone: level and ahead"
+
+    pitch_deg: Annotated[
+        float, Number("pitch", "deg", -90.0, 90.0, "above the horizon; below is negative")
+    ] = 0.0
+    yaw_deg: Annotated[
+        float, Number("yaw", "deg", -180.0, 180.0, "clockwise from the nose, with which it turns")
+    ] = 0.0
+
+    @property
+    def aim(self) -> GimbalAim:
+        """The same in radians."""
+        return GimbalAim(math.radians(self.pitch_deg), math.radians(self.yaw_deg))

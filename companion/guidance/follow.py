@@ -45,7 +45,13 @@ class FollowBehaviour(Behaviour):
 
     name = "follow"
     requirements = frozenset(
-        {Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION, Requirement.BATTERY}
+        {
+            Requirement.POSITION,
+            Requirement.IN_AIR,
+            Requirement.PERCEPTION,
+            Requirement.DEPTH_OR_SIZE,
+            Requirement.BATTERY,
+        }
     )
 
     def __init__(
@@ -174,7 +180,7 @@ class FollowBehaviour(Behaviour):
 
     def _lost(self, situation: Situation) -> str:
         if not situation.perception_fresh:
-            why = "nothing comes from the detector"
+            why = situation.why_blind("nothing comes from the detector")
         elif self._track is not None:
             north, east = self._track.velocity
             moving = (

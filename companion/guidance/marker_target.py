@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets import Pose, StateHistory
+from companion.guidance.targets import Pose, StateHistory, mount_at
 from companion.vehicle.state import Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import Marker, MarkerPose, PadMarker
@@ -100,17 +100,20 @@ def marker_targets(
         on_pads: those that lie on another's pad, by their own id.
 
     Raises:
-        HistoryError: the vehicle's pose at `captured_ns` is not known.
+        HistoryError: the vehicle's pose at `captured_ns`, or where its gimbal looked then, is not known.
     """
     if not markers:
         return ()
-    pose = history.at(captured_ns)
+    pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
     return tuple(_target(marker, captured_ns, mount, pose, on_pads) for marker in markers)
 
 
 def looks_down(camera: CameraModel, mount: CameraMount) -> bool:
-    """Whether what is straight below a level vehicle is well inside the picture."""
-    below = mount.body_from_optical.T @ np.array([0.0, 0.0, 1.0])
+    """Whether what is straight below a level vehicle is well inside the picture.
+
+    A camera on a gimbal must be told how it was held (`mount_at`).
+    """
+    below = mount.ned_from_optical(np.eye(3)).T @ np.array([0.0, 0.0, 1.0])
     column, row = camera.project(below.reshape(1, 3))[0]
     wide, high = camera.width * DOWN_MARGIN, camera.height * DOWN_MARGIN
     # NaN, which is behind the camera, fails both comparisons.

@@ -38,7 +38,9 @@ class OrbitBehaviour(Behaviour):
         class_name: str = "",
     ) -> None:
         needs = {Requirement.POSITION, Requirement.IN_AIR}
-        self.requirements = frozenset(needs | {Requirement.PERCEPTION} if class_name else needs)
+        if class_name:
+            needs |= {Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
+        self.requirements = frozenset(needs)
         self.class_names = (class_name,) if class_name else ()
         self._class_name = class_name
         self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps

@@ -60,6 +60,8 @@ class PatrolBehaviour(Behaviour):
         confidence: float = 0.4,
     ) -> None:
         self.class_names = tuple(class_names)
+        if approach_m is not None:
+            self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
         self._way = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
         self._sightings = Sightings(class_names, confidence)
         self._speed_mps, self._confidence = speed_mps, confidence
@@ -187,7 +189,8 @@ class PatrolBehaviour(Behaviour):
         if self._blind_since_ns is None:
             self._blind_since_ns, self._down_m, self._stop = now_ns, position[2], None
         if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-            return Outcome(False, f"nothing came from the detector for {BLIND_TIMEOUT_S:g} s")
+            why = situation.why_blind("nothing came from the detector")
+            return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
         _, yaw_rad = position_and_yaw(situation.state)
         return self._stand(situation, position, yaw_rad)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.gimbal_sight import missing_gimbal
 from companion.guidance.neighbours import missing_neighbours
 from companion.guidance.obstacles import NO_RULES, ObstacleRules
 from companion.vehicle.state import LandedState
@@ -50,6 +51,15 @@ def refusal(
                 missing.append(f"to be on the ground ({_where(situation)})")
             case Requirement.PERCEPTION if not _perceiving(situation):
                 missing.append(f"perception ({_perception_age(situation)})")
+            case Requirement.PERCEPTION if situation.gimbal.undirected:
+                missing.append(f"to know where its camera looks ({situation.gimbal.undirected})")
+            case Requirement.GIMBAL:
+                missing += missing_gimbal(state, now_ns, situation.gimbal, behaviour.gimbal_pitches_rad)
+                if Requirement.PERCEPTION in behaviour.requirements and not situation.gimbal.carries_camera:
+                    missing.append("the camera on the gimbal (camera.gimbal is not set)")
+            case Requirement.DEPTH_OR_SIZE:
+                if (why := situation.ranging.missing(behaviour.class_names)) is not None:
+                    missing.append(why)
             case Requirement.NEIGHBOURS:
                 missing += missing_neighbours(situation.neighbourhood, behaviour.neighbour_names)
             case Requirement.MARKER if (what := situation.markers.unavailable(PERCEPTION_GAP_S)) is not None:

@@ -12,6 +12,8 @@ from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.follow import FollowBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.formation import FormationBehaviour
+from companion.guidance.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.gimbal_sweep import GimbalSweep
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
@@ -23,6 +25,9 @@ from companion.guidance.search_pattern import Footprint
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
+
+# What a camera sees across at least, where nobody says what it does.
+NARROW_FIELD_RAD = math.radians(40.0)
 
 
 def behaviour_for(command: commands.Command, footprint: Footprint | None = None) -> Behaviour:
@@ -61,14 +66,10 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 speed_mps=command.speed_mps,
                 confidence=command.confidence,
             )
-        case commands.Seek(class_name, laps, rate_radps, confidence, direction):
-            return SeekBehaviour(
-                class_name,
-                laps=laps,
-                rate_radps=rate_radps,
-                confidence=confidence,
-                clockwise=direction == "clockwise",
-            )
+        case commands.Seek():
+            return _seek(command, footprint)
+        case commands.Gimbal():
+            return PointGimbalBehaviour(command.aim)
         case commands.Approach():
             return _approach(command)
         case commands.Follow():
@@ -106,6 +107,21 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
                 speed_mps=speed_mps,
             )
     raise TypeError(f"no behaviour is written for {type(command).__name__}")
+
+
+def _seek(command: commands.Seek, footprint: Footprint | None) -> SeekBehaviour:
+    sweep = None
+    if command.sweep_deg is not None:
+        field_rad = NARROW_FIELD_RAD if footprint is None else footprint.horizontal_fov_rad
+        sweep = GimbalSweep(math.radians(command.sweep_deg), math.radians(command.sweep_rate_dps), field_rad)
+    return SeekBehaviour(
+        command.class_name,
+        laps=command.laps,
+        rate_radps=command.rate_radps,
+        confidence=command.confidence,
+        clockwise=command.direction == "clockwise",
+        sweep=sweep,
+    )
 
 
 def _approach(command: commands.Approach) -> PersistentApproach:

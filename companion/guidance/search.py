@@ -62,7 +62,8 @@ class SearchBehaviour(PathFlight):
         if not situation.perception_fresh:
             self._blind_since_ns = now_ns if self._blind_since_ns is None else self._blind_since_ns
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-                return Outcome(False, f"nothing came from the detector for {BLIND_TIMEOUT_S:g} s")
+                why = situation.why_blind("nothing came from the detector")
+                return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
             return self._stand(situation, position, yaw_rad)
         self._blind_since_ns = None
         if self._gaze is not None:

@@ -1,13 +1,15 @@
-"""Turn on the spot until an object of a class is seen for sure, then face it."""
+"""Turn on the spot until an object of a class is seen for sure, then face it; a gimbal may sweep too."""
 
 from __future__ import annotations
 
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.gimbal_sweep import GimbalSweep
 from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
 from companion.guidance.sighting import FACING_TIMEOUT_S, Gaze, Sightings
 from companion.guidance.target import DOUBTED, Target
+from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.rotation import wrap_angle
@@ -17,8 +19,17 @@ BLIND_TIMEOUT_S = 5.0
 SLOWEST_TURN = 3.0
 
 
+# A gimbal that swept in vain is let back to where it looked before, so long at most.
+BACK_TIMEOUT_S = 5.0
+
+
 class SeekBehaviour(Behaviour):
-    """Turns up to `laps` (counted from the real heading), and ends facing the object."""
+    """Turns up to `laps` (counted from the real heading), and ends facing the object.
+
+    Args:
+        sweep: how the gimbal moves meanwhile, slowing the turn as it must; found, the gimbal looks at the
+            object. None: it is left alone.
+    """
 
     name = "seek"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
@@ -31,7 +42,16 @@ class SeekBehaviour(Behaviour):
         rate_radps: float = 0.5,
         confidence: float = 0.4,
         clockwise: bool = True,
+        sweep: GimbalSweep | None = None,
     ) -> None:
+        self._sweep = sweep
+        self._vain = ""
+        self._vain_until_ns: float = 0
+        self._begun_ns = 0
+        if sweep is not None:
+            self.requirements = SeekBehaviour.requirements | {Requirement.GIMBAL}
+            self.gimbal_pitches_rad = (0.0, sweep.end_rad)
+            rate_radps = min(rate_radps, sweep.turn_rate_radps)
         self.class_names = (class_name,)
         self._class_name = class_name
         self._laps = laps
@@ -50,6 +70,9 @@ class SeekBehaviour(Behaviour):
         self._turned_rad = 0.0
         self._sightings.reset(situation.now_ns)
         self._gaze = self._blind_since_ns = None
+        self._vain, self._begun_ns = "", situation.now_ns
+        if self._sweep is not None:
+            self._sweep.begin(_gimbal_pitch(situation))
         limit_s = SLOWEST_TURN * self._laps * math.tau / self._rate_radps + 2 * FACING_TIMEOUT_S
         self._give_up_ns = situation.now_ns + limit_s * 1e9
 
@@ -60,6 +83,10 @@ class SeekBehaviour(Behaviour):
         self._yaw_rad = yaw_rad
         stay = stay_at(self._place, position)
 
+        if self._sweep is not None and (why := self._hindered(self._sweep, situation)) is not None:
+            return Outcome(False, why)
+        if self._vain:
+            return self._look_back(dt_s, situation, stay)
         if now_ns > self._give_up_ns:
             return Outcome(False, f"seek timed out: {self._turned_rad / math.tau:.1f} laps turned")
         if not situation.perception_fresh:
@@ -70,19 +97,46 @@ class SeekBehaviour(Behaviour):
         elif (found := self._sightings.look(situation)) is not None:
             self._gaze = Gaze(found, now_ns)
         if self._gaze is not None:
+            if self._sweep is not None:
+                self._sweep.towards(
+                    _within_reach(self._gaze.target, situation), dt_s, _gimbal_pitch(situation)
+                )
             return self._face(self._gaze, situation, yaw_rad, stay)
         if abs(self._turned_rad) >= self._laps * math.tau:
             why = f": {DOUBTED}" if self._sightings.doubted else ""
-            return Outcome(False, f"no {self._class_name} seen in {laps_text(self._laps)}{why}")
+            self._vain = f"no {self._class_name} seen in {laps_text(self._laps)}{why}"
+            self._vain_until_ns = now_ns + BACK_TIMEOUT_S * 1e9
+            return self._look_back(dt_s, situation, stay)
         waiting = now_ns < self._sightings.look_until_ns
+        if self._sweep is not None and not waiting:
+            self._sweep.step(dt_s, _gimbal_pitch(situation))
+            waiting = self._sweep.waiting
         rate = 0.0 if waiting else self._turn * self._rate_radps
         return Setpoint.velocity(stay, now_ns, yaw_rate_radps=rate)
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        return None if self._sweep is None else self._sweep.aim
 
     @property
     def status(self) -> str:
         if self._gaze is not None:
             return f"facing the {self._class_name} at {in_degrees(self._gaze.target.bearing_rad)}°"
         return f"looking for a {self._class_name}, {max(0.0, self._turned_rad) / math.tau:.1f} laps"
+
+    def _hindered(self, sweep: GimbalSweep, situation: Situation) -> str | None:
+        """Why the gimbal does not do what is asked, in words; None: it does."""
+        # At the first turn it is still told of what came before.
+        if situation.gimbal.problem and situation.now_ns > self._begun_ns:
+            return f"seek lost the gimbal: {situation.gimbal.problem}"
+        return None if self._vain else sweep.stuck(_gimbal_pitch(situation))
+
+    def _look_back(self, dt_s: float, situation: Situation, stay: Vector3) -> Step:
+        """Found nothing: the gimbal goes back to where it looked before."""
+        sweep, now_ns = self._sweep, situation.now_ns
+        if sweep is None or now_ns > self._vain_until_ns or sweep.back(dt_s, _gimbal_pitch(situation)):
+            return Outcome(False, self._vain)
+        return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
 
     def _face(self, gaze: Gaze, situation: Situation, yaw_rad: float, stay: Vector3) -> Step:
         now_ns = situation.now_ns
@@ -101,8 +155,26 @@ class SeekBehaviour(Behaviour):
         if self._blind_since_ns is None:
             self._blind_since_ns = now_ns
         if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-            return Outcome(False, f"nothing came from the detector for {BLIND_TIMEOUT_S:g} s")
+            why = situation.why_blind("nothing came from the detector")
+            return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
         return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
+
+
+def _gimbal_pitch(situation: Situation) -> float:
+    """Radians above the horizon. Raises RuntimeError where a requirement was not checked."""
+    gimbal = situation.state.gimbal
+    if gimbal is None or gimbal.pitch_rad is None:
+        raise RuntimeError("where the gimbal looks is unknown: the behaviour must require GIMBAL")
+    return gimbal.pitch_rad
+
+
+def _within_reach(target: Target, situation: Situation) -> float:
+    """The pitch nearest to a target's that the gimbal has, radians above the horizon."""
+    gimbal = situation.state.gimbal
+    low, high = (-math.pi / 2, math.pi / 2)
+    if gimbal is not None:
+        low, high = max(low, gimbal.lowest_pitch_rad), min(high, gimbal.highest_pitch_rad)
+    return max(low, min(high, target.elevation_rad))
 
 
 def found_text(target: Target) -> str:

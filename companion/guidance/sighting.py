@@ -126,7 +126,7 @@ class Gaze:
     def faced(self, yaw_rad: float, now_ns: int) -> bool:
         """Whether the nose has pointed at it for long enough, and it is still seen."""
         unseen_s = (now_ns - self.target.captured_ns) / 1e9
-        off_rad = abs(wrap_angle(self.target.bearing_rad - yaw_rad))
+        off_rad = _across(wrap_angle(self.target.bearing_rad - yaw_rad), self.target.elevation_rad)
         if unseen_s > SIGHT_FRESH_S or off_rad > FACING_RAD:
             self._facing_since_ns = None
         elif self._facing_since_ns is None:
@@ -135,5 +135,11 @@ class Gaze:
 
 
 def apart_rad(first: Target, second: Target) -> float:
-    """The angle between the directions of two targets, level."""
-    return abs(wrap_angle(first.bearing_rad - second.bearing_rad))
+    """The angle between two targets across the line of sight: level, it is that between their bearings."""
+    elevation_rad = (first.elevation_rad + second.elevation_rad) / 2
+    return _across(wrap_angle(first.bearing_rad - second.bearing_rad), elevation_rad)
+
+
+def _across(bearing_rad: float, elevation_rad: float) -> float:
+    """What a difference of bearings comes to so far off the horizon: nearly below, all bearings are one."""
+    return abs(bearing_rad) * math.cos(elevation_rad)

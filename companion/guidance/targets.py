@@ -11,18 +11,21 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.guidance.target import RangeSource, Target
+from companion.vehicle.gimbal import YawFrame
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import direction_ned, foot_of_upright, point_at_depth, point_on_ground
-from vision.rotation import matrix_from_quaternion, slerp
+from vision.rotation import matrix_from_quaternion, slerp, turned_about_down
 from vision.tracking.association import overlaps
+
+_Sample = TypeVar("_Sample")
 
 HISTORY_S = 3.0
 # Beyond the ends of the history the nearest sample is taken for this long; a quadrotor turns 10° in it.
@@ -59,12 +62,16 @@ class Pose(NamedTuple):
 
 
 class StateHistory:
-    """The attitudes and positions of the last few seconds, each at its own stamp (CLOCK_MONOTONIC ns)."""
+    """The attitudes and positions of the last few seconds, each at its own stamp (CLOCK_MONOTONIC ns).
+
+    Of a gimbal the attitudes too, each with what its yaw counts from.
+    """
 
     def __init__(self, duration_s: float = HISTORY_S) -> None:
         self._duration_ns = round(duration_s * 1e9)
         self._attitudes: deque[tuple[int, Quaternion]] = deque()
         self._positions: deque[tuple[int, tuple[float, float, float, float]]] = deque()
+        self._gimbal: deque[tuple[int, tuple[Quaternion, YawFrame]]] = deque()
 
     def add(self, state: VehicleState) -> None:
         """Remember what is new in a snapshot; older or repeated stamps are passed over."""
@@ -75,6 +82,10 @@ class StateHistory:
         if position is not None and height_m is not None and _newer(self._positions, state.position_ns):
             self._positions.append((state.position_ns, (*position, height_m)))
             self._forget(self._positions)
+        gimbal = state.gimbal
+        if gimbal is not None and gimbal.attitude is not None and _newer(self._gimbal, gimbal.attitude_ns):
+            self._gimbal.append((gimbal.attitude_ns, (gimbal.attitude, gimbal.yaw_frame)))
+            self._forget(self._gimbal)
 
     def at(self, stamp_ns: int) -> Pose:
         """The pose at a moment: attitude by slerp, position linearly between the samples around it.
@@ -82,16 +93,48 @@ class StateHistory:
         Raises:
             HistoryError: nothing is known yet, or the moment lies outside by more than `MAX_OUTSIDE_S`.
         """
-        first, second, fraction = _around(self._attitudes, stamp_ns, "attitude")
-        quaternion = slerp(first, second, fraction)
-        before, after, fraction = _around(self._positions, stamp_ns, "position")
+        ned_from_body = self._ned_from_body(stamp_ns)
+        before, after, fraction = _around(self._positions, stamp_ns, "position of the vehicle")
         north, east, down, height = (a + (b - a) * fraction for a, b in zip(before, after, strict=True))
-        return Pose(matrix_from_quaternion(quaternion), (north, east, down), height)
+        return Pose(ned_from_body, (north, east, down), height)
 
-    def _forget(self, samples: deque[tuple[int, Quaternion]]) -> None:
+    def gimbal_at(self, stamp_ns: int) -> Quaternion:
+        """(w, x, y, z), turns the gimbal's frame (FRD) into NED at a moment, by slerp.
+
+        A yaw that the gimbal tells against the nose is turned by the vehicle's heading of that same moment.
+
+        Raises:
+            HistoryError: as `at`, of the gimbal's attitude or, where its yaw needs it, of the vehicle's.
+        """
+        first, second, fraction = _around(self._gimbal, stamp_ns, "attitude of the gimbal")
+        if first[1] is not second[1]:
+            # What it counts from has changed between the two: nothing lies between them.
+            first = second = first if fraction < 0.5 else second
+        turned = slerp(first[0], second[0], fraction)
+        if first[1] is YawFrame.NORTH:
+            return turned
+        nose = self._ned_from_body(stamp_ns)[:, 0]
+        return turned_about_down(math.atan2(float(nose[1]), float(nose[0])), turned)
+
+    def _ned_from_body(self, stamp_ns: int) -> NDArray[np.float64]:
+        first, second, fraction = _around(self._attitudes, stamp_ns, "attitude of the vehicle")
+        return matrix_from_quaternion(slerp(first, second, fraction))
+
+    def _forget(self, samples: deque[tuple[int, _Sample]]) -> None:
         oldest_ns = samples[-1][0] - self._duration_ns
         while samples[0][0] < oldest_ns:
             samples.popleft()
+
+
+def mount_at(mount: CameraMount, history: StateHistory, stamp_ns: int) -> CameraMount:
+    """How a camera was mounted at a moment: on a gimbal, as that looked then; else as ever.
+
+    Raises:
+        HistoryError: where the gimbal looked then is not known.
+    """
+    if not mount.on_gimbal:
+        return mount
+    return mount.held(matrix_from_quaternion(history.gimbal_at(stamp_ns)))
 
 
 def targets_from_detections(
@@ -114,9 +157,9 @@ def targets_from_detections(
     truck is not flown to.
 
     Raises:
-        HistoryError: the vehicle's pose at `captured_ns` is not known.
+        HistoryError: the vehicle's pose at `captured_ns`, or where its gimbal looked then, is not known.
     """
-    pose = history.at(captured_ns)
+    pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
     doubtful = _named_otherwise(detections)
     return tuple(
         _target(
@@ -204,22 +247,18 @@ def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:
     return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX and bottom - top >= LEAST_HEIGHT_PX
 
 
-def _newer(samples: deque[tuple[int, Quaternion]], stamp_ns: int) -> bool:
+def _newer(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> bool:
     return not samples or stamp_ns > samples[-1][0]
 
 
-def _around(
-    samples: deque[tuple[int, Quaternion]], stamp_ns: int, what: str
-) -> tuple[Quaternion, Quaternion, float]:
+def _around(samples: deque[tuple[int, _Sample]], stamp_ns: int, what: str) -> tuple[_Sample, _Sample, float]:
     """The samples before and after a moment and how far between them it is; the nearest beyond the ends."""
     if not samples:
-        raise HistoryError(f"no {what} of the vehicle is known yet")
+        raise HistoryError(f"no {what} is known yet")
     outside_s = max(samples[0][0] - stamp_ns, stamp_ns - samples[-1][0]) / 1e9
     if outside_s > MAX_OUTSIDE_S:
         side = "older than the oldest" if stamp_ns < samples[0][0] else "newer than the newest"
-        raise HistoryError(
-            f"the frame is {outside_s:.2f} s {side} {what} of the vehicle, allowed are {MAX_OUTSIDE_S:g} s"
-        )
+        raise HistoryError(f"the frame is {outside_s:.2f} s {side} {what}, allowed are {MAX_OUTSIDE_S:g} s")
     index = bisect_right(samples, stamp_ns, key=lambda sample: sample[0])
     if index == 0:
         return samples[0][1], samples[0][1], 0.0

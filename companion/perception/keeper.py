@@ -16,9 +16,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from companion.perception.attitude_pace import AttitudePace
 from companion.perception.messages import (
     Attitude,
     Ended,
+    GimbalAttitude,
     Heartbeat,
     Hud,
     LogLine,
@@ -45,8 +47,6 @@ __all__ = ["PerceptionKeeper", "PerceptionStartError", "PerceptionState", "Perce
 
 MAX_RESTARTS = 5
 RESTART_WINDOW_S = 60.0
-# At most 50 attitudes a second go to the worker; the tolerance is for telemetry of 50 Hz, which jitters.
-ATTITUDE_PERIOD_S, ATTITUDE_JITTER_S = 0.02, 0.005
 STOP_S, TERMINATE_S = 5.0, 1.0
 _BACK_OFF_S = (0.2, 1.0, 2.0, 4.0, 8.0)
 _TICK_S = 0.25
@@ -121,7 +121,7 @@ class PerceptionKeeper:
         self._times = StageTimes()
         self._first_sequence = 0
         self._tracks = LiveTracks()
-        self._attitude_due_ns = 0
+        self._vehicle_pace, self._gimbal_pace = AttitudePace(), AttitudePace()
 
     async def start(self) -> None:
         """Start the worker; returns when its model is loaded and its source has given a frame.
@@ -192,17 +192,19 @@ class PerceptionKeeper:
             attitude: (w, x, y, z), body FRD to NED.
             height_m: above home, None where unknown.
         """
+        if self._attitudes_wanted and self._process is not None and self._vehicle_pace.due(stamp_ns):
+            self._process.turn(Attitude(stamp_ns, attitude, height_m))
+
+    def send_gimbal(self, stamp_ns: int, attitude: Quaternion) -> None:
+        """Where the gimbal of this camera looked, as `send_attitude`; (w, x, y, z), its FRD to NED."""
+        if self._attitudes_wanted and self._process is not None and self._gimbal_pace.due(stamp_ns):
+            self._process.turn(GimbalAttitude(stamp_ns, attitude))
+
+    @property
+    def _attitudes_wanted(self) -> bool:
         tracker = self._settings.tracker
-        wanted = tracker.enabled and tracker.camera_motion and self._settings.detector.enabled
-        wanted = wanted or self._settings.guidance.obstacles != "off"
-        early_ns = self._attitude_due_ns - stamp_ns
-        if not wanted or self._process is None or early_ns > ATTITUDE_JITTER_S * 1e9:
-            return
-        self._attitude_due_ns = max(
-            self._attitude_due_ns + round(ATTITUDE_PERIOD_S * 1e9),
-            stamp_ns + round(2 * ATTITUDE_JITTER_S * 1e9),
-        )
-        self._process.turn(Attitude(stamp_ns, attitude, height_m))
+        tracked = tracker.enabled and tracker.camera_motion and self._settings.detector.enabled
+        return tracked or self._settings.guidance.obstacles != "off"
 
     @property
     def state(self) -> PerceptionState:

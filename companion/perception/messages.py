@@ -52,6 +52,14 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
+class GimbalAttitude:
+    """The attitude of the camera's gimbal (w, x, y, z), its FRD to NED, at a CLOCK_MONOTONIC stamp."""
+
+    stamp_ns: int
+    wxyz: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
 class Watched:
     """Whether anybody wants pictures."""
 
@@ -142,6 +150,7 @@ Message = (
     Begin
     | Hud
     | Attitude
+    | GimbalAttitude
     | Watched
     | Stop
     | Ready

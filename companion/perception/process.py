@@ -10,7 +10,17 @@ import socket
 import sys
 from typing import Self
 
-from companion.perception.messages import Attitude, Begin, Hud, Message, Stop, Watched, packed, read_message
+from companion.perception.messages import (
+    Attitude,
+    Begin,
+    GimbalAttitude,
+    Hud,
+    Message,
+    Stop,
+    Watched,
+    packed,
+    read_message,
+)
 from companion.settings import Settings
 
 # Results that wait in the kernel are old before they are read: room for about ten, no more.
@@ -82,8 +92,8 @@ class PerceptionProcess:
         if self._writer.transport.get_write_buffer_size() < _UNREAD_BYTES:
             self._put(hud)
 
-    def turn(self, attitude: Attitude) -> None:
-        """Tell how the vehicle was turned. Left out while an older one waits: a newer will come."""
+    def turn(self, attitude: Attitude | GimbalAttitude) -> None:
+        """Tell how vehicle or gimbal was turned. Left out while an older one waits: a newer will come."""
         if not self._writer.transport.get_write_buffer_size():
             self._put(attitude)
 

@@ -11,6 +11,9 @@ import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
 from companion.perception.keeper import PerceptionKeeper, PerceptionState
@@ -50,6 +53,7 @@ class View:
         self.newest: PerceptionResult | None = None
         self.targets: tuple[Target, ...] = ()
         self.unplaced = ""
+        self._depth_came = False
         self._between_s: deque[float] = deque(maxlen=9)
         self._on_result = on_result
         self._on_event = on_event
@@ -79,6 +83,19 @@ class View:
         usual_s = statistics.median(self._between_s) if self._between_s else 0.0
         return age_s is not None and age_s <= allowed_s + 2 * usual_s
 
+    def ranging(self, pitch_rad: float) -> RangeMeans:
+        """What there is to tell how far away something is; everything, before the first result.
+
+        Args:
+            pitch_rad: of the camera above the horizon, with the vehicle level.
+        """
+        newest = self.newest
+        if newest is None:
+            return ALL_MEANS
+        camera = self.settings.camera.model(newest.width, newest.height)
+        heights = frozenset(self.settings.detector.heights())
+        return RangeMeans(self._depth_came, sees_ground(camera, pitch_rad), heights)
+
     def place(self, result: PerceptionResult, history: StateHistory) -> None:
         """Work out where what a result shows is."""
         try:
@@ -99,6 +116,8 @@ class View:
         if self.newest is not None:
             self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
         self.newest = result
+        if result.obstacles is not None or bool(np.isfinite(result.detections.range_m).any()):
+            self._depth_came = True
         try:
             self._on_result(self, result)
         except Exception as error:

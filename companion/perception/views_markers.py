@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from companion.guidance.marker_target import MarkerSight, MarkerTarget, looks_down, marker_targets
-from companion.guidance.targets import HistoryError, StateHistory
+from companion.guidance.targets import HistoryError, StateHistory, mount_at
 from companion.perception.views import View
 from vision.markers import Marker
 from vision.pipeline import PerceptionResult
@@ -39,16 +39,16 @@ class MarkerWatch:
     ) -> dict[str, Any]:
         """Work out where the markers of one frame are; returns what is published of it."""
         markers, camera = result.markers or (), view.settings.camera
-        problem = ""
+        problem, down = "", False
         targets: tuple[MarkerTarget, ...] = ()
         try:
-            targets = marker_targets(
-                markers, result.captured_ns, camera.mount(), history, self._on_pads[view.name]
-            )
+            # A gimbal first: whether the camera looks down does not depend on the vehicle's place.
+            mount = mount_at(camera.mount(), history, result.captured_ns)
+            down = looks_down(camera.model(result.width, result.height), mount)
+            targets = marker_targets(markers, result.captured_ns, mount, history, self._on_pads[view.name])
         except HistoryError as error:
             # As with detections: without the attitude of that moment it is seen, and not steered by.
             problem = str(error)
-        down = looks_down(camera.model(result.width, result.height), camera.mount())
         self._seen[view.name] = _Seen(result.captured_ns, targets, down)
         placed: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
         return {
@@ -80,8 +80,12 @@ class MarkerWatch:
 
     def _no_camera_below(self) -> str:
         cameras = ", ".join(
-            f"{'camera' if view.name is None else f'views.{view.name}.camera'}.mount_pitch_deg is "
-            f"{view.settings.camera.mount_pitch_deg:g}"
+            ("camera" if view.name is None else f"views.{view.name}.camera")
+            + (
+                "'s gimbal does not look down, or does not tell where it looks: gimbal pitch=-90"
+                if view.settings.camera.gimbal
+                else f".mount_pitch_deg is {view.settings.camera.mount_pitch_deg:g}"
+            )
             for view in self._looking
         )
         return f"a camera that sees straight down ({cameras})"

@@ -26,6 +26,7 @@ from companion.perception.messages import (
     Attitude,
     Begin,
     Ended,
+    GimbalAttitude,
     Heartbeat,
     Hud,
     Ready,
@@ -38,6 +39,7 @@ from companion.perception.messages import (
 from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.preview import PreviewEncoder
 from companion.settings import Settings
+from vision.camera_model import CameraMount
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.markers import Marker, MarkerDetector
@@ -47,6 +49,7 @@ from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import FrameSharing
 from vision.tracking import AttitudeHistory, CameraView, Tracker
+from vision.tracking.camera_motion import Array
 from vision.video_writer import VideoWriterError
 
 if TYPE_CHECKING:
@@ -70,6 +73,7 @@ class Orders:
         stop: end now.
         hud: for the recorded video's next frames.
         attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
+        gimbal: the attitudes of the camera's gimbal; empty for a camera that sits on none.
         watched: whether anybody wants pictures.
     """
 
@@ -77,7 +81,7 @@ class Orders:
         self.stop = threading.Event()
         self.hud = Hud((), None)
         self.watched = False
-        self.attitudes = AttitudeHistory()
+        self.attitudes, self.gimbal = AttitudeHistory(), AttitudeHistory()
         self.height_m: float | None = None
         self._connection = connection
         self._finished = threading.Event()
@@ -94,6 +98,8 @@ class Orders:
             elif isinstance(message, Attitude):
                 self.attitudes.add(message.stamp_ns, message.wxyz)
                 self.height_m = message.height_m
+            elif isinstance(message, GimbalAttitude):
+                self.gimbal.add(message.stamp_ns, message.wxyz)
             elif isinstance(message, Watched):
                 self.watched = message.watched
             elif isinstance(message, Stop):
@@ -176,7 +182,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             selection=settings.detector.selection(),
             recorder=perception,
             tracker=_tracker(begin),
-            view_at=_view_at(settings, orders.attitudes),
+            view_at=_view_at(settings, orders),
             find_markers=_find_markers(settings),
             obstacles_in=_obstacles_in(settings, orders),
         )
@@ -272,16 +278,34 @@ def _tracker(begin: Begin) -> Tracker | None:
     return Tracker(following, first_track_id=begin.first_track_id)
 
 
-def _view_at(settings: Settings, attitudes: AttitudeHistory) -> Callable[[Frame], CameraView | None]:
-    """Where the camera looked when it took a frame; None without the vehicle's attitude of that moment."""
-    if not settings.tracker.camera_motion:
-        return lambda _: None
+def _held_at(settings: Settings, orders: Orders) -> Callable[[int], tuple[CameraMount, Array] | None]:
+    """How the camera was mounted, and (3, 3) `ned_from_body`, at a capture stamp (CLOCK_MONOTONIC ns).
+
+    None without the attitude of that moment: the vehicle's or, for a camera on a gimbal, the gimbal's.
+    """
     mount = settings.camera.mount()
 
+    def held_at(captured_ns: int) -> tuple[CameraMount, Array] | None:
+        ned_from_body = orders.attitudes.at(captured_ns)
+        if ned_from_body is None or not mount.on_gimbal:
+            return None if ned_from_body is None else (mount, ned_from_body)
+        ned_from_gimbal = orders.gimbal.at(captured_ns)
+        return None if ned_from_gimbal is None else (mount.held(ned_from_gimbal), ned_from_body)
+
+    return held_at
+
+
+def _view_at(settings: Settings, orders: Orders) -> Callable[[Frame], CameraView | None]:
+    """Where the camera looked when it took a frame; None without the attitude of that moment."""
+    if not settings.tracker.camera_motion:
+        return lambda _: None
+    held_at = _held_at(settings, orders)
+
     def view_at(frame: Frame) -> CameraView | None:
-        ned_from_body = attitudes.at(frame.captured_ns)
-        if ned_from_body is None:
+        held = held_at(frame.captured_ns)
+        if held is None:
             return None
+        mount, ned_from_body = held
         return CameraView(
             settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
         )
@@ -299,17 +323,15 @@ def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] |
 
 
 def _obstacles_in(settings: Settings, orders: Orders) -> Callable[[Frame], ObstacleSectors | None]:
-    """How far obstacles are in a frame with depth; None without the vehicle's attitude of that moment."""
-    mount = settings.camera.mount()
+    """How far obstacles are in a frame with depth; None without the attitude of that moment."""
+    held_at = _held_at(settings, orders)
 
     def obstacles_in(frame: Frame) -> ObstacleSectors | None:
-        ned_from_body = orders.attitudes.at(frame.captured_ns)
-        if settings.guidance.obstacles == "off" or frame.depth_m is None or ned_from_body is None:
+        held = held_at(frame.captured_ns)
+        if settings.guidance.obstacles == "off" or frame.depth_m is None or held is None:
             return None
         camera = settings.camera.model(frame.width, frame.height)
-        return obstacle_sectors(
-            frame.depth_m, frame.captured_ns, camera, mount, ned_from_body, orders.height_m
-        )
+        return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *held, orders.height_m)
 
     return obstacles_in
 

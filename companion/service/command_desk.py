@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
-from companion.guidance.behaviour import Behaviour, Outcome
-from companion.guidance.commands import Command, Mission
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement
+from companion.guidance.commands import Command, Gimbal, Mission
+from companion.guidance.gimbal_hand import GimbalHand
 from companion.guidance.pilot import Pilot
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search_pattern import Footprint
@@ -25,11 +25,20 @@ class CommandDesk:
 
     Args:
         pilot: flies them. steering: the view whose classes they may name and whose camera searches.
+        gimbal: moves the gimbal. camera_pitch_rad: of the steering camera above the horizon, now.
         on_event: called with (level, text) for what a person should know.
     """
 
-    def __init__(self, pilot: Pilot, steering: View, on_event: Callable[[str, str], None]) -> None:
+    def __init__(
+        self,
+        pilot: Pilot,
+        steering: View,
+        gimbal: GimbalHand,
+        on_event: Callable[[str, str], None],
+        camera_pitch_rad: Callable[[], float],
+    ) -> None:
         self._pilot, self._steering, self._on_event = pilot, steering, on_event
+        self._gimbal, self._camera_pitch_rad = gimbal, camera_pitch_rad
         self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
 
     async def do(self, text: str) -> dict[str, Any]:
@@ -42,7 +51,12 @@ class CommandDesk:
         except (GrammarError, MissionError) as error:
             return {"command": text, "success": False, "reason": "; ".join(str(error).splitlines())}
         self._on_event("info", f"command: {command}")
-        outcome = await self._outcome_of(command, behaviour)
+        if isinstance(command, Gimbal):
+            outcome = await self._gimbal.point(command.aim, self._pilot.behaviour)
+        else:
+            if Requirement.GIMBAL in behaviour.requirements:
+                await self._gimbal.find()
+            outcome = await self._outcome_of(command, behaviour)
         more: dict[str, Any] = {}
         if isinstance(behaviour, SequenceBehaviour):
             outcome, more = behaviour.told(outcome), {"steps": [asdict(step) for step in behaviour.records]}
@@ -52,7 +66,7 @@ class CommandDesk:
     def _behaviour_for(self, command: Command, enclosed: str) -> Behaviour:
         """Raises GrammarError or MissionError with what is wrong, a line for each."""
         camera = self._steering.settings.camera
-        footprint = Footprint(math.radians(camera.horizontal_fov_deg), math.radians(-camera.mount_pitch_deg))
+        footprint = Footprint(camera.field_rad, -self._camera_pitch_rad())
         if isinstance(command, Mission):
             names = self._steering.class_names
             return mission_behaviour(command, enclosed, names, self._pilot.refusal_of, footprint)

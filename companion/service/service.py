@@ -7,7 +7,9 @@ fed from the guidance loop, so whoever watches them watches the loop that steers
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -26,11 +28,12 @@ from companion.bus.session import Bus
 from companion.guidance import grammar
 from companion.guidance.behaviour import Situation
 from companion.guidance.envelope import Envelope
+from companion.guidance.gimbal_hand import GimbalHand
 from companion.guidance.obstacles import obstacles_message
 from companion.guidance.pilot import Pilot
 from companion.guidance.pilot_event import PilotEvent, PilotEventKind
 from companion.guidance.pose_sharing import PoseSharing
-from companion.guidance.targets import StateHistory
+from companion.guidance.targets import HistoryError, StateHistory
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.keeper import PerceptionKeeper, PerceptionStartError
@@ -95,10 +98,16 @@ class Service:
         self._obstacles: ObstacleSectors | None = None
         self.views = open_views(settings, on_result=self._use, on_preview=self._show, on_event=self._event)
         self.steering = next(view for view in self.views if view.name == guidance.view)
-        self._commands = CommandDesk(self.pilot, self.steering, self._event)
+        self.gimbal = GimbalHand(
+            self.driver,
+            self._event,
+            carries_camera=any(view.settings.camera.gimbal for view in self.views),
+            carries_steering=self.steering.settings.camera.gimbal,
+        )
+        self._commands = CommandDesk(self.pilot, self.steering, self.gimbal, self._event, self._camera_pitch)
         self.poses = PoseSharing(settings.vehicle.name, self._event)
         self.markers = MarkerWatch(self.views)
-        self._landing_target_ns = 0
+        self._landing_target_ns = self._gimbal_ns = 0
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
@@ -145,6 +154,7 @@ class Service:
                 await self._until_stopped(tasks)
             finally:
                 await self._leave()
+                await self.gimbal.close()
         finally:
             self._notifier.stopping()
             unsubscribe()
@@ -231,6 +241,7 @@ class Service:
             now_ns = time.monotonic_ns()
             self._watch_link(now_ns)
             self.pilot.update(self._situation(now_ns))
+            self.gimbal.update(now_ns, self.driver.state, self.pilot.behaviour)
             self._tell_landing_target()
             if seen:
                 self.streamer.hasten(now_ns)
@@ -303,12 +314,16 @@ class Service:
             views=self.views,
             steering=self.steering,
             poses=self.poses,
+            gimbal=self.gimbal.status(now_ns, self.driver.state),
             bus=self.bus,
         )
 
     def _situation(self, now_ns: int) -> Situation:
         age_s = self.steering.age_s(now_ns)
+        gimbal = self.gimbal.sight(now_ns, self.driver.state)
+        # What the camera sees is of no use while nobody knows where it looks.
         fresh = age_s is not None and age_s <= self.settings.guidance.perception_max_age_s
+        fresh = fresh and not gimbal.undirected
         return Situation(
             now_ns,
             self.driver.state,
@@ -320,7 +335,15 @@ class Service:
             neighbourhood=self.poses.around(self.driver.state, now_ns),
             min_separation_m=self.settings.guidance.min_separation_m,
             markers=self.markers.sight(now_ns, self.settings.guidance.perception_max_age_s),
+            gimbal=gimbal,
+            ranging=self.steering.ranging(self._camera_pitch()),
         )
+
+    def _camera_pitch(self) -> float:
+        """Of the steering camera above the horizon, radians, with the vehicle level."""
+        camera, gimbal = self.steering.settings.camera, self.driver.state.gimbal
+        held_rad = gimbal.pitch_rad if camera.gimbal and gimbal is not None else None
+        return math.radians(camera.mount_pitch_deg) + (held_rad or 0.0)
 
     def _tell_landing_target(self) -> None:
         """What the autopilot lands on by itself, once for every picture that shows it."""
@@ -348,6 +371,15 @@ class Service:
         if state.attitude is not None:
             for view in self.views:
                 view.keeper.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
+        gimbal = state.gimbal
+        if gimbal is None or gimbal.attitude_ns == self._gimbal_ns or gimbal.attitude is None:
+            return
+        self._gimbal_ns = gimbal.attitude_ns
+        with contextlib.suppress(HistoryError):
+            attitude = self._history.gimbal_at(gimbal.attitude_ns)
+            for view in self.views:
+                if view.settings.camera.gimbal:
+                    view.keeper.send_gimbal(gimbal.attitude_ns, attitude)
 
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Publish what a view saw; work out where it is, if that view steers."""

@@ -24,12 +24,13 @@ def status_message(
     views: Sequence[View],
     steering: View,
     poses: PoseSharing,
+    gimbal: dict[str, Any] | None,
     bus: Bus,
 ) -> dict[str, Any]:
     """What is published on `status` (`docs/messages.md`).
 
     Args:
-        now_ns: CLOCK_MONOTONIC. uptime_s: since the service began.
+        now_ns: CLOCK_MONOTONIC. uptime_s: since the service began. gimbal: as `GimbalHand.status`.
     """
     return {
         "stamp_ns": now_ns,
@@ -54,6 +55,7 @@ def status_message(
             "count": len(steering.targets),
             "problem": steering.unplaced,
         },
+        "gimbal": gimbal,
         "neighbours": poses.status(now_ns),
         "bus": {
             "connected": bus.connected,

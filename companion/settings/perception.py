@@ -76,6 +76,8 @@ class CameraSection(Section):
     """the camera's yaw on the body, degrees clockwise"""
     mount_levelled: bool = False
     """a gimbal holds the camera: its roll and pitch count from the horizon, its yaw from the nose"""
+    gimbal: bool = False
+    """the camera sits on the autopilot's gimbal, which tells where it looks; mount angles count from that"""
     fx_px: Annotated[float | None, Field(gt=0)] = None
     """calibrated focal length along x, pixels; with it fy_px, cx_px, cy_px and calibrated_* are needed"""
     fy_px: Annotated[float | None, Field(gt=0)] = None
@@ -92,7 +94,7 @@ class CameraSection(Section):
     """k1, k2, p1, p2, k3 in OpenCV's order: none, four or five numbers"""
 
     @model_validator(mode="after")
-    def _calibration_is_whole(self) -> Self:
+    def _consistent(self) -> Self:
         calibration = {
             name: getattr(self, name)
             for name in ("fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height")
@@ -100,6 +102,11 @@ class CameraSection(Section):
         missing = [name for name, value in calibration.items() if value is None]
         if missing and len(missing) < len(calibration):
             raise ValueError(f"a calibration needs all of {', '.join(calibration)}; {missing[0]} is not set")
+        if self.gimbal and self.mount_levelled:
+            raise ValueError(
+                "gimbal and mount_levelled exclude each other: a gimbal that tells where it looks (gimbal), "
+                "or one that is silent and holds the camera level (mount_levelled)"
+            )
         if len(self.distortion) not in (0, 4, 5):
             raise ValueError(f"distortion must have 0, 4 or 5 numbers, got {len(self.distortion)}")
         return self
@@ -128,6 +135,13 @@ class CameraSection(Section):
         )
         return calibrated.scaled(width, height)
 
+    @property
+    def field_rad(self) -> float:
+        """What is seen from the left edge to the right, radians: by the calibration where there is one."""
+        if self.fx_px is None or self.calibrated_width is None:
+            return math.radians(self.horizontal_fov_deg)
+        return 2 * math.atan(self.calibrated_width / 2 / self.fx_px)
+
     def mount(self) -> CameraMount:
         """How the camera sits on the body."""
         return CameraMount(
@@ -138,6 +152,7 @@ class CameraSection(Section):
             math.radians(self.mount_pitch_deg),
             math.radians(self.mount_yaw_deg),
             self.mount_levelled,
+            self.gimbal,
         )
 
 

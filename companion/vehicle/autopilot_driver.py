@@ -22,6 +22,8 @@ from companion.vehicle.connection_advice import why_no_autopilot, why_not_flown
 from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
 from companion.vehicle.framing import Frame, Framer, pack_frame
+from companion.vehicle.gimbal import Address, GimbalAim
+from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.heard_state import HeardState
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
@@ -70,6 +72,7 @@ class AutopilotDriver(ABC):
         self._started_ns = time.monotonic_ns()
         self._heard = HeardState(url, self._two_autopilots_heard)
         self._flight_commands = FlightCommands(url, self._heard, self._command, self._ack_is_ours)
+        self._gimbal_commands = GimbalCommands(url, self._heard, self._command, self.own_address)
         self._command_locks: dict[int, asyncio.Lock] = {}
         self._link: ByteLink | None = None
         self._reset()
@@ -86,8 +89,7 @@ class AutopilotDriver(ABC):
         self._others: set[tuple[Any, ...]] = set()
         self._received_count: Counter[int] = Counter()
         self._sequence = 0
-        self._keeper: asyncio.Task[None] | None = None
-        self._synchroniser: asyncio.Task[None] | None = None
+        self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
 
@@ -141,13 +143,16 @@ class AutopilotDriver(ABC):
             await self.close()
             raise
         logger.info("%s: %s, system %s, answers", self.url, self._heard.manners.name, self._system_id)
-        self._keeper = asyncio.create_task(self._keep(), name=f"keeper of {self.url}")
-        self._synchroniser = asyncio.create_task(self._synchronise(), name=f"clock of {self.url}")
+        for loop, what in (
+            (self._keep(), "keeper"),
+            (self._synchronise(), "clock"),
+            (self._gimbal_commands.keep(), "gimbal"),
+        ):
+            self._tasks.append(asyncio.create_task(loop, name=f"{what} of {self.url}"))
 
     async def close(self) -> None:
         """See Driver."""
-        tasks = [task for task in (self._keeper, self._synchroniser) if task is not None]
-        self._keeper = self._synchroniser = None
+        tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -341,6 +346,27 @@ class AutopilotDriver(ABC):
         """See Driver."""
         await self._flight_commands.takeoff(altitude_m)
 
+    @property
+    def own_address(self) -> Address:
+        """See Driver."""
+        return (self._own_system_id, self._own_component_id)
+
+    async def find_gimbal(self) -> bool:
+        """See Driver."""
+        return await self._gimbal_commands.find()
+
+    async def take_gimbal(self) -> None:
+        """See Driver."""
+        await self._gimbal_commands.take()
+
+    async def point_gimbal(self, aim: GimbalAim) -> None:
+        """See Driver."""
+        await self._gimbal_commands.point(aim)
+
+    async def give_gimbal_back(self) -> None:
+        """See Driver."""
+        await self._gimbal_commands.give_back()
+
     def _ack_is_ours(self, fields: Fields) -> bool:
         """MAVLink 1 and broadcasting autopilots leave the target 0."""
         target = (fields.get("target_system", 0), fields.get("target_component", 0))
@@ -352,6 +378,7 @@ class AutopilotDriver(ABC):
         """Ask for the streams we need, and say when the autopilot goes silent and when it comes back."""
         while True:
             await ask_for_streams(self.url, self._heard, self._received_count, self._command)
+            self._gimbal_commands.look_for_one()
             if not await self._silence():
                 logger.warning("%s: system %s has restarted", self.url, self._system_id)
                 continue

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
+from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
@@ -81,6 +82,28 @@ class Driver(Protocol):
 
     def send_heartbeat(self, status: SystemStatus) -> None:
         """Put one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER on the wire, now."""
+
+    @property
+    def own_address(self) -> Address:
+        """Whom our messages say they are from: system and component id."""
+
+    async def find_gimbal(self) -> bool:
+        """Ask the autopilot for its gimbal and for the streams of it. False: none answers. Never raises.
+
+        Asked by itself when the link opens, when the autopilot restarts and when a gimbal is heard.
+        """
+
+    async def take_gimbal(self) -> None:
+        """Take primary control of the gimbal, whoever has it. Raises CommandRefusedError."""
+
+    async def point_gimbal(self, aim: GimbalAim) -> None:
+        """Let the gimbal look there; returns when that is accepted, before it has turned.
+
+        Raises CommandRefusedError, also when another has taken control of it.
+        """
+
+    async def give_gimbal_back(self) -> None:
+        """Give primary control back, if it is ours; the gimbal stays as it is. Raises CommandRefusedError."""
 
     async def get_parameter(self, name: str) -> float:
         """The value of one parameter. Raises CommandRefusedError if there is none of that name."""

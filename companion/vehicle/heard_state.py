@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 
 from companion.vehicle.clock_sync import ClockSync
+from companion.vehicle.gimbal_fold import ATTITUDE_STATUS, from_gimbal_device
 from companion.vehicle.manners import Manners, Px4Manners
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, VehicleState
 from companion.vehicle.telemetry_fold import Fields, fold
@@ -21,7 +22,9 @@ _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
 # A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
 _SETBACKS_OF_TWO = 3
 _TWO_CLOCKS_S = 2.0
-_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION")
+_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION", ATTITUDE_STATUS)
+# PX4 keeps this from when it was first told: its stamp is as old as that, and no fault of the clock.
+_OF_LONG_AGO = "GIMBAL_MANAGER_INFORMATION"
 
 
 class HeardState:
@@ -60,6 +63,12 @@ class HeardState:
         for told, its_fields in self.manners.heard(name, fields, self.state):
             self.take_in(told, its_fields)
 
+    def handle_device(self, name: str, fields: Fields, component_id: int) -> None:
+        """One message of another component of the vehicle: a gimbal's attitude, or nothing to us."""
+        if from_gimbal_device(self.state, name, component_id):
+            # Its clock is its own: what it tells is stamped at its arrival.
+            self.take_in(name, {key: value for key, value in fields.items() if key != "time_boot_ms"})
+
     def take_in(self, name: str, fields: Fields) -> None:
         """One message in PX4's terms."""
         now_ns = time.monotonic_ns()
@@ -69,7 +78,8 @@ class HeardState:
             self.mode_ns = now_ns
         if name in _OF_ITS_PLACE and self.two_autopilots(now_ns):
             return  # Nobody can tell whose it is: what is known grows stale, and what needs it ends.
-        stamp_ns = self.clock.stamp(fields["time_boot_ms"], now_ns) if "time_boot_ms" in fields else now_ns
+        stamped = "time_boot_ms" in fields and name != _OF_LONG_AGO
+        stamp_ns = self.clock.stamp(fields["time_boot_ms"], now_ns) if stamped else now_ns
         state = fold(self.state, name, fields, stamp_ns)
         changed, self.state = state is not self.state, state
         for watcher in list(self._watchers.values()):
@@ -101,6 +111,7 @@ class HeardState:
                     home_altitude_amsl_m=None,
                     home_position_ned_m=None,
                     clock=None,
+                    gimbal=None,
                 )
         self._boot_ms = boot_ms
 

@@ -30,6 +30,7 @@ from mavsdk.plugins.param import Param, ParamError, ParamResult
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, LinkError
 from companion.vehicle.framing import Frame, frames_of, with_sequence
+from companion.vehicle.gimbal_fold import ATTITUDE_STATUS
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES
 
@@ -115,8 +116,14 @@ class MavsdkDriver(AutopilotDriver):
             self._mavsdk.pass_received_raw_bytes(b"".join(frame.raw for frame in frames))
 
     def _message(self, message: MavlinkMessage) -> None:
-        if message.component_id == AUTOPILOT_COMPONENT and self._mavsdk is not None:
+        if self._mavsdk is None:
+            return
+        if message.component_id == AUTOPILOT_COMPONENT:
             self._heard.handle(message.message_name, json.loads(message.fields_json))
+        elif message.message_name == ATTITUDE_STATUS:
+            self._heard.handle_device(
+                message.message_name, json.loads(message.fields_json), message.component_id
+            )
 
     async def _in_thread(self, call: Callable[..., _T], *arguments: object) -> _T:
         return await self._loop.run_in_executor(self._blocking, call, *arguments)

@@ -22,6 +22,7 @@ from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, Fields
 logger = logging.getLogger(__name__)
 
 _PARAM_VALUE_ID, _PARAM_SET_ID = 22, 23
+_GIMBAL_ATTITUDE_ID = 285
 # By the wire's order: the value's bytes as they are, not through a float.
 _PARAM_SET = struct.Struct("<4sBB16sB")
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
@@ -84,7 +85,8 @@ class PymavlinkDriver(AutopilotDriver):
 
     def _take_frames(self, frames: list[Frame]) -> None:
         for frame in frames:
-            if frame.component_id != AUTOPILOT_COMPONENT:
+            autopilots = frame.component_id == AUTOPILOT_COMPONENT
+            if not autopilots and frame.message_id != _GIMBAL_ATTITUDE_ID:
                 continue
             if frame.message_id == CURRENT_MODE_ID:
                 custom_mode, _ = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
@@ -99,7 +101,10 @@ class PymavlinkDriver(AutopilotDriver):
                 if frame.message_id == _PARAM_VALUE_ID:
                     # An integer's bytes read as a float may be a signalling NaN, which the reading changes.
                     fields["value_bytes"] = frame.padded(4)
-                self._heard.handle(message.get_type(), fields)
+                if autopilots:
+                    self._heard.handle(message.get_type(), fields)
+                else:
+                    self._heard.handle_device(message.get_type(), fields, frame.component_id)
 
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.vehicle.clock_sync import ClockOffset
+from companion.vehicle.gimbal import GimbalState
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -64,6 +65,7 @@ class VehicleState:
         ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
         failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
         clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until it has told its time.
+        gimbal: where it looks and who may move it; None until one was heard.
     """
 
     heartbeat_ns: int = 0
@@ -88,6 +90,7 @@ class VehicleState:
     home_position_ned_m: Vector3 | None = None
     battery_fraction: float | None = None
     clock: ClockOffset | None = None
+    gimbal: GimbalState | None = None
 
     @property
     def yaw_rad(self) -> float | None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from companion.vehicle.gimbal_fold import GIMBAL_STEPS
 from companion.vehicle.px4_modes import mode_of_custom_mode
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 
@@ -132,6 +133,7 @@ _STEPS: dict[str, Callable[[VehicleState, Fields, int], VehicleState]] = {
     "HOME_POSITION": _home_position,
     "SYS_STATUS": _sys_status,
     "BATTERY_STATUS": _battery_status,
+    **GIMBAL_STEPS,
 }
 
 FOLDED_MESSAGES = frozenset(_STEPS)

@@ -11,6 +11,7 @@ from companion.guidance.commands import (
     COMMANDS,
     Approach,
     Command,
+    Gimbal,
     Hold,
     Land,
     Mission,
@@ -53,6 +54,10 @@ NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic l
         ("seek traffic light", Seek("traffic light")),
         ("seek fire hydrant laps=3", Seek("fire_hydrant", laps=3.0)),
         ('approach class="traffic light"', Approach("traffic light")),
+        ("seek car sweep=-60deg sweep_rate=10", Seek("car", sweep_deg=-60.0, sweep_rate_dps=10.0)),
+        ("gimbal pitch=-30", Gimbal(-30.0)),
+        ("gimbal -30deg 15", Gimbal(-30.0, 15.0)),
+        ("gimbal", Gimbal(0.0, 0.0)),
     ],
 )
 def test_commands_are_read_as_they_are_written(text, command):
@@ -82,6 +87,10 @@ def test_commands_are_read_as_they_are_written(text, command):
         ("orbit direction=left", ["direction", "clockwise", "'left'"]),
         ("orbit radius=1 speed=5", ["speed", "1.41 m/s", "5"]),
         ("takeoff=5", ["unknown command 'takeoff=5'"]),
+        ("gimbal pitch=-100", ["pitch", "-90 to 90 deg", "-100"]),
+        ("seek car sweep=2", ["sweep must be 5 deg or more from level", "2"]),
+        ("seek car sweep_rate=5", ["sweep_rate needs sweep"]),
+        ("seek car pattern=square radius=20 sweep=-60", ["pattern=square takes no sweep"]),
     ],
 )
 def test_errors_are_one_line_that_says_what_would_be_right(text, parts):
@@ -140,6 +149,13 @@ commands = st.one_of(
     st.builds(Hold, number(0, 3600)),
     orbits,
     st.builds(Seek, class_names, number(0.25, 20), number(0.05, 1), number(0.05, 1), directions),
+    st.builds(
+        Seek,
+        class_names,
+        sweep_deg=number(5, 90) | number(-90, -5),
+        sweep_rate_dps=number(2, 60),
+    ),
+    st.builds(Gimbal, number(-90, 90), number(-180, 180)),
     st.builds(Approach, class_names, number(1, 100), number(0.2, 10), number(0.05, 1), number(0.5, 60)),
     st.builds(
         Seek, class_names, pattern=st.just("square"), radius_m=number(1, 500), speed_mps=number(0.2, 20)

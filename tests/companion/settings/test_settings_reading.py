@@ -335,3 +335,5 @@ def test_a_calibration_is_scaled_to_the_frames_size() -> None:
     camera = load_settings(REPOSITORY / "systemd/companion.toml", overrides, {}).camera
     assert (camera.model(640, 480).fx, camera.model(1280, 960).fx) == (500, 1000)
     assert camera.mount().pitch_rad == pytest.approx(-math.pi / 6)
+    assert camera.field_rad == pytest.approx(2 * math.atan(320 / 500))
+    assert Settings().camera.field_rad == pytest.approx(math.radians(80.0))

@@ -104,15 +104,17 @@ def test_no_content_of_a_message_breaks_the_fold(name, payload) -> None:
     definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
     size = definition.unpacker.size
     values = definition.unpacker.unpack(payload[:size].ljust(size, b"\0"))
-    ordered = (
-        [values[index] for index in definition.orders]
-        if sum(definition.lengths) == len(definition.lengths)
-        else None
-    )
-    if ordered is None:  # arrays: none of their elements is folded
-        fields = dict.fromkeys(definition.fieldnames, 0)
-    else:
-        fields = dict(zip(definition.fieldnames, ordered, strict=True))
+    fields = {}
+    for field, place, count in zip(
+        definition.fieldnames,
+        definition.orders,
+        (definition.lengths[order] for order in definition.orders),
+        strict=True,
+    ):
+        first = sum(definition.lengths[:place])
+        fields[field] = values[first] if count == 1 else list(values[first : first + count])
     state = fold(VehicleState(), name, fields, 5)
     for vector in (state.position_ned_m, state.velocity_ned_mps, state.attitude, state.home_position_ned_m):
         assert vector is None or all(math.isfinite(value) for value in vector)
+    if state.gimbal is not None and state.gimbal.attitude is not None:
+        assert math.hypot(*state.gimbal.attitude) == pytest.approx(1.0)

@@ -1,0 +1,44 @@
+"""Point the gimbal as a step of a mission: the vehicle holds until it looks there.
+
+An operator's `gimbal` does not pass here: it changes nothing about what flies (`gimbal_hand`).
+"""
+
+from __future__ import annotations
+
+from companion.guidance.behaviour import Outcome, Requirement, Situation, Step
+from companion.guidance.gimbal_hand import POINT_TIMEOUT_S, POINTED_RAD, direction_text
+from companion.guidance.hold import HoldBehaviour
+from companion.vehicle.gimbal import GimbalAim
+
+
+class PointGimbalBehaviour(HoldBehaviour):
+    """Holds, and ends when the gimbal looks where it is to look."""
+
+    name = "gimbal"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.GIMBAL})
+
+    def __init__(self, aim: GimbalAim) -> None:
+        super().__init__()
+        self._aim = aim
+        self.gimbal_pitches_rad = (aim.pitch_rad,)
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        # At the first turn it is still told of what came before.
+        if situation.gimbal.problem and situation.now_ns > self._since_ns:
+            return Outcome(False, f"gimbal: {situation.gimbal.problem}")
+        state, gimbal = situation.state, situation.state.gimbal
+        off_rad = None if gimbal is None else gimbal.off_rad(self._aim, state.yaw_rad or 0.0)
+        known = gimbal is not None and gimbal.attitude_fresh(situation.now_ns)
+        if known and off_rad is not None and off_rad <= POINTED_RAD:
+            return Outcome(True, f"the gimbal looks {direction_text(self._aim)}")
+        if situation.now_ns - self._since_ns > POINT_TIMEOUT_S * 1e9:
+            return Outcome(False, f"gimbal: it does not look {direction_text(self._aim)} after all")
+        return super().update(dt_s, situation)
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        return self._aim
+
+    @property
+    def status(self) -> str:
+        return f"pointing the gimbal {direction_text(self._aim)}"

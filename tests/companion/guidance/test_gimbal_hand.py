@@ -1,0 +1,90 @@
+"""What the hand asks of a driver, in which order, and what it does with a driver that fails."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from kinematic_vehicle import KinematicVehicle
+
+from companion.guidance.gimbal_hand import GimbalHand, direction_text
+from companion.guidance.gimbal_pointing import PointGimbalBehaviour
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.gimbal import GimbalAim
+
+
+class RecordingDriver:
+    """Does what it is told, and remembers it."""
+
+    own_address = (1, 191)
+
+    def __init__(self, fault: Exception | None = None) -> None:
+        self.asked: list[str] = []
+        self.fault = fault
+
+    async def take_gimbal(self) -> None:
+        self.asked.append("take")
+
+    async def point_gimbal(self, aim: GimbalAim) -> None:
+        self.asked.append(f"point {direction_text(aim)}")
+        if self.fault is not None:
+            raise self.fault
+
+    async def give_gimbal_back(self) -> None:
+        self.asked.append("give back")
+
+
+class Desk:
+    """The hand's turns, by a clock that tests turn."""
+
+    def __init__(self, fault: Exception | None = None) -> None:
+        self.driver = RecordingDriver(fault)
+        self.events: list[str] = []
+        self.hand = GimbalHand(self.driver, lambda level, text: self.events.append(text))
+        self.vehicle = KinematicVehicle()
+
+    async def turn(self, behaviour: PointGimbalBehaviour | None, count: int = 5) -> None:
+        for _ in range(count):
+            self.vehicle.now_ns += 50_000_000
+            self.hand.update(self.vehicle.now_ns, self.vehicle.state, behaviour)
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+
+
+DOWN = PointGimbalBehaviour(GimbalAim(-0.5, 0.3))
+
+
+async def test_for_a_behaviour_it_is_taken_pointed_and_given_back() -> None:
+    desk = Desk()
+    await desk.turn(None)
+    assert desk.driver.asked == []
+    await desk.turn(DOWN)
+    assert desk.driver.asked == ["take", "point 29° down, 17° to the right"]
+    await desk.turn(None)
+    assert desk.driver.asked[2:] == ["give back"]
+    await desk.hand.close()
+    assert len(desk.driver.asked) == 3, "what was given back is not given back again"
+
+
+async def test_what_is_held_when_the_service_ends_is_given_back() -> None:
+    desk = Desk()
+    await desk.turn(DOWN)
+    await desk.hand.close()
+    assert desk.driver.asked[-1] == "give back"
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (CommandRefusedError("the vehicle refused to point the gimbal (denied)"), "(denied)"),
+        (ZeroDivisionError("a fault of ours"), "ZeroDivisionError: a fault of ours"),
+    ],
+)
+async def test_what_goes_wrong_is_said_once_and_nothing_more_is_asked(fault, words) -> None:
+    desk = Desk(fault)
+    await desk.turn(DOWN, 40)
+    assert desk.driver.asked == ["take", "point 29° down, 17° to the right"]
+    (event,) = desk.events
+    assert event.startswith("the gimbal is not moved any more: ")
+    assert words in event
+    assert words in desk.hand.sight(desk.vehicle.now_ns, desk.vehicle.state).problem

@@ -1,0 +1,57 @@
+"""What flies up to something needs a way to tell how far away it is, and says so before it flies."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from kinematic_vehicle import KinematicVehicle
+
+from companion.guidance.behaviour import Situation
+from companion.guidance.grammar import parse
+from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
+from companion.guidance.refusal import refusal
+from companion.guidance.registry import behaviour_for
+from vision.camera_model import CameraModel
+
+NEEDING = ("approach kite", "follow kite", "orbit kite", 'patrol "0,0 9,9" classes=kite do=approach')
+OTHERS = ("seek kite", "orbit", 'patrol "0,0 9,9" classes=kite')
+
+
+def why(command: str, means: RangeMeans) -> str | None:
+    vehicle = KinematicVehicle()
+    situation = Situation(vehicle.now_ns, vehicle.state, (), 0.05, True, ranging=means)
+    return refusal(behaviour_for(parse(command)), situation, None)
+
+
+@pytest.mark.parametrize("command", NEEDING)
+def test_without_depth_ground_or_a_known_height_it_is_refused_and_named(command) -> None:
+    told = why(command, RangeMeans(False, False, frozenset({"car"})))
+    assert told is not None
+    assert "needs a range to a kite (a camera with depth, one that sees the ground, or its height" in told
+
+
+@pytest.mark.parametrize(
+    "means",
+    [
+        ALL_MEANS,
+        RangeMeans(True, False),
+        RangeMeans(False, True),
+        RangeMeans(False, False, frozenset({"kite"})),
+    ],
+)
+@pytest.mark.parametrize("command", NEEDING)
+def test_any_one_of_them_will_do(command, means) -> None:
+    assert why(command, means) is None
+
+
+@pytest.mark.parametrize("command", OTHERS)
+def test_what_flies_to_nothing_that_it_sees_does_not_ask(command) -> None:
+    assert why(command, RangeMeans(False, False)) is None
+
+
+@pytest.mark.parametrize(("pitch_deg", "seen"), [(-90.0, True), (0.0, True), (29.0, True), (31.0, False)])
+def test_a_camera_sees_the_ground_unless_it_looks_up(pitch_deg, seen) -> None:
+    """80° across are 64° from top to bottom: the lower edge is 32° below the axis."""
+    camera = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+    assert sees_ground(camera, math.radians(pitch_deg)) is seen

@@ -1,0 +1,145 @@
+"""`seek` with a camera on a gimbal, flown with the built-in vehicle in lockstep.
+
+Somebody stands nearly below the vehicle: 68° under the horizon, where a camera that looks ahead (its picture
+ends 32° down) does not see, and one on a gimbal does once it looks down.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.bench.drawn_detector import DrawnDetector, Faults, Pose, Thing
+from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment, Sight
+from companion.guidance.grammar import parse
+from companion.guidance.registry import behaviour_for
+from companion.guidance.search_pattern import Footprint
+from companion.guidance.sequence import SequenceBehaviour
+from companion.guidance.target import Target
+from companion.missions.mission_file import plan_from
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import Quaternion
+
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+ON_GIMBAL = CameraMount(forward_m=0.1, on_gimbal=True)
+FOOTPRINT = Footprint(math.radians(80.0), 0.0)
+HEIGHT_M = 10.0
+PERSON_M = (0.5, 0.6, 1.7)
+# Two axes and an estimate: what the picture, the gimbal and the estimator are off by together.
+DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
+
+
+def person(bearing_deg: float, distance_m: float = 4.0) -> Thing:
+    bearing = math.radians(bearing_deg)
+    pose = Pose(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
+    return Thing("person", PERSON_M, lambda _: pose)
+
+
+def fly(
+    command: str, thing: Thing, *, seed: int = 5, limit_s: float = 90.0, **options: object
+) -> tuple[LockstepFlight, FlightLog, list[Target]]:
+    """The flight, its log, and every target that was seen, once."""
+    flights: list[LockstepFlight] = []
+
+    def looks() -> Quaternion:
+        # The first frame comes after the take-off, when the flight is there.
+        return flights[0].vehicle.vehicle.gimbal.quaternion
+
+    # A box that shakes is the detector's fault, and is measured elsewhere.
+    detector = DrawnDetector(
+        [thing], CAMERA, ON_GIMBAL, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=looks
+    )
+    sight = Sight(CAMERA, ON_GIMBAL, detector)
+    flights.append(LockstepFlight(seed=seed, height_m=HEIGHT_M, sight=sight, gimbal=True, **options))
+    seen: dict[int, Target] = {}
+
+    def each(moment: Moment) -> None:
+        for target in moment.situation.targets:
+            seen.setdefault(target.captured_ns, target)
+
+    log = flights[0].fly(behaviour_for(parse(command), FOOTPRINT), limit_s, each=each)
+    return flights[0], log, list(seen.values())
+
+
+def direction(target: Target) -> np.ndarray:
+    level = math.cos(target.elevation_rad)
+    return np.array(
+        [
+            level * math.cos(target.bearing_rad),
+            level * math.sin(target.bearing_rad),
+            -math.sin(target.elevation_rad),
+        ]
+    )
+
+
+def cut_off(target: Target) -> bool:
+    """By the picture's edge: the middle of what is left is not the middle of the thing."""
+    left, top, right, bottom = target.box_xyxy
+    return left < 2 or top < 2 or right > CAMERA.width - 3 or bottom > CAMERA.height - 3
+
+
+def pitches(log: FlightLog) -> list[float]:
+    return [math.degrees(moment.situation.state.gimbal.pitch_rad) for moment in log.moments]
+
+
+@pytest.mark.parametrize("bearing_deg", [0.0, 150.0])
+def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing_deg):
+    thing = person(bearing_deg)
+    flight, log, seen = fly("seek person sweep=-60", thing)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    assert not log.violations
+    pose, truth = thing.pose(0.0), flight.vehicle.truth
+    bearing = math.atan2(pose.east_m - truth.position_ned_m[1], pose.north_m - truth.position_ned_m[0])
+    # So far off the horizon a bearing's degree is a third of one across.
+    assert abs(math.remainder(truth.yaw_rad - bearing, math.tau)) < math.radians(15.0)
+    assert pitches(log)[-1] < -50.0, "found, the gimbal looks at it"
+    assert thing.range_m(seen[-1].position_ned_m, 0.0) < PLACE_BOUND_M
+    # Nobody holds it any more.
+    flight.move_gimbal_on()
+    assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
+
+
+def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there():
+    table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
+    mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
+    flight = LockstepFlight(seed=5, height_m=HEIGHT_M, gimbal=True)
+    log = flight.fly(mission, 20.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    assert [step.reason for step in mission.records] == ["the gimbal looks 50° down", "held for 1 s"]
+    assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)
+    # The next step wants nothing of it, so it has been given back.
+    assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
+
+
+def test_without_the_sweep_it_is_not_found():
+    _, log, _ = fly("seek person laps=1", person(0.0))
+    assert log.outcome is not None
+    assert (log.outcome.success, log.outcome.reason) == (False, "no person seen in 1 lap")
+
+
+def test_directions_and_places_are_right_while_the_gimbal_moves_and_the_vehicle_turns():
+    """Another class is looked for, so that the sweep never stops; wind leans the vehicle."""
+    thing = person(60.0)
+    _, log, seen = fly("seek car sweep=-60 laps=1", thing, wind_mps=3.0)
+    assert log.outcome is not None
+    assert log.outcome.reason == "no car seen in 1 lap"
+    assert pitches(log)[-1] == pytest.approx(pitches(log)[0], abs=5.0), "in vain, it looks where it did"
+    assert min(pitches(log)) == pytest.approx(-60.0, abs=5.5)
+    errors_rad, errors_m = [], []
+    stamps = np.array([moment.situation.now_ns for moment in log.moments])
+    whole = [target for target in seen if not cut_off(target)]
+    for target in whole:
+        index = int(np.argmin(np.abs(stamps - target.captured_ns)))
+        place = np.array(log.moments[index].truth.position_ned_m)
+        pose = thing.pose(0.0)
+        true = np.array([pose.north_m, pose.east_m, -PERSON_M[2] / 2]) - place
+        errors_rad.append(math.acos(min(1.0, float(true @ direction(target) / np.linalg.norm(true)))))
+        if target.position_ned_m is not None:
+            errors_m.append(thing.range_m(target.position_ned_m, 0.0))
+    assert len(errors_rad) > 40
+    assert np.percentile(errors_rad, 95) < DIRECTION_BOUND_RAD, np.degrees(errors_rad)
+    assert np.percentile(errors_m, 95) < PLACE_BOUND_M, errors_m

@@ -1,0 +1,136 @@
+"""Boxes of a camera on a gimbal become directions by where the gimbal looked when the picture was taken."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.guidance.marker_target import looks_down
+from companion.guidance.targets import HistoryError, StateHistory, mount_at, targets_from_detections
+from companion.vehicle.gimbal import GimbalState, YawFrame
+from companion.vehicle.state import VehicleState
+from vision.camera_model import CameraModel, CameraMount
+from vision.rotation import quaternion_from_euler
+
+CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+MOUNT = CameraMount(forward_m=0.1, on_gimbal=True)
+T0, STEP_NS = 5_000_000_000, 20_000_000
+MIDDLE = {
+    "class_id": 0,
+    "class_name": "car",
+    "confidence": 0.8,
+    "xyxy": [CAMERA.cx - 8, CAMERA.cy - 8, CAMERA.cx + 8, CAMERA.cy + 8],
+    "center": [CAMERA.cx, CAMERA.cy],
+    "range_m": None,
+}
+
+
+def history_of(
+    frame: YawFrame,
+    *,
+    yaw_rate: float = 0.6,
+    pitch_rate: float = 0.4,
+    gimbal_every: int = 1,
+    steps: int = 60,
+    lean: float = 0.3,
+) -> StateHistory:
+    """A vehicle that leans and turns, and a gimbal whose pitch moves: both known at every moment."""
+    history = StateHistory()
+    for step in range(steps):
+        stamp = T0 + step * STEP_NS
+        heading, pitch = yaw_rate * step * 0.02, -0.2 - pitch_rate * step * 0.02
+        yaw = heading if frame is YawFrame.NORTH else 0.0
+        at = step - step % gimbal_every
+        behind = pitch_rate * (step - at) * 0.02, yaw_rate * (step - at) * 0.02
+        history.add(
+            VehicleState(
+                attitude_ns=stamp,
+                position_ns=stamp,
+                attitude=quaternion_from_euler(lean, -lean, heading),
+                position_ned_m=(0.0, 0.0, -8.0),
+                home_position_ned_m=(0.0, 0.0, 0.0),
+                gimbal=GimbalState(
+                    attitude_ns=T0 + at * STEP_NS,
+                    attitude=quaternion_from_euler(
+                        0.0, pitch + behind[0], yaw - (behind[1] if frame is YawFrame.NORTH else 0.0)
+                    ),
+                    yaw_frame=frame,
+                ),
+            )
+        )
+    return history
+
+
+@pytest.mark.parametrize("frame", list(YawFrame))
+@pytest.mark.parametrize("gimbal_every", [1, 10])
+@given(step=st.floats(0.0, 49.0))
+def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(frame, gimbal_every, step):
+    """Also when the gimbal tells five times a second: between two words it moved evenly here."""
+    history = history_of(frame, gimbal_every=gimbal_every)
+    captured_ns = T0 + round(step * STEP_NS)
+    (target,) = targets_from_detections([MIDDLE], captured_ns, CAMERA, MOUNT, history)
+    assert target.elevation_rad == pytest.approx(-0.2 - 0.4 * step * 0.02, abs=2e-3)
+    assert target.bearing_rad == pytest.approx(0.6 * step * 0.02, abs=4e-3)
+
+
+def test_without_the_gimbals_attitude_a_box_has_no_direction_and_the_reason_is_told():
+    history = StateHistory()
+    level = quaternion_from_euler(0.0, 0.0, 0.0)
+    state = VehicleState(
+        attitude_ns=T0,
+        position_ns=T0,
+        attitude=level,
+        position_ned_m=(0.0, 0.0, -8.0),
+        home_position_ned_m=(0.0, 0.0, 0.0),
+    )
+    history.add(state)
+    with pytest.raises(HistoryError, match="no attitude of the gimbal is known yet"):
+        targets_from_detections([MIDDLE], T0, CAMERA, MOUNT, history)
+    history = history_of(YawFrame.NORTH, gimbal_every=60)
+    late_ns = T0 + 30 * STEP_NS
+    with pytest.raises(HistoryError, match=r"0\.60 s newer than the newest attitude of the gimbal"):
+        targets_from_detections([MIDDLE], late_ns, CAMERA, MOUNT, history)
+    # A camera that sits on the body does not ask for it.
+    assert targets_from_detections([MIDDLE], late_ns, CAMERA, CameraMount(), history)
+
+
+def test_where_the_yaw_counts_from_may_change_and_nothing_is_mixed():
+    history = history_of(YawFrame.NOSE, steps=10)
+    stamp = T0 + 10 * STEP_NS
+    heading = 0.6 * 10 * 0.02
+    history.add(
+        VehicleState(
+            attitude_ns=stamp,
+            position_ns=stamp,
+            attitude=quaternion_from_euler(0.0, 0.0, heading),
+            position_ned_m=(0.0, 0.0, -8.0),
+            home_position_ned_m=(0.0, 0.0, 0.0),
+            gimbal=GimbalState(
+                attitude_ns=stamp,
+                attitude=quaternion_from_euler(0.0, -0.28, heading),
+                yaw_frame=YawFrame.NORTH,
+            ),
+        )
+    )
+    for back_ns in (0, 4_000_000, 16_000_000, STEP_NS):
+        (target,) = targets_from_detections([MIDDLE], stamp - back_ns, CAMERA, MOUNT, history)
+        assert target.bearing_rad == pytest.approx(heading, abs=0.02)
+
+
+def test_a_mount_on_a_gimbal_refuses_to_say_where_it_looks_without_it():
+    with pytest.raises(ValueError, match="needs the gimbal's attitude"):
+        MOUNT.ned_from_optical(np.eye(3))
+    with pytest.raises(ValueError, match="does not look one way of the body"):
+        _ = MOUNT.body_from_optical
+
+
+@pytest.mark.parametrize(("pitch_deg", "down"), [(-90.0, True), (-75.0, True), (-40.0, False), (0.0, False)])
+def test_a_camera_on_a_gimbal_looks_down_when_the_gimbal_does(pitch_deg, down):
+    history = StateHistory()
+    attitude = quaternion_from_euler(0.0, math.radians(pitch_deg), 1.0)
+    history.add(VehicleState(gimbal=GimbalState(attitude_ns=T0, attitude=attitude)))
+    assert looks_down(CAMERA, mount_at(MOUNT, history, T0)) is down

@@ -1,0 +1,166 @@
+"""One contract, two drivers: a gimbal is found, heard, taken, pointed and given back, over a real socket."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+
+import pytest
+from fake_autopilot import FakeAutopilot, state_shows, wait_until
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.drivers import open_driver
+from companion.vehicle.gimbal import NOBODY, GimbalAim, YawFrame
+from mavlink_sim.testing import running_simulator
+from vision.rotation import quaternion_from_euler
+
+pytestmark = pytest.mark.usefixtures("short_measurement")
+OURS = (1, 191)
+
+
+@contextlib.asynccontextmanager
+async def connected(kind: str, port: int) -> AsyncIterator[Driver]:
+    driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    await driver.connect(20.0)
+    try:
+        yield driver
+    finally:
+        await driver.close()
+
+
+@contextlib.contextmanager
+def ground_station(port: int) -> Iterator[Any]:
+    station = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245, source_component=190)
+    try:
+        yield station
+    finally:
+        station.close()
+
+
+async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_for(kind: str) -> None:
+    with (
+        running_simulator(speed=2.0, gimbal=True) as simulator,
+        ground_station(simulator.gcs_port) as station,
+    ):
+        async with connected(kind, simulator.onboard_port) as driver:
+            state = await state_shows(driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0)
+            assert state.gimbal is not None
+            assert math.degrees(state.gimbal.lowest_pitch_rad) == pytest.approx(-135.0)
+            assert math.degrees(state.gimbal.highest_pitch_rad) == pytest.approx(45.0)
+            state = await state_shows(
+                driver,
+                lambda s: s.gimbal.attitude_fresh(time.monotonic_ns()) and s.gimbal.primary_control == NOBODY,
+            )
+            assert state.gimbal.yaw_frame is YawFrame.NORTH
+            # Unasked it comes 5 times a second, of a clock that is twice as fast here: 10 take 0.9 s.
+            stamps: list[int] = []
+            unsubscribe = driver.subscribe(lambda s: stamps.append(s.gimbal.attitude_ns))
+            await wait_until(
+                lambda: len(ten := sorted(set(stamps))[-10:]) == 10 and ten[-1] - ten[0] < 0.5e9, 10.0
+            )
+            unsubscribe()
+
+            with pytest.raises(CommandRefusedError, match=r"refused to point the gimbal \(denied\)"):
+                await driver.point_gimbal(GimbalAim(-0.5))
+            await driver.take_gimbal()
+            await state_shows(driver, lambda s: s.gimbal.primary_control == OURS)
+            aim = GimbalAim(math.radians(-40.0), math.radians(25.0))
+            await driver.point_gimbal(aim)
+            state = await state_shows(driver, lambda s: s.gimbal.off_rad(aim, s.yaw_rad) < math.radians(1.0))
+            assert math.degrees(state.gimbal.pitch_rad) == pytest.approx(-40.0, abs=1.0)
+
+            # The station takes it: what is shown says so, and what we ask is denied.
+            assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)
+            station.mav.command_long_send(1, 1, 1001, 0, 245, 190, -1, -1, 0, 0, 0)
+            await state_shows(driver, lambda s: s.gimbal.primary_control == (245, 190))
+            with pytest.raises(CommandRefusedError, match="denied"):
+                await driver.point_gimbal(GimbalAim(0.0))
+            await driver.give_gimbal_back()  # it is not ours: nothing changes
+            since_ns = driver.state.gimbal.status_ns
+            state = await state_shows(driver, lambda s: s.gimbal.status_ns > since_ns)
+            assert state.gimbal.primary_control == (245, 190)
+
+            await driver.take_gimbal()
+            await driver.give_gimbal_back()
+            await state_shows(driver, lambda s: s.gimbal.primary_control == NOBODY)
+
+
+async def test_without_a_gimbal_none_is_found_and_nothing_is_said(kind: str, caplog) -> None:
+    with running_simulator(speed=4.0) as simulator:
+        async with connected(kind, simulator.onboard_port) as driver:
+            assert not await driver.find_gimbal()
+            assert driver.state.gimbal is None
+    assert "gimbal" not in caplog.text
+
+
+def information(device: int) -> Any:
+    return mavlink.MAVLink_gimbal_manager_information_message(
+        7, 0, device, math.nan, math.nan, -1.5, 0.5, math.nan, math.nan
+    )
+
+
+def attitude(flags: int, pitch_rad: float, yaw_rad: float, device: int = 0) -> Any:
+    q = quaternion_from_euler(0.0, pitch_rad, yaw_rad)
+    nan = math.nan
+    return mavlink.MAVLink_gimbal_device_attitude_status_message(
+        0, 0, 123_456, flags, list(q), nan, nan, nan, 0, nan, nan, device
+    )
+
+
+async def test_a_gimbal_that_appears_later_is_asked_what_it_can_do(driver, autopilot) -> None:
+    def answer(message: Any) -> None:
+        autopilot.acknowledge(message.command)
+        if (message.command, message.param1) == (512, 280):
+            autopilot.say(information(1))
+
+    await autopilot.hears("COMMAND_LONG")
+    assert driver.state.gimbal is None
+    autopilot.answers["COMMAND_LONG"] = answer
+    autopilot.say(mavlink.MAVLink_gimbal_manager_status_message(9, 0, 1, 0, 0, 0, 0))
+    state = await state_shows(driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0)
+    assert (state.gimbal.device, state.gimbal.lowest_pitch_rad) == (1, -1.5)
+
+    def asked() -> set[tuple[float, float]]:
+        return {(m.param1, m.param2) for m in autopilot.heard_named("COMMAND_LONG") if m.command == 511}
+
+    await wait_until(lambda: {(285, 20_000), (281, 200_000)} <= asked(), 10.0, asked)
+
+
+async def test_a_gimbal_in_a_component_of_its_own_is_heard_and_its_clock_is_not_believed(
+    driver, autopilot, port
+) -> None:
+    other, gimbal = (FakeAutopilot(port, component_id=component) for component in (171, 154))
+    autopilot.say(information(154))
+    await state_shows(driver, lambda s: s.gimbal is not None)
+    # As PX4 forwards it: from the gimbal's own component, by the same socket.
+    for sender in (other, gimbal):
+        sender.socket.close()
+        sender.socket = autopilot.socket
+    before_ns = time.monotonic_ns()
+    other.say(attitude(16, 0.3, 0.0))
+    gimbal.say(attitude(32, -0.7, 0.2))
+    state = await state_shows(driver, lambda s: s.gimbal.attitude is not None)
+    assert state.gimbal.pitch_rad == pytest.approx(-0.7, abs=1e-6)
+    assert state.gimbal.yaw_frame is YawFrame.NOSE
+    assert before_ns <= state.gimbal.attitude_ns <= time.monotonic_ns()
+
+
+async def test_the_commands_to_a_gimbal_at_a_landing_are_not_ours_to_answer(driver, autopilot) -> None:
+    for command, values in (
+        (1001, (1.0, 1.0, -1.0, -1.0, 0.0, 0.0, 0.0)),
+        (1000, (math.nan, math.nan, math.nan, math.nan, 2.0, 0.0, 0.0)),
+        (1001, (-3.0, -3.0, -1.0, -1.0, 0.0, 0.0, 0.0)),
+    ):
+        for confirmation in (0, 1):
+            autopilot.say(mavlink.MAVLink_command_long_message(1, 0, command, confirmation, *values))
+    # What is answered after them is answered: the driver is well, and all before was taken in.
+    await driver.point_gimbal(GimbalAim(-0.2))
+    await autopilot.hears("COMMAND_LONG")
+    assert not autopilot.heard_named("COMMAND_ACK")
+    assert driver.state.gimbal is None
