@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import math
@@ -299,6 +300,9 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
         )
     if len(reports) > 1:
         _say(f"ready: {len(reports)} vehicles")
+    # What is there stays: to look through it all would hold every vehicle up for some steps.
+    gc.collect()
+    gc.freeze()
     fleet.run()
     _say("stopped")
 

