@@ -331,8 +331,10 @@ def _obstacles_in(settings: Settings, orders: Orders) -> Callable[[Frame], Obsta
     held_at = _held_at(settings, orders)
 
     def obstacles_in(frame: Frame) -> ObstacleSectors | None:
+        if settings.guidance.obstacles == "off" or frame.depth_m is None:
+            return None
         held = held_at(frame.captured_ns)
-        if settings.guidance.obstacles == "off" or frame.depth_m is None or held is None:
+        if held is None:
             return None
         camera = settings.camera.model(frame.width, frame.height)
         return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *held, orders.height_m)

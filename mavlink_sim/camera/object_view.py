@@ -92,9 +92,8 @@ class PlacedObject:
             return None
         twin = copy.copy(self)
         twin.item = item
-        twin.origin = np.array(item.position_ned_m, np.float64)
-        shift = twin.origin - self.origin
-        twin.middle = self.middle + shift
+        shift = np.subtract(item.position_ned_m, self.item.position_ned_m)
+        twin.origin, twin.middle = self.origin + shift, self.middle + shift
         if self._shadow is not None and shift[2] == 0.0:
             corners, first = self._shadow
             twin._shadow = (corners + shift, first)

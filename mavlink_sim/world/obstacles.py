@@ -59,11 +59,15 @@ class Obstacle:
     Attributes:
         identifier: of the object. name: its class and identifier, "wall-2".
         moves: it follows a path.
+
+    Raises ValueError for one that leans, which a scene file cannot make.
     """
 
     def __init__(self, thing: WorldObject, way: Way | None, flatness: float) -> None:
         self.identifier = thing.identifier
         self.name = f"{thing.class_name}-{thing.identifier}"
+        if thing.leans:
+            raise ValueError(f"{self.name} leans: only what stands level can be in a vehicle's way")
         self.moves = way is not None
         self._way = way
         self._scale = thing.scale

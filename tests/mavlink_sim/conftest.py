@@ -39,16 +39,19 @@ class Cockpit:
 
     @property
     def vehicle(self) -> Vehicle:
+        return self._made()
+
+    @property
+    def events(self) -> list[str]:
+        self._made()  # a list that somebody holds must be the one that fills
+        return self._events
+
+    def _made(self) -> Vehicle:
         if self._vehicle is None:
             self._vehicle = Vehicle(on_event=self._events.append, **self._options)
             self._vehicle.add_link("onboard")
             self._vehicle.add_link("gcs", GCS_RATES_HZ)
         return self._vehicle
-
-    @property
-    def events(self) -> list[str]:
-        assert self.vehicle is not None  # made by now: the events are its own
-        return self._events
 
     # ---- time
 
@@ -175,7 +178,8 @@ class Cockpit:
 
     def take_off(self, height_m: float | None = None) -> None:
         """Arm, take off, wait for HOLD and a moment more."""
-        if self._vehicle is not None or self.heartbeats or "on_event" in self._options:
+        plain = all(isinstance(value, (str, int, float, tuple, dict)) for value in self._options.values())
+        if self._vehicle is not None or self.heartbeats or not plain:
             self._fly_up(height_m)
             return
         key = repr((sorted(self._options.items()), height_m))

@@ -221,3 +221,8 @@ def test_nothing_in_the_way_is_said_as_that() -> None:
     assert nothing.nearest((0.0, 0.0, -1.0), 0.0).clear_m == math.inf
     assert nothing.range_along((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), 0.0) == math.inf
     assert nothing.ranges_around((0.0, 0.0, -1.0), 0.3, 12.0, 0.0) == [math.inf] * SECTORS
+
+
+def test_what_leans_is_refused_by_name_rather_than_met_upright() -> None:
+    with pytest.raises(ValueError, match="box-4 leans"):
+        obstacles(WorldObject(4, "box", (3.0, 0.0, 0.0), roll_rad=0.5))
