@@ -2,7 +2,8 @@
 
 Control is taken when somebody wants the gimbal moved and given back when nobody does any more. It is never
 fought for: who has it at the beginning keeps it (the autopilot itself, which keeps it after a landing, is
-nobody), and once another has taken it, it is not taken again for the same errand.
+nobody), and once another has taken it, it is not taken again for the same errand. While the manager does not
+tell who has it, it may be a ground station's, and is not taken.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ AIM_PERIOD_S = 0.1
 SAME_AIM_RAD = math.radians(0.2)
 # GIMBAL_MANAGER_STATUS may come once in two seconds, and what it shows may be from before we asked.
 SHOWN_WITHIN_S = 2.5
+_UNTOLD = "its manager does not tell who has control of it"
 
 
 class GimbalAsk(StrEnum):
@@ -63,7 +65,7 @@ class GimbalControl:
         self._doubted_ns: int | None = None
 
     def elsewhere(self, gimbal: GimbalState | None) -> Address | None:
-        """Who has control that is not to be taken from him; None: it may be taken."""
+        """Who is known to have control that is not to be taken from him; None: nobody is."""
         primary = None if gimbal is None else gimbal.primary_control
         free = (None, NOBODY, self._own, (self._own[0], AUTOPILOT_COMPONENT))
         return None if primary in free else primary
@@ -90,8 +92,8 @@ class GimbalControl:
         if not self.held or self._doubted_ns is not None:
             if self._unsure(now_ns, gimbal):
                 return None
-            if (who := self.elsewhere(gimbal)) is not None:
-                self.problem = f"{address_text(who)} has control of it"
+            if (why := self._not_to_be_taken(now_ns, gimbal)) is not None:
+                self.problem = why
                 return None
             self._taken_from = None if gimbal is None else gimbal.primary_control
             return self._ask(GimbalRequest(GimbalAsk.TAKE))
@@ -120,6 +122,15 @@ class GimbalControl:
     def _ask(self, request: GimbalRequest) -> GimbalRequest:
         self._asked = request
         return request
+
+    def _not_to_be_taken(self, now_ns: int, gimbal: GimbalState | None) -> str | None:
+        """Why control is not asked for, in words; None: whoever has it, it may be taken from him."""
+        if gimbal is None or not gimbal.control_known(now_ns):
+            return _UNTOLD
+        if self._doubted_ns is not None and gimbal.status_ns <= self._doubted_ns:
+            return _UNTOLD  # since the denial
+        who = self.elsewhere(gimbal)
+        return None if who is None else f"{address_text(who)} has control of it"
 
     def _taken_over(self, now_ns: int, gimbal: GimbalState | None) -> str | None:
         """Why control is not ours any more, by what the manager shows; None: it is, or it does not tell."""

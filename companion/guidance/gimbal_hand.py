@@ -15,7 +15,7 @@ from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.gimbal_control import GimbalAsk, GimbalControl, GimbalRequest
 from companion.guidance.gimbal_sight import GimbalSight, missing_gimbal
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
-from companion.vehicle.gimbal import GimbalAim, address_text
+from companion.vehicle.gimbal import GimbalAim, GimbalState, address_text
 from companion.vehicle.state import VehicleState
 
 logger = logging.getLogger(__name__)
@@ -102,23 +102,26 @@ class GimbalHand:
         if self._control.problem != self._told:
             self._told = self._control.problem
             if self._told:
-                self._on_event("warning", f"the gimbal is not moved any more: {self._told}")
+                self._on_event("warning", f"the gimbal is not moved: {self._told}")
         if errand is not None:
             self._judge(errand, now_ns, state)
         self._listen(now_ns, state)
 
     async def find(self) -> None:
-        """Return when it is known where the gimbal looks, or when none told that in time."""
-        gimbal = self._driver.state.gimbal
-        if gimbal is not None and gimbal.attitude_fresh(time.monotonic_ns()):
+        """Return when it is known where the gimbal looks and who has it, or when it was not told in time."""
+        if _told(self._driver.state.gimbal, time.monotonic_ns()):
             return
         heard: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._heard.append(heard)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIND_TIMEOUT_S):
-                if await self._driver.find_gimbal():
-                    await heard
-        heard.cancel()
+        try:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(FIND_TIMEOUT_S):
+                    if await self._driver.find_gimbal():
+                        await heard
+        finally:
+            heard.cancel()
+            if heard in self._heard:
+                self._heard.remove(heard)
 
     async def point(self, aim: GimbalAim, moved_by: Behaviour | None) -> Outcome:
         """Point it for an operator and give it back; it stays as it was pointed.
@@ -211,7 +214,7 @@ class GimbalHand:
         """Say whether it is known where a camera's gimbal looks, and look for one that is not heard."""
         gimbal = state.gimbal
         looking = gimbal is not None and gimbal.why_not_looking(now_ns) is None
-        if looking:
+        if _told(gimbal, now_ns):
             while self._heard:
                 waiting = self._heard.pop()
                 if not waiting.done():
@@ -230,6 +233,11 @@ class GimbalHand:
         if not looking and idle and now_ns >= self._search_due_ns and state.connected(now_ns):
             self._search_due_ns = now_ns + round(SEARCH_PERIOD_S * 1e9)
             self._search = asyncio.get_running_loop().create_task(self._driver.find_gimbal())
+
+
+def _told(gimbal: GimbalState | None, now_ns: int) -> bool:
+    """Whether all that must be known before it is moved was told."""
+    return gimbal is not None and gimbal.attitude_fresh(now_ns) and gimbal.control_known(now_ns)
 
 
 def direction_text(aim: GimbalAim) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from dataclasses import replace
 
 import pytest
 from kinematic_vehicle import KinematicVehicle
@@ -10,7 +12,8 @@ from kinematic_vehicle import KinematicVehicle
 from companion.guidance.gimbal_hand import GimbalHand, direction_text
 from companion.guidance.gimbal_pointing import PointGimbalBehaviour
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.gimbal import GimbalAim
+from companion.vehicle.gimbal import NOBODY, GimbalAim, GimbalState
+from companion.vehicle.state import VehicleState
 
 
 class RecordingDriver:
@@ -21,6 +24,10 @@ class RecordingDriver:
     def __init__(self, fault: Exception | None = None) -> None:
         self.asked: list[str] = []
         self.fault = fault
+        self.state = VehicleState()
+
+    async def find_gimbal(self) -> bool:
+        return True
 
     async def take_gimbal(self) -> None:
         self.asked.append("take")
@@ -42,11 +49,18 @@ class Desk:
         self.events: list[str] = []
         self.hand = GimbalHand(self.driver, lambda level, text: self.events.append(text))
         self.vehicle = KinematicVehicle()
+        self.began_ns = self.vehicle.now_ns
+
+    @property
+    def state(self) -> VehicleState:
+        """With a gimbal of which only is known that nobody has it: what is shown later is not tested here."""
+        gimbal = GimbalState(1, status_ns=self.began_ns, primary_control=NOBODY)
+        return replace(self.vehicle.state, gimbal=gimbal)
 
     async def turn(self, behaviour: PointGimbalBehaviour | None, count: int = 5) -> None:
         for _ in range(count):
             self.vehicle.now_ns += 50_000_000
-            self.hand.update(self.vehicle.now_ns, self.vehicle.state, behaviour)
+            self.hand.update(self.vehicle.now_ns, self.state, behaviour)
             await asyncio.sleep(0)
             await asyncio.sleep(0)
 
@@ -85,6 +99,28 @@ async def test_what_goes_wrong_is_said_once_and_nothing_more_is_asked(fault, wor
     await desk.turn(DOWN, 40)
     assert desk.driver.asked == ["take", "point 29° down, 17° to the right"]
     (event,) = desk.events
-    assert event.startswith("the gimbal is not moved any more: ")
+    assert event.startswith("the gimbal is not moved: ")
     assert words in event
-    assert words in desk.hand.sight(desk.vehicle.now_ns, desk.vehicle.state).problem
+    assert words in desk.hand.sight(desk.vehicle.now_ns, desk.state).problem
+
+
+async def test_a_gimbal_is_found_when_it_is_known_where_it_looks_and_who_has_it() -> None:
+    desk, now_ns = Desk(), time.monotonic_ns()
+    looking = GimbalState(1, attitude_ns=now_ns, attitude=(1.0, 0.0, 0.0, 0.0))
+    desk.driver.state = replace(desk.state, gimbal=looking)
+    finding = asyncio.create_task(desk.hand.find())
+    await asyncio.sleep(0)
+    desk.hand.update(now_ns, desk.driver.state, None)
+    await asyncio.sleep(0)
+    assert not finding.done(), "its manager has not told who has it"
+    told = replace(looking, status_ns=now_ns, primary_control=NOBODY)
+    desk.hand.update(now_ns, replace(desk.state, gimbal=told), None)
+    await finding
+
+
+async def test_of_a_gimbal_that_was_not_found_in_time_nothing_is_left(monkeypatch) -> None:
+    monkeypatch.setattr("companion.guidance.gimbal_hand.FIND_TIMEOUT_S", 0.0)
+    desk = Desk()
+    desk.driver.state = desk.state
+    await desk.hand.find()
+    assert desk.hand._heard == []
