@@ -63,6 +63,7 @@ class GimbalControl:
         self._taken_from: Address | None = None
         self._shown = False
         self._doubted_ns: int | None = None
+        self._give_back_due_ns: float = -math.inf
 
     def elsewhere(self, gimbal: GimbalState | None) -> Address | None:
         """Who is known to have control that is not to be taken from him; None: nobody is."""
@@ -113,8 +114,11 @@ class GimbalControl:
                 self._pointed_ns = -math.inf
             case GimbalAsk.POINT if refused is None:
                 self.pointed = asked.aim
+            case GimbalAsk.GIVE_BACK if refused is None:
+                self.held, self._doubted_ns = False, None
             case GimbalAsk.GIVE_BACK:
-                self.held = False
+                # Still ours, perhaps: asked again when the manager shows that, but not at every word of it.
+                self._doubted_ns, self._give_back_due_ns = now_ns, now_ns + SHOWN_WITHIN_S * 1e9
             case _:
                 self.problem = refused or ""
                 self._doubted_ns = now_ns
@@ -151,15 +155,16 @@ class GimbalControl:
         """Whether there is something to give back.
 
         After a refusal only what the manager has shown since tells: given back by one who does not have it,
-        control may be lost to the one who does (PX4 compares system and component each by itself).
+        control may be lost to the one who does (PX4 compares system and component each by itself). That
+        may also be ours where only the answer to the taking was lost.
         """
-        if not self.held or self._doubted_ns is None:
+        if self._doubted_ns is None:
             return self.held
         if self._unsure(now_ns, gimbal):
             return False
         shown = gimbal is not None and gimbal.status_ns > self._doubted_ns
         self.held = shown and gimbal is not None and gimbal.primary_control == self._own
-        return self.held
+        return self.held and now_ns >= self._give_back_due_ns
 
     def _unsure(self, now_ns: int, gimbal: GimbalState | None) -> bool:
         """Refused, and the manager has not shown since whose it is: it may be another's by now."""

@@ -154,8 +154,10 @@ class Service:
             try:
                 await self._until_stopped(tasks)
             finally:
-                await self._leave()
-                await self.gimbal.close()
+                try:
+                    await self._leave()
+                finally:
+                    await self.gimbal.close()
         finally:
             self._notifier.stopping()
             unsubscribe()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.gimbal_control import GimbalAsk, GimbalControl, GimbalRequest
+from companion.guidance.gimbal_control import SHOWN_WITHIN_S, GimbalAsk, GimbalControl, GimbalRequest
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 
 OURS, STATION, AUTOPILOT = (1, 191), (245, 190), (1, 1)
@@ -176,6 +176,41 @@ def test_after_a_denial_that_the_manager_never_clears_up_it_is_not_taken_again()
     assert bench.control.problem == UNTOLD
     bench.shows(NOBODY)
     assert bench.turn(DOWN, object()) == TAKE, "now it is known to be free"
+
+
+def test_what_could_not_be_given_back_is_tried_again_once_it_shows_to_be_ours_still() -> None:
+    bench = Bench()
+    bench.held()
+    assert bench.turn(None, None) == GIVE_BACK
+    bench.answer("not answered")
+    assert bench.control.held
+    assert bench.turn(None, None) is None, "whose it is now is not known yet"
+    bench.shows(OURS)
+    assert bench.turn(None, None) is None, "not at every word of the manager"
+    assert bench.turn(None, None, seconds=SHOWN_WITHIN_S) == GIVE_BACK
+    bench.answer()
+    assert not bench.control.held
+    assert bench.turn(None, None, seconds=SHOWN_WITHIN_S) is None
+    assert bench.control.problem == ""
+
+
+@pytest.mark.parametrize("shown", [NOBODY, STATION, AUTOPILOT])
+def test_what_could_not_be_given_back_and_is_not_ours_any_more_is_left(shown) -> None:
+    bench = Bench()
+    bench.held()
+    assert bench.turn(None, None) == GIVE_BACK
+    bench.answer("not answered")
+    bench.shows(shown)
+    assert bench.turn(None, None, seconds=2 * SHOWN_WITHIN_S) is None
+    assert not bench.control.held
+
+
+def test_what_was_taken_although_the_answer_was_lost_is_given_back() -> None:
+    bench = Bench()
+    assert bench.turn(DOWN) == TAKE
+    bench.answer("not answered")
+    bench.shows(OURS)
+    assert bench.turn(DOWN) == GIVE_BACK
 
 
 def test_while_the_manager_does_not_tell_who_has_it_it_is_not_taken() -> None:

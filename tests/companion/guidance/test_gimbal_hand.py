@@ -25,12 +25,16 @@ class RecordingDriver:
         self.asked: list[str] = []
         self.fault = fault
         self.state = VehicleState()
+        self.answers: asyncio.Event | None = None
+        self.kept: Exception | None = None
 
     async def find_gimbal(self) -> bool:
         return True
 
     async def take_gimbal(self) -> None:
         self.asked.append("take")
+        if self.answers is not None:
+            await self.answers.wait()
 
     async def point_gimbal(self, aim: GimbalAim) -> None:
         self.asked.append(f"point {direction_text(aim)}")
@@ -39,6 +43,8 @@ class RecordingDriver:
 
     async def give_gimbal_back(self) -> None:
         self.asked.append("give back")
+        if self.kept is not None:
+            raise self.kept
 
 
 class Desk:
@@ -124,3 +130,49 @@ async def test_of_a_gimbal_that_was_not_found_in_time_nothing_is_left(monkeypatc
     desk.driver.state = desk.state
     await desk.hand.find()
     assert desk.hand._heard == []
+
+
+async def test_what_is_granted_while_the_service_ends_is_given_back() -> None:
+    desk = Desk()
+    desk.driver.answers = asyncio.Event()
+    await desk.turn(DOWN)
+    closing = asyncio.create_task(desk.hand.close())
+    await asyncio.sleep(0)
+    await desk.turn(DOWN)
+    assert desk.driver.asked == ["take"], "closed, it is moved no more, and the answer is waited for"
+    desk.driver.answers.set()
+    await closing
+    assert desk.driver.asked == ["take", "give back"]
+
+
+@pytest.mark.parametrize(("shown", "asked"), [((1, 191), ["take", "give back"]), ((245, 190), ["take"])])
+async def test_what_is_never_answered_is_given_back_if_the_manager_shows_it_to_be_ours(
+    monkeypatch, shown, asked
+) -> None:
+    monkeypatch.setattr("companion.guidance.gimbal_hand.CLOSE_TIMEOUT_S", 0.01)
+    desk = Desk()
+    desk.driver.answers = asyncio.Event()
+    await desk.turn(DOWN)
+    gimbal = GimbalState(1, status_ns=desk.vehicle.now_ns + 1, primary_control=shown)
+    desk.driver.state = replace(desk.state, gimbal=gimbal)
+    await desk.hand.close()
+    assert desk.driver.asked == asked
+
+
+async def test_an_operators_word_that_still_waits_when_the_service_ends_is_answered() -> None:
+    desk = Desk()
+    pointing = asyncio.create_task(desk.hand.point(GimbalAim(-0.5), None))
+    await asyncio.sleep(0)
+    await desk.hand.close()
+    assert not (await pointing).success
+    assert desk.driver.asked == []
+
+
+async def test_that_it_could_not_be_given_back_is_said() -> None:
+    desk = Desk()
+    desk.driver.kept = CommandRefusedError("the vehicle refused to give the gimbal back (failed)")
+    await desk.turn(DOWN)
+    await desk.turn(None)
+    assert desk.events == [
+        "the gimbal could not be given back: the vehicle refused to give the gimbal back (failed)"
+    ]
