@@ -240,7 +240,7 @@ class GimbalHand:
         looking = gimbal is not None and gimbal.why_not_looking(now_ns) is None
         if _told(gimbal, now_ns):
             while self._heard:
-                waiting = self._heard.pop()
+                waiting = self._heard.pop(0)  # so that the newest word comes last, and counts
                 if not waiting.done():
                     waiting.set_result(None)
         if not self._carries_camera:
