@@ -2,7 +2,8 @@
 
 Control is taken when somebody wants the gimbal moved and given back when nobody does any more. It is never
 fought for: who has it at the beginning keeps it (the autopilot itself, which keeps it after a landing, is
-nobody), and once another has taken it, it is not taken again for the same errand.
+nobody), and once another has taken it, it is not taken again for the same errand. While the manager does not
+tell who has it, it may be a ground station's, and is not taken.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ AIM_PERIOD_S = 0.1
 SAME_AIM_RAD = math.radians(0.2)
 # GIMBAL_MANAGER_STATUS may come once in two seconds, and what it shows may be from before we asked.
 SHOWN_WITHIN_S = 2.5
+_UNTOLD = "its manager does not tell who has control of it"
 
 
 class GimbalAsk(StrEnum):
@@ -61,9 +63,10 @@ class GimbalControl:
         self._taken_from: Address | None = None
         self._shown = False
         self._doubted_ns: int | None = None
+        self._give_back_due_ns: float = -math.inf
 
     def elsewhere(self, gimbal: GimbalState | None) -> Address | None:
-        """Who has control that is not to be taken from him; None: it may be taken."""
+        """Who is known to have control that is not to be taken from him; None: nobody is."""
         primary = None if gimbal is None else gimbal.primary_control
         free = (None, NOBODY, self._own, (self._own[0], AUTOPILOT_COMPONENT))
         return None if primary in free else primary
@@ -90,8 +93,8 @@ class GimbalControl:
         if not self.held or self._doubted_ns is not None:
             if self._unsure(now_ns, gimbal):
                 return None
-            if (who := self.elsewhere(gimbal)) is not None:
-                self.problem = f"{address_text(who)} has control of it"
+            if (why := self._not_to_be_taken(now_ns, gimbal)) is not None:
+                self.problem = why
                 return None
             self._taken_from = None if gimbal is None else gimbal.primary_control
             return self._ask(GimbalRequest(GimbalAsk.TAKE))
@@ -111,8 +114,11 @@ class GimbalControl:
                 self._pointed_ns = -math.inf
             case GimbalAsk.POINT if refused is None:
                 self.pointed = asked.aim
+            case GimbalAsk.GIVE_BACK if refused is None:
+                self.held, self._doubted_ns = False, None
             case GimbalAsk.GIVE_BACK:
-                self.held = False
+                # Still ours, perhaps: asked again when the manager shows that, but not at every word of it.
+                self._doubted_ns, self._give_back_due_ns = now_ns, now_ns + SHOWN_WITHIN_S * 1e9
             case _:
                 self.problem = refused or ""
                 self._doubted_ns = now_ns
@@ -120,6 +126,15 @@ class GimbalControl:
     def _ask(self, request: GimbalRequest) -> GimbalRequest:
         self._asked = request
         return request
+
+    def _not_to_be_taken(self, now_ns: int, gimbal: GimbalState | None) -> str | None:
+        """Why control is not asked for, in words; None: whoever has it, it may be taken from him."""
+        if gimbal is None or not gimbal.control_known(now_ns):
+            return _UNTOLD
+        if self._doubted_ns is not None and gimbal.status_ns <= self._doubted_ns:
+            return _UNTOLD  # since the denial
+        who = self.elsewhere(gimbal)
+        return None if who is None else f"{address_text(who)} has control of it"
 
     def _taken_over(self, now_ns: int, gimbal: GimbalState | None) -> str | None:
         """Why control is not ours any more, by what the manager shows; None: it is, or it does not tell."""
@@ -140,15 +155,16 @@ class GimbalControl:
         """Whether there is something to give back.
 
         After a refusal only what the manager has shown since tells: given back by one who does not have it,
-        control may be lost to the one who does (PX4 compares system and component each by itself).
+        control may be lost to the one who does (PX4 compares system and component each by itself). That
+        may also be ours where only the answer to the taking was lost.
         """
-        if not self.held or self._doubted_ns is None:
+        if self._doubted_ns is None:
             return self.held
         if self._unsure(now_ns, gimbal):
             return False
         shown = gimbal is not None and gimbal.status_ns > self._doubted_ns
         self.held = shown and gimbal is not None and gimbal.primary_control == self._own
-        return self.held
+        return self.held and now_ns >= self._give_back_due_ns
 
     def _unsure(self, now_ns: int, gimbal: GimbalState | None) -> bool:
         """Refused, and the manager has not shown since whose it is: it may be another's by now."""

@@ -15,7 +15,7 @@ from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.gimbal_control import GimbalAsk, GimbalControl, GimbalRequest
 from companion.guidance.gimbal_sight import GimbalSight, missing_gimbal
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
-from companion.vehicle.gimbal import GimbalAim, address_text
+from companion.vehicle.gimbal import GimbalAim, GimbalState, address_text
 from companion.vehicle.state import VehicleState
 
 logger = logging.getLogger(__name__)
@@ -26,7 +26,9 @@ SEARCH_PERIOD_S = 5.0
 FIND_TIMEOUT_S = 4.0
 POINTED_RAD = math.radians(3.0)
 POINT_TIMEOUT_S = 10.0
+# For the answer to what is being asked, and again for giving control back.
 CLOSE_TIMEOUT_S = 1.0
+_ENDING = "the service ends"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,8 @@ class GimbalHand:
         self._carries_camera, self._carries_steering = carries_camera, carries_steering
         self._control = GimbalControl(driver.own_address)
         self._asking: asyncio.Task[None] | None = None
+        self._asked_ns = 0
+        self._not_given_back = self._closed = False
         self._search: asyncio.Task[bool] | None = None
         self._search_due_ns = 0
         self._errand: _Errand | None = None
@@ -86,6 +90,8 @@ class GimbalHand:
 
     def update(self, now_ns: int, state: VehicleState, behaviour: Behaviour | None) -> None:
         """One turn of the guidance loop, after the pilot's."""
+        if self._closed:
+            return
         flown = None if behaviour is None else behaviour.flown
         aim = None if flown is None else flown.gimbal_aim
         owner: object | None = flown
@@ -98,27 +104,31 @@ class GimbalHand:
             aim, owner = errand.aim, errand
         request = self._control.update(now_ns, state.gimbal, aim, owner)
         if request is not None:
+            self._asked_ns = now_ns
             self._asking = asyncio.get_running_loop().create_task(self._ask(request))
         if self._control.problem != self._told:
             self._told = self._control.problem
             if self._told:
-                self._on_event("warning", f"the gimbal is not moved any more: {self._told}")
+                self._on_event("warning", f"the gimbal is not moved: {self._told}")
         if errand is not None:
             self._judge(errand, now_ns, state)
         self._listen(now_ns, state)
 
     async def find(self) -> None:
-        """Return when it is known where the gimbal looks, or when none told that in time."""
-        gimbal = self._driver.state.gimbal
-        if gimbal is not None and gimbal.attitude_fresh(time.monotonic_ns()):
+        """Return when it is known where the gimbal looks and who has it, or when it was not told in time."""
+        if _told(self._driver.state.gimbal, time.monotonic_ns()):
             return
         heard: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._heard.append(heard)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIND_TIMEOUT_S):
-                if await self._driver.find_gimbal():
-                    await heard
-        heard.cancel()
+        try:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(FIND_TIMEOUT_S):
+                    if await self._driver.find_gimbal():
+                        await heard
+        finally:
+            heard.cancel()
+            if heard in self._heard:
+                self._heard.remove(heard)
 
     async def point(self, aim: GimbalAim, moved_by: Behaviour | None) -> Outcome:
         """Point it for an operator and give it back; it stays as it was pointed.
@@ -129,6 +139,8 @@ class GimbalHand:
         if moved_by is not None and moved_by.flown.gimbal_aim is not None:
             return Outcome(False, f"gimbal: {moved_by.flown.name} moves it; end that first")
         await self.find()
+        if self._closed:
+            return Outcome(False, _ENDING)
         now_ns, state = time.monotonic_ns(), self._driver.state
         missing = missing_gimbal(state, now_ns, self.sight(now_ns, state), (aim.pitch_rad,))
         if missing:
@@ -156,16 +168,27 @@ class GimbalHand:
 
     async def close(self) -> None:
         """Move it no more, and give it back if it is ours."""
+        self._closed = True
         if self._errand is not None:
-            self._errand.end(Outcome(False, "the service ends"))
+            self._errand.end(Outcome(False, _ENDING))
+        for waiting in self._heard:
+            if not waiting.done():
+                waiting.set_result(None)
+        if self._asking is not None:
+            # Control that is asked for may be had by now: without the answer nobody would give it back.
+            await asyncio.wait({self._asking}, timeout=CLOSE_TIMEOUT_S)
         tasks = [task for task in (self._asking, self._search) if task is not None]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._control.held and not self._control.problem:
-            with contextlib.suppress(CommandRefusedError, LinkError, TimeoutError):
+        if self._asking is not None and self._asking.cancelled():
+            # What the manager has shown since it was asked tells instead.
+            self._control.answered(self._asked_ns, "the gimbal's manager did not answer")
+        request = self._control.update(time.monotonic_ns(), self._driver.state.gimbal, None, None)
+        if request is not None:
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CLOSE_TIMEOUT_S):
-                    await self._driver.give_gimbal_back()
+                    await self._ask(request)
 
     def _problem(self, now_ns: int, state: VehicleState) -> str:
         if self._control.problem:
@@ -190,6 +213,10 @@ class GimbalHand:
             logger.exception("the gimbal's manager could not be asked")
             refused = f"{type(error).__name__}: {error}"
         self._control.answered(time.monotonic_ns(), refused)
+        if request.ask is GimbalAsk.GIVE_BACK:
+            if refused is not None and not self._not_given_back:
+                self._on_event("warning", f"the gimbal could not be given back: {refused}")
+            self._not_given_back = refused is not None
 
     def _judge(self, errand: _Errand, now_ns: int, state: VehicleState) -> None:
         """Whether what an operator asked for is done, or will not be."""
@@ -211,9 +238,9 @@ class GimbalHand:
         """Say whether it is known where a camera's gimbal looks, and look for one that is not heard."""
         gimbal = state.gimbal
         looking = gimbal is not None and gimbal.why_not_looking(now_ns) is None
-        if looking:
+        if _told(gimbal, now_ns):
             while self._heard:
-                waiting = self._heard.pop()
+                waiting = self._heard.pop(0)  # so that the newest word comes last, and counts
                 if not waiting.done():
                     waiting.set_result(None)
         if not self._carries_camera:
@@ -230,6 +257,11 @@ class GimbalHand:
         if not looking and idle and now_ns >= self._search_due_ns and state.connected(now_ns):
             self._search_due_ns = now_ns + round(SEARCH_PERIOD_S * 1e9)
             self._search = asyncio.get_running_loop().create_task(self._driver.find_gimbal())
+
+
+def _told(gimbal: GimbalState | None, now_ns: int) -> bool:
+    """Whether all that must be known before it is moved was told."""
+    return gimbal is not None and gimbal.attitude_fresh(now_ns) and gimbal.control_known(now_ns)
 
 
 def direction_text(aim: GimbalAim) -> str:

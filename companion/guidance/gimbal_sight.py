@@ -43,7 +43,9 @@ def missing_gimbal(
     missing = []
     if (why := gimbal.why_not_looking(now_ns)) is not None:
         missing.append(f"a gimbal that tells where it looks ({why})")
-    if sight.elsewhere:
+    if not gimbal.control_known(now_ns):
+        missing.append("to know who has control of it (its manager does not tell)")
+    elif sight.elsewhere:
         missing.append(f"control of the gimbal ({sight.elsewhere} has it, and must give it back)")
     beyond = [pitch for pitch in pitches_rad if not gimbal.reaches(pitch)]
     if beyond:

@@ -71,8 +71,9 @@ class SeekBehaviour(Behaviour):
         self._sightings.reset(situation.now_ns)
         self._gaze = self._blind_since_ns = None
         self._vain, self._begun_ns = "", situation.now_ns
-        if self._sweep is not None:
-            self._sweep.begin(_gimbal_pitch(situation))
+        gimbal = situation.state.gimbal
+        if self._sweep is not None and gimbal is not None and gimbal.pitch_rad is not None:
+            self._sweep.begin(gimbal.pitch_rad)  # else the first step says what is missing
         limit_s = SLOWEST_TURN * self._laps * math.tau / self._rate_radps + 2 * FACING_TIMEOUT_S
         self._give_up_ns = situation.now_ns + limit_s * 1e9
 
@@ -129,7 +130,14 @@ class SeekBehaviour(Behaviour):
         # At the first turn it is still told of what came before.
         if situation.gimbal.problem and situation.now_ns > self._begun_ns:
             return f"seek lost the gimbal: {situation.gimbal.problem}"
-        return None if self._vain else sweep.stuck(_gimbal_pitch(situation))
+        gimbal = situation.state.gimbal
+        if gimbal is None:
+            return "seek lost the gimbal: none answers"
+        if gimbal.pitch_rad is None:
+            # An attitude that says what nobody can read is withdrawn, and so is all after a restart.
+            why = gimbal.why_not_looking(situation.now_ns)
+            return f"seek lost the gimbal: {why}"
+        return None if self._vain else sweep.stuck(gimbal.pitch_rad)
 
     def _look_back(self, dt_s: float, situation: Situation, stay: Vector3) -> Step:
         """Found nothing: the gimbal goes back to where it looked before."""

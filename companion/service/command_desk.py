@@ -40,6 +40,8 @@ class CommandDesk:
         self._pilot, self._steering, self._on_event = pilot, steering, on_event
         self._gimbal, self._camera_pitch_rad = gimbal, camera_pitch_rad
         self._awaited: tuple[Behaviour, asyncio.Future[None]] | None = None
+        # Counts what a command that still waits must not outlive, and what the last of it was.
+        self._overtakings, self._overtaken_by = 0, ""
 
     async def do(self, text: str) -> dict[str, Any]:
         """Do what a command says; the reply tells how it ended. See `Service.command`."""
@@ -51,17 +53,32 @@ class CommandDesk:
         except (GrammarError, MissionError) as error:
             return {"command": text, "success": False, "reason": "; ".join(str(error).splitlines())}
         self._on_event("info", f"command: {command}")
+        self.overtake(str(command))
+        given = self._overtakings
         if isinstance(command, Gimbal):
             outcome = await self._gimbal.point(command.aim, self._pilot.behaviour)
         else:
             if Requirement.GIMBAL in behaviour.requirements:
                 await self._gimbal.find()
-            outcome = await self._outcome_of(command, behaviour)
+            if given == self._overtakings:
+                outcome = await self._outcome_of(command, behaviour)
+            else:
+                why = f"overtaken by {self._overtaken_by} while the gimbal was looked for"
+                outcome = Outcome(False, why)
         more: dict[str, Any] = {}
         if isinstance(behaviour, SequenceBehaviour):
             outcome, more = behaviour.told(outcome), {"steps": [asdict(step) for step in behaviour.records]}
         self._on_event("info" if outcome.success else "warning", f"{command}: {outcome.reason}")
         return {"command": str(command), **asdict(outcome), **more}
+
+    def overtake(self, by: str) -> None:
+        """A command that has not begun yet shall not begin any more: what it was given for is past.
+
+        Args:
+            by: what has happened since, for the answer.
+        """
+        self._overtakings += 1
+        self._overtaken_by = by
 
     def _behaviour_for(self, command: Command, enclosed: str) -> Behaviour:
         """Raises GrammarError or MissionError with what is wrong, a line for each."""

@@ -108,6 +108,7 @@ class Service:
         self.poses = PoseSharing(settings.vehicle.name, self._event)
         self.markers = MarkerWatch(self.views)
         self._landing_target_ns = self._gimbal_ns = 0
+        self._shown: tuple[FlightMode, bool] | None = None
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
@@ -153,8 +154,10 @@ class Service:
             try:
                 await self._until_stopped(tasks)
             finally:
-                await self._leave()
-                await self.gimbal.close()
+                try:
+                    await self._leave()
+                finally:
+                    await self.gimbal.close()
         finally:
             self._notifier.stopping()
             unsubscribe()
@@ -212,6 +215,7 @@ class Service:
     async def _leave(self) -> None:
         """Take no more commands; a vehicle that flies our setpoints goes to the autopilot's own hold."""
         self._ending = True
+        self._commands.overtake("the end of the service")
         flying = self.streamer.state is not StreamState.SILENT
         self.pilot.close("the service ends")
         if not flying or not self.driver.state.connected(time.monotonic_ns()):
@@ -367,6 +371,11 @@ class Service:
 
     def _take_state(self, state: VehicleState) -> None:
         """Remember where the vehicle was; the trackers want to know where their cameras looked."""
+        if (state.mode, state.armed) != self._shown:
+            self._shown = (state.mode, state.armed)
+            # Whoever changed it, it is not the vehicle that a waiting command was given to.
+            now = f"{state.mode.value}, {'armed' if state.armed else 'disarmed'}"
+            self._commands.overtake(f"a change of the vehicle (now {now})")
         self._history.add(state)
         if state.attitude is not None:
             for view in self.views:
@@ -428,6 +437,8 @@ class Service:
 
     def _pilot_event(self, event: PilotEvent) -> None:
         lost = event.kind in (PilotEventKind.LOST, PilotEventKind.BATTERY, PilotEventKind.BLIND)
+        if event.kind in (PilotEventKind.LOST, PilotEventKind.BATTERY):
+            self._commands.overtake(f"an event ({event.message})")
         # What is refused or ended is told with the command's own outcome.
         if event.kind not in (PilotEventKind.REFUSED, PilotEventKind.ENDED, PilotEventKind.STARTED):
             self._event("warning" if lost else "info", event.message)

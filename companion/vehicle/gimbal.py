@@ -17,6 +17,8 @@ Address = tuple[int, int]
 NOBODY: Address = (0, 0)
 # An attitude that was not told for this long is not where the gimbal looks: it may have turned by 10° since.
 GIMBAL_MAX_AGE_S = 0.5
+# Whose control was not told for this long is not known: PX4 tells every two seconds, and at every change.
+CONTROL_MAX_AGE_S = 6.5
 # Device ids up to this are of gimbals that speak through the autopilot's component; others are component ids.
 LAST_ATTACHED_DEVICE = 6
 
@@ -95,6 +97,10 @@ class GimbalState:
     def attitude_fresh(self, now_ns: int) -> bool:
         """It is known where the gimbal looks."""
         return self.attitude is not None and now_ns - self.attitude_ns <= GIMBAL_MAX_AGE_S * 1e9
+
+    def control_known(self, now_ns: int) -> bool:
+        """It is known who may move the gimbal."""
+        return self.primary_control is not None and now_ns - self.status_ns <= CONTROL_MAX_AGE_S * 1e9
 
     def why_not_looking(self, now_ns: int) -> str | None:
         """Why it is not known where the gimbal looks, in words; None: it is."""

@@ -52,7 +52,7 @@ def fold_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleStat
 
 def fold_attitude(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
     """GIMBAL_DEVICE_ATTITUDE_STATUS: where the gimbal looks."""
-    gimbal = _told(state, fields, of_device=True)
+    gimbal = _told(state, fields)
     if gimbal is None:
         return state
     frame = _yaw_frame(int(fields["flags"]))
@@ -77,7 +77,7 @@ def from_gimbal_device(state: VehicleState, name: str, component_id: int) -> boo
     )
 
 
-def _told(state: VehicleState, fields: Fields, *, of_device: bool = False) -> GimbalState | None:
+def _told(state: VehicleState, fields: Fields) -> GimbalState | None:
     """The gimbal that a message is about; None: another one than the vehicle's."""
     device = int(fields.get("gimbal_device_id") or 0)
     gimbal = state.gimbal
@@ -87,8 +87,7 @@ def _told(state: VehicleState, fields: Fields, *, of_device: bool = False) -> Gi
         return gimbal
     if gimbal.device == 0:
         return replace(gimbal, device=device)
-    # A device in a component of its own leaves its number out or gives that of its component.
-    return gimbal if of_device and gimbal.device > LAST_ATTACHED_DEVICE < device else None
+    return None
 
 
 def _yaw_frame(flags: int) -> YawFrame | None:

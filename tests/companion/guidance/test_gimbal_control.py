@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.gimbal_control import GimbalAsk, GimbalControl, GimbalRequest
-from companion.vehicle.gimbal import NOBODY, GimbalAim, GimbalState
+from companion.guidance.gimbal_control import SHOWN_WITHIN_S, GimbalAsk, GimbalControl, GimbalRequest
+from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 
 OURS, STATION, AUTOPILOT = (1, 191), (245, 190), (1, 1)
 DOWN, LEVEL = GimbalAim(-0.5), GimbalAim(0.0)
 TAKE, GIVE_BACK = GimbalRequest(GimbalAsk.TAKE), GimbalRequest(GimbalAsk.GIVE_BACK)
 SEEK = object()
+UNTOLD = "its manager does not tell who has control of it"
 
 
 def point(aim: GimbalAim) -> GimbalRequest:
@@ -24,8 +25,8 @@ class Bench:
 
     def __init__(self, primary=NOBODY) -> None:
         self.control = GimbalControl(OURS)
-        self.gimbal = GimbalState(device=1, primary_control=primary, status_ns=1)
         self.now_ns = 10_000_000_000
+        self.gimbal = GimbalState(device=1, primary_control=primary, status_ns=self.now_ns)
 
     def turn(self, aim, owner=SEEK, *, seconds: float = 0.1) -> GimbalRequest | None:
         self.now_ns += round(seconds * 1e9)
@@ -75,7 +76,9 @@ def test_an_aim_that_moves_goes_out_ten_times_a_second() -> None:
     assert 1 <= sum(request is not None for request in asked) <= 11
 
 
-@pytest.mark.parametrize(("primary", "free"), [(NOBODY, True), (OURS, True), (AUTOPILOT, True), (None, True)])
+@pytest.mark.parametrize(
+    ("primary", "free"), [(NOBODY, True), (OURS, True), (AUTOPILOT, True), (None, False)]
+)
 def test_it_is_taken_from_nobody_and_from_the_autopilot_itself(primary, free) -> None:
     assert (Bench(primary).turn(DOWN) == TAKE) is free
 
@@ -163,8 +166,62 @@ def test_after_a_denial_it_is_not_taken_from_who_turns_out_to_have_it() -> None:
     assert bench.control.problem == "245/190 has control of it"
 
 
-def test_a_gimbal_that_tells_nothing_is_taken_and_pointed_all_the_same() -> None:
+def test_after_a_denial_that_the_manager_never_clears_up_it_is_not_taken_again() -> None:
+    """What it showed before, nobody, is from before somebody denied it to us."""
+    bench = Bench()
+    assert bench.turn(LEVEL) == TAKE
+    bench.answer("denied")
+    another = object()
+    assert [bench.turn(DOWN, another) for _ in range(40)] == [None] * 40
+    assert bench.control.problem == UNTOLD
+    bench.shows(NOBODY)
+    assert bench.turn(DOWN, object()) == TAKE, "now it is known to be free"
+
+
+def test_what_could_not_be_given_back_is_tried_again_once_it_shows_to_be_ours_still() -> None:
+    bench = Bench()
+    bench.held()
+    assert bench.turn(None, None) == GIVE_BACK
+    bench.answer("not answered")
+    assert bench.control.held
+    assert bench.turn(None, None) is None, "whose it is now is not known yet"
+    bench.shows(OURS)
+    assert bench.turn(None, None) is None, "not at every word of the manager"
+    assert bench.turn(None, None, seconds=SHOWN_WITHIN_S) == GIVE_BACK
+    bench.answer()
+    assert not bench.control.held
+    assert bench.turn(None, None, seconds=SHOWN_WITHIN_S) is None
+    assert bench.control.problem == ""
+
+
+@pytest.mark.parametrize("shown", [NOBODY, STATION, AUTOPILOT])
+def test_what_could_not_be_given_back_and_is_not_ours_any_more_is_left(shown) -> None:
+    bench = Bench()
+    bench.held()
+    assert bench.turn(None, None) == GIVE_BACK
+    bench.answer("not answered")
+    bench.shows(shown)
+    assert bench.turn(None, None, seconds=2 * SHOWN_WITHIN_S) is None
+    assert not bench.control.held
+
+
+def test_what_was_taken_although_the_answer_was_lost_is_given_back() -> None:
+    bench = Bench()
+    assert bench.turn(DOWN) == TAKE
+    bench.answer("not answered")
+    bench.shows(OURS)
+    assert bench.turn(DOWN) == GIVE_BACK
+
+
+def test_while_the_manager_does_not_tell_who_has_it_it_is_not_taken() -> None:
     control = GimbalControl(OURS)
-    assert control.update(1, None, DOWN, SEEK) == TAKE
-    control.answered(2, None)
-    assert control.update(3, None, DOWN, SEEK) == point(DOWN)
+    assert control.update(1, None, DOWN, SEEK) is None
+    assert control.problem == UNTOLD
+
+
+def test_what_the_manager_told_long_ago_does_not_count() -> None:
+    bench = Bench()
+    assert bench.turn(DOWN, seconds=CONTROL_MAX_AGE_S + 0.1) is None
+    assert bench.control.problem == UNTOLD
+    bench.shows(NOBODY)
+    assert bench.turn(DOWN, object(), seconds=CONTROL_MAX_AGE_S - 0.1) == TAKE

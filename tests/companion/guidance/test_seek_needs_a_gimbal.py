@@ -15,7 +15,8 @@ from companion.guidance.gimbal_sight import GimbalSight
 from companion.guidance.gimbal_sweep import GimbalSweep
 from companion.guidance.refusal import refusal
 from companion.guidance.seek import SeekBehaviour
-from companion.vehicle.gimbal import GimbalAim, GimbalState
+from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
+from companion.vehicle.setpoint import Setpoint
 from vision.rotation import quaternion_from_euler
 
 CARRIED = GimbalSight(carries_camera=True)
@@ -33,8 +34,8 @@ def seek() -> SeekBehaviour:
 def gimbal(now_ns: int, pitch_deg: float = 0.0, **changes: object) -> GimbalState:
     attitude = quaternion_from_euler(0.0, math.radians(pitch_deg), 0.0)
     low, high = math.radians(-90.0), math.radians(30.0)
-    known = GimbalState(1, now_ns, now_ns, now_ns, attitude, lowest_pitch_rad=low, highest_pitch_rad=high)
-    return replace(known, **changes)
+    known = GimbalState(1, now_ns, now_ns, now_ns, attitude, primary_control=NOBODY)
+    return replace(known, **{"lowest_pitch_rad": low, "highest_pitch_rad": high, **changes})
 
 
 def situation(told: GimbalState | None, sight: GimbalSight = CARRIED, now_ns: int = 0) -> Situation:
@@ -68,6 +69,18 @@ NOW_NS = KinematicVehicle().now_ns
             GimbalSight(carries_camera=True, elsewhere="245/190"),
             "control of the gimbal (245/190 has it, and must give it back)",
             id="another's",
+        ),
+        pytest.param(
+            gimbal(NOW_NS, primary_control=None),
+            CARRIED,
+            "to know who has control of it (its manager does not tell)",
+            id="nobody tells whose",
+        ),
+        pytest.param(
+            gimbal(NOW_NS, status_ns=NOW_NS - round((CONTROL_MAX_AGE_S + 0.1) * 1e9)),
+            CARRIED,
+            "to know who has control of it (its manager does not tell)",
+            id="told whose long ago",
         ),
         pytest.param(
             gimbal(NOW_NS),
@@ -152,6 +165,34 @@ def test_a_gimbal_that_falls_silent_ends_the_seek_and_the_reason_is_told() -> No
     assert outcome.reason == (
         "where the camera looks is not known (the gimbal that carries it: its attitude is 0.6 s old) for 5 s"
     )
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [
+        (None, "none answers"),
+        (GimbalState(1, NOW_NS, NOW_NS, NOW_NS), "it has not told its attitude"),
+        (GimbalState(1, NOW_NS, NOW_NS, NOW_NS, attitude_problem="it says two things"), "it says two things"),
+    ],
+)
+@pytest.mark.parametrize("vain", [False, True])
+def test_a_gimbal_whose_attitude_is_withdrawn_ends_the_sweep_and_the_reason_is_told(
+    left, words, vain
+) -> None:
+    behaviour = SeekBehaviour("car", sweep=sweep())
+    told = situation(gimbal(NOW_NS))
+    behaviour.on_activate(told)
+    assert isinstance(behaviour.update(0.05, told), Setpoint)
+    behaviour._vain = "no car seen in 2 laps" if vain else ""  # the gimbal then goes back
+    later = replace(told, now_ns=NOW_NS + 50_000_000, state=replace(told.state, gimbal=left))
+    assert behaviour.update(0.05, later) == Outcome(False, f"seek lost the gimbal: {words}")
+
+
+def test_a_gimbal_that_is_gone_when_the_seek_begins_is_named_too() -> None:
+    behaviour = seek()
+    told = situation(None)
+    behaviour.on_activate(told)
+    assert behaviour.update(0.05, told) == Outcome(False, "seek lost the gimbal: none answers")
 
 
 def test_the_mission_step_ends_when_the_gimbal_looks_there_or_will_not() -> None:

@@ -93,6 +93,13 @@ def test_of_several_gimbals_the_first_is_the_vehicles() -> None:
     assert fold(state, ATTITUDE, attitude(device=0), 9).gimbal.attitude_ns == 9
 
 
+def test_of_two_gimbals_in_components_of_their_own_only_the_vehicles_attitude_counts() -> None:
+    state = fold(VehicleState(), INFORMATION, information(154), 5)
+    assert fold(state, ATTITUDE, attitude(device=171), 9) is state
+    for device in (0, 154):
+        assert fold(state, ATTITUDE, attitude(device=device), 9).gimbal.attitude_ns == 9
+
+
 def status(device: int, system: int) -> dict:
     return {
         "gimbal_device_id": device,
