@@ -187,6 +187,7 @@ class Cockpit:
             self._fly_up(height_m)
             inbox = {link: list(messages) for link, messages in self.inbox.items()}
             self._in_the_air[key] = (pickle.dumps((self._vehicle, self._events)), inbox)
+            gc.collect()
             gc.freeze()  # thousands of messages that stay: not to be looked through at every collection
         stored, inbox = self._in_the_air[key]
         self._vehicle, self._events = pickle.loads(stored)
