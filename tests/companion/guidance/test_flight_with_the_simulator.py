@@ -1,74 +1,20 @@
 """The pilot with a real driver, a real socket and the built-in vehicle in its own process."""
 
 import asyncio
-import contextlib
 import math
 import time
 
 import pytest
+from live_flight import LiveFlight, ground_station
 from pymavlink import mavutil
 
-from companion.guidance.behaviour import Situation
-from companion.guidance.envelope import Envelope
 from companion.guidance.grammar import parse
-from companion.guidance.pilot import Pilot
 from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.registry import behaviour_for
-from companion.vehicle.drivers import open_driver
 from companion.vehicle.state import FlightMode
-from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import running_simulator
 
 SPEED = 2.0
-
-
-class Service:
-    """Driver, streamer and guidance loop, as the service runs them."""
-
-    def __init__(self, kind, port):
-        self.driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
-        self.streamer = Streamer(self.driver.send_setpoint)
-        self.events = []
-        self.pilot = Pilot(self.driver, self.streamer, Envelope(), on_event=self.events.append)
-
-    async def guide(self):
-        while True:
-            now_ns = time.monotonic_ns()
-            self.pilot.update(Situation(now_ns, self.driver.state))
-            await asyncio.sleep(0.02)
-
-    async def until(self, condition, timeout_s=30.0):
-        async with asyncio.timeout(timeout_s):
-            while not condition():
-                await asyncio.sleep(0.01)
-
-    async def fly(self, text, timeout_s=60.0):
-        return await asyncio.wait_for(self.pilot.command(behaviour_for(parse(text))), timeout_s)
-
-
-@contextlib.asynccontextmanager
-async def running_service(kind, port):
-    service = Service(kind, port)
-    await service.driver.connect(20.0)
-    tasks = [asyncio.create_task(service.guide()), asyncio.create_task(service.streamer.run())]
-    try:
-        yield service
-    finally:
-        service.pilot.close()
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await service.driver.close()
-
-
-@contextlib.contextmanager
-def pilots_station(port):
-    """A second MAVLink client, on the ground station's link."""
-    station = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245, source_component=190)
-    try:
-        yield station
-    finally:
-        station.close()
 
 
 def choose_mode(station, main, sub):
@@ -77,8 +23,9 @@ def choose_mode(station, main, sub):
 
 @pytest.mark.parametrize("kind", ["pymavlink", "mavsdk"])
 async def test_a_flight_by_commands_until_the_pilot_takes_over(kind):
-    with running_simulator(speed=SPEED) as simulator, pilots_station(simulator.gcs_port) as station:
-        async with running_service(kind, simulator.onboard_port) as service:
+    with running_simulator(speed=SPEED) as simulator, ground_station(simulator.gcs_port) as station:
+        service = LiveFlight(kind, simulator.onboard_port)
+        async with service.running():
             driver, pilot = service.driver, service.pilot
             await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
             assert not driver.state.armed
@@ -118,7 +65,8 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over(kind):
 async def test_places_and_paths_are_flown_with_the_built_in_vehicle():
     """By truth as telemetry tells it: where goto ends, and how far beside its path follow-path is."""
     with running_simulator(speed=SPEED, seed=3) as simulator:
-        async with running_service("pymavlink", simulator.onboard_port) as service:
+        service = LiveFlight("pymavlink", simulator.onboard_port)
+        async with service.running():
             driver = service.driver
             await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
             assert (await service.fly("takeoff 4")).success

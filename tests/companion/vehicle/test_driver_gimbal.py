@@ -6,12 +6,12 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 from fake_autopilot import FakeAutopilot, state_shows, wait_until
-from pymavlink import mavutil
+from live_flight import ground_station
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import CommandRefusedError, Driver
@@ -32,15 +32,6 @@ async def connected(kind: str, port: int) -> AsyncIterator[Driver]:
         yield driver
     finally:
         await driver.close()
-
-
-@contextlib.contextmanager
-def ground_station(port: int) -> Iterator[Any]:
-    station = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=245, source_component=190)
-    try:
-        yield station
-    finally:
-        station.close()
 
 
 async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_for(kind: str) -> None:
