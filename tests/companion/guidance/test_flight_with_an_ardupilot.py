@@ -6,7 +6,7 @@ import math
 import time
 
 import pytest
-from test_flight_with_the_simulator import pilots_station, running_service
+from live_flight import LiveFlight, ground_station
 
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
@@ -18,8 +18,9 @@ LOITER, GUIDED = 5, 4
 
 async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot() -> None:
     options = {"autopilot": "ardupilot", "ready_after": 0.0, "speed": 2.0, "seed": 3}
-    with running_simulator(**options) as simulator, pilots_station(simulator.gcs_port) as station:
-        async with running_service("pymavlink", simulator.onboard_port) as service:
+    with running_simulator(**options) as simulator, ground_station(simulator.gcs_port) as station:
+        service = LiveFlight("pymavlink", simulator.onboard_port)
+        async with service.running():
             driver, pilot = service.driver, service.pilot
             await service.until(lambda: driver.state.ready_to_arm and driver.state.home_position_ned_m)
 
