@@ -34,7 +34,7 @@ class RehearsalError(RuntimeError):
 
 @asynccontextmanager
 async def simulator(
-    port: int, camera: str, truth_path: Path, seed: int, log_path: Path
+    port: int, camera: str, truth_path: Path, seed: int, log_path: Path, *, camera_rate_hz: float = 30.0
 ) -> AsyncIterator[asyncio.subprocess.Process]:
     """`mavlink-sim` as a process of its own, sending to `port`; what it says goes to `log_path`.
 
@@ -51,7 +51,8 @@ async def simulator(
         "--gcs-bind",
         "0",
     ]
-    arguments += ["--camera", camera, "--truth", str(truth_path), "--seed", str(seed)]
+    arguments += ["--camera", camera, "--camera-rate", f"{camera_rate_hz:g}"]
+    arguments += ["--truth", str(truth_path), "--seed", str(seed)]
     # The open field of the built-in world needs no 30 m on the way home (PX4's default).
     arguments += ["--param", "RTL_RETURN_ALT=5"]
     process = await asyncio.create_subprocess_exec(
@@ -115,7 +116,7 @@ async def _copy(stream: asyncio.StreamReader, lines: list[str]) -> None:
 
 
 def rehearsal_settings(
-    port: int, camera: str, *, video: Path | None = None, driver: str = "mavsdk"
+    port: int, camera: str, *, video: Path | None = None, video_rate_hz: float = 7.5, driver: str = "mavsdk"
 ) -> Settings:
     """Settings for the built-in vehicle and its camera, whatever is configured on this machine."""
     from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
@@ -139,7 +140,7 @@ def rehearsal_settings(
     }
     if video is not None:
         overrides["recording.video"] = str(video)
-        overrides["recording.rate_hz"] = "8"
+        overrides["recording.rate_hz"] = f"{video_rate_hz:g}"
     return load_settings(Path(os.devnull), overrides, environment={})
 
 
@@ -169,7 +170,9 @@ async def with_service(service: Service, work: Callable[[], Coroutine[Any, Any, 
         working.cancel()
         # Before it is ready there is nothing to leave in order.
         service.stop() if service.ready else running.cancel()
-        await asyncio.gather(running, working, return_exceptions=True)
+        ended, _ = await asyncio.gather(running, working, return_exceptions=True)
+    if isinstance(ended, BaseException):
+        raise ended  # it went wrong after the work was done, which is no success
 
 
 async def until_ready_to_arm(service: Service) -> None:

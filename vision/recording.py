@@ -7,6 +7,7 @@ import math
 import os
 import queue
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,8 @@ logger = logging.getLogger(__name__)
 
 # Frames that wait for the encoder. More would only be memory: an encoder that is too slow stays too slow.
 _QUEUED_FRAMES = 4
+# Whoever ends the program is not kept waiting: what still waits then is given up, and that is said.
+_FINISHING_S = 2.0
 # The network, in the same process, comes first.
 _NICER = 5
 
@@ -65,6 +68,7 @@ class Recording:
         self._refused_slot: int | None = None
         self._queue: queue.Queue[_Picture | None] = queue.Queue(_QUEUED_FRAMES)
         self._failed = threading.Event()
+        self._finished_by_s = math.inf
         # A size is known only with the first frame; that nothing can be written there is known now.
         with VideoWriter(self._path, 16, 16, rate_hz):
             pass
@@ -94,9 +98,13 @@ class Recording:
             self.skipped += 1
 
     def close(self) -> None:
-        """Finish the file; no file is left if it got no frame. A second call does nothing."""
+        """Finish the file; no file is left if it got no frame. A second call does nothing.
+
+        The encoder gets two seconds for the few pictures that wait; a film that is shorter for it is whole.
+        """
         if not self._thread.is_alive():
             return
+        self._finished_by_s = time.monotonic() + _FINISHING_S
         self._queue.put(None)
         self._thread.join()
         self._note_lost_before(math.inf)
@@ -114,24 +122,30 @@ class Recording:
         while (picture := self._queue.get()) is not None:
             if self._failed.is_set():
                 continue
+            if time.monotonic() > self._finished_by_s:
+                self.skipped += 1
+                continue
             try:
                 if writer is None:
                     writer = VideoWriter(self._path, picture.frame.width, picture.frame.height, self._rate_hz)
                 _add(writer, picture)
-            except (VideoWriterError, OSError) as error:
+            except Exception as error:
                 self._fail(error)
         try:
             if writer is not None:
                 writer.close()
             elif not self._failed.is_set():
                 self._path.unlink(missing_ok=True)  # a film without a frame is none
-        except (VideoWriterError, OSError) as error:
+        except Exception as error:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        if not self._failed.is_set():
-            self._failed.set()
-            logger.error("the recording has failed: %s", error)
+        if self._failed.is_set():
+            return
+        self._failed.set()
+        # What is wrong with a file is said in a line; of a fault of ours one wants to know where.
+        fault = None if isinstance(error, VideoWriterError | OSError) else error
+        logger.error("the recording has failed: %s", error, exc_info=fault)
 
 
 def _add(writer: VideoWriter, picture: _Picture) -> None:

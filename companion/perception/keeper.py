@@ -105,6 +105,7 @@ class PerceptionKeeper:
         self._state = PerceptionState.STOPPED
         self._task: asyncio.Task[None] | None = None
         self._stop_asked = asyncio.Event()
+        self._killed = False
         self._process: PerceptionProcess | None = None
         self._pulse: Pulse | None = None
         self._input: StandardInput | None = None
@@ -145,7 +146,10 @@ class PerceptionKeeper:
             raise PerceptionStartError(self._problem)
 
     async def stop(self) -> None:
-        """End the worker: asked (it finishes the video), then terminated, then killed; in at most 7 s."""
+        """End the worker: asked (it finishes the video), then terminated, then killed; in at most 7 s.
+
+        An end that is not in order is a warning: the video may not be whole then.
+        """
         task = self._task
         if task is None or self._stop_asked.is_set():
             return
@@ -157,9 +161,7 @@ class PerceptionKeeper:
             self._process.terminate()
             await asyncio.wait({task}, timeout=TERMINATE_S)
         if self._process is not None:
-            self._on_event(
-                "warning", f"perception process {self._process.pid} did not end when asked; killed"
-            )
+            self._killed = True
             self._process.kill()
         await asyncio.wait({task})
         if self._input is not None:
@@ -264,6 +266,7 @@ class PerceptionKeeper:
         while True:
             end = await self._run_one(started)
             if self._stop_asked.is_set():
+                self._after_stop(end)
                 return
             if end.finished:
                 self._state = PerceptionState.FINISHED
@@ -283,6 +286,17 @@ class PerceptionKeeper:
                     await self._stop_asked.wait()
                 return
             self._restarts += 1
+
+    def _after_stop(self, end: _End) -> None:
+        """Say it when a worker that had been seeing did not end as it should have."""
+        if end.finished or self._state is not PerceptionState.RUNNING:
+            return
+        text = f"did not end in order: {end.text}"
+        if self._killed:
+            text = f"did not end when asked: {end.text}"
+        if self._settings.recording.video is not None:
+            text += f"; the video {self._settings_of_worker().recording.video} may not be whole"
+        self._on_event("warning", f"perception {text}")
 
     def _after_death(self, end: _End) -> float | None:
         """Say what was lost; the seconds until the next start, None to give up."""
@@ -333,7 +347,7 @@ class PerceptionKeeper:
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
 
     async def _spawn(self) -> PerceptionProcess:
-        settings = self._settings_of_next_worker()
+        settings = self._settings_of_worker()
         if settings.source.uri != STANDARD_INPUT:
             return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, self._tracks.next_id)
         if self._input is None:
@@ -345,7 +359,7 @@ class PerceptionKeeper:
             # The worker's copy must be the only one, or its death would not be seen.
             os.close(descriptor)
 
-    def _settings_of_next_worker(self) -> Settings:
+    def _settings_of_worker(self) -> Settings:
         video = self._settings.recording.video
         if video is None or self._restarts == 0:
             return self._settings
@@ -366,7 +380,8 @@ class PerceptionKeeper:
             if now_s - before_s > 4 * _TICK_S:
                 # We stood still ourselves; what the worker said meanwhile is still to be read.
                 pulse.forgive(now_s)
-            elif pulse.silent_s(now_s) > pulse.stuck_after_s:
+            # Once it is asked to stop it says nothing more, and `stop` has limits of its own.
+            elif not self._stop_asked.is_set() and pulse.silent_s(now_s) > pulse.stuck_after_s:
                 assert self._process is not None
                 text = f"process {self._process.pid} is stuck, no message for {pulse.silent_s(now_s):.1f} s"
                 return _End(False, text)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from pathlib import Path
 
@@ -109,6 +110,53 @@ def test_an_encoder_that_is_too_slow_costs_frames_and_no_time(
     recording.close()
     assert 0 < recording.skipped <= 200
     assert any("the encoder was slow" in record.getMessage() for record in caplog.records)
+
+
+def test_the_end_does_not_wait_for_a_slow_encoder_and_the_film_is_whole(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vision.recording._FINISHING_S", -1.0)
+    drawing, may_go_on = threading.Event(), threading.Event()
+
+    def slowly(image: np.ndarray, *_: object, **__: object) -> np.ndarray:
+        drawing.set()
+        assert may_go_on.wait(30)
+        return image
+
+    monkeypatch.setattr("vision.recording.annotate", slowly)
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 20.0)
+    for sequence in range(4):
+        give(recording, frame_of(sequence))
+        assert drawing.wait(30)
+    closing = threading.Thread(target=recording.close)
+    closing.start()
+    while recording._queue.qsize() < 4:  # three pictures, and the word that it is the end
+        time.sleep(0.001)
+    may_go_on.set()
+    closing.join(30)
+    assert len(played(path)) == 1
+    assert recording.skipped == 3
+    assert any("3 pictures are missing" in record.getMessage() for record in caplog.records)
+
+
+def test_a_fault_of_ours_ends_the_film_and_not_in_silence(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def faulty(image: np.ndarray, detections: Detections, **_: object) -> np.ndarray:
+        return image if len(detections) else [][0]
+
+    monkeypatch.setattr("vision.recording.annotate", faulty)
+    path = tmp_path / "flight.webm"
+    recording = Recording(path, 20.0)
+    give(recording, frame_of(0))
+    give(recording, frame_of(1), SPOT[:0])
+    give(recording, frame_of(2), SPOT[:0])
+    recording.close()
+    (said,) = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert "the recording has failed: list index out of range" in said.getMessage()
+    assert said.exc_info is not None
+    assert played(path)  # what was in it until then
 
 
 @pytest.mark.parametrize("name", ["flight.mp4", "blocked/flight.webm"])

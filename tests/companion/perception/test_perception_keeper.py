@@ -238,8 +238,49 @@ async def test_a_stopped_worker_does_not_hold_up_the_end(
         pid = keeper.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-    assert heard.said(f"perception process {pid} did not end when asked; killed")
+    assert heard.said(f"perception did not end when asked: process {pid} was killed by SIGKILL")
     assert not alive(pid)
+
+
+async def test_an_end_that_costs_the_video_is_said_and_silence_is_none_of_its_reasons(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.perception.pulse.SHORTEST_S", 0.3)
+    monkeypatch.setattr("companion.perception.keeper.STOP_S", 1.5)
+    monkeypatch.setattr("companion.perception.keeper.TERMINATE_S", 0.3)
+    video = str(tmp_path / "flight.webm")
+    async with kept(settings_of(photos, **{"recording.video": video})) as (keeper, heard):
+        await until(lambda: keeper.status.stuck_after_s is not None and keeper.status.stuck_after_s < 1.0)
+        pid = keeper.status.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)  # an encoder that takes long is as silent as this
+        await keeper.stop()
+    assert not alive(pid)
+    assert heard.events[-1] == (
+        "warning",
+        f"perception did not end when asked: process {pid} was killed by SIGKILL; "
+        f"the video {video} may not be whole",
+    )
+
+
+async def test_a_worker_that_dies_while_it_ends_is_told(photos: Path) -> None:
+    async with kept(settings_of(photos)) as (keeper, heard):
+        pid = keeper.status.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        stopping = asyncio.create_task(keeper.stop())
+        await asyncio.sleep(0)
+        os.kill(pid, signal.SIGKILL)
+        await stopping
+    assert heard.said(f"perception did not end in order: process {pid} was killed by SIGKILL")
+
+
+async def test_a_worker_that_ends_in_order_is_no_news(photos: Path, tmp_path: Path) -> None:
+    video = tmp_path / "flight.webm"
+    async with kept(settings_of(photos, **{"recording.video": str(video)})) as (_, heard):
+        await until(lambda: len(heard.results) >= 3)
+    assert [level for level, _ in heard.events] == ["info"]
+    assert video.stat().st_size > 0
 
 
 async def test_a_start_that_is_cancelled_leaves_no_process(photos: Path, tiny_model: Path) -> None:
