@@ -34,6 +34,15 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def filming(pictures: Path) -> list[str]:
+    """Flags for a service that takes the pictures, over and over, ten times a second, and looks for nothing."""
+    return [
+        *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
+        *("--detector-enabled", "false", "--guidance-perception-max-age-s", "3"),
+    ]
+
+
+@pytest.fixture
 def seeing(small_model: Path, pictures: Path) -> list[str]:
     """Flags for a service that looks at the pictures, over and over, ten times a second."""
     return [

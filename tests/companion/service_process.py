@@ -76,6 +76,13 @@ class ServiceProcess:
         with self.client() as session:
             return send_command(session, "vehicle1", text, timeout_s=timeout_s)
 
+    def take_off(self, altitude_m: float) -> None:
+        """As soon as the vehicle has told all that a take-off needs to know; it does in its first seconds."""
+        deadline_s = time.monotonic() + 20.0
+        while not (reply := self.command(f"takeoff {altitude_m:g}"))["success"]:
+            assert "needs" in reply["reason"], reply
+            assert time.monotonic() < deadline_s, reply
+
     def signal(self, number: signal.Signals) -> None:
         os.kill(self.pid, number)
 

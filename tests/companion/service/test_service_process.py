@@ -44,7 +44,7 @@ def wait_for_truth(path: Path, condition: Any, timeout_s: float = 30.0) -> dict[
 
 def fly(service: ServiceProcess) -> None:
     """In the air and in OFFBOARD."""
-    assert service.command("takeoff 2.5")["success"]
+    service.take_off(2.5)
     assert service.command("hold") == {"command": "hold", "success": True, "reason": "under way"}
 
 
@@ -76,12 +76,12 @@ def test_a_flight_by_commands_while_a_subscriber_receives_every_detection_messag
 
 
 def test_a_stopped_service_leaves_the_vehicle_to_its_failsafe_and_does_not_take_it_back(
-    seeing: list[str], tmp_path: Path
+    filming: list[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "truth.jsonl"
     with (
         running_simulator(truth=path) as simulator,
-        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
     ):
         fly(service)
         stopped_ns = time.monotonic_ns()
@@ -129,10 +129,10 @@ def test_a_killed_perception_worker_is_replaced_while_the_vehicle_holds(
         assert truth(path)[-1]["mode"] == "OFFBOARD"
 
 
-def test_a_vehicle_that_vanishes_is_told_and_found_again(seeing: list[str], tmp_path: Path) -> None:
+def test_a_vehicle_that_vanishes_is_told_and_found_again(filming: list[str], tmp_path: Path) -> None:
     with running_simulator() as first:
         ports = {"onboard_port": first.onboard_port, "onboard_bind": first.onboard_bind}
-        with running_service(first.onboard_port, seeing, cwd=tmp_path) as service:
+        with running_service(first.onboard_port, filming, cwd=tmp_path) as service:
             fly(service)
             first.kill()
             service.wait_for_line("the autopilot is not heard any more")
@@ -145,11 +145,11 @@ def test_a_vehicle_that_vanishes_is_told_and_found_again(seeing: list[str], tmp_
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_service_that_is_ended_in_flight_lets_the_autopilot_hold(
-    number: signal.Signals, seeing: list[str], tmp_path: Path
+    number: signal.Signals, filming: list[str], tmp_path: Path
 ) -> None:
     with (
         running_simulator() as simulator,
-        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
     ):
         fly(service)
         simulator.wait_for_event("mode OFFBOARD")
