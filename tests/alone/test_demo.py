@@ -46,5 +46,5 @@ def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Pat
     pictures = 0
     while video.grab():
         pictures += 1
-    # Whole: from the first frame, seconds after the start, to the end. A slow encoder repeats, it leaves none out.
+    # Whole, from the first frame to the end: a slow encoder repeats pictures, it leaves none out.
     assert pictures / video.get(cv2.CAP_PROP_FPS) > 0.7 * summary["duration_s"]

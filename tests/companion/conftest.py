@@ -35,7 +35,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def filming(pictures: Path) -> list[str]:
-    """Flags for a service that takes the pictures, over and over, ten times a second, and looks for nothing."""
+    """Flags for a service that takes the pictures, ten a second, and looks for nothing in them."""
     return [
         *("--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"),
         *("--detector-enabled", "false", "--guidance-perception-max-age-s", "3"),
