@@ -45,7 +45,17 @@ def _range_of_box(
     known = central[np.isfinite(central) & (central > 0)]
     if known.size == 0 or known.size < MIN_KNOWN_FRACTION * central.size:
         return math.nan
-    return float(np.percentile(known, NEAR_PERCENTILE))
+    return _near_percentile(known)
+
+
+def _near_percentile(known: NDArray[np.float32]) -> float:
+    """As `np.percentile`, which takes longer to look at what it was given than this takes."""
+    place = (known.size - 1) * (NEAR_PERCENTILE / 100.0)
+    below = int(place)
+    above = min(below + 1, known.size - 1)
+    ordered = np.partition(known, (below, above))
+    first, second = float(ordered[below]), float(ordered[above])
+    return first + (second - first) * (place - below)
 
 
 def _central(first: float, last: float, size: int) -> slice:

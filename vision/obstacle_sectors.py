@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,45 +80,52 @@ def obstacle_sectors(
     turn = mount.ned_from_optical(ned_from_body).astype(np.float32)
     eye = (ned_from_body @ mount.position_frd_m).astype(np.float32)
 
-    level = rays @ turn.T
-    looked = _sector(level[:, 0], level[:, 1])
+    north, east, down = turn @ rays
+    looked = _sector(north, east)
     known = np.isfinite(depth) & (depth > 0.0)
     counted = np.bincount(looked, minlength=SECTORS)
     with_depth = np.bincount(looked[known], minlength=SECTORS)
     seen = (counted >= LEAST_POINTS) & (with_depth >= LEAST_KNOWN_SHARE * counted)
 
-    points = level[known] * depth[known, None] + eye
     below_m = BELOW_M if height_m is None else min(BELOW_M, height_m - GROUND_GAP_M)
-    in_band = (points[:, 2] > -ABOVE_M) & (points[:, 2] < below_m)
-    north, east = points[in_band, 0], points[in_band, 1]
+    with np.errstate(invalid="ignore"):  # an unknown depth is no number, and in no band
+        below = down * depth + eye[2]
+    in_band = known & (below > -ABOVE_M) & (below < below_m)
+    away = depth[in_band]
+    north, east = north[in_band] * away + eye[0], east[in_band] * away + eye[1]
     distance = np.full(SECTORS, np.nan)
     distance[seen] = np.inf
     _nearest_of_each(_sector(north, east), np.hypot(north, east), distance)
-    return ObstacleSectors(captured_ns, tuple(float(value) for value in distance))
+    return ObstacleSectors(captured_ns, tuple(distance.tolist()))
 
 
 def _nearest_of_each(
     sector: NDArray[np.int64], range_m: NDArray[np.float32], distance: NDArray[np.float64]
 ) -> None:
     """Write each sector's low percentile where it has points enough."""
-    order = np.lexsort((range_m, sector))
-    ordered = range_m[order]
+    # By sector and in it by range, in one sort of integers: the bits of a float above zero ascend as it does.
+    ordered = np.sort((sector << 32) | range_m.view(np.int32))
     counts = np.bincount(sector, minlength=SECTORS)
     firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
     enough = counts >= LEAST_POINTS
     places = firsts + (counts * (NEAR_PERCENTILE / 100.0)).astype(np.int64)
-    distance[enough] = ordered[places[enough]]
+    distance[enough] = ordered[places[enough]].astype(np.int32).view(np.float32)
 
 
 def _sector(north: NDArray[np.float32], east: NDArray[np.float32]) -> NDArray[np.int64]:
-    return np.rint(np.arctan2(east, north) / SECTOR_RAD).astype(np.int64) % SECTORS
+    if not north.size:
+        return np.zeros(0, np.int64)
+    # Good to a hundredth of a degree, and many times as fast as arctan2.
+    bearing_rad = cv2.phase(north, east).ravel()
+    sector: NDArray[np.int64] = np.rint(bearing_rad / SECTOR_RAD).astype(np.int64) % SECTORS
+    return sector
 
 
 _cached: dict[tuple[CameraModel, int, int], NDArray[np.float32]] = {}
 
 
 def _rays(camera: CameraModel, row_step: int, column_step: int) -> NDArray[np.float32]:
-    """(N, 3) float32 rays of the looked-at pixels with z = 1; the last camera's are kept."""
+    """(3, N) float32 rays of the looked-at pixels with z = 1; the last camera's are kept."""
     key = (camera, row_step, column_step)
     if key not in _cached:
         across, down = np.meshgrid(
@@ -125,5 +133,5 @@ def _rays(camera: CameraModel, row_step: int, column_step: int) -> NDArray[np.fl
         )
         rays = camera.rays(np.column_stack([across.ravel(), down.ravel()]))
         _cached.clear()
-        _cached[key] = (rays / rays[:, 2:]).astype(np.float32)
+        _cached[key] = np.ascontiguousarray((rays / rays[:, 2:]).T, np.float32)
     return _cached[key]

@@ -160,10 +160,14 @@ def targets_from_detections(
         HistoryError: the vehicle's pose at `captured_ns`, or where its gimbal looked then, is not known.
     """
     pose, mount = history.at(captured_ns), mount_at(mount, history, captured_ns)
+    if not detections:
+        return ()
+    sights = _sights(detections, camera, mount, pose)
     doubtful = _named_otherwise(detections)
     return tuple(
         _target(
             detection,
+            sight,
             captured_ns,
             camera,
             mount,
@@ -171,8 +175,43 @@ def targets_from_detections(
             height_m=heights_m.get(detection["class_name"]),
             trusted=not doubt,
         )
-        for detection, doubt in zip(detections, doubtful, strict=True)
+        for detection, sight, doubt in zip(detections, sights, doubtful, strict=True)
     )
+
+
+class _Sight(NamedTuple):
+    """What the geometry of one box says: (3,) in NED, offsets in metres; NaN where it says nothing.
+
+    Attributes:
+        direction: unit, to the box's centre.
+        at_depth: to what is seen there, by its depth.
+        on_ground: to where the middle of its lower edge meets the ground.
+    """
+
+    direction: NDArray[np.float64]
+    at_depth: NDArray[np.float64]
+    on_ground: NDArray[np.float64]
+
+
+def _sights(
+    detections: Sequence[DetectionRecord], camera: CameraModel, mount: CameraMount, pose: Pose
+) -> list[_Sight]:
+    """Of all boxes at once: a frame's targets are worked out between its arrival and the next setpoint."""
+    boxes = np.array([detection["xyxy"] for detection in detections])
+    depths_m = np.array([detection["range_m"] for detection in detections], np.float64)  # None is NaN
+    middle = (boxes[:, 0] + boxes[:, 2]) / 2
+    centre = np.column_stack([middle, (boxes[:, 1] + boxes[:, 3]) / 2])
+    foot = np.column_stack([middle, boxes[:, 3]])
+    attitude = pose.ned_from_body
+    return [
+        _Sight(*rows)
+        for rows in zip(
+            direction_ned(camera, mount, attitude, centre),
+            point_at_depth(camera, mount, attitude, centre, depths_m),
+            point_on_ground(camera, mount, attitude, foot, pose.height_m, MIN_DEPRESSION_RAD),
+            strict=True,
+        )
+    ]
 
 
 def _named_otherwise(detections: Sequence[DetectionRecord]) -> list[bool]:
@@ -194,6 +233,7 @@ def _score(detection: DetectionRecord) -> float:
 
 def _target(
     detection: DetectionRecord,
+    sight: _Sight,
     captured_ns: int,
     camera: CameraModel,
     mount: CameraMount,
@@ -203,19 +243,15 @@ def _target(
     trusted: bool,
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
-    centre = np.array([[(left + right) / 2, (top + bottom) / 2]])
-    direction = direction_ned(camera, mount, pose.ned_from_body, centre)[0]
+    direction = sight.direction
     source, offset = RangeSource.NONE, np.full(3, np.nan)
     depth_m = detection["range_m"]
     if depth_m is not None and math.isfinite(depth_m) and depth_m > 0.0:
         source = RangeSource.DEPTH
-        offset = point_at_depth(camera, mount, pose.ned_from_body, centre, np.array([depth_m]))[0]
+        offset = sight.at_depth
     elif bottom < camera.height - 1 - EDGE_PX and pose.height_m > MIN_HEIGHT_M:
-        foot = np.array([[(left + right) / 2, bottom]])
-        offset = point_on_ground(camera, mount, pose.ned_from_body, foot, pose.height_m, MIN_DEPRESSION_RAD)[
-            0
-        ]
-        if np.isfinite(offset).all():
+        offset = sight.on_ground
+        if math.isfinite(offset[0]):
             source = RangeSource.GROUND_PLANE
     if source is RangeSource.NONE and height_m is not None and _measurable(camera, top, bottom):
         ends = np.array([[(left + right) / 2, top], [(left + right) / 2, bottom]])

@@ -179,6 +179,10 @@ class PerceptionKeeper:
         if self._process is not None and self._settings.recording.video is not None:
             self._process.show(self._hud)
 
+    def published(self, result: PerceptionResult) -> None:
+        """A result is on the network now: the last of its stages, from when it was known, is over."""
+        self._times.add({"publish": (time.monotonic_ns() - result.inferred_ns) / 1e6})
+
     def watch(self, watched: bool) -> None:
         """Whether anybody wants pictures; until then none is made."""
         if watched != self._watched:
@@ -444,10 +448,8 @@ class PerceptionKeeper:
         self._results += 1
         self._arrivals_s.append(time.monotonic())
         self._rate_hz()
+        self._times.add(result.timing_ms)
         self._on_result(result)
-        # Whoever is called back publishes; what lies between is the way here and that.
-        publish_ms = (time.monotonic_ns() - result.inferred_ns) / 1e6
-        self._times.add({**result.timing_ms, "publish": publish_ms})
 
     def _count(self, frames: int, dropped: int, left_out: Mapping[str, int], unsent: int) -> None:
         """What the present worker has read and lost so far."""

@@ -391,24 +391,32 @@ class Service:
                     view.keeper.send_gimbal(gimbal.attitude_ns, attitude)
 
     def _use(self, view: View, result: PerceptionResult) -> None:
-        """Publish what a view saw; work out where it is, if that view steers."""
-        name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
-        clock = self.driver.state.clock
-        message = detections_message(result, name, now_ns, view.name, clock)
-        self.bus.publish(topics.DETECTIONS, message, view.name)
-        self.bus.publish(topics.LABELS, labels_message(result), view.name)
-        if result.track_events:
-            self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+        """Work out where what a view saw is, if that view steers; publish it, when it has been steered by."""
+        markers = None
         if result.markers is not None:
-            seen = self.markers.take(view, result, self._history, name, now_ns)
-            self.bus.publish(topics.MARKERS, seen, view.name)
+            name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
+            markers = self.markers.take(view, result, self._history, name, now_ns)
             self._seen.set()
         if view is self.steering:
             view.place(result, self._history)
             if result.obstacles is not None:
                 self._obstacles = result.obstacles
-                self.bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
             self._seen.set()
+        # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
+        asyncio.get_running_loop().call_soon(self._publish, view, result, markers)
+
+    def _publish(self, view: View, result: PerceptionResult, markers: dict[str, Any] | None) -> None:
+        name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
+        message = detections_message(result, name, now_ns, view.name, self.driver.state.clock)
+        self.bus.publish(topics.DETECTIONS, message, view.name)
+        self.bus.publish(topics.LABELS, labels_message(result), view.name)
+        if result.track_events:
+            self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+        if markers is not None:
+            self.bus.publish(topics.MARKERS, markers, view.name)
+        if view is self.steering and result.obstacles is not None:
+            self.bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
+        view.keeper.published(result)
 
     def _show(self, view: View, preview: Preview) -> None:
         """A picture for whoever watches; what it is of goes with it."""

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vision.depth import range_of_boxes
+from vision.depth import CENTRAL_FRACTION, NEAR_PERCENTILE, range_of_boxes
 
 HEIGHT, WIDTH = 48, 64
 
@@ -76,3 +76,12 @@ def test_in_front_of_a_wall_every_box_that_meets_the_image_has_the_walls_range_o
     x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
     if 0 <= x < WIDTH - 1 and 0 <= y < HEIGHT - 1:
         assert range_m == pytest.approx(wall_m)
+
+
+@given(st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_it_is_numpys_percentile_of_the_middle(side: int, seed: int) -> None:
+    depth = np.random.default_rng(seed).uniform(0.5, 60.0, (side, side)).astype(np.float32)
+    box = np.array([[-side / 2, -side / 2, side * 1.5, side * 1.5]])  # the picture is its middle half
+    assert CENTRAL_FRACTION == 0.5
+    (range_m,) = range_of_boxes(depth, box)
+    assert range_m == pytest.approx(np.percentile(depth, NEAR_PERCENTILE), rel=1e-6)

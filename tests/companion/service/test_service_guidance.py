@@ -50,6 +50,26 @@ async def test_a_new_detection_is_flown_by_at_once_and_without_one_the_rate_hold
         await asyncio.gather(steering, return_exceptions=True)
 
 
+async def test_it_is_flown_by_before_it_is_published() -> None:
+    service = Service(load_settings(os.devnull, {"guidance.rate_hz": SLOWEST_HZ}, {}))
+    order: list[str] = []
+    service.streamer.hasten = lambda _: order.append("setpoint")  # type: ignore[method-assign]
+    service.bus.publish = lambda topic, *_: order.append(topic.name)  # type: ignore[method-assign]
+    steering = asyncio.create_task(service._guide())
+    try:
+        await asyncio.sleep(0)
+        for sequence in range(3):
+            service._use(service.steering, result(sequence))
+            await until(lambda: len(order) >= 3)
+            assert order == ["setpoint", "detections", "labels"]
+            order.clear()
+        status = service.steering.keeper.status
+        assert status.timing_p50_ms.keys() == {"publish"}  # the last of the stages, told when it is over
+    finally:
+        steering.cancel()
+        await asyncio.gather(steering, return_exceptions=True)
+
+
 async def test_what_another_camera_sees_is_not_waited_for() -> None:
     settings = load_settings(
         os.devnull, {"guidance.rate_hz": SLOWEST_HZ, "views.down.source.uri": "down.mp4"}, {}
