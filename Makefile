@@ -21,12 +21,13 @@ demo: $(READY)
 	$(BIN)/companion demo --output demo-output
 
 # The tests start hundreds of processes, in workers that all read all tests: not each is to compile them anew.
-# So bytecode is kept, whatever the environment says, and made while what must run alone leaves the machine idle.
-# (What cannot be collected is told by the run that follows.)
+# So bytecode is kept, whatever the environment says, and made while what must run alone leaves some of the
+# machine idle. (What cannot be collected is told by the run that follows.)
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	nice -n 19 $(BIN)/python -m pytest --collect-only --quiet >/dev/null 2>&1 & \
-	$(BIN)/python -m pytest tests/alone && wait
+	nice -n 19 $(BIN)/python -m pytest --collect-only --quiet >/dev/null 2>&1 & reading=$$!; \
+	trap 'kill $$reading 2>/dev/null' EXIT; trap 'exit 130' INT TERM; \
+	$(BIN)/python -m pytest tests/alone && { wait $$reading || true; }
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --ignore tests/alone
 
 lint: $(READY)

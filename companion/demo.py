@@ -31,8 +31,8 @@ STOP_DISTANCE_M = 5.0
 # Arrival counts when the simulator agrees with it to within this.
 RANGE_TOLERANCE_M = 1.0
 VIDEO_NAME = "flight.webm"
-# What two cores can draw, look at and film at once; of every second frame of the camera a picture.
-_FILM_RATE_HZ = 7.5
+# What two cores draw, look at and film at once. Of an odd number of frames to a picture none is between two.
+_CAMERA_RATE_HZ, _FILM_RATE_HZ = 18.0, 6.0
 
 # What is flown: a mission file that comes with this package. Its steps `find` and `stand` are looked at.
 MISSION = "demo"
@@ -116,7 +116,7 @@ async def _fly(output: Path, truth_path: Path, *, seed: int, limit_s: float, say
     camera = f"companion-demo-{os.getpid()}"
     port = free_port()
     log_path = output / "simulator.log"
-    async with simulator(port, camera, truth_path, seed, log_path, camera_rate_hz=2 * _FILM_RATE_HZ):
+    async with simulator(port, camera, truth_path, seed, log_path, camera_rate_hz=_CAMERA_RATE_HZ):
         say("the vehicle and its camera are running")
         settings = rehearsal_settings(port, camera, video=output / VIDEO_NAME, video_rate_hz=_FILM_RATE_HZ)
         with (output / "events.jsonl").open("w") as events:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import random
 import re
 import signal
 import socket
@@ -26,6 +27,11 @@ from typing import Any
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
 
 FLEET_READY = re.compile(r"^ready: \d+ vehicles")
+
+
+# Between the choice of a port and its use another program may ask for any; Linux gives those from 32768 on.
+_NOT_GIVEN_AWAY = range(16384, 32768)
+_chance = random.SystemRandom()  # tests that run side by side may all have the same seed
 
 
 def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
@@ -48,14 +54,25 @@ def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
 
 
 def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
-    """UDP ports that nobody is bound to at this moment."""
+    """UDP ports that nobody is bound to at this moment, and that nobody gets who asks for any port.
+
+    Raises:
+        OSError: none were found in a thousand places.
+    """
+    ports: list[int] = []
     with ExitStack() as stack:
-        ports = []
-        for _ in range(count):
+        for _ in range(1000):
+            if len(ports) == count:
+                return ports
+            port = _chance.choice(_NOT_GIVEN_AWAY)
             candidate = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            candidate.bind((host, 0))
-            ports.append(int(candidate.getsockname()[1]))
-        return ports
+            try:
+                candidate.bind((host, port))
+            except OSError:
+                continue
+            ports.append(port)
+    first, last = _NOT_GIVEN_AWAY[0], _NOT_GIVEN_AWAY[-1]
+    raise OSError(f"found {len(ports)} of {count} free UDP ports on {host} between {first} and {last}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,7 @@ def obstacle_sectors(
         )
     rows = slice(None, None, max(1, math.ceil(camera.height / GRID_ROWS)))
     columns = slice(None, None, max(1, math.ceil(camera.width / GRID_COLUMNS)))
-    depth = depth_m[rows, columns].ravel()
+    depth = depth_m[rows, columns].ravel().astype(np.float32, copy=False)
     rays = _rays(camera, rows.step, columns.step)
     turn = mount.ned_from_optical(ned_from_body).astype(np.float32)
     eye = (ned_from_body @ mount.position_frd_m).astype(np.float32)

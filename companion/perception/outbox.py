@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -128,5 +129,7 @@ class OutboxHandler(logging.Handler):
         try:
             text = " ".join(record.getMessage().split())[:_LONGEST_LINE]
             self._outbox.put(LogLine(record.levelno, record.name, text))
+            if record.exc_info:
+                traceback.print_exception(record.exc_info[1])
         except Exception:  # a bad log call must not end perception; logging shows it on standard error
             self.handleError(record)

@@ -393,19 +393,29 @@ class Service:
     def _use(self, view: View, result: PerceptionResult) -> None:
         """Work out where what a view saw is, if that view steers; publish it, when it has been steered by."""
         markers = None
-        if result.markers is not None:
-            name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
-            markers = self.markers.take(view, result, self._history, name, now_ns)
-            self._seen.set()
-        if view is self.steering:
-            view.place(result, self._history)
-            if result.obstacles is not None:
-                self._obstacles = result.obstacles
-            self._seen.set()
-        # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
-        asyncio.get_running_loop().call_soon(self._publish, view, result, markers)
+        try:
+            if result.markers is not None:
+                name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
+                markers = self.markers.take(view, result, self._history, name, now_ns)
+                self._seen.set()
+            if view is self.steering:
+                view.place(result, self._history)
+                if result.obstacles is not None:
+                    self._obstacles = result.obstacles
+                self._seen.set()
+        finally:
+            # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
+            asyncio.get_running_loop().call_soon(self._publish, view, result, markers)
 
     def _publish(self, view: View, result: PerceptionResult, markers: dict[str, Any] | None) -> None:
+        try:
+            self._publish_all(view, result, markers)
+        except Exception as error:
+            # It was flown by, and that goes on; that nobody hears of it must not pass in silence.
+            logger.exception("a detection message could not be published")
+            view.unplaced = f"{type(error).__name__}: {error}"
+
+    def _publish_all(self, view: View, result: PerceptionResult, markers: dict[str, Any] | None) -> None:
         name, now_ns = self.settings.vehicle.name, time.monotonic_ns()
         message = detections_message(result, name, now_ns, view.name, self.driver.state.clock)
         self.bus.publish(topics.DETECTIONS, message, view.name)
@@ -413,7 +423,7 @@ class Service:
         if result.track_events:
             self.bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
         if markers is not None:
-            self.bus.publish(topics.MARKERS, markers, view.name)
+            self.bus.publish(topics.MARKERS, {**markers, "published_ns": now_ns}, view.name)
         if view is self.steering and result.obstacles is not None:
             self.bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
         view.keeper.published(result)

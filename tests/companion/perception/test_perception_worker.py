@@ -88,19 +88,24 @@ def test_a_heartbeat_never_takes_the_place_of_a_result(ends: tuple[socket.socket
     assert reports[-1].result.sequence == 7
 
 
-def test_the_end_is_told_last_and_lines_keep_their_order(ends: tuple[socket.socket, socket.socket]) -> None:
+def test_the_end_is_told_last_and_lines_keep_their_order(
+    ends: tuple[socket.socket, socket.socket], capfd: pytest.CaptureFixture[str]
+) -> None:
     service, worker = ends
     outbox = Outbox(worker, on_lost=lambda: None)
     log = logging.Logger("vision.test")
     log.addHandler(OutboxHandler(outbox))
     log.warning("lost %s\nagain", "street.mp4")
     log.info("second")
+    log.error("a fault", exc_info=ValueError("of ours"))
     outbox.put_newest(report(3))
     outbox.close(Ended(False, "broken", 4), 30.0)
-    first, second, *_, last = everything(service)
+    first, second, third, *_, last = everything(service)
     assert first == LogLine(logging.WARNING, "vision.test", "lost street.mp4 again")
     assert second == LogLine(logging.INFO, "vision.test", "second")
+    assert third == LogLine(logging.ERROR, "vision.test", "a fault")
     assert last == Ended(False, "broken", 4)
+    assert capfd.readouterr().err == "ValueError: of ours\n"  # where it happened is not for the bus
 
 
 def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.socket]) -> None:

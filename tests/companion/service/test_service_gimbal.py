@@ -59,7 +59,7 @@ def take(service: Service, state: VehicleState) -> None:
     service._take_state(state)
 
 
-def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_where_it_looks() -> None:
+async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_where_it_looks() -> None:
     service, now_ns = service_of(camera__gimbal="true"), time.monotonic_ns()
     take(service, state_at(now_ns, None))
     service.steering._take(seen(now_ns))
@@ -88,7 +88,7 @@ def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_where_it_
     assert "old" in service._situation(later_ns).gimbal.undirected
 
 
-def test_a_camera_on_the_body_asks_no_gimbal() -> None:
+async def test_a_camera_on_the_body_asks_no_gimbal() -> None:
     service, now_ns = service_of(), time.monotonic_ns()
     take(service, state_at(now_ns, None))
     service.steering._take(seen(now_ns))

@@ -7,6 +7,8 @@ import os
 import time
 from collections.abc import Callable
 
+import pytest
+
 from companion.guidance.behaviour import Situation
 from companion.service import Service
 from companion.settings.reading import load_settings
@@ -68,6 +70,29 @@ async def test_it_is_flown_by_before_it_is_published() -> None:
     finally:
         steering.cancel()
         await asyncio.gather(steering, return_exceptions=True)
+
+
+async def test_a_fault_on_one_side_does_not_silence_the_other(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    service = Service(load_settings(os.devnull, {}, {}))
+    view = service.steering
+    published: list[str] = []
+    service.bus.publish = lambda topic, *_: published.append(topic.name)  # type: ignore[method-assign]
+    with monkeypatch.context() as broken:
+        broken.setattr(type(view), "place", lambda *_: [][0])
+        view._take(result(1))
+        assert view.unplaced == "IndexError: list index out of range"
+        await until(lambda: published == ["detections", "labels"])
+    with monkeypatch.context() as broken:
+        broken.setattr("companion.service.service.labels_message", lambda *_: {}["nothing"])
+        view._take(result(2))
+        assert view.unplaced == "no attitude of the vehicle is known yet"
+        await until(lambda: view.unplaced == "KeyError: 'nothing'")
+    assert [record.getMessage() for record in caplog.records if record.exc_info] == [
+        "a detection message could not be used",
+        "a detection message could not be published",
+    ]
 
 
 async def test_what_another_camera_sees_is_not_waited_for() -> None:
