@@ -106,10 +106,7 @@ class GimbalHand:
         if request is not None:
             self._asked_ns = now_ns
             self._asking = asyncio.get_running_loop().create_task(self._ask(request))
-        if self._control.problem != self._told:
-            self._told = self._control.problem
-            if self._told:
-                self._on_event("warning", f"the gimbal is not moved: {self._told}")
+        self._tell_problem()
         if errand is not None:
             self._judge(errand, now_ns, state)
         self._listen(now_ns, state)
@@ -213,10 +210,17 @@ class GimbalHand:
             logger.exception("the gimbal's manager could not be asked")
             refused = f"{type(error).__name__}: {error}"
         self._control.answered(time.monotonic_ns(), refused)
+        self._tell_problem()  # at once: by the next turn, what flew may have ended for it
         if request.ask is GimbalAsk.GIVE_BACK:
             if refused is not None and not self._not_given_back:
                 self._on_event("warning", f"the gimbal could not be given back: {refused}")
             self._not_given_back = refused is not None
+
+    def _tell_problem(self) -> None:
+        if self._control.problem != self._told:
+            self._told = self._control.problem
+            if self._told:
+                self._on_event("warning", f"the gimbal is not moved: {self._told}")
 
     def _judge(self, errand: _Errand, now_ns: int, state: VehicleState) -> None:
         """Whether what an operator asked for is done, or will not be."""

@@ -110,6 +110,16 @@ async def test_what_goes_wrong_is_said_once_and_nothing_more_is_asked(fault, wor
     assert words in desk.hand.sight(desk.vehicle.now_ns, desk.state).problem
 
 
+async def test_what_is_refused_is_said_though_the_behaviour_ends_by_it_first() -> None:
+    desk = Desk(CommandRefusedError("command 1000: denied"))
+    while "point" not in " ".join(desk.driver.asked):
+        await desk.turn(DOWN, 1)
+    # The pilot comes first in a turn: what it ended for this reason is not there when the hand looks.
+    assert desk.hand.sight(desk.vehicle.now_ns, desk.state).problem == "command 1000: denied"
+    await desk.turn(None)
+    assert desk.events == ["the gimbal is not moved: command 1000: denied"]
+
+
 async def test_a_gimbal_is_found_when_it_is_known_where_it_looks_and_who_has_it() -> None:
     desk, now_ns = Desk(), time.monotonic_ns()
     looking = GimbalState(1, attitude_ns=now_ns, attitude=(1.0, 0.0, 0.0, 0.0))
