@@ -18,13 +18,13 @@ from typing import Any
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
 from companion.rehearsal import (
-    free_port,
     rehearsal_settings,
     simulator,
     until_ready_to_arm,
     with_service,
 )
 from companion.service import Event, Service
+from mavlink_sim.testing import free_port
 
 # Where the mission's approach stops.
 STOP_DISTANCE_M = 5.0

@@ -18,6 +18,7 @@ from typing import Any
 from companion.service import Service
 from companion.settings import Settings
 from companion.settings.reading import load_settings
+from mavlink_sim.testing import free_port
 
 # High enough to see far, low enough that a car at 5 m is in the picture.
 ALTITUDE_M = 4.0
@@ -186,10 +187,3 @@ async def until_ready_to_arm(service: Service) -> None:
         raise RehearsalError(f"the vehicle was not ready to arm in {_ARMABLE_S:g} s") from error
     finally:
         unsubscribe()
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A port of loopback that nobody holds now."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

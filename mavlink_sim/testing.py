@@ -41,7 +41,7 @@ def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
         OSError: none were found in a hundred places.
     """
     for _ in range(100):
-        (start,) = free_udp_ports(1, host)
+        start = free_port(host=host)
         try:
             with ExitStack() as stack:
                 for port in range(start, start + count):
@@ -53,26 +53,39 @@ def free_udp_port_range(count: int, host: str = "127.0.0.1") -> int:
     raise OSError(f"no {count} consecutive UDP ports are free on {host}")
 
 
-def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
-    """UDP ports that nobody is bound to at this moment, and that nobody gets who asks for any port.
+def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM, host: str = "127.0.0.1") -> int:
+    """A port (UDP's unless told) that nobody is bound to now, and that nobody is given who asks for any.
 
     Raises:
-        OSError: none were found in a thousand places.
+        OSError: none was found in a thousand places.
     """
+    return _free_ports(1, kind, host)[0]
+
+
+def free_udp_ports(count: int, host: str = "127.0.0.1") -> list[int]:
+    """UDP ports as `free_port` finds them, no two the same.
+
+    Raises:
+        OSError: so many were not found in a thousand places.
+    """
+    return _free_ports(count, socket.SOCK_DGRAM, host)
+
+
+def _free_ports(count: int, kind: socket.SocketKind, host: str) -> list[int]:
     ports: list[int] = []
     with ExitStack() as stack:
         for _ in range(1000):
             if len(ports) == count:
                 return ports
             port = _chance.choice(_NOT_GIVEN_AWAY)
-            candidate = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            candidate = stack.enter_context(socket.socket(socket.AF_INET, kind))
             try:
                 candidate.bind((host, port))
             except OSError:
                 continue
             ports.append(port)
     first, last = _NOT_GIVEN_AWAY[0], _NOT_GIVEN_AWAY[-1]
-    raise OSError(f"found {len(ports)} of {count} free UDP ports on {host} between {first} and {last}")
+    raise OSError(f"found {len(ports)} of {count} free ports on {host} between {first} and {last}")
 
 
 @dataclass(frozen=True, slots=True)

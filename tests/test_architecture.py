@@ -52,7 +52,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.rotation",
     "vision.shared_frame",
 }
-MAY_IMPORT_SIMULATOR = {"rehearsal", "train", "bench", "models"}
+MAY_IMPORT_SIMULATOR = {"rehearsal", "demo", "train", "bench", "models"}
 
 
 @cache

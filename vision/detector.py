@@ -1,4 +1,7 @@
-"""Frames in, detections out: letterbox → runtime → class filter → suppression → the frame's own pixels."""
+"""Frames in, detections out: letterbox → runtime → class filter → suppression → the frame's own pixels.
+
+Torch is loaded for what it computes alone: an ONNX or OpenVINO file does without its seconds and its memory.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +23,11 @@ from vision.runtimes.contract import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, start_runtime
 from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
-from vision.yolo.checkpoint import CheckpointError
-from vision.yolo.description import ModelDescription
 from vision.yolo.postprocess import boxes_from, candidates_of, sides_of
+from vision.yolo.safe_pickle import CheckpointError
+
+if TYPE_CHECKING:
+    from vision.yolo.description import ModelDescription
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +86,7 @@ class Detector:
             confidence: boxes not above this are dropped, 0..1.
             iou: of two boxes of one class overlapping more than this the less confident is dropped, 0..1.
             image_size: longer side of the network's input, pixels, a multiple of its largest stride (32).
-            precision: `auto` takes bfloat16 only where the processor computes in it and it measures faster.
+            precision: `auto` takes bfloat16 only where the processor computes in it, a fifth faster or more.
             threads: processor threads of the runtime (torch: of the whole process); None: its own choice.
             square: pad the input to a square rather than to the next multiple of the stride.
             runtime: by name, or `auto` for the fastest installed one (measured once, remembered).

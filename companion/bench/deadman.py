@@ -25,9 +25,10 @@ from rich.table import Table
 
 from companion.bus.client import client_settings, listen, open_client, send_command
 from companion.bus.topics import command_key
-from companion.rehearsal import ALTITUDE_M, RehearsalError, free_port, rehearsal_settings, simulator
+from companion.rehearsal import ALTITUDE_M, RehearsalError, rehearsal_settings, simulator
 from companion.settings import Settings
 from companion.settings.reading import to_toml
+from mavlink_sim.testing import free_port
 
 SPEED_MPS = 2.0
 # The speed has begun to fall below this share of the median of the second before; standing is below this.

@@ -14,7 +14,6 @@ from companion.guidance.behaviour import Situation
 from companion.rehearsal import (
     ALTITUDE_M,
     RehearsalError,
-    free_port,
     rehearsal_settings,
     simulator,
     until_ready_to_arm,
@@ -22,6 +21,7 @@ from companion.rehearsal import (
 )
 from companion.service import Service
 from companion.vehicle.setpoint import Setpoint
+from mavlink_sim.testing import free_port
 from vision.pipeline import PerceptionResult
 
 

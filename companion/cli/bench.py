@@ -125,7 +125,7 @@ def bench_tracking(
     from rich.console import Console
 
     from companion.bench.tracking import measure_tracking, tracking_table
-    from vision.yolo.checkpoint import CheckpointError
+    from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, ValueError):
         figures = measure_tracking(seconds, rate_hz=rate_hz, model=model, seed=seed)

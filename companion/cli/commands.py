@@ -174,7 +174,7 @@ def detect(
     from vision.sources import SourceError, SourceSettings, open_source
     from vision.tiling import TiledDetector
     from vision.tracking import Tracker, TrackerSettings
-    from vision.yolo.checkpoint import CheckpointError
+    from vision.yolo.safe_pickle import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     following = TrackerSettings(keep_confidence=confidence)

@@ -44,7 +44,7 @@ def evaluate(
     from vision.evaluation.samples import DatasetError
     from vision.pipeline import FrameDetector
     from vision.tiling import TiledDetector
-    from vision.yolo.checkpoint import CheckpointError
+    from vision.yolo.safe_pickle import CheckpointError
 
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     with plain_errors(CheckpointError, DatasetError, ValueError, OSError):

@@ -54,7 +54,7 @@ def info(
 ) -> None:
     """What a model file is, and what it computes in here: generation, classes, GFLOPs, licence, precision."""
     from companion.models.info import info_lines, model_info
-    from vision.yolo.checkpoint import CheckpointError
+    from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, ValueError):
         found = model_info(_path(file), image_size, runtime)  # type: ignore[arg-type]  # checked there
@@ -137,7 +137,7 @@ def verify(
     """Whether an exported model finds what its source finds. Exit code 1 if not."""
     from companion.models.verify import parity_lines, sample_pictures, verify
     from vision.runtimes.contract import RuntimeUnusableError
-    from vision.yolo.checkpoint import CheckpointError
+    from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
         pictures = sample_pictures(images, count)

@@ -19,14 +19,9 @@ import zenoh
 
 from companion.bus.client import client_settings, open_client, send_command
 from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
 
 START_S = 60.0
-
-
-def free_tcp_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class ServiceProcess:
@@ -112,7 +107,7 @@ def running_service(
     command = [sys.executable, "-m", "companion.cli", "run"]
     command += ["--vehicle-url", f"udpin://127.0.0.1:{onboard_port}", "--detector-threads", "1", *flags]
     if endpoint is None:
-        endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+        endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         command += ["--zenoh-listen", endpoint]
     process = subprocess.Popen(command, stdin=stdin, stderr=subprocess.PIPE, cwd=cwd)
     service = ServiceProcess(process, endpoint)

@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from mavlink_sim.faults.zenoh_door import ControlError, FaultControl
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import free_port, running_simulator
 from mavlink_sim.vehicle import Vehicle
 from mavlink_sim.wire.faulty_socket import FaultySocket
 from mavlink_sim.wire.link_faults import Delay, LinkStage, Loss
@@ -120,12 +120,6 @@ def test_what_cannot_be_is_said_in_one_line(arguments, said) -> None:
     assert "Traceback" not in done.stderr
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as candidate:
-        candidate.bind(("127.0.0.1", 0))
-        return int(candidate.getsockname()[1])
-
-
 def client(port: int) -> zenoh.Session:
     config = zenoh.Config()
     for key, value in {
@@ -138,7 +132,7 @@ def client(port: int) -> zenoh.Session:
 
 
 def test_faults_come_over_zenoh_and_are_answered() -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     with (
         running_simulator(control=f"tcp/127.0.0.1:{port}", system_id=3) as simulator,
         client(port) as session,

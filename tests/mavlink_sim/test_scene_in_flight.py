@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mavlink_sim.testing import free_port
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
 pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
@@ -41,12 +42,6 @@ pitch_deg = 5
 [camera.depth]
 maximum_m = 15
 """
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -> None:

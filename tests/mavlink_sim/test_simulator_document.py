@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from mavlink_sim.testing import RunningSimulator, free_udp_ports, running_simulator
+from mavlink_sim.testing import RunningSimulator, free_port, free_udp_ports, running_simulator
 
 pytest_plugins = ["pytester"]
 
@@ -71,7 +71,7 @@ def scripts() -> list[str]:
 
 @pytest.mark.parametrize("script", scripts(), ids=lambda script: script.split()[1])
 def test_every_example_runs(script: str, tmp_path: Path) -> None:
-    (port,) = free_udp_ports(1)
+    port = free_port()
     (tmp_path / "example.py").write_text(script.replace("14540", str(port)))
     with running_simulator(onboard_port=port):
         finished = subprocess.run(

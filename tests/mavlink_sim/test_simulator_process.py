@@ -15,7 +15,7 @@ import pytest
 from pymavlink import mavutil
 
 from mavlink_sim.cli import main
-from mavlink_sim.testing import free_udp_ports, running_simulator
+from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
 from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SharedFrameReader
@@ -250,7 +250,7 @@ def test_an_endpoint_says_which_port_is_taken() -> None:
 def test_an_endpoint_answers_its_first_correspondent_until_that_one_falls_silent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    (unheard,) = free_udp_ports(1)
+    unheard = free_port()
     endpoint = UdpEndpoint("127.0.0.1", 0, unheard)
     peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
     beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)

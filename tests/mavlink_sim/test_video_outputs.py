@@ -23,6 +23,7 @@ from mavlink_sim.camera.mjpeg_output import MAX_CLIENTS, MjpegOutput
 from mavlink_sim.camera.newest_frame import NewestFrame
 from mavlink_sim.camera.pipe_output import PipeOutput
 from mavlink_sim.camera.video_outputs import FrameOutput, check_output, open_output
+from mavlink_sim.testing import free_port
 from vision.frame import Frame
 from vision.sources import open_source
 from vision.sources.source import SourceSettings
@@ -240,15 +241,9 @@ def test_a_taken_port_is_an_error_at_once() -> None:
         open_output(f"http://127.0.0.1:{output.port}", *SIZE, 30.0)
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def test_h264_in_rtp_is_decoded_by_our_own_source(feeding: Callable[[FrameOutput], None]) -> None:
     pytest.importorskip("av", reason="PyAV encodes the stream; it is not installed")
-    port = free_udp_port()
+    port = free_port()
     with closing(open_output(f"rtp://127.0.0.1:{port}", *SIZE, 10.0)) as output:
         feeding(output)
         with open_source(f"udp://127.0.0.1:{port}?format=rtp-h264", SETTINGS) as source:

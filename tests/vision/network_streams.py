@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 import struct
 import threading
 import time
@@ -36,12 +35,6 @@ def wait_for_frame(source: Source, wanted: Callable[[Frame], bool], within_s: fl
 
 def is_blue(value: int) -> Callable[[Frame], bool]:
     return lambda frame: abs(int(frame.image[24, 32, 0]) - value) < 12
-
-
-def free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def rtp_packets(image: np.ndarray[Any, Any], sequence: int, timestamp: int) -> list[bytes]:

@@ -9,14 +9,15 @@ import time
 
 import numpy as np
 import pytest
-from network_streams import QUICK, free_port, is_blue, sending, wait_for_frame
+from network_streams import QUICK, is_blue, sending, wait_for_frame
 
+from mavlink_sim.testing import free_port
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import UdpStream
 
 
 def test_rtp_jpeg_is_received_and_its_sender_may_stop_and_return(caplog: pytest.LogCaptureFixture) -> None:
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
     settings = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.5, retry_min_s=0.05)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.connect(("127.0.0.1", port))
@@ -39,7 +40,7 @@ def test_rtp_jpeg_is_received_and_its_sender_may_stop_and_return(caplog: pytest.
 
 
 def test_a_udp_port_where_nothing_comes_says_what_was_expected(capfd: pytest.CaptureFixture[str]) -> None:
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
     settings = SourceSettings(open_timeout_s=0.5)
     with pytest.raises(SourceError, match=f"no MPEG-TS came on UDP port {port}; is the sender sending"):
         open_source(f"udp://127.0.0.1:{port}", settings)
@@ -92,7 +93,7 @@ def test_an_encoded_stream_over_udp_is_received(container: str, codec: str, addr
     av = pytest.importorskip("av", reason="PyAV encodes the stream; it is not installed")
     if codec not in av.codecs_available:
         pytest.skip(f"this PyAV has no {codec}")
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
     stop = threading.Event()
 
     def send() -> None:

@@ -9,9 +9,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
-
-import torch
+from typing import TYPE_CHECKING, Literal
 
 from vision.runtimes.contract import (
     RUNTIMES,
@@ -23,13 +21,13 @@ from vision.runtimes.contract import (
     required,
     version,
 )
-from vision.runtimes.export import export_network
 from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
-from vision.runtimes.network import Network
 from vision.runtimes.source import ModelSource, cannot_run
-from vision.runtimes.torch_runtime import TorchRuntime
 from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.maps import Head
+
+if TYPE_CHECKING:
+    from vision.runtimes.network import Network
 
 logger = logging.getLogger(__name__)
 
@@ -149,7 +147,10 @@ def _start(
         required(name)
     if source.kind is not None:
         return runtime_of_file(name, source.path, precision=precision, threads=threads)
+    # What builds and runs a checkpoint's network is torch; a file for another runtime does without it.
     if name == "torch":
+        from vision.runtimes.torch_runtime import TorchRuntime
+
         return TorchRuntime(
             source.take_model(),
             class_ids=class_ids,
@@ -157,6 +158,8 @@ def _start(
             threads=threads,
             sparse_boxes=sparse_boxes,
         )
+    from vision.runtimes.network import Network
+
     network = Network(source.take_model(), class_ids, sparse_boxes=sparse_boxes)
     path = _converted(source, network, name, image_size)
     return runtime_of_file(name, path, network.head, precision=precision, threads=threads)
@@ -164,6 +167,8 @@ def _start(
 
 def _converted(source: ModelSource, network: Network, name: RuntimeName, image_size: int) -> Path:
     """The checkpoint's network as a file for another runtime, made once and kept."""
+    from vision.runtimes.export import export_network
+
     assert source.description is not None
     kind = _EXPORTS[name]
     head = network.head
@@ -172,7 +177,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     side = image_size if kind == "tensorrt" else 640
     plain = source.description.to_plain()
     made_of = [FORMAT, digest, plain, head.class_ids, head.kinds, side]
-    key = json.dumps([*made_of, torch.__version__, version(name)])
+    key = json.dumps([*made_of, version("torch"), version(name)])
     stem = f"{source.path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
     path = cache_folder() / f"{stem}{SUFFIXES[kind]}"
     facts = ExportedFacts(

@@ -5,13 +5,16 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
-from vision.yolo.architecture import YoloModel
-from vision.yolo.checkpoint import load_checkpoint
-from vision.yolo.description import ModelDescription
+from vision.yolo.checkpoint_pair import is_pair
+from vision.yolo.safe_pickle import CheckpointError
+
+if TYPE_CHECKING:
+    from vision.yolo.architecture import YoloModel
+    from vision.yolo.description import ModelDescription
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +52,8 @@ class ModelSource:
 
     def take_model(self) -> YoloModel:
         """The checkpoint's network, for the caller to change; read again if it was given away before."""
+        from vision.yolo.checkpoint import load_checkpoint
+
         model, self._model = self._model, None
         return load_checkpoint(self.path).model if model is None else model
 
@@ -67,6 +72,11 @@ def read_source(path: Path) -> ModelSource:
     """
     kind = kind_of(path)
     if kind is None:
+        if not (is_pair(path) or path.exists()):
+            # Said without waiting for torch. What is missing of a pair its reader knows.
+            raise CheckpointError(f"{path}: no such file; give the path of a .pt checkpoint")
+        from vision.yolo.checkpoint import load_checkpoint
+
         loaded = load_checkpoint(path)
         return ModelSource(
             path,

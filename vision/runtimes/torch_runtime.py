@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import copy
 import logging
-import statistics
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -30,9 +29,12 @@ _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _MOST_GRAPHS = 4
 # What the tracer is shown, and what its graph is then tried on; in strides, high and wide.
 _TRACED, _TRIED = (2, 4), (4, 6)
-# Enough to tell two precisions apart, little enough not to delay the start.
-_TRIAL_RUNS = 5
+# Enough to tell two precisions apart, little enough not to delay the start: as many pairs of runs as fit.
+_TRIAL_PAIRS = range(3, 20)
+_TRIAL_S = 0.1
 _TRIAL_SIDE = 320
+# What bfloat16 loses must buy something; and what is nearly as fast in both is to choose the same each time.
+_WORTH = 0.8
 
 
 def torch_product(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -48,7 +50,7 @@ class TorchRuntime:
     Args:
         model: is taken over and changed.
         class_ids: sorted; the only classes to compute. None: all.
-        precision: `auto` takes bfloat16 only where the processor computes in it and it measures faster.
+        precision: `auto` takes bfloat16 only where the processor computes in it, a fifth faster or more.
         threads: processor threads, of the whole process's torch; None leaves them as they are.
         sparse_boxes: see `Network`.
     """
@@ -137,22 +139,27 @@ class TorchRuntime:
             return asked, "as asked"
         if not native:
             return "float32", "this processor does not compute in bfloat16"
-        full, half = self._measure_ms(torch.float32), self._measure_ms(torch.bfloat16)
-        chosen = "bfloat16" if half < full else "float32"
+        full, half = self._measured_ms(torch.float32, torch.bfloat16)
+        chosen = "bfloat16" if half < _WORTH * full else "float32"
         return chosen, f"measured {full:.1f} ms in float32, {half:.1f} ms in bfloat16 ({native})"
 
-    def _measure_ms(self, dtype: torch.dtype) -> float:
-        """Median time of one inference of a small input."""
-        network = copy.deepcopy(self._network).in_precision(dtype)
+    def _measured_ms(self, *dtypes: torch.dtype) -> list[float]:
+        """The shortest of some inferences of a small input in each, by turns: other work slows down both."""
         pixels = torch.zeros(1, _TRIAL_SIDE, _TRIAL_SIDE, 3, dtype=torch.uint8)
-        times = []
         with torch.inference_mode():
-            graph = traced(network, pixels)
-            for _ in range(_TRIAL_RUNS):
-                started = time.perf_counter()
-                graph(pixels)
-                times.append((time.perf_counter() - started) * 1e3)
-        return statistics.median(times[2:])
+            graphs = [traced(copy.deepcopy(self._network).in_precision(dtype), pixels) for dtype in dtypes]
+            for graph in graphs * 2:
+                graph(pixels)  # its first runs settle its memory
+            times: list[list[float]] = [[] for _ in dtypes]
+            since = time.perf_counter()
+            for count in range(_TRIAL_PAIRS.stop):
+                if count >= _TRIAL_PAIRS.start and time.perf_counter() - since > _TRIAL_S:
+                    break
+                for graph, spent in zip(graphs, times, strict=True):
+                    started = time.perf_counter()
+                    graph(pixels)
+                    spent.append((time.perf_counter() - started) * 1e3)
+        return [min(spent) for spent in times]
 
 
 def traced(network: Network, pixels: Tensor) -> Graph:

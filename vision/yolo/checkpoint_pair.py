@@ -11,14 +11,15 @@ import hashlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from torch import Tensor
 
 from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml
 from vision.yolo.safe_pickle import CheckpointError, one_line
-from vision.yolo.safetensors_file import read_safetensors, write_safetensors
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 PAIR_FORMAT = "mavlink-companion.yolo.v2"
 WEIGHTS_SUFFIX = ".safetensors"
@@ -45,6 +46,8 @@ def read_pair(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: a file is missing or damaged, or the two do not belong together. One line.
     """
+    from vision.yolo.safetensors_file import read_safetensors
+
     weights_path, description_path = pair_paths(path)
     table = _read_description(description_path, weights_path)
     said = table.pop("weights", {})
@@ -77,6 +80,8 @@ def write_pair(
         description: a network's own, `ModelDescription.to_plain()`.
         metadata: plain values; the keys `format`, `weights` and `architecture` are taken.
     """
+    from vision.yolo.safetensors_file import write_safetensors
+
     taken = metadata.keys() & {"format", "weights", "architecture"}
     if taken:
         raise ValueError(f"the metadata must not have the key {sorted(taken)[0]!r}")

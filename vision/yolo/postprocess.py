@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-from vision.yolo.architecture import YoloModel
 from vision.yolo.maps import Head, LevelMaps, Product
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from vision.yolo.architecture import YoloModel
 
 MOST_BOXES = 300
 # Up to so many boxes all pairs are compared at once; beyond, the table of pairs costs more than it saves.

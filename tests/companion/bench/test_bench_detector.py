@@ -25,7 +25,7 @@ def small_model(tmp_path: Path) -> Path:
 
 def bench(model: Path, *more: str) -> str:
     arguments = ["bench", "detector", "--model", str(model), "--runtime", "torch", "--image-size", "64"]
-    arguments += ["--frame", "64x48", "--frames", "6", "--threads", "1", *more]
+    arguments += ["--frame", "64x48", "--frames", "6", "--threads", "1", "--precision", "float32", *more]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     return result.output

@@ -22,14 +22,9 @@ from companion.bus import topics
 from companion.bus.client import NoAnswerError, client_settings, listen, open_client, send_command
 from companion.bus.session import Bus, BusError
 from companion.settings import ZenohSection
+from mavlink_sim.testing import free_port
 
 WAIT_S = 20.0
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -78,7 +73,7 @@ def router(port: int) -> Iterator[multiprocessing.process.BaseProcess]:
 
 
 async def test_a_subscriber_receives_what_is_published_and_a_command_is_answered() -> None:
-    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port()}",))
+    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
     await bus.start()
     received: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
@@ -123,7 +118,7 @@ def _read(endpoint: str, ready: Connection) -> None:
 
 
 async def test_a_reader_that_is_frozen_holds_nobody_up() -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     bus = Bus(ZenohSection(listen=(endpoint,)), "alpha", on_event=Events(), on_command=refuse)
     await bus.start()
     context = multiprocessing.get_context("spawn")
@@ -156,7 +151,7 @@ async def test_a_command_is_sent_once_whatever_becomes_of_it() -> None:
         heard.append(text)
         raise RuntimeError("broken on purpose")
 
-    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port()}",))
+    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=fail)
     await bus.start()
     try:
@@ -174,7 +169,7 @@ async def test_a_command_is_sent_once_whatever_becomes_of_it() -> None:
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
 async def test_a_router_that_is_killed_is_missed_and_found_again(mode: str) -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     events = Events()
     settings = ZenohSection(mode=mode, connect=(f"tcp/127.0.0.1:{port}",), listen=())
     bus = Bus(settings, "alpha", on_event=events, on_command=refuse)
@@ -199,7 +194,7 @@ async def test_a_router_that_is_killed_is_missed_and_found_again(mode: str) -> N
 
 
 async def test_what_is_published_before_the_session_is_open_is_counted() -> None:
-    settings = ZenohSection(mode="client", connect=(f"tcp/127.0.0.1:{free_port()}",))
+    settings = ZenohSection(mode="client", connect=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
     bus.publish(topics.LABELS, "car")
     assert bus.unsent == 1
@@ -207,7 +202,7 @@ async def test_what_is_published_before_the_session_is_open_is_counted() -> None
 
 
 def test_a_client_without_a_service_says_so_in_one_line() -> None:
-    settings = client_settings(ZenohSection(listen=(f"tcp/127.0.0.1:{free_port()}",)))
+    settings = client_settings(ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",)))
     with (
         pytest.raises(NoAnswerError, match="is `companion run` running"),
         open_client(settings, timeout_s=0.5),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import socket
 import subprocess
 import sys
 import zipfile
@@ -15,11 +16,10 @@ import cv2
 import pytest
 import typer
 from command_line import companion
-from service_process import free_tcp_port
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
-from mavlink_sim.testing import free_udp_ports
+from mavlink_sim.testing import free_port
 
 
 def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
@@ -151,11 +151,11 @@ def test_a_bad_value_in_the_settings_file_is_one_line_with_key_and_range(tmp_pat
 
 
 def test_a_vehicle_that_never_answers_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
-    port = free_udp_ports(1)[0]
+    port = free_port()
     done = companion(
         "run", "--source", pictures, "--source-loop", "true", "--model", small_model,
         "--vehicle-url", f"udpin://127.0.0.1:{port}", "--vehicle-connect-timeout-s", "1",
-        "--zenoh-listen", f"tcp/127.0.0.1:{free_tcp_port()}", cwd=tmp_path,
+        "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
     )  # fmt: skip
     line = one_line_of_bad_input(done)
     assert f"udpin://127.0.0.1:{port}" in line
@@ -166,14 +166,14 @@ def test_a_source_that_cannot_be_opened_ends_the_service_with_one_line(
 ) -> None:
     done = companion(
         "run", "--source", tmp_path / "no.mp4", "--model", small_model,
-        "--vehicle-url", f"udpin://127.0.0.1:{free_udp_ports(1)[0]}",
-        "--zenoh-listen", f"tcp/127.0.0.1:{free_tcp_port()}", cwd=tmp_path,
+        "--vehicle-url", f"udpin://127.0.0.1:{free_port()}",
+        "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
     )  # fmt: skip
     assert "no.mp4" in one_line_of_bad_input(done)
 
 
 def test_send_without_a_service_is_one_line(tmp_path: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     line = one_line_of_bad_input(companion("send", "hold", "--connect", endpoint, cwd=tmp_path))
     assert endpoint in line
 

@@ -23,15 +23,9 @@ from companion.guidance.registry import behaviour_for
 from companion.settings import ZenohSection
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.streamer import Streamer
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import free_port, running_simulator
 
 VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
-
-
-def free_tcp_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Companion:
@@ -82,7 +76,7 @@ class Companion:
 async def companions(simulator, count):
     ports, members = [], []
     for index, vehicle in enumerate(simulator.vehicles[:count]):
-        port = free_tcp_port()
+        port = free_port(socket.SOCK_STREAM)
         members.append(Companion(f"vehicle{index + 1}", vehicle, port, ports.copy()))
         ports.append(port)
     tasks = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -64,7 +65,8 @@ def test_info_tells_what_a_model_is() -> None:
     assert facts["runtime"] == "torch"
     assert facts["precision"] in ("float32", "bfloat16")
     told = run("info", "default")
-    assert f"{facts['precision']} (" in told
+    # It is measured anew, and where both are as fast may come out otherwise.
+    assert re.search(r"\b(float32|bfloat16) \((measured|this processor)", told)
     assert "Apache-2.0" in told
     assert facts["sha256"] in told
 

@@ -8,10 +8,10 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from service_process import free_tcp_port, running_service
+from service_process import running_service
 
 from companion.operator.metrics import MetricsError, MetricsServer
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import free_port, running_simulator
 
 
 def fetch(port: int) -> dict[str, float]:
@@ -25,7 +25,7 @@ def fetch(port: int) -> dict[str, float]:
 def test_a_running_service_tells_its_stages_and_what_became_of_every_frame(
     seeing: list[str], tmp_path: Path
 ) -> None:
-    port = free_tcp_port()
+    port = free_port(socket.SOCK_STREAM)
     flags = [*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"]
     with (
         running_simulator() as simulator,

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
-from fake_autopilot import FakeAutopilot, free_port
+from fake_autopilot import FakeAutopilot
 
 from companion.vehicle import stream_requests
 from companion.vehicle.driver import Driver
 from companion.vehicle.drivers import open_driver
+from mavlink_sim.testing import free_port
 
 
 @pytest.fixture(params=["mavsdk", "pymavlink"])

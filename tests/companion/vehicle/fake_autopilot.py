@@ -119,9 +119,3 @@ async def state_shows(
 ) -> VehicleState:
     await wait_until(lambda: met(driver.state), timeout_s, lambda: f"another state than {driver.state}")
     return driver.state
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as candidate:
-        candidate.bind(("127.0.0.1", 0))
-        return int(candidate.getsockname()[1])

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
-from fake_autopilot import SETPOINT, FakeAutopilot, free_port, state_shows, wait_until
+from fake_autopilot import SETPOINT, FakeAutopilot, state_shows, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.ardupilot_manners import ArduPilotManners
@@ -18,7 +18,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from mavlink_sim.testing import RunningSimulator, running_simulator
+from mavlink_sim.testing import RunningSimulator, free_port, running_simulator
 
 
 @asynccontextmanager

@@ -10,11 +10,12 @@ import pty
 import socket
 
 import pytest
-from fake_autopilot import free_port, wait_until
+from fake_autopilot import wait_until
 
 from companion.vehicle.byte_link import open_link
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import parse_link_url
+from mavlink_sim.testing import free_port
 
 
 class Ear:
@@ -196,7 +197,7 @@ async def test_a_tcp_port_nobody_listens_on_is_said() -> None:
     with pytest.raises(
         LinkError, match="cannot connect: Connection refused; is a vehicle or a router listening"
     ):
-        await open_link(parse_link_url(f"tcp://127.0.0.1:{free_port()}"), Ear())
+        await open_link(parse_link_url(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}"), Ear())
 
 
 async def test_a_serial_device_another_program_holds_is_said() -> None:

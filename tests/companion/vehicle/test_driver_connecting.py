@@ -6,7 +6,7 @@ import asyncio
 import time
 
 import pytest
-from fake_autopilot import SETPOINT, FakeAutopilot, free_port, wait_until
+from fake_autopilot import SETPOINT, FakeAutopilot, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
@@ -14,6 +14,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
+from mavlink_sim.testing import free_port
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -78,16 +79,30 @@ def test_an_exported_file_is_a_model_by_itself(
     exported: Any, checkpoint: Path, kind: ExportKind, runtime: RuntimeName
 ) -> None:
     needs(runtime)
-    alone = Detector(exported(kind), runtime=runtime, image_size=96, threads=1, classes=["car", "boat"])
-    source = Detector(checkpoint, image_size=96, precision="float32", classes=["car", "boat"])
+    asked: Any = {"image_size": 96, "precision": "float32", "classes": ["car", "boat"]}
+    alone = Detector(exported(kind), runtime=runtime, threads=1, **asked)
+    source = Detector(checkpoint, **asked)
     assert alone.class_names == NAMES
     assert alone.metadata == {"licence": "Apache-2.0"}
-    assert (alone.runtime, alone.runtime_reason, alone.precision) == (runtime, "as asked", alone.precision)
+    assert (alone.runtime, alone.runtime_reason, alone.precision) == (runtime, "as asked", "float32")
     image = picture(64, 96)
     a, b = alone.detect(image), source.detect(image)
     assert len(a) == len(b)
     np.testing.assert_allclose(a.confidence, b.confidence, atol=1e-3)
     np.testing.assert_allclose(a.xyxy, b.xyxy, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", ["onnx", "openvino"])
+def test_an_exported_file_is_run_without_torch(exported: Any, kind: ExportKind) -> None:
+    runtime = {"onnx": "onnxruntime", "openvino": "openvino"}[kind]
+    program = (
+        "import sys, numpy as np; from vision.detector import Detector\n"
+        f"found = Detector({str(exported(kind))!r}, runtime={runtime!r}, image_size=96, threads=1)\n"
+        "found.detect(np.zeros((64, 96, 3), np.uint8))\n"
+        "print(found.runtime, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [runtime, "False"]
 
 
 @pytest.mark.parametrize("kind", ["onnx", "openvino", "torchscript"])

@@ -75,12 +75,12 @@ def test_without_native_bfloat16_auto_is_float32() -> None:
 
 
 @pytest.mark.usefixtures("with_bfloat16")
-@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (9.0, "float32")])
-def test_with_native_bfloat16_auto_takes_the_faster(
+@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (4.5, "float32"), (9.0, "float32")])
+def test_with_native_bfloat16_auto_takes_it_where_it_is_much_faster(
     monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
 ) -> None:
     times = {torch.float32: 5.0, torch.bfloat16: half_ms}
-    monkeypatch.setattr(TorchRuntime, "_measure_ms", lambda self, dtype: times[dtype])
+    monkeypatch.setattr(TorchRuntime, "_measured_ms", lambda self, *dtypes: [times[d] for d in dtypes])
     runtime = TorchRuntime(lively_model())
     assert runtime.precision == chosen
     assert "5.0 ms in float32" in runtime.precision_reason
