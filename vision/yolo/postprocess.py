@@ -186,15 +186,27 @@ def _logit(probability: float) -> float:
 
 def _best_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(K, N) logits → the cells whose largest is above `floor`, and which that is."""
-    cells = np.flatnonzero(logits.max(axis=0) > floor)
+    cells = _cells_above(logits, floor)
     return cells, logits[:, cells].argmax(axis=0)
 
 
 def _pairs_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(K, N) logits → every cell and channel above `floor`, cell by cell."""
-    cells = np.flatnonzero(logits.max(axis=0) > floor)
+    cells = _cells_above(logits, floor)
     place, channel = (logits[:, cells].T > floor).nonzero()
     return cells[place], channel
+
+
+def _cells_above(logits: NDArray[np.float32], floor: float) -> NDArray[np.int64]:
+    """(K, N) logits → the cells of which any is above `floor`, rising.
+
+    Looked through in the order in which they lie in memory: across it takes five times as long.
+    """
+    by_cell = logits.T
+    if not by_cell.flags.c_contiguous:
+        return np.flatnonzero(logits.max(axis=0) > floor)
+    above = np.flatnonzero((by_cell > floor).ravel()) // len(logits)
+    return above[np.flatnonzero(np.diff(above, prepend=-1))]
 
 
 def _decode(
