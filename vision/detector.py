@@ -220,6 +220,15 @@ def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) ->
     return tuple(sorted(ids))
 
 
+def class_names_of(model: str | Path = DEFAULT_MODEL) -> tuple[str, ...]:
+    """What a model knows, id → name, without making it ready.
+
+    Raises:
+        CheckpointError, RuntimeUnusableError: the model cannot be read.
+    """
+    return read_source(_model_path(model)).class_names
+
+
 def _model_path(model: str | Path) -> Path:
     if str(model) != DEFAULT_MODEL:
         return find_model(model)

@@ -49,6 +49,6 @@ def _class_names(settings: Settings) -> tuple[str, ...] | None:
     """What the configured detector knows; None where nothing is to be detected."""
     if not settings.detector.enabled:
         return None
-    from vision.detector import Detector
+    from vision.detector import class_names_of
 
-    return Detector(settings.detector.model, runtime=settings.detector.runtime).class_names
+    return class_names_of(settings.detector.model)

@@ -21,6 +21,8 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from mavlink_sim.testing import free_port
 
+ONNX = ("--runtime", "onnxruntime")
+
 
 def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
     """The one line on standard error; nothing else is said, and the exit code is 2."""
@@ -56,9 +58,9 @@ def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path
     assert cv2.imread(str(tmp_path / "saved" / "000000_detections.jpg")).shape == (120, 160, 3)
 
 
-def test_detect_tells_tracks_when_asked(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_tells_tracks_when_asked(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
     done = companion(
-        "detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "0",
+        "detect", pictures, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
         "--json", "--limit", "2", "--track", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -70,10 +72,19 @@ def test_detect_tells_tracks_when_asked(small_model: Path, pictures: Path, tmp_p
 
 
 def test_detect_without_json_writes_a_readable_line_a_frame(
-    small_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     done = companion(
-        "detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "1", cwd=tmp_path
+        "detect",
+        pictures,
+        "--model",
+        exported_model,
+        *ONNX,
+        "--image-size",
+        "160",
+        "--confidence",
+        "1",
+        cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
@@ -81,8 +92,18 @@ def test_detect_without_json_writes_a_readable_line_a_frame(
     assert all(line.endswith("no objects detected") for line in lines)
 
 
-def test_detect_sees_only_the_classes_asked_for(small_model: Path, pictures: Path, tmp_path: Path) -> None:
-    common = ["detect", pictures, "--model", small_model, "--image-size", "160", "--confidence", "0"]
+def test_detect_sees_only_the_classes_asked_for(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
+    common = [
+        "detect",
+        pictures,
+        "--model",
+        exported_model,
+        *ONNX,
+        "--image-size",
+        "160",
+        "--confidence",
+        "0",
+    ]
     common += ["--json", "--limit", "3"]
 
     def names(*more: str) -> set[str]:
@@ -128,18 +149,18 @@ def test_a_checkpoint_that_calls_the_system_is_refused_by_name_and_not_run(
 
 
 def test_an_unknown_class_is_one_line_with_the_nearest_names(
-    small_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
-    arguments = ["detect", pictures, "--model", small_model, "--classes", "persn"]
+    arguments = ["detect", pictures, "--model", exported_model, *ONNX, "--classes", "persn"]
     line = one_line_of_bad_input(companion(*arguments, cwd=tmp_path))
     assert "'persn'" in line
     assert "person" in line
 
 
-def test_an_unreadable_video_is_one_line(small_model: Path, tmp_path: Path) -> None:
+def test_an_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> None:
     video = tmp_path / "broken.mp4"
     video.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
-    line = one_line_of_bad_input(companion("detect", video, "--model", small_model, cwd=tmp_path))
+    line = one_line_of_bad_input(companion("detect", video, "--model", exported_model, *ONNX, cwd=tmp_path))
     assert "broken.mp4" in line
 
 
@@ -150,10 +171,13 @@ def test_a_bad_value_in_the_settings_file_is_one_line_with_key_and_range(tmp_pat
     assert "0 to 1" in line
 
 
-def test_a_vehicle_that_never_answers_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_a_vehicle_that_never_answers_is_one_line(
+    exported_model: Path, pictures: Path, tmp_path: Path
+) -> None:
     port = free_port()
     done = companion(
-        "run", "--source", pictures, "--source-loop", "true", "--model", small_model,
+        "run", "--source", pictures, "--source-loop", "true",
+        *("--model", exported_model, "--detector-runtime", "onnxruntime"),
         "--vehicle-url", f"udpin://127.0.0.1:{port}", "--vehicle-connect-timeout-s", "1",
         "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
     )  # fmt: skip
@@ -162,10 +186,11 @@ def test_a_vehicle_that_never_answers_is_one_line(small_model: Path, pictures: P
 
 
 def test_a_source_that_cannot_be_opened_ends_the_service_with_one_line(
-    small_model: Path, tmp_path: Path
+    exported_model: Path, tmp_path: Path
 ) -> None:
     done = companion(
-        "run", "--source", tmp_path / "no.mp4", "--model", small_model,
+        "run", "--source", tmp_path / "no.mp4",
+        *("--model", exported_model, "--detector-runtime", "onnxruntime"),
         "--vehicle-url", f"udpin://127.0.0.1:{free_port()}",
         "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
     )  # fmt: skip

@@ -190,15 +190,15 @@ def test_a_file_that_is_none_is_told_in_plain_words(tmp_path: Path) -> None:
         read_mission(path)
 
 
-def test_the_command_line_checks_a_mission_and_prints_its_plan(small_model: Path, tmp_path: Path) -> None:
-    done = companion("mission", "demo", "--check", "--model", small_model, cwd=tmp_path)
+def test_the_command_line_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
+    done = companion("mission", "demo", "--check", "--model", exported_model, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
         "mission demo: 5 steps",
         "1. takeoff altitude=4 → find; failing → rtl",
     ]
     (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
-    done = companion("mission", "bad.toml", "--check", "--model", small_model, cwd=tmp_path)
+    done = companion("mission", "bad.toml", "--check", "--model", exported_model, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (

@@ -73,6 +73,7 @@ def settings_of(source: Path | str, model: Path | None = None, **overrides: str)
         "source.rate_hz": "50",
         "detector.enabled": "false",
         **({} if model is None else {"detector.enabled": "true", "detector.model": str(model)}),
+        **({"detector.runtime": "onnxruntime"} if model is not None and model.suffix == ".onnx" else {}),
         "detector.image_size": "64",
         "detector.threads": "1",
         "detector.precision": "float32",
@@ -178,8 +179,8 @@ async def test_what_cannot_start_is_told_in_one_line(
     await keeper.stop()
 
 
-async def test_an_unknown_class_is_told_with_the_nearest(photos: Path, tiny_model: Path) -> None:
-    settings = settings_of(photos, tiny_model, **{"detector.classes": "persn"})
+async def test_an_unknown_class_is_told_with_the_nearest(photos: Path, exported_model: Path) -> None:
+    settings = settings_of(photos, exported_model, **{"detector.classes": "persn"})
     keeper = PerceptionKeeper(settings, on_result=lambda _: None, on_event=lambda *_: None)
     with pytest.raises(PerceptionStartError, match=r"'persn'.*person"):
         await keeper.start()
@@ -283,9 +284,9 @@ async def test_a_worker_that_ends_in_order_is_no_news(photos: Path, tmp_path: Pa
     assert video.stat().st_size > 0
 
 
-async def test_a_start_that_is_cancelled_leaves_no_process(photos: Path, tiny_model: Path) -> None:
+async def test_a_start_that_is_cancelled_leaves_no_process(photos: Path, exported_model: Path) -> None:
     keeper = PerceptionKeeper(
-        settings_of(photos, tiny_model), on_result=lambda _: None, on_event=lambda *_: None
+        settings_of(photos, exported_model), on_result=lambda _: None, on_event=lambda *_: None
     )
     starting = asyncio.create_task(keeper.start())
     await until(lambda: keeper.status.pid is not None)
@@ -314,14 +315,14 @@ async def test_a_callback_that_fails_is_told_and_leaves_no_process(photos: Path)
 
 
 async def test_warnings_of_the_worker_are_events_and_lesser_lines_are_log(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, tiny_model: Path
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, exported_model: Path
 ) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     cv2.imwrite(str(folder / "0.png"), np.zeros((48, 64, 3), np.uint8))
     (folder / "1.png").write_bytes(b"\x89PNG broken")
     caplog.set_level("INFO")
-    async with kept(settings_of(folder, tiny_model, **{"source.loop": "false"})) as (keeper, heard):
+    async with kept(settings_of(folder, exported_model, **{"source.loop": "false"})) as (keeper, heard):
         await until(lambda: keeper.status.state is PerceptionState.FINISHED)
         assert any(level == "warning" and "1.png" in text for level, text in heard.events)
         assert any(record.name == "vision.detector" for record in caplog.records)

@@ -66,17 +66,17 @@ def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alon
 
 
 def test_the_view_that_steers_is_the_one_that_is_named(
-    seeing: list[str], small_model: Path, pictures: Path, tmp_path: Path
+    exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "companion.toml").write_text(
         '[detector]\nenabled = false\n[guidance]\nview = "side"\n'
         f"[views.side.source]\nuri = {str(pictures)!r}\nloop = true\n"
-        f"[views.side.detector]\nmodel = {str(small_model)!r}\nimage_size = 96\n"
+        f"[views.side.detector]\nmodel = {str(exported_model)!r}\nruntime = 'onnxruntime'\nimage_size = 96\n"
     )
-    without_model = [flag for flag in seeing if flag not in ("--model", str(small_model))]
+    flags = ["--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"]
     with (
         running_simulator() as simulator,
-        running_service(simulator.onboard_port, without_model, cwd=tmp_path) as service,
+        running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
         # What may be sought is what that view's model knows, and it alone has one.
         assert "unknown class 'bicycle'" in service.command("seek bicycle")["reason"]

@@ -59,7 +59,7 @@ def test_a_flight_by_commands_while_a_subscriber_receives_every_detection_messag
     ):
         received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         listen(session, "detections", lambda _key, text: received.put(json.loads(text)))
-        assert service.command("takeoff 2.5")["success"]
+        service.take_off(2.5)
         assert service.command("orbit radius=3 speed=1")["success"]
         refused = service.command("seek bicycle")
         assert not refused["success"]
@@ -139,7 +139,7 @@ def test_a_vehicle_that_vanishes_is_told_and_found_again(filming: list[str], tmp
             said = len(service.lines)
             with running_simulator(**ports) as second:
                 service.wait_for_line("the autopilot is heard", after=said)
-                assert service.command("takeoff 2.5")["success"]
+                service.take_off(2.5)
                 second.wait_for_event("takeoff")
 
 
@@ -159,7 +159,7 @@ def test_a_service_that_is_ended_in_flight_lets_the_autopilot_hold(
         simulator.wait_for_event("mode HOLD", since=offboard)
 
 
-def test_frames_that_ffmpeg_writes_to_standard_input(small_model: Path, tmp_path: Path) -> None:
+def test_frames_that_ffmpeg_writes_to_standard_input(exported_model: Path, tmp_path: Path) -> None:
     writer = subprocess.Popen(
         [
             *(imageio_ffmpeg.get_ffmpeg_exe(), "-re", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=20"),
@@ -172,7 +172,7 @@ def test_frames_that_ffmpeg_writes_to_standard_input(small_model: Path, tmp_path
     assert writer.stdout is not None
     flags = [
         *("--source", "-", "--source-pixel-format", "bgr24", "--source-width", "64", "--source-height", "48"),
-        *("--model", str(small_model), "--detector-image-size", "64"),
+        *("--model", str(exported_model), "--detector-runtime", "onnxruntime", "--detector-image-size", "64"),
     ]
     try:
         with (
