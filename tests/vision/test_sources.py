@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
-from vision.sources.images import natural_key
+from vision.sources.feed import LoopingFeed
+from vision.sources.images import ImagesFeed, natural_key
 from vision.sources.source import SourceStatistics
 
 DATA = Path(
@@ -60,6 +61,16 @@ def test_a_video_in_a_loop_goes_on_after_its_end(film: Path) -> None:
     assert [frame.sequence for frame in frames if frame] == list(range(45))
     assert frames[44] is not None
     assert round(float(frames[44].image.mean()) / 10) == 4
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_single_picture_in_a_loop_stands_as_long_as_any_other(count: int, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{number}.png" for number in range(count)]
+    for path in paths:
+        cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
+    feed = LoopingFeed(lambda: ImagesFeed(paths, rate_hz=10.0))
+    pictures = [feed.read(1.0) for _ in range(5)]
+    assert [picture.media_s for picture in pictures if picture] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 
 def test_a_video_in_real_time_keeps_its_own_pace_and_ends(film: Path) -> None:

@@ -45,11 +45,13 @@ class Feed(ABC):
         total_frames: how many pictures there are, if known.
         unreadable: pictures that could not be decoded so far.
         silence_is_loss: whether opening it again may help when nothing comes for a while.
+        interval_s: between two pictures of a recording, where there are no two to tell.
     """
 
     total_frames: int | None = None
     unreadable: int = 0
     silence_is_loss: bool = True
+    interval_s: float = 1 / 30
 
     @abstractmethod
     def read(self, timeout_s: float) -> Picture | None:
@@ -98,15 +100,17 @@ class LoopingFeed(Feed):
         self._pictures += 1
         if picture.media_s is None:
             return picture
-        self._interval_s = max(picture.media_s - self._last_s, 0.0)
+        if self._pictures > 1:
+            self._interval_s = max(picture.media_s - self._last_s, 0.0)
         self._last_s = picture.media_s
         return replace(picture, media_s=picture.media_s + self._offset_s)
 
     def _start_over(self) -> None:
         self._feed.close()
         self._unreadable_before += self._feed.unreadable
+        # A single picture stands as long as any other: else it would be read as fast as the processor can.
+        self._offset_s += self._last_s + (self._interval_s or self._feed.interval_s)
         self._feed = self._open_feed()
-        self._offset_s += self._last_s + self._interval_s
         self._last_s = self._interval_s = 0.0
         self._pictures = 0
 

@@ -65,7 +65,7 @@ class ImagesFeed(Feed):
     def __init__(self, paths: list[Path], rate_hz: float) -> None:
         quiet_opencv()
         self._paths = paths
-        self._rate_hz = rate_hz
+        self.interval_s = 1 / rate_hz
         self._next = 0
         self.total_frames = len(paths)
 
@@ -82,7 +82,7 @@ class ImagesFeed(Feed):
                 image, reason = None, error.strerror or str(error)
             if image is not None:
                 decode_ms = (time.monotonic_ns() - started_ns) / 1e6
-                return Picture(image, media_s=index / self._rate_hz, decode_ms=decode_ms)
+                return Picture(image, media_s=index * self.interval_s, decode_ms=decode_ms)
             self.unreadable += 1
             logger.warning("%s: passed over: %s", path, reason)
         if self.unreadable == len(self._paths):

@@ -64,7 +64,8 @@ class PipeFeed(Feed):
             self._take(data)
         image, captured_ns, decode_ms = self._ready.popleft()
         rate_hz = self._settings.rate_hz or (self._parser.rate_hz if self._parser else None) or 30.0
-        media_s = self._delivered / rate_hz
+        self.interval_s = 1 / rate_hz
+        media_s = self._delivered * self.interval_s
         self._delivered += 1
         stamp_ns = None if self._is_file else captured_ns
         return Picture(image, stamp_ns, media_s=media_s, decode_ms=decode_ms)

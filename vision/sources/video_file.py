@@ -33,9 +33,9 @@ class VideoFileFeed(Feed):
         claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.total_frames = int(claimed) if 0 < claimed < 1e9 else None
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
-        self._interval_s = 1.0 / rate_hz if 0.1 < rate_hz < 1000.0 else 1.0 / 25.0
+        self.interval_s = 1.0 / rate_hz if 0.1 < rate_hz < 1000.0 else 1.0 / 25.0
         self._delivered = 0
-        self._last_s = -self._interval_s
+        self._last_s = -self.interval_s
 
     def read(self, timeout_s: float) -> Picture | None:
         started_ns = time.monotonic_ns()
@@ -50,7 +50,7 @@ class VideoFileFeed(Feed):
         self._delivered += 1
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
         if not stamp_s > self._last_s:  # some containers carry no stamps, or repeat them
-            stamp_s = self._last_s + self._interval_s
+            stamp_s = self._last_s + self.interval_s
         self._last_s = stamp_s
         return Picture(np.ascontiguousarray(image, dtype=np.uint8), media_s=stamp_s, decode_ms=decode_ms)
 
