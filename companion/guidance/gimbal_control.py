@@ -71,6 +71,10 @@ class GimbalControl:
         free = (None, NOBODY, self._own, (self._own[0], AUTOPILOT_COMPONENT))
         return None if primary in free else primary
 
+    def holds(self, now_ns: int, gimbal: GimbalState | None) -> bool:
+        """Whether control is ours by what the manager shows now, which `update` may not have seen yet."""
+        return self.held and self._taken_over(now_ns, gimbal) is None
+
     def update(
         self, now_ns: int, gimbal: GimbalState | None, aim: GimbalAim | None, owner: object | None
     ) -> GimbalRequest | None:

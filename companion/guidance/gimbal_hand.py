@@ -84,7 +84,7 @@ class GimbalHand:
         return GimbalSight(
             self._carries_steering,
             undirected,
-            "" if elsewhere is None or self._control.held else address_text(elsewhere),
+            "" if elsewhere is None or self._control.holds(now_ns, state.gimbal) else address_text(elsewhere),
             self._control.problem if self._errand is None else "",
         )
 

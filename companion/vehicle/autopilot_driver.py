@@ -46,6 +46,7 @@ _HEARTBEAT = struct.Struct(
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
 _FRAME_LOCAL_NED = 1
 _TIMESYNC_ID = 111
+_SETPOINT_ID = 84  # SET_POSITION_TARGET_LOCAL_NED
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
 
@@ -89,6 +90,7 @@ class AutopilotDriver(ABC):
         self._others: set[tuple[Any, ...]] = set()
         self._received_count: Counter[int] = Counter()
         self._sequence = 0
+        self._setpoint_deadline_ns = 0
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
@@ -268,8 +270,15 @@ class AutopilotDriver(ABC):
     # --- sending ------------------------------------------------------------------------------------
 
     def _transmit(self, frame: bytes) -> None:
-        if self._link is not None:
-            self._link.send(frame if self._signer is None else self._signer.signed(frame))
+        if self._link is None:
+            return
+        ready = frame if self._signer is None else self._signer.signed(frame)
+        # A process that was stopped goes on where it was, perhaps after a setpoint was found to be fresh; and
+        # PX4 would go back to OFFBOARD for it.
+        if _is_setpoint(frame) and time.monotonic_ns() > self._setpoint_deadline_ns:
+            logger.warning("%s: a setpoint is not sent: its time was over before it left", self.url)
+            return
+        self._link.send(ready)
 
     def _next_sequence(self) -> int:
         sequence, self._sequence = self._sequence, (self._sequence + 1) & 0xFF
@@ -295,6 +304,7 @@ class AutopilotDriver(ABC):
         """See Driver."""
         if self._link is None or self._system_id is None:
             return
+        self._setpoint_deadline_ns = setpoint.deadline_ns
         zero = (0.0, 0.0, 0.0)  # the type mask says what counts
         kinematics = (*(setpoint.position_ned_m or zero), *(setpoint.velocity_ned_mps or zero), *zero)
         self._send_message(
@@ -406,6 +416,11 @@ class AutopilotDriver(ABC):
             if await _happens(self._heard.restarted, max(left_s, 0.0) + 1e-3):
                 return False
         return True
+
+
+def _is_setpoint(frame: bytes) -> bool:
+    """Whether a frame of MAVLink 2 is a SET_POSITION_TARGET_LOCAL_NED."""
+    return int.from_bytes(frame[7:10], "little") == _SETPOINT_ID
 
 
 def manners_of(autopilot: int) -> Manners:

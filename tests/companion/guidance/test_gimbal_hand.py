@@ -120,6 +120,15 @@ async def test_what_is_refused_is_said_though_the_behaviour_ends_by_it_first() -
     assert desk.events == ["the gimbal is not moved: command 1000: denied"]
 
 
+async def test_who_took_it_is_named_before_the_next_turn_too() -> None:
+    desk = Desk()
+    await desk.turn(DOWN)
+    now_ns = time.monotonic_ns()  # the clock by which it was taken
+    taken = GimbalState(1, status_ns=now_ns, primary_control=(245, 190))
+    assert desk.hand.sight(now_ns, replace(desk.state, gimbal=taken)).elsewhere == "245/190"
+    assert desk.hand.sight(now_ns, desk.state).elsewhere == ""
+
+
 async def test_a_gimbal_is_found_when_it_is_known_where_it_looks_and_who_has_it() -> None:
     desk, now_ns = Desk(), time.monotonic_ns()
     looking = GimbalState(1, attitude_ns=now_ns, attitude=(1.0, 0.0, 0.0, 0.0))

@@ -91,6 +91,16 @@ async def test_what_waited_for_a_hung_loop_does_not_arrive_late(port, autopilot,
         await driver.close()
 
 
+async def test_a_setpoint_whose_time_is_over_when_it_would_leave_does_not(driver, autopilot, caplog) -> None:
+    """As after SIGCONT: the streamer had found it fresh, then the process was stopped."""
+    now_ns = time.monotonic_ns()
+    driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), now_ns - 1_000_000_000))
+    await wait_until(lambda: "its time was over before it left" in caplog.text, 10.0, lambda: caplog.text)
+    driver.send_setpoint(Setpoint.velocity((2.0, 0.0, 0.0), time.monotonic_ns()))
+    (message,) = await autopilot.hears(SETPOINT)
+    assert message.vx == 2.0
+
+
 async def test_the_state_follows_every_kind_of_message(driver, autopilot) -> None:
     snapshots = []
     unsubscribe = driver.subscribe(snapshots.append)
