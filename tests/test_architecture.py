@@ -106,7 +106,7 @@ def test_the_simulator_imports_only_geometry_and_frames_of_vision() -> None:
             assert strangers <= SIMULATOR_MAY_IMPORT | {"vision"}, f"{name} imports {strangers}"
 
 
-def test_only_rehearsal_training_and_benchmarks_know_the_simulator() -> None:
+def test_only_rehearsal_demonstration_training_and_benchmarks_know_the_simulator() -> None:
     for name, path in modules().items():
         if name.startswith("companion.") and any(m.startswith("mavlink_sim") for m in imports_of(name, path)):
             assert room(name) in MAY_IMPORT_SIMULATOR, f"{name} imports the simulator"

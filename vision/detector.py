@@ -20,7 +20,7 @@ from vision.detections import Detections
 from vision.letterbox import Letterbox, fit
 from vision.model_files import find_model
 from vision.runtimes.contract import PRECISIONS, Precision
-from vision.runtimes.selection import RuntimeChoice, start_runtime
+from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.postprocess import boxes_from, candidates_of, sides_of
@@ -86,7 +86,7 @@ class Detector:
             confidence: boxes not above this are dropped, 0..1.
             iou: of two boxes of one class overlapping more than this the less confident is dropped, 0..1.
             image_size: longer side of the network's input, pixels, a multiple of its largest stride (32).
-            precision: `auto` takes bfloat16 only where the processor computes in it, a fifth faster or more.
+            precision: `auto` takes bfloat16 only where the processor computes in it, in a fifth less time.
             threads: processor threads of the runtime (torch: of the whole process); None: its own choice.
             square: pad the input to a square rather than to the next multiple of the stride.
             runtime: by name, or `auto` for the fastest installed one (measured once, remembered).
@@ -220,13 +220,16 @@ def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) ->
     return tuple(sorted(ids))
 
 
-def class_names_of(model: str | Path = DEFAULT_MODEL) -> tuple[str, ...]:
+def class_names_of(model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice = "torch") -> tuple[str, ...]:
     """What a model knows, id → name, without making it ready.
 
     Raises:
-        CheckpointError, RuntimeUnusableError: the model cannot be read.
+        CheckpointError: the model cannot be read.
+        RuntimeMissingError, RuntimeUnusableError: the runtime is not installed, or does not run such a file.
     """
-    return read_source(_model_path(model)).class_names
+    source = read_source(_model_path(model))
+    check_runtime(source, runtime)
+    return source.class_names
 
 
 def _model_path(model: str | Path) -> Path:

@@ -76,7 +76,7 @@ def measure_tracking(
 
 
 def _looking(model: str) -> Callable[[SceneFrame], Detections]:
-    from vision.detector import Detector  # only here: it brings torch
+    from vision.detector import Detector
 
     detector = Detector(model, confidence=TrackerSettings().low_confidence)
     return lambda frame: detector.detect(frame.image)

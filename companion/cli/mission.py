@@ -51,4 +51,4 @@ def _class_names(settings: Settings) -> tuple[str, ...] | None:
         return None
     from vision.detector import class_names_of
 
-    return class_names_of(settings.detector.model)
+    return class_names_of(settings.detector.model, settings.detector.runtime)

@@ -86,6 +86,8 @@ class GimbalControl:
         """
         if owner is not self._owner:
             self._owner, self.problem, self.pointed = owner, "", None
+        if gimbal is not None and gimbal.status_ns > self._taken_ns and gimbal.primary_control == self._own:
+            self._shown = True
         if self.held and (why := self._taken_over(now_ns, gimbal)) is not None:
             self.held = False
             if self._doubted_ns is None:  # else it was told already, of whose errand it was
@@ -146,7 +148,6 @@ class GimbalControl:
             return None
         primary = gimbal.primary_control
         if primary == self._own:
-            self._shown = True
             return None
         waiting = now_ns - self._taken_ns <= SHOWN_WITHIN_S * 1e9
         if not self._shown and primary == self._taken_from and waiting:

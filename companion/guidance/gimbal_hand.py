@@ -159,7 +159,7 @@ class GimbalHand:
             "heard": gimbal is not None,
             "pitch_deg": None if pitch_rad is None else round(math.degrees(pitch_rad), 1),
             "primary_control": None if primary is None else address_text(primary),
-            "ours": self._control.held,
+            "ours": self._control.holds(now_ns, gimbal),
             "problem": self._problem(now_ns, state),
         }
 

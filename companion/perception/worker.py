@@ -249,7 +249,7 @@ def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | N
 
 
 def _load(settings: Settings) -> Detector:
-    # Only here: this import brings torch, and a worker that only records needs none.
+    # Only here: a worker that only records needs none of it.
     from vision.detector import Detector
 
     wanted = settings.detector

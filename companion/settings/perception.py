@@ -17,7 +17,7 @@ from vision.markers import MarkerKind, PadMarker, markers_in
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
 
-# What `vision.detector` calls the bundled model. Named here too, as importing that module would load torch.
+# What `vision.detector` calls the bundled model. Named here too, as settings are read without a detector.
 DEFAULT_MODEL = "default"
 
 

@@ -28,7 +28,7 @@ from companion.vehicle.heard_state import HeardState
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
-from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
 from companion.vehicle.stream_requests import ask_for_streams
@@ -90,7 +90,6 @@ class AutopilotDriver(ABC):
         self._others: set[tuple[Any, ...]] = set()
         self._received_count: Counter[int] = Counter()
         self._sequence = 0
-        self._setpoint_deadline_ns = 0
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
@@ -275,10 +274,17 @@ class AutopilotDriver(ABC):
         ready = frame if self._signer is None else self._signer.signed(frame)
         # A process that was stopped goes on where it was, perhaps after a setpoint was found to be fresh; and
         # PX4 would go back to OFFBOARD for it.
-        if _is_setpoint(frame) and time.monotonic_ns() > self._setpoint_deadline_ns:
-            logger.warning("%s: a setpoint is not sent: its time was over before it left", self.url)
+        made_ms = _setpoint_made_ms(frame)
+        if made_ms is not None and (self._boot_ms() - made_ms) & 0xFFFF_FFFF > LEAVES_WITHIN_S * 1e3:
+            self._say_late()
             return
         self._link.send(ready)
+
+    def _boot_ms(self) -> int:
+        return (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF
+
+    def _say_late(self) -> None:
+        logger.warning("%s: a setpoint is not sent: its time was over before it left", self.url)
 
     def _next_sequence(self) -> int:
         sequence, self._sequence = self._sequence, (self._sequence + 1) & 0xFF
@@ -304,14 +310,19 @@ class AutopilotDriver(ABC):
         """See Driver."""
         if self._link is None or self._system_id is None:
             return
-        self._setpoint_deadline_ns = setpoint.deadline_ns
+        made_ms = self._boot_ms()
+        if setpoint.expired(
+            time.monotonic_ns()
+        ):  # after the stamp: a stop between the two shows at one of them
+            self._say_late()
+            return
         zero = (0.0, 0.0, 0.0)  # the type mask says what counts
         kinematics = (*(setpoint.position_ned_m or zero), *(setpoint.velocity_ned_mps or zero), *zero)
         self._send_message(
             "SET_POSITION_TARGET_LOCAL_NED",
             self._heard.manners.setpoint_fields(
                 {
-                    "time_boot_ms": (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF,
+                    "time_boot_ms": made_ms,
                     "target_system": self._system_id,
                     "target_component": AUTOPILOT_COMPONENT,
                     "coordinate_frame": _FRAME_LOCAL_NED,
@@ -418,9 +429,11 @@ class AutopilotDriver(ABC):
         return True
 
 
-def _is_setpoint(frame: bytes) -> bool:
-    """Whether a frame of MAVLink 2 is a SET_POSITION_TARGET_LOCAL_NED."""
-    return int.from_bytes(frame[7:10], "little") == _SETPOINT_ID
+def _setpoint_made_ms(frame: bytes) -> int | None:
+    """`time_boot_ms` of a SET_POSITION_TARGET_LOCAL_NED, in MAVLink 2; None of any other frame."""
+    if int.from_bytes(frame[7:10], "little") != _SETPOINT_ID:
+        return None
+    return int.from_bytes(frame[10 : 10 + min(4, frame[1])], "little")
 
 
 def manners_of(autopilot: int) -> Manners:

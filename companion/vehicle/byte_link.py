@@ -14,6 +14,7 @@ import logging
 import os
 import socket
 import termios
+import time
 import tty
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -30,6 +31,8 @@ Received = Callable[[bytes, Source], None]
 _READ_BYTES = 65535
 _READS_A_TURN = 64  # then other work of the loop has its turn
 _REOPEN_S = 0.5
+# The rest of a frame that waits longer for its line is given up.
+_REST_S = 0.3
 
 
 class ByteLink(Protocol):
@@ -167,6 +170,7 @@ class _StreamLink:
         self._loop = asyncio.get_running_loop()
         self._descriptor = -1
         self._unsent = b""  # the rest of a frame of which a part has left
+        self._unsent_since_s = 0.0
         self._reopening: asyncio.Task[None] | None = None
         self.dropped_count = 0
 
@@ -209,9 +213,21 @@ class _StreamLink:
             return
         was_waiting, self._unsent = bool(self._unsent), data[written:]
         if self._unsent and not was_waiting:
-            self._loop.add_writer(self._descriptor, lambda: self._write(self._unsent))
+            self._unsent_since_s = time.monotonic()
+            self._loop.add_writer(self._descriptor, self._write_rest)
         elif was_waiting and not self._unsent:
             self._loop.remove_writer(self._descriptor)
+
+    def _write_rest(self) -> None:
+        waited_s = time.monotonic() - self._unsent_since_s
+        if waited_s <= _REST_S:
+            self._write(self._unsent)
+            return
+        # We were stopped, or the line was: what may be a setpoint must not be completed now.
+        logger.warning("%s: the rest of a frame waited for %.1f s and is not sent", self._url, waited_s)
+        self.dropped_count += 1
+        self._unsent = b""
+        self._loop.remove_writer(self._descriptor)
 
     def answer_to(self, source: Source) -> None:
         """A stream has one other end."""

@@ -20,6 +20,8 @@ IGNORE_YAW_RATE = 0b1000_0000_0000
 
 # How long a setpoint counts unless its maker says otherwise: a quarter of PX4's default COM_OF_LOSS_T.
 DEFAULT_LIFETIME_S = 0.3
+# Between being chosen and being on the wire; whatever takes longer was held up, perhaps for seconds.
+LEAVES_WITHIN_S = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,11 @@ class Setpoint:
     def expired(self, now_ns: int) -> bool:
         """The deadline has passed."""
         return now_ns > self.deadline_ns
+
+    def leaving(self, now_ns: int) -> Setpoint:
+        """The same, for the way from here to the wire: it is to leave now, however long it counts."""
+        latest_ns = now_ns + round(LEAVES_WITHIN_S * 1e9)
+        return self if self.deadline_ns <= latest_ns else replace(self, deadline_ns=latest_ns)
 
     def with_velocity(self, velocity_ned_mps: Vector3) -> Setpoint:
         """The same with another velocity (of a velocity setpoint)."""

@@ -133,7 +133,7 @@ class Streamer:
         return running and self._sent_ns is not None and now_ns - self._sent_ns > SILENCE_S * 1e9
 
     def _put(self, setpoint: Setpoint, now_ns: int) -> None:
-        self.send(setpoint)
+        self.send(setpoint.leaving(now_ns))
         self._sent, self._sent_ns = setpoint, now_ns
         self.sent_count += 1
 

@@ -26,6 +26,8 @@ def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same for ONNX Runtime: where it does not matter what computes, half of a start is torch's."""
+    for package in ("onnx", "onnxruntime"):
+        pytest.importorskip(package, reason=f"{package} is an optional extra")
     path = tmp_path_factory.mktemp("exported") / "small.onnx"
     return export(small_model, "onnx", path, 160, generation="YOLOv8")
 

@@ -76,15 +76,13 @@ def start_runtime(
     """
     if choice != "auto" and choice not in RUNTIMES:
         raise ValueError(f"runtime must be auto, {', '.join(RUNTIMES)}; got {choice!r}")
+    check_runtime(source, choice)
     if choice != "auto":
         runtime = _start(source, choice, class_ids, precision, threads, image_size, sparse_boxes)
         return Started(runtime, "as asked")
     from vision.runtimes.trial import fastest_runtime
 
     candidates = [name for name in source.runners() if installed(name)]
-    if not candidates:
-        # Says what to install.
-        required(source.runners()[0])
     if len(candidates) == 1:
         name, reason = candidates[0], "no other that runs this model is installed"
     else:
@@ -97,6 +95,18 @@ def start_runtime(
             image_size=image_size,
         )
     return Started(_start(source, name, class_ids, precision, threads, image_size, sparse_boxes), reason)
+
+
+def check_runtime(source: ModelSource, choice: RuntimeChoice) -> None:
+    """Raises RuntimeUnusableError, RuntimeMissingError as `start_runtime` would; nothing is started."""
+    if choice == "auto":
+        if not any(installed(name) for name in source.runners()):
+            required(source.runners()[0])  # says what to install
+        return
+    if choice not in source.runners():
+        raise cannot_run(source, choice)
+    if choice != "torch":
+        required(choice)
 
 
 def runtime_of_file(
@@ -141,10 +151,6 @@ def _start(
     image_size: int,
     sparse_boxes: bool,
 ) -> Runtime:
-    if name not in source.runners():
-        raise cannot_run(source, name)
-    if name != "torch":
-        required(name)
     if source.kind is not None:
         return runtime_of_file(name, source.path, precision=precision, threads=threads)
     # What builds and runs a checkpoint's network is torch; a file for another runtime does without it.
@@ -167,6 +173,8 @@ def _start(
 
 def _converted(source: ModelSource, network: Network, name: RuntimeName, image_size: int) -> Path:
     """The checkpoint's network as a file for another runtime, made once and kept."""
+    import torch
+
     from vision.runtimes.export import export_network
 
     assert source.description is not None
@@ -177,7 +185,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     side = image_size if kind == "tensorrt" else 640
     plain = source.description.to_plain()
     made_of = [FORMAT, digest, plain, head.class_ids, head.kinds, side]
-    key = json.dumps([*made_of, version("torch"), version(name)])
+    key = json.dumps([*made_of, torch.__version__, version(name)])
     stem = f"{source.path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
     path = cache_folder() / f"{stem}{SUFFIXES[kind]}"
     facts = ExportedFacts(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
-from vision.yolo.checkpoint_pair import is_pair
 from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
@@ -72,9 +71,9 @@ def read_source(path: Path) -> ModelSource:
     """
     kind = kind_of(path)
     if kind is None:
-        if not (is_pair(path) or path.exists()):
-            # Said without waiting for torch. What is missing of a pair its reader knows.
-            raise CheckpointError(f"{path}: no such file; give the path of a .pt checkpoint")
+        if not path.exists():  # said without waiting for torch
+            wanted = "a .pt checkpoint, or of NAME.safetensors beside its NAME.yaml"
+            raise CheckpointError(f"{path}: no such file; give the path of {wanted}")
         from vision.yolo.checkpoint import load_checkpoint
 
         loaded = load_checkpoint(path)

@@ -50,7 +50,7 @@ class TorchRuntime:
     Args:
         model: is taken over and changed.
         class_ids: sorted; the only classes to compute. None: all.
-        precision: `auto` takes bfloat16 only where the processor computes in it, a fifth faster or more.
+        precision: `auto` takes bfloat16 only where the processor computes in it, in a fifth less time.
         threads: processor threads, of the whole process's torch; None leaves them as they are.
         sparse_boxes: see `Network`.
     """

@@ -200,10 +200,10 @@ def _pairs_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.
 def _cells_above(logits: NDArray[np.float32], floor: float) -> NDArray[np.int64]:
     """(K, N) logits → the cells of which any is above `floor`, rising.
 
-    Looked through in the order in which they lie in memory: across it takes five times as long.
+    Where few are, it is quickest to look through all in the order in which they lie in memory.
     """
     by_cell = logits.T
-    if not by_cell.flags.c_contiguous:
+    if floor == -math.inf or len(logits) == 1 or not by_cell.flags.c_contiguous:
         return np.flatnonzero(logits.max(axis=0) > floor)
     above = np.flatnonzero((by_cell > floor).ravel()) // len(logits)
     return above[np.flatnonzero(np.diff(above, prepend=-1))]

@@ -191,19 +191,23 @@ def test_a_file_that_is_none_is_told_in_plain_words(tmp_path: Path) -> None:
 
 
 def test_the_command_line_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
-    done = companion("mission", "demo", "--check", "--model", exported_model, cwd=tmp_path)
+    options = ("--check", "--model", exported_model, "--detector-runtime", "onnxruntime")
+    done = companion("mission", "demo", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
         "mission demo: 5 steps",
         "1. takeoff altitude=4 → find; failing → rtl",
     ]
     (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
-    done = companion("mission", "bad.toml", "--check", "--model", exported_model, cwd=tmp_path)
+    done = companion("mission", "bad.toml", *options, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (
         "companion: bad.toml: step 1 (look): unknown class 'zebra'; there are: person, car, boat\n"
     )
+    done = companion("mission", "demo", *options[:3], cwd=tmp_path)
+    assert done.returncode == 2
+    assert "torch does not run .onnx files" in done.stderr
 
 
 SHORT = """

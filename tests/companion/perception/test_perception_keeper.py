@@ -130,6 +130,15 @@ async def test_results_come_with_the_models_classes_their_stamps_and_their_timin
     assert keeper.status.pid is None
 
 
+async def test_a_worker_on_an_exported_model_never_loads_torch(photos: Path, exported_model: Path) -> None:
+    async with kept(settings_of(photos, exported_model)) as (keeper, heard):
+        await until(lambda: heard.results)
+        pid = keeper.status.pid
+        loaded = await asyncio.to_thread(Path(f"/proc/{pid}/maps").read_text)
+    assert "onnxruntime" in loaded
+    assert "libtorch" not in loaded
+
+
 async def test_without_a_detector_frames_come_and_nothing_is_seen(photos: Path) -> None:
     async with kept(settings_of(photos)) as (keeper, heard):
         await until(lambda: len(heard.results) >= 3)

@@ -105,7 +105,39 @@ async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog) -> No
     await server.wait_closed()
 
 
-async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_one() -> None:
+async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(monkeypatch, caplog) -> None:
+    """As after SIGSTOP in the middle of a setpoint, on a line that was full."""
+    monkeypatch.setattr("companion.vehicle.byte_link._REST_S", -1.0)
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    listener.bind(("127.0.0.1", 0))
+    listener.listen()
+    link = await open_link(parse_link_url(f"tcp://127.0.0.1:{listener.getsockname()[1]}"), Ear())
+    peer, _ = listener.accept()
+    peer.setblocking(False)
+    size = 1_000_003
+    while not link._unsent:
+        link.send(bytes(size))
+    arrived = 0
+    while "is not sent" not in caplog.text:
+        with contextlib.suppress(BlockingIOError):
+            arrived += len(peer.recv(1 << 20))
+        await asyncio.sleep(0)
+    assert link.dropped_count == 1
+    link.send(b"next")
+    await link.close()
+    peer.setblocking(True)
+    while data := peer.recv(1 << 20):
+        arrived += len(data)
+        last = data
+    assert last.endswith(b"next")
+    assert (arrived - 4) % size != 0, "half a frame, and no other half"
+    peer.close()
+    listener.close()
+
+
+async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_one(monkeypatch) -> None:
+    monkeypatch.setattr("companion.vehicle.byte_link._REST_S", 60.0)
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     listener.bind(("127.0.0.1", 0))

@@ -101,6 +101,18 @@ async def test_a_setpoint_whose_time_is_over_when_it_would_leave_does_not(driver
     assert message.vx == 2.0
 
 
+async def test_a_setpoint_that_was_held_up_on_its_way_to_the_wire_does_not_leave(
+    driver, autopilot, caplog, monkeypatch
+) -> None:
+    now_ms = iter([1000, 1400, 2000, 2010])
+    monkeypatch.setattr(driver, "_boot_ms", lambda: next(now_ms))
+    driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns(), lifetime_s=2.0))
+    await wait_until(lambda: "its time was over before it left" in caplog.text, 10.0, lambda: caplog.text)
+    driver.send_setpoint(Setpoint.velocity((2.0, 0.0, 0.0), time.monotonic_ns()))
+    (message,) = await autopilot.hears(SETPOINT)
+    assert message.vx == 2.0
+
+
 async def test_the_state_follows_every_kind_of_message(driver, autopilot) -> None:
     snapshots = []
     unsubscribe = driver.subscribe(snapshots.append)

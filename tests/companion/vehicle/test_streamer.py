@@ -7,7 +7,7 @@ import itertools
 import logging
 import time
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 from hypothesis import given
@@ -184,7 +184,10 @@ def test_whatever_happens_nothing_expired_leaves_and_silence_is_final(steps, bra
             assert not silent
             assert newest is not None
             assert not setpoint.expired(at_ms * MS)
-            if setpoint is not newest:
+            assert setpoint.deadline_ns <= at_ms * MS + 300 * MS, (
+                "what is held up on its way may not arrive late"
+            )
+            if replace(setpoint, deadline_ns=newest.deadline_ns) != newest:
                 assert is_brake(setpoint)
                 assert 0 < at_ms * MS - newest.deadline_ns <= brake_ms * MS
         silent = silent or bench.streamer.state is StreamState.EXPIRED

@@ -75,7 +75,9 @@ def test_without_native_bfloat16_auto_is_float32() -> None:
 
 
 @pytest.mark.usefixtures("with_bfloat16")
-@pytest.mark.parametrize(("half_ms", "chosen"), [(1.0, "bfloat16"), (4.5, "float32"), (9.0, "float32")])
+@pytest.mark.parametrize(
+    ("half_ms", "chosen"), [(1.0, "bfloat16"), (3.9, "bfloat16"), (4.1, "float32"), (9.0, "float32")]
+)
 def test_with_native_bfloat16_auto_takes_it_where_it_is_much_faster(
     monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
 ) -> None:
