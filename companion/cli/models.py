@@ -69,10 +69,6 @@ def info(
 def pull(
     name: Annotated[str, typer.Argument(help="such as yolov8n; `companion models list` has them all")],
     folder: _FOLDER = None,
-    sha256: Annotated[str | None, typer.Option(help="what the file must have, where none is known")] = None,
-    trust_first: Annotated[
-        bool, typer.Option("--trust-first", help="where none is known: take what comes, and note its SHA-256")
-    ] = False,
     url: Annotated[str | None, typer.Option(help="fetch the same file from here instead")] = None,
 ) -> None:
     """Fetch an official model, check its SHA-256, keep it in the models folder. Goes on where it stopped."""
@@ -92,8 +88,6 @@ def pull(
         pulled = pull(
             known if url is None else at_address(known, url),
             folder or models_folder(),
-            sha256=sha256,
-            trust_first=trust_first,
             progress=progress,
         )
     typer.echo(f"{pulled.path} ({'fetched' if pulled.fetched else 'was there'}), SHA-256 {pulled.sha256}")

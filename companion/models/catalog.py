@@ -1,8 +1,8 @@
 """The official models that can be had by name, each with what its file must be.
 
-Size and SHA-256 are those that GitHub records for the assets of Ultralytics' release v8.4.0, taken from
-published tables of them; every digest was found in at least two independent ones. A model whose digest was
-not found stands here without one, and `pull` asks for it.
+Size and SHA-256 are those of the assets of Ultralytics' release v8.4.0, taken from published tables of them.
+Every digest was found in at least two independent ones, but for the scales m, l and x of YOLOv5u: those are
+of one table, whose n and s others confirm.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ class KnownModel:
     Attributes:
         name: what `pull` is given; the file is `NAME.pt`.
         url: where it is published.
-        size_bytes: of the file; None where it is not known here.
-        sha256: 64 hexadecimal digits; None where it is not known here.
+        size_bytes: of the file.
+        sha256: 64 hexadecimal digits.
         licence: SPDX identifier.
         about: one line.
     """
 
     name: str
     url: str
-    size_bytes: int | None
-    sha256: str | None
+    size_bytes: int
+    sha256: str
     licence: str
     about: str
 
@@ -46,6 +46,11 @@ class KnownModel:
 
 
 _PINNED = {
+    "yolov5nu": (5562759, "9e9c1be448b0e1b8598975a9abcab9a0fd0e21182eb422cda7f044a0442d0937"),
+    "yolov5su": (18581255, "054272ddbbb3035cea7ff6b97e5becea63d2cc57a4f06a2a8133f4d1a56e74ed"),
+    "yolov5mu": (50589507, "02a430d1cec02dfabdcaf8afa05e3b967c19d3795a42c0ab8ad78bf2e24d016c"),
+    "yolov5lu": (106913919, "4c78fd8b24761480f1e855361df39eaab131512babf2ba73ba6b394bba3c9061"),
+    "yolov5xu": (195132283, "b173a82e928b444456f5d3d3d7cf11197fda04df8f59c114801d837036e25061"),
     "yolov8n": (6549796, "f59b3d833e2ff32e194b5bb8e08d211dc7c5bdf144b90d2c8412c47ccfc83b36"),
     "yolov8s": (22588772, "1f47a78bf100391c2a140b7ac73a1caae18c32779be7d310658112f7ac9aa78a"),
     "yolov8m": (52136884, "5d4a90cdc7a21786cc59cd19778e9eafff836df9e2da32524737c7ee6efe4fe5"),
@@ -67,7 +72,6 @@ _PINNED = {
     "yolo26l": (53211173, "9fe3c544f2b19bebad7ea41e76d7ad3d88b7c2f10d11d24430c5311f6b32db26"),
     "yolo26x": (118667365, "9fdd44a31c504547ffb81d2c6d9e6dac3493c8eaa8b0398d3f43bae6c7003e92"),
 }
-_UNPINNED = tuple(f"yolov5{scale}u" for scale in "nsmlx")
 _GENERATIONS = {
     "yolov5": "YOLOv5u",
     "yolov8": "YOLOv8",
@@ -82,11 +86,8 @@ def _about(name: str) -> str:
 
 
 KNOWN: dict[str, KnownModel] = {
-    **{name: KnownModel(name, f"{_RELEASE}/{name}.pt", None, None, AGPL, _about(name)) for name in _UNPINNED},
-    **{
-        name: KnownModel(name, f"{_RELEASE}/{name}.pt", size, digest, AGPL, _about(name))
-        for name, (size, digest) in _PINNED.items()
-    },
+    name: KnownModel(name, f"{_RELEASE}/{name}.pt", size, digest, AGPL, _about(name))
+    for name, (size, digest) in _PINNED.items()
 }
 
 

@@ -144,7 +144,7 @@ def list_rows(folder: Path) -> list[dict[str, Any]]:
                 "state": "can be pulled" if path is None else "here",
                 "size_bytes": model.size_bytes if path is None else path.stat().st_size,
                 "licence": model.licence,
-                "about": model.about + ("" if model.sha256 else "; no SHA-256 known"),
+                "about": model.about,
                 "path": None if path is None else str(path),
             }
         )

@@ -71,8 +71,8 @@ def server() -> Iterator[Server]:
     thread.join()
 
 
-def official(server: Server, *, sha256: str | None = DIGEST, size: int | None = len(CONTENT)) -> KnownModel:
-    return KnownModel("model", server.url, size, sha256, "AGPL-3.0", "a test")
+def official(server: Server, *, size: int = len(CONTENT)) -> KnownModel:
+    return KnownModel("model", server.url, size, DIGEST, "AGPL-3.0", "a test")
 
 
 def test_a_model_is_fetched_once_and_found_the_next_time(tmp_path: Path, server: Server) -> None:
@@ -149,40 +149,10 @@ def test_a_file_put_there_by_hand_is_checked(tmp_path: Path, server: Server) -> 
         pull(official(server), tmp_path)
 
 
-def test_a_model_without_a_known_digest_needs_one_or_trust(tmp_path: Path, server: Server) -> None:
-    unknown = official(server, sha256=None, size=None)
-    with pytest.raises(PullError, match=r"--sha256.*--trust-first"):
-        pull(unknown, tmp_path)
-    with pytest.raises(PullError, match="64 hexadecimal digits"):
-        pull(unknown, tmp_path, sha256="abc")
-    assert pull(unknown, tmp_path / "given", sha256=DIGEST.upper()).sha256 == DIGEST
-    assert pull(unknown, tmp_path / "trusted", trust_first=True).sha256 == DIGEST
-    assert DIGEST in (tmp_path / "trusted" / "model.pt.sha256").read_text()
-
-
-def test_what_was_trusted_once_must_be_the_same_ever_after(tmp_path: Path, server: Server) -> None:
-    unknown = official(server, sha256=None, size=None)
-    pull(unknown, tmp_path, trust_first=True).path.unlink()
-    server.content = bytes(1000)
-    with pytest.raises(PullError, match="not the file that was meant"):
-        pull(unknown, tmp_path, trust_first=True)
-
-
-def test_a_digest_given_against_the_pinned_one_is_refused(tmp_path: Path, server: Server) -> None:
-    with pytest.raises(PullError, match="you gave"):
-        pull(official(server), tmp_path, sha256="0" * 64)
-
-
 @pytest.mark.parametrize("url", ["file:///etc/passwd", "ftp://127.0.0.1/model.pt"])
 def test_only_the_web_is_fetched_from(tmp_path: Path, server: Server, url: str) -> None:
     with pytest.raises(PullError, match="only http and https"):
         pull(at_address(official(server), url), tmp_path)
-
-
-def test_trust_without_a_digest_needs_https(tmp_path: Path, server: Server) -> None:
-    unknown = at_address(official(server, sha256=None), "http://example.invalid/model.pt")
-    with pytest.raises(PullError, match="only https"):
-        pull(unknown, tmp_path, trust_first=True)
 
 
 def test_the_command_shows_the_licence_and_how_to_do_it_offline(tmp_path: Path) -> None:
@@ -198,10 +168,10 @@ def test_the_command_shows_the_licence_and_how_to_do_it_offline(tmp_path: Path) 
     assert "nearest: yolov8" in result.stderr
 
 
-def test_every_pinned_model_has_a_digest_of_its_own_and_an_official_address() -> None:
-    pinned = [model for model in KNOWN.values() if model.sha256]
-    assert len({model.sha256 for model in pinned}) == len(pinned) == 20
+def test_every_model_has_a_digest_of_its_own_and_an_official_address() -> None:
+    assert len({model.sha256 for model in KNOWN.values()}) == len(KNOWN) == 25
     for model in KNOWN.values():
         assert model.url == f"https://github.com/ultralytics/assets/releases/download/v8.4.0/{model.file}"
-        assert model.sha256 is None or (len(model.sha256) == 64 and model.size_bytes)
-    assert known_by_digest(KNOWN["yolo11n"].sha256 or "") is KNOWN["yolo11n"]
+        assert len(bytes.fromhex(model.sha256)) == 32
+        assert model.size_bytes > 5_000_000
+    assert known_by_digest(KNOWN["yolo11n"].sha256) is KNOWN["yolo11n"]
