@@ -157,7 +157,8 @@ def _frames_a_second(scene: str | None, model: CameraModel, frames: int, others:
     from mavlink_sim.camera.scene_file import scene_or_demo
     from mavlink_sim.camera.simulated_camera import SimulatedCamera
     from mavlink_sim.world.aircraft import Aircraft
-    from vision.rotation import matrix_from_quaternion, quaternion_from_euler
+    from vision.attitude import quaternion_from_euler
+    from vision.rotation import matrix_from_quaternion
 
     camera = SimulatedCamera(replace(scene_or_demo(scene, 0), camera=CameraSettings(model)))
 

@@ -12,8 +12,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mavlink_sim.flock import Flock, place_in_world
 from mavlink_sim.world.aircraft import identifier_offset
-from vision.rotation import euler_from_quaternion
-from vision.shared_frame import segment_path
+from vision.attitude import euler_from_quaternion
 
 if TYPE_CHECKING:
     from mavlink_sim.camera.process import CameraProcess
@@ -85,6 +84,7 @@ class Spectators:
 
     def _open_camera(self, scene: Scene, resources: ExitStack) -> None:
         from mavlink_sim.camera.process import CameraProcess
+        from vision.shared_frame import segment_path
 
         options = self._options
         if options.camera is not None:

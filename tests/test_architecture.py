@@ -46,6 +46,7 @@ SIMULATOR_FLOORS = {
 }
 SIMULATOR_TOP = 7
 SIMULATOR_MAY_IMPORT = {
+    "vision.attitude",
     "vision.camera_model",
     "vision.frame",
     "vision.geolocation",

@@ -28,7 +28,7 @@ from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
 from mavlink_sim.wire.messages import dialect
-from vision.rotation import quaternion_from_euler, wrap_angle
+from vision.attitude import quaternion_from_euler, wrap_angle
 
 GUIDANCE_HZ = 20.0
 POSES_EVERY = 2  # guidance turns: 10 Hz

@@ -29,9 +29,9 @@ from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle, Truth
 from mavlink_sim.wire.messages import dialect
+from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
-from vision.rotation import Quaternion
 from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings
 
 # What the drivers ask of an autopilot (`manners.Manners.rates_hz`), and home.

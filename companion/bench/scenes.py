@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.ground_view import Buffers
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.attitude import Quaternion, quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
-from vision.rotation import Quaternion, matrix_from_quaternion, quaternion_from_euler
+from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-20.0))

@@ -21,7 +21,7 @@ import typer
 
 from companion.cli.bench import bench
 from companion.cli.evaluate import evaluate
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, with_settings
+from companion.cli.flags import EXIT_BAD_INPUT, WithSettings, plain_errors, with_settings
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.settings import Settings
@@ -40,7 +40,7 @@ app = typer.Typer(
 
 app.add_typer(models, name="models")
 app.command()(evaluate)
-app.command()(mission)
+app.command(cls=WithSettings)(mission)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
@@ -64,7 +64,7 @@ def every_command(
     """What holds for every command."""
 
 
-@app.command()
+@app.command(cls=WithSettings)
 @with_settings
 def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
@@ -257,7 +257,7 @@ def train(
     )
 
 
-@app.command()
+@app.command(cls=WithSettings)
 @with_settings
 def config(settings: Settings) -> None:
     """Print the effective settings as a TOML file with a comment on every key."""
@@ -266,7 +266,7 @@ def config(settings: Settings) -> None:
     typer.echo(to_toml(settings), nl=False)
 
 
-@app.command()
+@app.command(cls=WithSettings)
 @with_settings
 def send(
     settings: Settings,
@@ -286,7 +286,7 @@ def send(
         raise typer.Exit(EXIT_FAILED)
 
 
-@app.command()
+@app.command(cls=WithSettings)
 @with_settings
 def echo(
     settings: Settings,

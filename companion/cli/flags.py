@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
+import typer.core
+import typer.main
 
-from companion.settings.reading import ConfigurationError, Flag, flags, load_settings
+from companion.settings.reading import ConfigurationError, flags, load_settings
 
 EXIT_BAD_INPUT = 2
+_GIVEN = "companion.settings given as flags"  # in a context's `meta`
 
 # The ones typed every day; each is also there under its full name.
 SHORT_NAMES = {
@@ -39,23 +42,36 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
         raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
+class WithSettings(typer.core.TyperCommand):
+    """A command that takes every setting as a flag: `@app.command(cls=WithSettings)` over `@with_settings`.
+
+    The flags of all commands together are hundreds, and each takes its time to make: they are made of the
+    command that is run, or whose help is asked for, alone.
+    """
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Its own parameters, the settings, and click's."""
+        parameters = super().get_params(ctx)
+        own = len(self.params)
+        return [*parameters[:own], *_setting_parameters(), *parameters[own:]]
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run it; what was given for the settings goes by way of the context."""
+        ctx.meta[_GIVEN] = {key: ctx.params.pop(name) for name, key in _keys_of_parameters().items()}
+        return super().invoke(ctx)
+
+
 def with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command `--config` and a flag for every setting; it gets the checked `settings` as its first."""
+    """Give a command `--config` and, with `WithSettings`, the flags; its first is the checked `settings`."""
     own = inspect.signature(command)
     hints = get_type_hints(command, include_extras=True)
-    table = {_parameter_name(flag): flag for flag in flags()}
 
     @functools.wraps(command)
-    def wrapper(**values: Any) -> None:
-        path: Path | None = values.pop("config_file")
-        given = {flag.key: values.pop(name) for name, flag in table.items()}
+    def wrapper(context: typer.Context, config_file: Path | None, **values: Any) -> None:
+        given: dict[str, str | None] = context.meta[_GIVEN]
         overrides = {key: text for key, text in given.items() if text is not None}
-        try:
-            settings = load_settings(path, overrides)
-        except ConfigurationError as error:
-            for problem in error.problems:
-                typer.echo(f"companion: {problem}", err=True)
-            raise typer.Exit(2) from error
+        with plain_errors(ConfigurationError):
+            settings = load_settings(config_file, overrides)
         command(settings, **values)
 
     parameters = [
@@ -66,18 +82,39 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
     parameters.append(
         _option("config_file", Path | None, "--config", help="settings file; else ./companion.toml")
     )
-    for name, flag in table.items():
-        names = [f"--{flag.key.replace('.', '-').replace('_', '-')}"]
-        if short := SHORT_NAMES.get(flag.key):
-            names.insert(0, short)
-        parameters.append(_option(name, str | None, *names, help=flag.help, panel=flag.key.partition(".")[0]))
-    wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    parameters.append(inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context))
+    _declare(wrapper, parameters)
     return wrapper
 
 
-def _parameter_name(flag: Flag) -> str:
-    return flag.key.replace(".", "__")
+def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
+    """Let typer see these parameters."""
+    function.__signature__ = inspect.Signature(parameters)
+    function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+
+
+@functools.cache
+def _keys_of_parameters() -> dict[str, str]:
+    return {flag.key.replace(".", "__"): flag.key for flag in flags()}
+
+
+@functools.cache
+def _setting_parameters() -> list[Any]:
+    """A flag for every setting, as typer makes them."""
+
+    def carrier(**_values: Any) -> None:
+        """Carries the flags; it is never run."""
+
+    parameters = []
+    for (name, key), flag in zip(_keys_of_parameters().items(), flags(), strict=True):
+        names = [f"--{key.replace('.', '-').replace('_', '-')}"]
+        if short := SHORT_NAMES.get(key):
+            names.insert(0, short)
+        parameters.append(_option(name, str | None, *names, help=flag.help, panel=key.partition(".")[0]))
+    _declare(carrier, parameters)
+    app = typer.Typer(add_completion=False)
+    app.command()(carrier)
+    return list(typer.main.get_command(app).params)
 
 
 def _option(name: str, kind: Any, *names: str, help: str, panel: str | None = None) -> inspect.Parameter:

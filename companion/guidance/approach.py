@@ -19,7 +19,7 @@ from companion.guidance.target import DOUBTED, Target
 from companion.guidance.track import ObjectTrack
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # Well under the envelope's acceleration, so that a vehicle that answers late still stops in time.
 DECELERATION_MPS2 = 0.7

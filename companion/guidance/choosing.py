@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from companion.guidance.target import Target
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # From the first true object on it is looked for so long whether another is meant.
 CHOOSING_S = 0.4

@@ -16,7 +16,7 @@ from companion.guidance.neighbours import Neighbour
 from companion.guidance.separation import BRAKING, Row, apart, level_rows, rows_at
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # PX4 flies towards a position with about this much speed for each metre that is missing (MPC_XY_P 0.95,
 # MPC_Z_P 1.0), so a position limit/gain ahead is flown to with no more than the limit.

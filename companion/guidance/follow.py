@@ -10,7 +10,7 @@ from companion.guidance.motion import correction, in_degrees, position_and_yaw, 
 from companion.guidance.moving_track import MovingTrack
 from companion.guidance.target import DOUBTED
 from companion.vehicle.setpoint import Setpoint
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # Answer to what is missing in distance and along the circle, 1/s, and the fastest that is made good: on top
 # of the object's own velocity.

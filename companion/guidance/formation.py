@@ -21,7 +21,7 @@ from companion.guidance.pose import FormationNote, Plan, Structure
 from companion.guidance.separation import MARGIN_M, around, pushed_apart
 from companion.guidance.virtual_structure import VirtualStructure
 from companion.vehicle.setpoint import Setpoint
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 VIRTUAL = "virtual"
 LOST_TIMEOUT_S = 5.0

@@ -17,7 +17,7 @@ import numpy as np
 from companion.guidance.moving_estimate import Fit, MovingEstimate
 from companion.guidance.target import Target
 from companion.vehicle.state import Vector3
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # Unseen, the gate grows without end: a stranger is taken for the object no farther than this from where it is
 # expected, and so much more for each second.

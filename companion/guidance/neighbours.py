@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from companion.guidance.geodesy import north_east
 from companion.guidance.pose import FormationNote, Pose, global_problem
 from companion.vehicle.state import Vector3, VehicleState
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # A pose older than this says nothing of the present: the vehicle counts as silent.
 SILENT_S = 1.0

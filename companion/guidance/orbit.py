@@ -9,7 +9,7 @@ from companion.guidance.motion import correction, in_degrees, laps_text, positio
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # Nearer to the centre than this there is no direction outwards.
 MIN_RADIUS_M = 0.2

@@ -12,7 +12,7 @@ from companion.guidance.target import DOUBTED, Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 BLIND_TIMEOUT_S = 5.0
 # A turn may take this many times what it should, plus the looks on the way.

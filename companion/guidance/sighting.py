@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection
 
 from companion.guidance.behaviour import Situation
 from companion.guidance.target import Target
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # So many frames of the last so many seconds must agree on a direction.
 FRAMES_NEEDED = 3

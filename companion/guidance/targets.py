@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.gimbal import YawFrame
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
+from vision.attitude import slerp, turned_about_down
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import direction_ned, foot_of_upright, point_at_depth, point_on_ground
-from vision.rotation import matrix_from_quaternion, slerp, turned_about_down
+from vision.rotation import matrix_from_quaternion
 from vision.tracking.association import overlaps
 
 _Sample = TypeVar("_Sample")

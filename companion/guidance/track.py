@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.state import Vector3
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # How far an object may wander: 1 m in a second, one sigma. A walking person's pace.
 WANDER_M2_PER_S = 1.0

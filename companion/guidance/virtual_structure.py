@@ -16,7 +16,7 @@ from companion.guidance.neighbours import Anchor
 from companion.guidance.path import Path
 from companion.guidance.pose import Structure
 from companion.vehicle.state import Vector3
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 # It moves on at full speed with the worst slot error below the first, not at all from the second on.
 FULL_SPEED_ERROR_M = 0.7

@@ -38,8 +38,8 @@ from companion.perception.status import PerceptionState, PerceptionStatus
 from companion.perception.timing import StageTimes
 from companion.perception.tracks import LiveTracks
 from companion.settings import Settings
+from vision.attitude import Quaternion
 from vision.pipeline import PerceptionResult
-from vision.rotation import Quaternion
 
 logger = logging.getLogger(__name__)
 

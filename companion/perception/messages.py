@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from companion.settings import Settings
+from vision.attitude import Quaternion
 from vision.pipeline import PerceptionResult
-from vision.rotation import Quaternion
 
 _LENGTH = struct.Struct(">I")
 # Far above any message: a result is a few kilobytes. What claims to be longer is not one of ours.

@@ -21,8 +21,8 @@ _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 _LONGEST_SHOWN = 80
 
 
-def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
-    """Section → name → field, in the order of the file; without the views."""
+def sections_of_file() -> dict[str, type[Section]]:
+    """Name → section, in the order of the file; without the views."""
     sections = {}
     for name, field in Settings.model_fields.items():
         if name == "views":
@@ -30,8 +30,13 @@ def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
         section = field.annotation
         assert isinstance(section, type)
         assert issubclass(section, Section)
-        sections[name] = section.model_fields
+        sections[name] = section
     return sections
+
+
+def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
+    """Section → name → field, in the order of the file; without the views."""
+    return {name: section.model_fields for name, section in sections_of_file().items()}
 
 
 SECTIONS_OF_VIEW = tuple(ViewSections.model_fields)
@@ -60,10 +65,11 @@ def plain_type(field: FieldInfo) -> type:
     return annotation
 
 
-def help_line(field: FieldInfo) -> str:
-    """The field's line of help and, where it has one, its range."""
+def help_line(section: type[Section], name: str) -> str:
+    """A key's line of help and, where it has one, its range."""
+    field = section.model_fields[name]
     annotation, _ = _without_none(field)
-    text = " ".join((field.description or "").split())
+    text = section.help_texts().get(name, "")
     span = " or ".join(get_args(annotation)) if get_origin(annotation) is Literal else _span(field)
     return f"{text} ({span})" if span else text
 

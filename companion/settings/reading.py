@@ -24,6 +24,7 @@ from companion.settings.fields import (
     help_line,
     plain_type,
     section_of,
+    sections_of_file,
     shown,
     toml_value,
     value_from_text,
@@ -65,9 +66,9 @@ class Flag(NamedTuple):
 def flags() -> list[Flag]:
     """Every value there is, in the order of the file."""
     return [
-        Flag(f"{section}.{name}", plain_type(field), field.default, help_line(field))
-        for section, fields in fields_of_sections().items()
-        for name, field in fields.items()
+        Flag(f"{table}.{name}", plain_type(field), field.default, help_line(section, name))
+        for table, section in sections_of_file().items()
+        for name, field in section.model_fields.items()
     ]
 
 
@@ -104,7 +105,7 @@ def load_settings(
 
 def to_toml(settings: Settings) -> str:
     """The settings as a TOML file with a comment on every key; `load_settings` reads the same back."""
-    paragraphs = [_table(section, getattr(settings, section)) for section in fields_of_sections()]
+    paragraphs = [_table(section, getattr(settings, section)) for section in sections_of_file()]
     for view, sections in settings.views.items():
         paragraphs += [
             _table(f"views.{view}.{section}", getattr(sections, section)) for section in SECTIONS_OF_VIEW
@@ -114,9 +115,9 @@ def to_toml(settings: Settings) -> str:
 
 def _table(name: str, section: Section) -> str:
     lines = [f"# {(type(section).__doc__ or '').strip()}", f"[{name}]"]
-    for key, field in type(section).model_fields.items():
+    for key in type(section).model_fields:
         value = getattr(section, key)
-        lines.append(f"# {help_line(field)}")
+        lines.append(f"# {help_line(type(section), key)}")
         # TOML has no null: what is unset stands there as a comment.
         lines.append(f"# {key} =" if value is None else f"{key} = {toml_value(value)}")
     return "\n".join(lines) + "\n"

@@ -14,7 +14,7 @@ from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor, Vector
 from mavlink_sim.px4.parameters import Parameters
-from vision.rotation import Quaternion, quaternion_from_euler
+from vision.attitude import Quaternion, quaternion_from_euler
 
 # A target that runs ahead of the vehicle waits for it (ArduPilot's leash).
 LEASH_M = 2.0

@@ -17,7 +17,7 @@ from mavlink_sim.flight.precision_landing import LandingTarget
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.quaternions import inverse, product
 from mavlink_sim.px4.parameters import Parameters
-from vision.rotation import Quaternion
+from vision.attitude import Quaternion
 
 BODY_FRD = 12  # MAV_FRAME_BODY_FRD
 COMPANION_TYPE = 1  # PLND_TYPE: MAVLink messages

@@ -15,7 +15,7 @@ from mavlink_sim.flight.position_control import Demand, PositionController
 from mavlink_sim.physics.airframe import MAX_THRUST_MPS2, Multirotor, Vector
 from mavlink_sim.physics.quaternions import IDENTITY, inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
-from vision.rotation import Quaternion, quaternion_from_euler
+from vision.attitude import Quaternion, quaternion_from_euler
 
 NAN = math.nan
 MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint may ask for any number

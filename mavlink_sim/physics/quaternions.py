@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from vision.rotation import Quaternion
+from vision.attitude import Quaternion
 
 Vector = tuple[float, float, float]
 

@@ -14,7 +14,7 @@ from mavlink_sim.flight.position_control import NAN
 from mavlink_sim.physics.geography import local
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.wire.messages import dialect
-from vision.rotation import euler_from_quaternion
+from vision.attitude import euler_from_quaternion
 
 if TYPE_CHECKING:
     from mavlink_sim.services.commands import Command

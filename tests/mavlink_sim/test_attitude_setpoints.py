@@ -14,7 +14,8 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_TH
 from mavlink_sim.physics.quaternions import inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from vision.rotation import euler_from_quaternion, matrix_from_quaternion, quaternion_from_euler
+from vision.attitude import euler_from_quaternion, quaternion_from_euler
+from vision.rotation import matrix_from_quaternion
 
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2
 RATES_IGNORED = 7

@@ -17,9 +17,9 @@ import pytest
 from mavlink_sim.camera.process import CameraProcess
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.world import Ground, World, WorldObject
+from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
-from vision.rotation import quaternion_from_euler
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
 pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")

@@ -165,8 +165,3 @@ def test_a_busy_control_endpoint_is_named() -> None:
         port = busy.getsockname()[1]
         with pytest.raises(ControlError, match=f"--control tcp/127.0.0.1:{port}: zenoh cannot listen there"):
             FaultControl(f"tcp/127.0.0.1:{port}", 1, vehicle.faults)
-
-
-def test_zenoh_is_not_imported_unless_asked_for() -> None:
-    code = "import sys, mavlink_sim.cli, mavlink_sim.testing; sys.exit('zenoh' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

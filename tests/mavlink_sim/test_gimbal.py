@@ -15,7 +15,8 @@ from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.simulation import Simulation, SimulationOptions
 from mavlink_sim.wire.messages import dialect
-from vision.rotation import matrix_from_quaternion, quaternion_from_euler
+from vision.attitude import quaternion_from_euler
+from vision.rotation import matrix_from_quaternion
 
 NAN = math.nan
 LEVEL = (1.0, 0.0, 0.0, 0.0)

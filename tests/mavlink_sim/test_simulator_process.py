@@ -293,3 +293,13 @@ def test_garbage_is_skipped_and_the_message_after_it_read() -> None:
             found += [message.get_type() for message in endpoint.receive()]
     endpoint.close()
     assert set(found) == {"HEARTBEAT"}
+
+
+def test_a_vehicle_without_a_camera_needs_no_library_of_pictures_and_no_zenoh() -> None:
+    code = (
+        "import sys, mavlink_sim.cli, mavlink_sim.testing; from mavlink_sim import LockstepVehicle\n"
+        "vehicle = LockstepVehicle(gimbal=True); vehicle.take_off()\n"
+        "print(*({'numpy', 'cv2', 'zenoh', 'av'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr

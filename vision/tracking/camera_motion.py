@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.attitude import Quaternion, slerp
 from vision.camera_model import CameraModel
-from vision.rotation import Quaternion, matrix_from_quaternion, slerp
+from vision.rotation import matrix_from_quaternion
 from vision.tracking.kalman import BoxStates
 
 Array = NDArray[np.float64]

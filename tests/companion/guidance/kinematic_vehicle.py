@@ -11,7 +11,7 @@ from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from vision.rotation import quaternion_from_euler, wrap_angle
+from vision.attitude import quaternion_from_euler, wrap_angle
 
 START_NS = 1_000_000_000_000
 

@@ -10,7 +10,7 @@ from companion.geometry.fence import Fence
 from companion.guidance.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
-from vision.rotation import quaternion_from_euler, wrap_angle
+from vision.attitude import quaternion_from_euler, wrap_angle
 
 LIMITS = Limits()
 NOW = 10**12

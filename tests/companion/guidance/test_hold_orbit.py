@@ -8,7 +8,7 @@ from companion.guidance.behaviour import Situation
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.vehicle.setpoint import Setpoint
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 
 def test_hold_keeps_the_place_and_heading_it_began_with():

@@ -13,9 +13,10 @@ from companion.guidance.marker_target import MarkerSight, looks_down, marker_tar
 from companion.guidance.pad_filter import PadFilter
 from companion.guidance.targets import HistoryError, StateHistory
 from companion.vehicle.state import VehicleState
+from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import PadMarker, marker_from_corners, square
-from vision.rotation import matrix_from_quaternion, quaternion_from_euler, wrap_angle
+from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(75.0))
 DOWNWARD = CameraMount(forward_m=0.1, right_m=-0.05, down_m=0.08, pitch_rad=-math.pi / 2)

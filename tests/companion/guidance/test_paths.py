@@ -22,7 +22,7 @@ from companion.guidance.goto import GotoBehaviour
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.guidance.registry import behaviour_for
 from companion.vehicle.setpoint import Setpoint
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 WIDE = Limits(max_distance_m=1000.0, max_altitude_m=100.0)
 places = st.tuples(*[st.floats(-50, 50)] * 3)

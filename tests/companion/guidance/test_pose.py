@@ -21,7 +21,7 @@ from companion.guidance.pose import (
     pose_of,
 )
 from companion.vehicle.state import LandedState, VehicleState
-from vision.rotation import quaternion_from_euler
+from vision.attitude import quaternion_from_euler
 
 STRUCTURE = Structure((47.4, 8.5, 490.0), (1.0, 0.0, 0.0), 0.1, (47.39, 8.5, 480.0), 12.25, True)
 NOTE = FormationNote(

@@ -4,7 +4,7 @@ import pytest
 from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
 
 from companion.guidance.seek import SeekBehaviour
-from vision.rotation import wrap_angle
+from vision.attitude import wrap_angle
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 179, 200, 300, 355])

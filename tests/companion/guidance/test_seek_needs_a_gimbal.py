@@ -17,7 +17,7 @@ from companion.guidance.refusal import refusal
 from companion.guidance.seek import SeekBehaviour
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from companion.vehicle.setpoint import Setpoint
-from vision.rotation import quaternion_from_euler
+from vision.attitude import quaternion_from_euler
 
 CARRIED = GimbalSight(carries_camera=True)
 FIELD_RAD = math.radians(80.0)

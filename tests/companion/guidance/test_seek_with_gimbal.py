@@ -19,8 +19,8 @@ from companion.guidance.search_pattern import Footprint
 from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.target import Target
 from companion.missions.mission_file import plan_from
+from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
-from vision.rotation import Quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 ON_GIMBAL = CameraMount(forward_m=0.1, on_gimbal=True)

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from companion.guidance.target import RangeSource
 from companion.guidance.targets import HistoryError, StateHistory, slerp, targets_from_detections
 from companion.vehicle.state import VehicleState
+from vision.attitude import euler_from_quaternion, quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.geolocation import foot_of_upright
-from vision.rotation import euler_from_quaternion, matrix_from_quaternion, quaternion_from_euler, wrap_angle
+from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80))
 DISTORTED = replace(CAMERA, distortion=(-0.12, 0.03, 0.001, -0.001, 0.0))

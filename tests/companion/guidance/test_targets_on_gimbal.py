@@ -13,8 +13,8 @@ from companion.guidance.marker_target import looks_down
 from companion.guidance.targets import HistoryError, StateHistory, mount_at, targets_from_detections
 from companion.vehicle.gimbal import GimbalState, YawFrame
 from companion.vehicle.state import VehicleState
+from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount
-from vision.rotation import quaternion_from_euler
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, on_gimbal=True)

@@ -22,9 +22,10 @@ from companion.perception.tracks import LiveTracks
 from companion.perception.worker import Orders
 from companion.settings import Settings
 from companion.settings.reading import load_settings
+from vision.attitude import quaternion_from_euler
 from vision.detections import NO_TRACK, Detections
 from vision.pipeline import PerceptionResult
-from vision.rotation import matrix_from_euler, quaternion_from_euler
+from vision.rotation import matrix_from_euler
 from vision.tracking import Track, TrackEvent, TrackEventKind, TrackState
 
 NEW, UPDATE, LOST, END = (

@@ -18,10 +18,10 @@ from companion.service import Service
 from companion.settings.reading import ConfigurationError, load_settings
 from companion.vehicle.gimbal import GimbalState, YawFrame
 from companion.vehicle.state import VehicleState
+from vision.attitude import quaternion_from_euler
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult
-from vision.rotation import quaternion_from_euler
 from vision.tracking import AttitudeHistory
 
 PITCH_RAD, HEADING_RAD = -0.9, 1.2

@@ -18,7 +18,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.gimbal import NOBODY, GimbalAim, YawFrame
 from mavlink_sim.testing import running_simulator
-from vision.rotation import quaternion_from_euler
+from vision.attitude import quaternion_from_euler
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 OURS = (1, 191)

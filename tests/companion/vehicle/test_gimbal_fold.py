@@ -11,7 +11,7 @@ from companion.vehicle.gimbal_fold import from_gimbal_device
 from companion.vehicle.heard_state import HeardState
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry_fold import fold
-from vision.rotation import quaternion_from_euler
+from vision.attitude import quaternion_from_euler
 
 NEUTRAL, YAW_LOCK, IN_VEHICLE, IN_EARTH = 2, 16, 32, 64
 INFORMATION, STATUS, ATTITUDE = (

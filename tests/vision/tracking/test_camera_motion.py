@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel
-from vision.rotation import matrix_from_euler, matrix_from_quaternion, quaternion_from_euler
+from vision.rotation import matrix_from_euler, matrix_from_quaternion
 from vision.tracking.camera_motion import HISTORY_S, MAX_AHEAD_S, AttitudeHistory, CameraView, turned
 from vision.tracking.kalman import begun
 
