@@ -1,7 +1,7 @@
-"""What the service and the perception worker say to each other over their socket, and how it is framed.
+"""What the service and the perception worker say to each other over their sockets, and how it is framed.
 
 A message is one of the dataclasses below, pickled, after its length (4 bytes, big-endian). Both ends are this
-program, and nobody else holds the socket.
+program, and nobody else holds the sockets.
 """
 
 from __future__ import annotations

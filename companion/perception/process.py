@@ -1,4 +1,4 @@
-"""The perception worker seen from the service: one process, the socket to it, and its end."""
+"""The perception worker seen from the service: one process, the sockets to it, and its end."""
 
 from __future__ import annotations
 
@@ -30,17 +30,22 @@ _UNREAD_BYTES = 65536
 
 
 class PerceptionProcess:
-    """A worker that was started. Make one with `spawn`."""
+    """A worker that was started. Make one with `spawn`.
+
+    What it says and what it is told go by sockets of their own: to write to a worker that has just ended
+    fails, and asyncio then closes that socket with all that was not read yet, the last words among it.
+    """
 
     def __init__(
         self,
         process: asyncio.subprocess.Process,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
+        reports: tuple[asyncio.StreamReader, asyncio.StreamWriter],
+        orders: tuple[asyncio.StreamReader, asyncio.StreamWriter],
     ) -> None:
         self._process = process
-        self._reader = reader
-        self._writer = writer
+        self._reports = reports[0]
+        self._orders = orders[1]
+        self._ends = (reports[1], orders[1])
 
     @classmethod
     async def spawn(cls, settings: Settings, standard_input: int, first_track_id: int = 1) -> Self:
@@ -53,29 +58,31 @@ class PerceptionProcess:
         Raises:
             OSError: no more processes or descriptors.
         """
-        ours, theirs = socket.socketpair()
-        with theirs:
-            try:
-                theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-                process = await asyncio.create_subprocess_exec(
-                    sys.executable,
-                    "-P",  # the search path below, and not the working directory, says what is imported
-                    "-m",
-                    "companion.perception.worker",
-                    str(theirs.fileno()),
-                    str(os.getpid()),
-                    pass_fds=(theirs.fileno(),),
-                    stdin=standard_input,
-                    stdout=2,  # standard output is the service's own
-                    env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                    # A Ctrl-C in the terminal is for the service, which then asks the worker to end.
-                    process_group=0,
-                )
-            except BaseException:
-                ours.close()
-                raise
-        reader, writer = await asyncio.open_connection(sock=ours)
-        worker = cls(process, reader, writer)
+        said, saying = socket.socketpair()
+        told, telling = socket.socketpair()
+        with saying, told, contextlib.ExitStack() as ours:
+            ours.enter_context(said)
+            ours.enter_context(telling)
+            saying.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-P",  # the search path below, and not the working directory, says what is imported
+                "-m",
+                "companion.perception.worker",
+                str(saying.fileno()),
+                str(told.fileno()),
+                str(os.getpid()),
+                pass_fds=(saying.fileno(), told.fileno()),
+                stdin=standard_input,
+                stdout=2,  # standard output is the service's own
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                # A Ctrl-C in the terminal is for the service, which then asks the worker to end.
+                process_group=0,
+            )
+            reports = await asyncio.open_connection(sock=said)
+            orders = await asyncio.open_connection(sock=telling)
+            ours.pop_all()
+        worker = cls(process, reports, orders)
         worker._put(Begin(settings, first_track_id))
         return worker
 
@@ -85,16 +92,16 @@ class PerceptionProcess:
 
     async def read(self) -> Message | None:
         """The next message; None when the worker has closed its end, which it does by dying too."""
-        return await read_message(self._reader)
+        return await read_message(self._reports)
 
     def show(self, hud: Hud) -> None:
         """Tell what to draw on the recorded video. Left out while the worker takes no orders."""
-        if self._writer.transport.get_write_buffer_size() < _UNREAD_BYTES:
+        if self._orders.transport.get_write_buffer_size() < _UNREAD_BYTES:
             self._put(hud)
 
     def turn(self, attitude: Attitude | GimbalAttitude) -> None:
         """Tell how vehicle or gimbal was turned. Left out while an older one waits: a newer will come."""
-        if not self._writer.transport.get_write_buffer_size():
+        if not self._orders.transport.get_write_buffer_size():
             self._put(attitude)
 
     def watch(self, watched: bool) -> None:
@@ -121,9 +128,10 @@ class PerceptionProcess:
     async def wait(self) -> str:
         """Wait for its death; how it died, in words."""
         code = await self._process.wait()
-        self._writer.close()
-        with contextlib.suppress(ConnectionError):
-            await self._writer.wait_closed()
+        for end in self._ends:
+            end.close()
+            with contextlib.suppress(ConnectionError):
+                await end.wait_closed()
         if code >= 0:
             return f"process {self.pid} exited with code {code}"
         try:
@@ -138,5 +146,5 @@ class PerceptionProcess:
 
     def _put(self, message: Message) -> None:
         # A write to a worker that is gone is dropped by the transport; its death shows in `read`.
-        if not self._writer.is_closing():
-            self._writer.write(packed(message))
+        if not self._orders.is_closing():
+            self._orders.write(packed(message))

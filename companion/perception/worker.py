@@ -1,7 +1,7 @@
 """The perception worker: the process in which frames live. `process.py` starts it.
 
-It is given one end of a socket, takes its orders there, says there what it sees, and ends when the other end
-does: frames without anyone to tell are of no use, and a camera can have only one owner.
+It is given the ends of two sockets, says on one what it sees, takes its orders from the other, and ends when
+their other ends do: frames without anyone to tell are of no use, and a camera can have only one owner.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class Orders:
-    """What the service wants, taken from the socket by a thread.
+    """What the service wants, taken from its socket by a thread.
 
     Attributes:
         stop: end now.
@@ -131,18 +131,18 @@ def main(arguments: list[str]) -> int:
     """Work until the source, the service or the order ends it.
 
     Args:
-        arguments: the socket's descriptor and the service's process id.
+        arguments: the descriptors of the sockets for reports and for orders, and the service's process id.
     """
-    descriptor, service_pid = (int(argument) for argument in arguments)
+    reports, told, service_pid = (int(argument) for argument in arguments)
     _end_with(service_pid)
     os.nice(NICENESS)
-    connection = socket.socket(fileno=descriptor)
+    connection = socket.socket(fileno=told)
     begin = receive(connection)
     if not isinstance(begin, Begin):
         return 1
     orders = Orders(connection)
     signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop.set())
-    outbox = Outbox(connection, on_lost=orders.stop.set)
+    outbox = Outbox(socket.socket(fileno=reports), on_lost=orders.stop.set)
     logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[OutboxHandler(outbox)])
     last = _work(begin, orders, outbox)
     outbox.close(last, FAREWELL_S)

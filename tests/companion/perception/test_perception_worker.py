@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import select
 import socket
 import struct
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from companion.perception.messages import (
+    Attitude,
     Ended,
     Heartbeat,
     Hud,
@@ -26,7 +30,9 @@ from companion.perception.messages import (
     receive,
 )
 from companion.perception.outbox import Outbox, OutboxHandler
+from companion.perception.process import PerceptionProcess
 from companion.perception.pulse import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Pulse
+from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 
@@ -146,10 +152,29 @@ def test_a_worker_without_a_service_ends_at_once() -> None:
     ours, theirs = socket.socketpair()
     with theirs:
         # The process id is not that of its parent, as when the service died in between.
-        arguments = [sys.executable, "-m", "companion.perception.worker", str(theirs.fileno()), "-1"]
+        end = str(theirs.fileno())
+        arguments = [sys.executable, "-m", "companion.perception.worker", end, end, "-1"]
         process = subprocess.run(arguments, pass_fds=[theirs.fileno()], timeout=60, check=False)
     ours.close()
     assert process.returncode == 1
+
+
+async def test_the_last_words_of_a_worker_are_read_whatever_it_was_told_after_them(pictures: Path) -> None:
+    settings = load_settings(
+        Path(os.devnull), {"source.uri": str(pictures), "detector.enabled": "false"}, environment={}
+    )
+    process = await PerceptionProcess.spawn(settings, subprocess.DEVNULL)
+    # Nothing is read until it has ended, as when the service's own loop stands still for a moment.
+    ended = os.pidfd_open(process.pid)
+    assert select.select([ended], [], [], 60.0)[0]
+    os.close(ended)
+    for count in range(3):
+        process.turn(Attitude(count, (1.0, 0.0, 0.0, 0.0)))
+    heard = []
+    while (message := await process.read()) is not None:
+        heard.append(message)
+    assert heard[-1] == Ended(finished=True, text="end of stream", frames=20)
+    assert "exited with code 0" in await process.wait()
 
 
 def test_a_worker_that_may_still_be_loading_is_given_time() -> None:
