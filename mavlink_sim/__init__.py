@@ -10,12 +10,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mavlink_sim.flock import Flock
     from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
     from mavlink_sim.testing import RunningSimulator, running_simulator
     from mavlink_sim.vehicle import Vehicle
 
 __all__ = [
     "CommandRefusedError",
+    "Flock",
     "LockstepVehicle",
     "NotReachedError",
     "RunningSimulator",
@@ -26,6 +28,7 @@ __all__ = [
 
 _HOMES = {
     "CommandRefusedError": "lockstep",
+    "Flock": "flock",
     "LockstepVehicle": "lockstep",
     "NotReachedError": "lockstep",
     "RunningSimulator": "testing",

@@ -76,7 +76,7 @@ def _numbered(path: Path | None, system_id: int) -> Path | None:
 
 
 class Fleet:
-    """Vehicles on one clock, in real time, which see one another.
+    """Vehicles on one clock, in real time, which see one another and cannot fly through each other.
 
     Use as a context manager; `run` returns after `stop`.
 
@@ -88,11 +88,11 @@ class Fleet:
         self._stopped = False
         self._on_event = on_event
         self.simulations: list[Simulation] = []
-        flock = Flock(len(options))
+        self._flock = Flock(len(options))
         try:
             for one in options:
                 told = on_event if len(options) == 1 else _named(on_event, one.system_id)
-                self.simulations.append(self._resources.enter_context(Simulation(one, told, flock)))
+                self.simulations.append(self._resources.enter_context(Simulation(one, told, self._flock)))
         except BaseException:
             self._resources.close()
             raise
@@ -112,7 +112,7 @@ class Fleet:
 
     def run(self) -> None:
         """Run until `stop`."""
-        run_together(self.simulations, lambda: self._stopped, self._on_event)
+        run_together(self.simulations, lambda: self._stopped, self._on_event, self._flock.meet)
 
 
 def _named(on_event: Callable[[str], None], system_id: int) -> Callable[[str], None]:

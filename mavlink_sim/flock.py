@@ -1,4 +1,4 @@
-"""The vehicles of a fleet as they see one another: each is a thing in the world of the others.
+"""The vehicles of a fleet as they see and meet one another: each is a thing in the world of the others.
 
 The world begins where the first of them started; each one's own local frame begins at its own start.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.midair import Body, Midair
 from mavlink_sim.vehicle import Vehicle
-from mavlink_sim.world.aircraft import Aircraft, aircraft_objects
+from mavlink_sim.world.aircraft import Aircraft, aircraft_objects, identifier_offset
 
 if TYPE_CHECKING:
     from mavlink_sim.world.world import WorldObject
@@ -39,17 +40,35 @@ class Flock:
 
     Args:
         size: how many there will be.
+
+    Whoever steps them in lockstep calls `meet` after each step of all, and none can fly through another.
     """
 
     def __init__(self, size: int) -> None:
         self.size = size
         self._vehicles: list[Vehicle] = []
+        self._midair = Midair()
         self._seen: tuple[int, int, tuple[WorldObject, ...]] | None = None
 
-    def join(self, vehicle: Vehicle) -> None:
-        """From now on the others see it."""
+    def join(self, vehicle: Vehicle, offset: int | None = None) -> None:
+        """From now on the others see it, and run into it.
+
+        Args:
+            offset: from its system id to its identifier among the world's things (`identifier_offset`); None:
+                that of the scene that is in its way.
+        """
         self._vehicles.append(vehicle)
         self._seen = None
+        if offset is None:
+            around = vehicle.surroundings
+            offset = 0 if around is None else identifier_offset(around.scene.world)
+        number = vehicle.system_id
+        self._midair.join(Body(vehicle.airframe, vehicle.start_ned_m, offset + number, f"vehicle {number}"))
+
+    def meet(self) -> None:
+        """Let those that touch run into each other; to be called when all have been stepped."""
+        if len(self._vehicles) > 1:
+            self._midair.look(self._vehicles[0].faults.now_s)
 
     def others(self, vehicle: Vehicle) -> list[Aircraft]:
         """All but this one, as they are at this moment, in the order in which they joined."""

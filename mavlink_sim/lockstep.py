@@ -26,7 +26,7 @@ from mavlink_sim.wire.messages import Outgoing, dialect
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 
 if TYPE_CHECKING:
-    from mavlink_sim.physics.collisions import Collision
+    from mavlink_sim.physics.contact import Collision
 
 COMPANION = (1, 191)  # MAV_COMP_ID_ONBOARD_COMPUTER
 ANSWER_LIMIT_S = 1.0
@@ -55,7 +55,8 @@ class Truth:
         rates_radps: body FRD.
         mode: PX4's name of the flight mode. on_ground: touching it, or on top of something.
         landed: as the land detector has it.
-        collisions: how often it met something of the scene. collision: the newest; None before the first.
+        collisions: how often it met something of the scene, or another vehicle of its flock.
+        collision: the newest; None before the first.
     """
 
     time_s: float
@@ -354,7 +355,6 @@ class LockstepVehicle:
     def truth(self) -> Truth:
         """What is really so now."""
         airframe, autopilot = self.vehicle.airframe, self.vehicle.autopilot
-        around = self.vehicle.surroundings
         return Truth(
             self.now_s,
             airframe.position,
@@ -369,8 +369,8 @@ class LockstepVehicle:
             autopilot.landed,
             airframe.on_ground,
             airframe.crashed,
-            0 if around is None else around.airframe.collisions,
-            None if around is None else around.airframe.last_collision,
+            airframe.collisions,
+            airframe.last_collision,
         )
 
 

@@ -71,9 +71,15 @@ class _Pace:
 
 
 def run_together(
-    simulations: Sequence[Paced], stopped: Callable[[], bool], on_event: Callable[[str], None]
+    simulations: Sequence[Paced],
+    stopped: Callable[[], bool],
+    on_event: Callable[[str], None],
+    stepped_all: Callable[[], None] = lambda: None,
 ) -> None:
-    """The loop: wait for the sockets until the next step is due, take in what came, step, send."""
+    """The loop: wait for the sockets until the next step is due, take in what came, step, send.
+
+    `stepped_all` is called whenever all of them have been stepped to one simulated time.
+    """
     first = simulations[0]
     speed = first.speed
     pace = _Pace(speed, on_event)
@@ -100,5 +106,6 @@ def run_together(
             for simulation in simulations:
                 stepped |= simulation.advance(now_ns)
             if stepped:
+                stepped_all()
                 for simulation in simulations:
                     simulation.show(now_ns)

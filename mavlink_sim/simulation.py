@@ -23,6 +23,7 @@ from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.streams import GCS_RATES_HZ
 from mavlink_sim.wire.traffic_log import recording
+from mavlink_sim.world.aircraft import identifier_offset
 
 if TYPE_CHECKING:
     from mavlink_sim.physics.airframe import Vector
@@ -164,7 +165,7 @@ class Simulation:
                 fault_room(self.vehicle, self.endpoints, options, on_event)
             )
             flock = Flock(1) if flock is None else flock
-            flock.join(self.vehicle)
+            flock.join(self.vehicle, 0 if scene is None else identifier_offset(scene.world))
             self._spectators = Spectators(self.vehicle, scene, flock, options, on_event, self._resources)
         except BaseException:
             self._resources.close()

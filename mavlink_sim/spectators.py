@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mavlink_sim.camera.process import CameraProcess
     from mavlink_sim.camera.scene import Scene
     from mavlink_sim.physics.airframe import Vector
+    from mavlink_sim.physics.contact import Collision
     from mavlink_sim.simulation import SimulationOptions
     from mavlink_sim.vehicle import Vehicle
     from mavlink_sim.world.world import WorldObject
@@ -141,7 +142,6 @@ class Spectators:
     def truth(self, simulated_s: float, stamp_ns: int) -> dict[str, Any]:
         """What is really so now: pose, mode, what it ran into, the range to every object, the others too."""
         airframe, autopilot = self._vehicle.airframe, self._vehicle.autopilot
-        surroundings = self._vehicle.surroundings
         return {
             "stamp_ns": stamp_ns,
             "position_ned_m": [round(value, 4) for value in airframe.position],
@@ -150,7 +150,9 @@ class Spectators:
             "mode": autopilot.mode.name,
             "armed": autopilot.armed,
             "landed": autopilot.landed,
-            **({} if surroundings is None else surroundings.truth()),
+            "crashed": airframe.crashed,
+            "collisions": airframe.collisions,
+            "last_collision": _collision_truth(airframe.last_collision),
             "objects": [] if self._scene is None else self._objects(self._scene, simulated_s, stamp_ns),
         }
 
@@ -158,6 +160,19 @@ class Spectators:
         here = place_in_world(self._vehicle)
         others = self._flock.objects(self._vehicle, self._identifier_offset, stamp_ns)
         return [_object_truth(thing, here) for thing in (*scene.objects_at(simulated_s), *others)]
+
+
+def _collision_truth(collision: Collision | None) -> dict[str, Any] | None:
+    if collision is None:
+        return None
+    return {
+        "time_s": round(collision.time_s, 3),
+        "identifier": collision.identifier,
+        "object": collision.name,
+        "speed_mps": round(collision.speed_mps, 3),
+        "standing": collision.standing,
+        "crashed": collision.crashed,
+    }
 
 
 def _object_truth(thing: WorldObject, position_ned_m: Vector) -> dict[str, Any]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import load_scene
 from mavlink_sim.flight.collision_prevention import FRAME_BODY_FRD, ObstacleMap
-from mavlink_sim.physics.collisions import HALF_HEIGHT_M, RADIUS_M, CollidingMultirotor
+from mavlink_sim.physics.collisions import CollidingMultirotor
+from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
 from mavlink_sim.physics.obstacle_sensor import MAXIMUM_CM, MINIMUM_CM, SECTOR_DEG, ObstacleSensor
 from mavlink_sim.world.obstacles import Obstacles
 from mavlink_sim.world.world import World
@@ -57,24 +57,6 @@ class Surroundings:
         _, _, x, _, _, y, _, _, z = self.airframe.matrix
         found = self._obstacles.range_along(self.airframe.centre_ned_m, (x, y, z), self._clock())
         return max(found - HALF_HEIGHT_M, 0.0)
-
-    def truth(self) -> dict[str, Any]:
-        """What became of the airframe among the obstacles, as plain values for JSON."""
-        newest = self.airframe.last_collision
-        return {
-            "crashed": self.airframe.crashed,
-            "collisions": self.airframe.collisions,
-            "last_collision": None
-            if newest is None
-            else {
-                "time_s": round(newest.time_s, 3),
-                "identifier": newest.identifier,
-                "object": newest.name,
-                "speed_mps": round(newest.speed_mps, 3),
-                "standing": newest.standing,
-                "crashed": newest.crashed,
-            },
-        }
 
     def sense_obstacles(self, into: ObstacleMap, yaw_rad: float, now_s: float) -> None:
         """Let the obstacle sensor measure, for collision prevention.

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.faults.schedule import Faults
 from mavlink_sim.flight.transmitter import Transmitter
-from mavlink_sim.physics.airframe import HARD_LANDING_MPS, Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.contact import HARD_LANDING_MPS, Collision
 from mavlink_sim.physics.estimate_errors import FallibleEstimate
 from mavlink_sim.physics.geography import geographic, start_of_vehicle
 from mavlink_sim.physics.gimbal import Gimbal
@@ -40,7 +41,6 @@ from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_C
 
 if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
-    from mavlink_sim.physics.collisions import Collision
     from mavlink_sim.surroundings import Surroundings
     from mavlink_sim.world.world import World
 
@@ -150,8 +150,8 @@ class Vehicle:
                 clock=self._scene_time_s,
             )
             self.airframe = self.surroundings.airframe
-            self.surroundings.airframe.on_collision = self._collided
         self.airframe.on_touch = self._touched
+        self.airframe.on_collision = self._collided
         self._air = None if air_seed is None else SharedAir(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
@@ -355,7 +355,7 @@ class Vehicle:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
     def _collided(self, collision: Collision) -> None:
-        """The airframe met something of the scene."""
+        """The airframe met something of the scene, or another vehicle."""
         self._on_event(str(collision))
 
     def _look_around(self) -> None:

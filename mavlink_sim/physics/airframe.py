@@ -13,6 +13,7 @@ import math
 import random
 from collections.abc import Callable
 
+from mavlink_sim.physics.contact import BOUNCE_MPS, CRASH_MPS, NEW_CONTACT_S, RESTITUTION, Collision
 from mavlink_sim.physics.normal_numbers import BITS, NORMAL
 from mavlink_sim.physics.rate_loop import MAX_YAW_RATE_RADPS, demanded_rates, mixed_thrusts
 
@@ -37,13 +38,9 @@ _TORQUE_PER_THRUST_M = ROTOR_TORQUE_NM / ROTOR_THRUST_MPS2
 GUST_TIME_CONSTANT_S = 1.5
 GUST_STEP_S = 0.032  # a fiftieth of the time constant: finer steps would not be seen
 
-# The ground. A multirotor's legs take a landing at a walking pace; at 5 m/s something breaks.
+# The ground.
 GEAR_TIME_CONSTANT_S = 0.1
 FRICTION = 0.8
-RESTITUTION = 0.25
-BOUNCE_MPS = 0.8
-HARD_LANDING_MPS = 2.0
-CRASH_MPS = 5.0
 # Leaning farther than this when it touches, it does not come to stand on its legs.
 MAX_STANDING_TILT_COSINE = 0.5
 
@@ -68,11 +65,14 @@ class Multirotor:
         crashed: it hit the ground too hard or upside down: the rotors are broken.
         touchdown_mps: the downward speed of the last contact with the ground.
         on_touch: called with that speed at every contact.
+        collisions: with things and with others, how many. last_collision: the newest; None before the first.
+        on_collision: called with each.
         floor_down_m: NED z of what it stands on or stood on last; the ground's, unless there are obstacles.
         wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
     """
 
     __slots__ = (
+        "_contacts",
         "_demand",
         "_gust",
         "_gust_left_s",
@@ -81,8 +81,11 @@ class Multirotor:
         "_rate_demand",
         "_spin",
         "acceleration",
+        "collisions",
         "crashed",
         "gusts_mps",
+        "last_collision",
+        "on_collision",
         "on_ground",
         "on_touch",
         "position",
@@ -111,6 +114,10 @@ class Multirotor:
         self.crashed = False
         self.touchdown_mps = 0.0
         self.on_touch: Callable[[float], None] | None = None
+        self.collisions = 0
+        self.last_collision: Collision | None = None
+        self.on_collision: Callable[[Collision], None] | None = None
+        self._contacts: dict[int, float] = {}
         self.wind = wind
         self.gusts_mps = gusts_mps
         self._matrix = _LEVEL
@@ -388,6 +395,18 @@ class Multirotor:
         if self._matrix[8] < 1.0 and not self.crashed:
             keep = 1.0 - min(1.0, dt_s / GEAR_TIME_CONSTANT_S)
             self.set_attitude(self.roll_rad * keep, self.pitch_rad * keep, self.yaw_rad)
+
+    # ---- things and others ------------------------------------------------------------------------------
+
+    def count(self, collision: Collision) -> None:
+        """It met something; staying in touch is no new meeting, unless it breaks now."""
+        before_s = self._contacts.get(collision.identifier, -math.inf)
+        self._contacts[collision.identifier] = collision.time_s
+        if collision.crashed or collision.time_s - before_s > NEW_CONTACT_S:
+            self.collisions += 1
+            self.last_collision = collision
+            if self.on_collision is not None:
+                self.on_collision(collision)
 
     def repair(self) -> None:
         """Whole rotors again, upright where it stands: what a new start of the vehicle finds."""

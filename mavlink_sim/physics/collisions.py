@@ -1,65 +1,22 @@
 """An airframe among obstacles: it cannot pass through them, breaks on them, and stands on them.
 
-It counts as an upright ellipsoid of its propellers' reach and a flat body's height; hitting something takes
-its speed, not its attitude. Where there is no scene there is the plain `Multirotor`, and nothing of this.
+Where there is no scene there is the plain `Multirotor`, and nothing of this.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from mavlink_sim.physics.airframe import (
-    BOUNCE_MPS,
-    CRASH_MPS,
-    HARD_LANDING_MPS,
-    MAX_STANDING_TILT_COSINE,
-    RESTITUTION,
-    Multirotor,
-    Vector,
-)
+from mavlink_sim.physics.airframe import MAX_STANDING_TILT_COSINE, Multirotor, Vector
+from mavlink_sim.physics.contact import BOUNCE_MPS, CRASH_MPS, HALF_HEIGHT_M, Collision, after_contact
 from mavlink_sim.world.obstacles import Gap, Obstacle, Obstacles
 
-RADIUS_M = 0.3
-HALF_HEIGHT_M = 0.12
-# Propeller guards slide along a wall; legs hold on a roof as on the ground.
-SLIDING_FRICTION = 0.3
 # It stands on what slopes by up to 37 degrees.
 STANDING_COSINE = 0.8
 SUPPORT_M = 0.01
-# Away from a thing for so long, it hits it anew.
-NEW_CONTACT_S = 0.5
 TOUCH_M = 1e-9
 
 _STILL: Vector = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Collision:
-    """One meeting with an obstacle, when it began.
-
-    Attributes:
-        time_s: the scene's time.
-        identifier, name: of the obstacle ("wall-2").
-        speed_mps: at which they met, along the surface's normal.
-        standing: on top of it: the airframe came to stand there, or bounced.
-        crashed: this broke the rotors.
-    """
-
-    time_s: float
-    identifier: int
-    name: str
-    speed_mps: float
-    standing: bool
-    crashed: bool
-
-    def __str__(self) -> str:
-        if self.crashed:
-            return f"crashed into {self.name} at {self.speed_mps:.1f} m/s"
-        if self.standing and self.speed_mps <= HARD_LANDING_MPS:
-            return f"touched down on {self.name}"
-        return f"hit {self.name} at {self.speed_mps:.1f} m/s"
 
 
 class CollidingMultirotor(Multirotor):
@@ -73,8 +30,6 @@ class CollidingMultirotor(Multirotor):
 
     Attributes:
         floor_down_m: NED z of what it stands on, or stood on last.
-        collisions: how many there were. last_collision: the newest.
-        on_collision: called with each.
 
     Raises:
         ValueError: something stands where it starts.
@@ -82,16 +37,12 @@ class CollidingMultirotor(Multirotor):
 
     __slots__ = (
         "_clock",
-        "_contacts",
         "_looked_at",
         "_obstacles",
         "_room_m",
         "_start",
         "_support",
-        "collisions",
         "floor_down_m",
-        "last_collision",
-        "on_collision",
     )
 
     def __init__(
@@ -106,12 +57,8 @@ class CollidingMultirotor(Multirotor):
         self._obstacles = obstacles
         self._start = start_ned_m
         self._clock = clock
-        self._contacts: dict[int, float] = {}
         self._support: Obstacle | None = None
         self.floor_down_m = 0.0
-        self.collisions = 0
-        self.last_collision: Collision | None = None
-        self.on_collision: Callable[[Collision], None] | None = None
         gap = obstacles.nearest(self.centre_ned_m, 0.0)
         if gap.obstacle is not None and gap.clear_m < 0.0:
             north, east = start_ned_m
@@ -162,49 +109,32 @@ class CollidingMultirotor(Multirotor):
         px, py, pz = gap.push_ned_m
         x, y, z = self.position
         self.position = (x + px, y + py, min(z + pz, 0.0))
-        nx, ny, nz = gap.normal_ned
         ux, uy, uz = obstacle.velocity_at(now_s)
         vx, vy, vz = self.velocity
-        rx, ry, rz = vx - ux, vy - uy, vz - uz
-        into = -(rx * nx + ry * ny + rz * nz)
+        into, (rx, ry, rz) = after_contact((vx - ux, vy - uy, vz - uz), gap.normal_ned)
         if into < 0.0:
             return
-        back = RESTITUTION * into if into > BOUNCE_MPS else 0.0
-        tx, ty, tz = rx + into * nx, ry + into * ny, rz + into * nz
-        sliding = math.sqrt(tx * tx + ty * ty + tz * tz)
-        keep = 1.0 - min(SLIDING_FRICTION * (into + back) / sliding, 1.0) if sliding > 0.0 else 0.0
-        after = (ux + keep * tx + back * nx, uy + keep * ty + back * ny, uz + keep * tz + back * nz)
-        self.velocity = after
-        if not back:  # it leans on it: what would accelerate it is held
+        after = self.velocity = (ux + rx, uy + ry, uz + rz)
+        bounces = into > BOUNCE_MPS
+        if not bounces:  # it leans on it: what would accelerate it is held
             ax, ay, az = self.acceleration
             self.acceleration = (
                 ax + (after[0] - vx) / dt_s,
                 ay + (after[1] - vy) / dt_s,
                 az + (after[2] - vz) / dt_s,
             )
-        standing = -nz > STANDING_COSINE
+        standing = -gap.normal_ned[2] > STANDING_COSINE
         was_crashed = self.crashed
         if into > CRASH_MPS or (standing and self.matrix[8] < MAX_STANDING_TILT_COSINE):
             self.crashed = True
         if standing:
             self.touchdown_mps = into
-            if not back:
+            if not bounces:
                 self.on_ground = True
                 self._support = obstacle
                 self.floor_down_m = self.position[2]
-        self._tell(obstacle, now_s, into, standing, self.crashed and not was_crashed)
-
-    def _tell(
-        self, obstacle: Obstacle, now_s: float, speed_mps: float, standing: bool, crashed: bool
-    ) -> None:
-        before_s = self._contacts.get(obstacle.identifier, -math.inf)
-        self._contacts[obstacle.identifier] = now_s
-        if crashed or now_s - before_s > NEW_CONTACT_S:
-            self.collisions += 1
-            collision = Collision(now_s, obstacle.identifier, obstacle.name, speed_mps, standing, crashed)
-            self.last_collision = collision
-            if self.on_collision is not None:
-                self.on_collision(collision)
+        crashed = self.crashed and not was_crashed
+        self.count(Collision(now_s, obstacle.identifier, obstacle.name, into, standing, crashed))
 
     # ---- standing on something --------------------------------------------------------------------------
 

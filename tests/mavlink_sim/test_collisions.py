@@ -13,13 +13,9 @@ from hypothesis import strategies as st
 from mavlink_sim.camera.scene import Path, Scene
 from mavlink_sim.cli import main
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.physics.airframe import CRASH_MPS, Multirotor
-from mavlink_sim.physics.collisions import (
-    HALF_HEIGHT_M,
-    RADIUS_M,
-    CollidingMultirotor,
-    Collision,
-)
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.collisions import CollidingMultirotor
+from mavlink_sim.physics.contact import CRASH_MPS, HALF_HEIGHT_M, RADIUS_M, Collision
 from mavlink_sim.simulation import Simulation, SimulationOptions
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
