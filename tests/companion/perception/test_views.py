@@ -27,7 +27,8 @@ def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alon
     (tmp_path / "companion.toml").write_text(
         f'[source]\nshare = "{shared}"\n'
         f'[views.down.source]\nuri = "shm://{shared}"\n'
-        f"[views.down.detector]\nmodel = {str(small_model)!r}\nimage_size = 96\nclasses = ['boat']\n"
+        f"[views.down.detector]\nmodel = {str(small_model)!r}\nprecision = 'float32'\nimage_size = 96\n"
+        "classes = ['boat']\n"
     )
     received: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
 
