@@ -37,7 +37,8 @@ def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
 def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path, tmp_path: Path) -> None:
     done = companion(
         "detect", pictures, "--model", small_model, "--precision", "float32", "--image-size", "160",
-        "--confidence", "0", "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved", cwd=tmp_path,
+        "--confidence", "0", "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved",
+        cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     messages = [json.loads(line) for line in done.stdout.splitlines()]
