@@ -76,10 +76,11 @@ class AttitudeController:
         if self._yaw_weight > 1e-4:
             yaw_gain /= self._yaw_weight  # the weight shall not slow a pure turn down
         self._gains = (value("MC_ROLL_P"), value("MC_PITCH_P"), yaw_gain)
-        self._limits = tuple(
-            min(math.radians(self._parameters.positive(name)), MAX_RATE_RADPS)
-            for name in ("MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX")
-        )
+
+        def limit(name: str) -> float:
+            return min(math.radians(self._parameters.positive(name)), MAX_RATE_RADPS)
+
+        self._limits = (limit("MC_ROLLRATE_MAX"), limit("MC_PITCHRATE_MAX"), limit("MC_YAWRATE_MAX"))
 
     def release(self) -> None:
         """Another controller has the vehicle."""
@@ -136,15 +137,18 @@ class AttitudeController:
         if wanted is None:
             return (NAN, NAN, NAN)
         attitude = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
-        error = product(inverse(attitude), _weighted(attitude, wanted, self._yaw_weight))
-        sign = 2.0 if error[0] >= 0.0 else -2.0
+        back = inverse(attitude)
+        w, x, y, z = product(back, _weighted(attitude, wanted, self._yaw_weight))
+        sign = 2.0 if w >= 0.0 else -2.0
         feed_forward = setpoint.yaw_rate_radps if math.isfinite(setpoint.yaw_rate_radps) else 0.0
-        down = third_axis(inverse(attitude))
-        p, q, r = (
-            min(max(gain * sign * part + feed_forward * axis, -limit), limit)
-            for gain, part, axis, limit in zip(self._gains, error[1:], down, self._limits, strict=True)
+        down_x, down_y, down_z = third_axis(back)
+        gain_p, gain_q, gain_r = self._gains
+        limit_p, limit_q, limit_r = self._limits
+        return (
+            min(max(gain_p * sign * x + feed_forward * down_x, -limit_p), limit_p),
+            min(max(gain_q * sign * y + feed_forward * down_y, -limit_q), limit_q),
+            min(max(gain_r * sign * z + feed_forward * down_z, -limit_r), limit_r),
         )
-        return (p, q, r)
 
 
 def _possible(rates: Vector, now: Vector) -> Vector:

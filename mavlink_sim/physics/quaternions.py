@@ -31,11 +31,11 @@ def inverse(quaternion: Quaternion) -> Quaternion:
 
 def unit(quaternion: Quaternion) -> Quaternion | None:
     """The quaternion at length one; None if it is no rotation (zero or not finite)."""
-    norm = math.hypot(*quaternion)
+    w, x, y, z = quaternion
+    norm = math.hypot(w, x, y, z)
     if not math.isfinite(norm) or norm < 1e-12:
         return None
-    w, x, y, z = (value / norm for value in quaternion)
-    return (w, x, y, z)
+    return (w / norm, x / norm, y / norm, z / norm)
 
 
 def third_axis(quaternion: Quaternion) -> Vector:

@@ -185,12 +185,14 @@ def position_target_global_int(vehicle: Vehicle) -> Any:
     )
 
 
+_UNUSED_OUTPUTS = (900,) * 12
+
+
 def servo_output_raw(vehicle: Vehicle) -> Any:
     widths = [900] * 4
     if vehicle.autopilot.armed:
         widths = [1000 + round(1000 * command) for command in vehicle.airframe.rotor_commands]
-    rest = {f"servo{number}_raw": 900 for number in range(9, 17)}
-    return packing.servo_output_raw(vehicle.boot_us & 0xFFFFFFFF, 0, *widths, 900, 900, 900, 900, **rest)
+    return packing.servo_output_raw(vehicle.boot_us & 0xFFFFFFFF, 0, *widths, *_UNUSED_OUTPUTS)
 
 
 def vfr_hud(vehicle: Vehicle) -> Any:
