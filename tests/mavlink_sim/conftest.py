@@ -72,7 +72,8 @@ class Cockpit:
         must: bool = True,
     ) -> float:
         """Let time pass until `condition`; returns how long that took."""
-        clock = self.vehicle.faults  # it goes on through a reboot
+        vehicle = self.vehicle
+        clock = vehicle.faults  # it goes on through a reboot
         started = clock.now_s
         next_setpoint = started
         while clock.now_s - started < limit_s - STEP_S / 2:
@@ -83,7 +84,7 @@ class Cockpit:
             if setpoint is not None and clock.now_s >= next_setpoint - 1e-9:
                 next_setpoint += 1.0 / rate_hz
                 self.send(setpoint)
-            self.vehicle.step(STEP_S)
+            vehicle.step(STEP_S)
             self._take()
             if condition():
                 return clock.now_s - started
@@ -92,8 +93,11 @@ class Cockpit:
         return limit_s
 
     def _take(self) -> None:
-        for link in self.vehicle.links:
-            self.inbox[link] += [(self.now_s, item) for item in self.vehicle.outgoing(link)]
+        vehicle = self.vehicle
+        for name, link in vehicle.links.items():
+            if link.outbox:
+                now_s = vehicle.now_s
+                self.inbox[name] += [(now_s, item) for item in vehicle.outgoing(name)]
 
     # ---- messages
 
