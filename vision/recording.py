@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import os
+import queue
 import threading
 import time
-from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,19 +21,16 @@ from vision.video_writer import VideoWriter, VideoWriterError
 
 logger = logging.getLogger(__name__)
 
-# Pictures that wait for the encoder. More would only be memory: an encoder that is too slow stays too slow.
-_WAITING_PICTURES = 4
-# Whoever ends the program is not kept waiting: what waits then gets so long, and what would take longer is
-# given up, and that is said. The last picture may take a second more, for the film to end with the flight.
+# Frames that wait for the encoder. More would only be memory: an encoder that is too slow stays too slow.
+_QUEUED_FRAMES = 4
+# Whoever ends the program is not kept waiting: what still waits then is given up, and that is said.
 _FINISHING_S = 2.0
-_LAST_PICTURE_S = 1.0
 # The network, in the same process, comes first.
 _NICER = 5
 
 
 @dataclass(frozen=True, slots=True)
 class _Picture:
-    slot: int  # its place in the film
     frame: Frame
     detections: Detections
     lines: tuple[str, ...]
@@ -68,10 +65,9 @@ class Recording:
         self._rate_hz = rate_hz
         self._first_ns: int | None = None
         self._next_slot = 0
-        self._waiting: deque[_Picture] = deque()
-        self._changed = threading.Condition()
+        self._refused_slot: int | None = None
+        self._queue: queue.Queue[_Picture | None] = queue.Queue(_QUEUED_FRAMES)
         self._failed = threading.Event()
-        self._closing = False
         self._finished_by_s = math.inf
         # A size is known only with the first frame; that nothing can be written there is known now.
         with VideoWriter(self._path, 16, 16, rate_hz):
@@ -86,15 +82,20 @@ class Recording:
         slot = round((frame.captured_ns - self._first_ns) / self._period_ns)
         if slot < self._next_slot or self._failed.is_set():
             return
-        picture = _Picture(slot, frame, detections, self.lines, self.highlight)
-        with self._changed:
-            if len(self._waiting) < _WAITING_PICTURES:
-                self._waiting.append(picture)
-            else:  # the newest is kept, whatever the encoder cannot draw before it
-                self._waiting[-1] = picture
-                self.skipped += 1
-            self._changed.notify()
-        self._next_slot = slot + 1
+        try:
+            self._queue.put_nowait(_Picture(frame, detections, self.lines, self.highlight))
+        except queue.Full:
+            # Not lost yet: a later frame may still take this picture's place in the film.
+            self._note_lost_before(slot)
+            self._refused_slot = slot
+        else:
+            self._note_lost_before(slot)
+            self._refused_slot = None
+            self._next_slot = slot + 1
+
+    def _note_lost_before(self, slot: float) -> None:
+        if self._refused_slot is not None and self._refused_slot < slot:
+            self.skipped += 1
 
     def close(self) -> None:
         """Finish the file; no file is left if it got no frame. A second call does nothing.
@@ -103,11 +104,10 @@ class Recording:
         """
         if not self._thread.is_alive():
             return
-        with self._changed:
-            self._finished_by_s = time.monotonic() + _FINISHING_S
-            self._closing = True
-            self._changed.notify()
+        self._finished_by_s = time.monotonic() + _FINISHING_S
+        self._queue.put(None)
         self._thread.join()
+        self._note_lost_before(math.inf)
         if self.skipped:
             logger.warning(
                 "%s: %d pictures are missing, the encoder was slow; a lower rate_hz suits this computer",
@@ -115,36 +115,20 @@ class Recording:
                 self.skipped,
             )
 
-    def _next(self) -> _Picture | None:
-        """The picture to draw next, when there is one; None at the end."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._closing)
-            return self._waiting.popleft() if self._waiting else None
-
-    def _fits(self, picture: _Picture, writer: VideoWriter, spent_s: float) -> bool:
-        """Whether there is time for it. Places before it that are empty take theirs, too."""
-        left_s = self._finished_by_s - time.monotonic()
-        if not self._waiting:
-            left_s = max(left_s, _LAST_PICTURE_S)
-        return (picture.slot + 1 - writer.frames) * spent_s / writer.frames <= left_s
-
     def _run(self) -> None:
         nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(nice + _NICER, 19))
         writer: VideoWriter | None = None
-        spent_s = 0.0
-        while (picture := self._next()) is not None:
+        while (picture := self._queue.get()) is not None:
             if self._failed.is_set():
+                continue
+            if time.monotonic() > self._finished_by_s:
+                self.skipped += 1
                 continue
             try:
                 if writer is None:
                     writer = VideoWriter(self._path, picture.frame.width, picture.frame.height, self._rate_hz)
-                elif not self._fits(picture, writer, spent_s):
-                    self.skipped += 1
-                    continue
-                started_s = time.monotonic()
                 _add(writer, picture)
-                spent_s += time.monotonic() - started_s
             except Exception as error:
                 self._fail(error)
         try:
