@@ -18,6 +18,7 @@ import typer
 from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.personality import AUTOPILOTS, PX4
+from mavlink_sim.physics.midair import REACH_M
 from mavlink_sim.px4.parameters import UnknownParameterError
 from mavlink_sim.releases import NEWEST, RELEASES
 from mavlink_sim.simulation import SimulationOptions
@@ -199,7 +200,7 @@ def simulate(
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     if spacing is not None:
-        _check("spacing", spacing, 0.5, 1000.0)
+        _check("spacing", spacing, REACH_M, 1000.0)  # nearer than that they would start in one another
     if noise not in ("on", "off"):
         _fail(f"--noise {noise!r}: expected on or off")
     parameters = _parameters(param or [])

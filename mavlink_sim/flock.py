@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.midair import Body, Midair
-from mavlink_sim.vehicle import Vehicle
-from mavlink_sim.world.aircraft import Aircraft, aircraft_objects, identifier_offset
+from mavlink_sim.vehicle import STEP_S, Vehicle
+from mavlink_sim.world.aircraft import Aircraft, aircraft_objects
 
 if TYPE_CHECKING:
     from mavlink_sim.world.world import WorldObject
@@ -38,10 +38,11 @@ def as_aircraft(vehicle: Vehicle) -> Aircraft:
 class Flock:
     """The vehicles that fly in one world.
 
+    Whoever steps them in lockstep calls `meet` after each step of 4 ms of all, and none can fly through
+    another. A vehicle's `copy` is in no flock.
+
     Args:
         size: how many there will be.
-
-    Whoever steps them in lockstep calls `meet` after each step of all, and none can fly through another.
     """
 
     def __init__(self, size: int) -> None:
@@ -50,25 +51,35 @@ class Flock:
         self._midair = Midair()
         self._seen: tuple[int, int, tuple[WorldObject, ...]] | None = None
 
-    def join(self, vehicle: Vehicle, offset: int | None = None) -> None:
+    def join(self, vehicle: Vehicle, offset: int = 0) -> None:
         """From now on the others see it, and run into it.
 
         Args:
-            offset: from its system id to its identifier among the world's things (`identifier_offset`); None:
-                that of the scene that is in its way.
+            offset: from a system id to its identifier among the world's things (`identifier_offset`), by
+                which the others' collisions with it are told; the same for all.
+
+        Raises:
+            ValueError: it is in one place with another, has joined before, or is one too many.
         """
+        number = vehicle.system_id
+        if len(self._vehicles) == self.size:
+            raise ValueError(f"vehicle {number}: this flock is of {self.size}, and all have joined")
+        faults = vehicle.faults
+        self._midair.join(
+            Body(
+                vehicle.airframe,
+                vehicle.start_ned_m,
+                offset + number,
+                f"vehicle {number}",
+                lambda: faults.now_s,
+            )
+        )
         self._vehicles.append(vehicle)
         self._seen = None
-        if offset is None:
-            around = vehicle.surroundings
-            offset = 0 if around is None else identifier_offset(around.scene.world)
-        number = vehicle.system_id
-        self._midair.join(Body(vehicle.airframe, vehicle.start_ned_m, offset + number, f"vehicle {number}"))
 
     def meet(self) -> None:
-        """Let those that touch run into each other; to be called when all have been stepped."""
-        if len(self._vehicles) > 1:
-            self._midair.look(self._vehicles[0].faults.now_s)
+        """Let those that touch run into each other; to be called when all have been stepped by 4 ms."""
+        self._midair.look(STEP_S)
 
     def others(self, vehicle: Vehicle) -> list[Aircraft]:
         """All but this one, as they are at this moment, in the order in which they joined."""

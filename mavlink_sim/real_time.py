@@ -37,8 +37,14 @@ class Paced(Protocol):
 
     def receive(self, name: str) -> None: ...
 
-    def advance(self, now_ns: int) -> bool:
-        """Take the steps that are due at a monotonic moment; whether there were any."""
+    def steps_due(self, now_ns: int) -> int:
+        """How many steps are to be taken at a monotonic moment; the same for all on one clock."""
+
+    def step(self) -> None:
+        """Take one."""
+
+    def settle(self, *, stepped: bool) -> None:
+        """Send what the steps brought, if there were any, and look what faults are asked for."""
 
     def show(self, now_ns: int) -> None:
         """Let those who look on see where it is at that moment."""
@@ -78,7 +84,7 @@ def run_together(
 ) -> None:
     """The loop: wait for the sockets until the next step is due, take in what came, step, send.
 
-    `stepped_all` is called whenever all of them have been stepped to one simulated time.
+    `stepped_all` is called after each step of all of them.
     """
     first = simulations[0]
     speed = first.speed
@@ -102,10 +108,13 @@ def run_together(
                 simulation.receive(name)
             # one moment for all, so that whoever looks on sees all of them at one simulated time
             now_ns = time.monotonic_ns()
-            stepped = False
-            for simulation in simulations:
-                stepped |= simulation.advance(now_ns)
-            if stepped:
+            steps = first.steps_due(now_ns)
+            for _ in range(steps):
+                for simulation in simulations:
+                    simulation.step()
                 stepped_all()
+            for simulation in simulations:
+                simulation.settle(stepped=steps > 0)
+            if steps:
                 for simulation in simulations:
                     simulation.show(now_ns)

@@ -237,23 +237,27 @@ class Simulation:
             if outgoing:
                 endpoint.send(outgoing)
 
-    def advance(self, now_ns: int) -> bool:
-        """The physics steps that are due at a moment (monotonic); whether there were any.
+    def steps_due(self, now_ns: int) -> int:
+        """How many physics steps are to be taken at a moment (monotonic).
 
         At most a few, so that the sockets are never left waiting long. Vehicles on one clock that are told
         of the same moments are always at the same simulated time.
         """
         due = self._clock_ns(now_ns) / 1e9 - self._simulated_s
-        steps = min(int(due / STEP_S), max(4, int(4 * self.options.speed)))
-        for _ in range(steps):
-            self.vehicle.step(STEP_S)
-            self._simulated_s += STEP_S
-            for name in self._faults.delivered():
-                self.receive(name)
-        if steps:
+        return min(int(due / STEP_S), max(4, int(4 * self.options.speed)))
+
+    def step(self) -> None:
+        """One physics step, and what a fault of the link held back until then."""
+        self.vehicle.step(STEP_S)
+        self._simulated_s += STEP_S
+        for name in self._faults.delivered():
+            self.receive(name)
+
+    def settle(self, *, stepped: bool) -> None:
+        """Send what the steps brought, if there were any, and look what faults are asked for."""
+        if stepped:
             self.flush()
         self._faults.poll()
-        return steps > 0
 
     def show(self, now_ns: int) -> None:
         """The pose to the camera and the truth to its file, each at its rate, stamped with the moment."""

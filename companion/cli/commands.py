@@ -21,7 +21,7 @@ import typer
 
 from companion.cli.bench import bench
 from companion.cli.evaluate import evaluate
-from companion.cli.flags import EXIT_BAD_INPUT, WithSettings, plain_errors, with_settings
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.settings import Settings
@@ -40,7 +40,7 @@ app = typer.Typer(
 
 app.add_typer(models, name="models")
 app.command()(evaluate)
-app.command(cls=WithSettings)(mission)
+settings_command(app)(mission)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
@@ -64,8 +64,7 @@ def every_command(
     """What holds for every command."""
 
 
-@app.command(cls=WithSettings)
-@with_settings
+@settings_command(app)
 def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
     from companion.bus.session import BusError
@@ -257,8 +256,7 @@ def train(
     )
 
 
-@app.command(cls=WithSettings)
-@with_settings
+@settings_command(app)
 def config(settings: Settings) -> None:
     """Print the effective settings as a TOML file with a comment on every key."""
     from companion.settings.reading import to_toml
@@ -266,8 +264,7 @@ def config(settings: Settings) -> None:
     typer.echo(to_toml(settings), nl=False)
 
 
-@app.command(cls=WithSettings)
-@with_settings
+@settings_command(app)
 def send(
     settings: Settings,
     command: Annotated[str, typer.Argument(help='such as "seek car" or "approach person distance=3"')],
@@ -286,8 +283,7 @@ def send(
         raise typer.Exit(EXIT_FAILED)
 
 
-@app.command(cls=WithSettings)
-@with_settings
+@settings_command(app)
 def echo(
     settings: Settings,
     key: Annotated[str, typer.Argument(help="a topic (labels), or a zenoh key with wildcards")] = "**",

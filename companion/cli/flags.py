@@ -13,7 +13,7 @@ import typer
 import typer.core
 import typer.main
 
-from companion.settings.reading import ConfigurationError, flags, load_settings
+from companion.settings.reading import ConfigurationError, Flag, flags, load_settings
 
 EXIT_BAD_INPUT = 2
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
@@ -42,12 +42,20 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
         raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
-class WithSettings(typer.core.TyperCommand):
-    """A command that takes every setting as a flag: `@app.command(cls=WithSettings)` over `@with_settings`.
+def settings_command(app: typer.Typer) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function a command of `app` that takes `--config` and every setting as a flag.
 
-    The flags of all commands together are hundreds, and each takes its time to make: they are made of the
-    command that is run, or whose help is asked for, alone.
+    Its first parameter, `settings`, is what they come to, checked; the others are its own.
     """
+
+    def register(command: Callable[..., None]) -> Callable[..., None]:
+        return app.command(cls=_WithSettings)(_given_settings(command))
+
+    return register
+
+
+class _WithSettings(typer.core.TyperCommand):
+    """Its flags are made when it is run, or its help is asked for: of all commands they are hundreds."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Its own parameters, the settings, and click's."""
@@ -57,12 +65,12 @@ class WithSettings(typer.core.TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; what was given for the settings goes by way of the context."""
-        ctx.meta[_GIVEN] = {key: ctx.params.pop(name) for name, key in _keys_of_parameters().items()}
+        ctx.meta[_GIVEN] = {flag.key: ctx.params.pop(name) for name, flag in _flags_by_parameter().items()}
         return super().invoke(ctx)
 
 
-def with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command `--config` and, with `WithSettings`, the flags; its first is the checked `settings`."""
+def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """The command as typer shall see it: without `settings`, with `--config`."""
     own = inspect.signature(command)
     hints = get_type_hints(command, include_extras=True)
 
@@ -94,26 +102,27 @@ def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
 
 
 @functools.cache
-def _keys_of_parameters() -> dict[str, str]:
-    return {flag.key.replace(".", "__"): flag.key for flag in flags()}
+def _flags_by_parameter() -> dict[str, Flag]:
+    return {flag.key.replace(".", "__"): flag for flag in flags()}
 
 
 @functools.cache
 def _setting_parameters() -> list[Any]:
-    """A flag for every setting, as typer makes them."""
+    """A flag for every setting, made by typer, as those of any command."""
 
-    def carrier(**_values: Any) -> None:
-        """Carries the flags; it is never run."""
+    def settings(**_values: Any) -> None:
+        """A command that is never run: typer makes parameters of commands alone."""
 
     parameters = []
-    for (name, key), flag in zip(_keys_of_parameters().items(), flags(), strict=True):
-        names = [f"--{key.replace('.', '-').replace('_', '-')}"]
-        if short := SHORT_NAMES.get(key):
+    for name, flag in _flags_by_parameter().items():
+        names = [f"--{flag.key.replace('.', '-').replace('_', '-')}"]
+        if short := SHORT_NAMES.get(flag.key):
             names.insert(0, short)
-        parameters.append(_option(name, str | None, *names, help=flag.help, panel=key.partition(".")[0]))
-    _declare(carrier, parameters)
+        panel = flag.key.partition(".")[0]
+        parameters.append(_option(name, str | None, *names, help=flag.help, panel=panel))
+    _declare(settings, parameters)
     app = typer.Typer(add_completion=False)
-    app.command()(carrier)
+    app.command()(settings)
     return list(typer.main.get_command(app).params)
 
 

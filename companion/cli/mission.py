@@ -6,13 +6,12 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.flags import plain_errors, with_settings
+from companion.cli.flags import plain_errors
 from companion.settings import Settings
 
 EXIT_FAILED = 1
 
 
-@with_settings
 def mission(
     settings: Settings,
     file: Annotated[str, typer.Argument(help="a mission file, or the name of one that came along: demo")],

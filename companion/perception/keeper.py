@@ -344,6 +344,7 @@ class PerceptionKeeper:
         finally:
             reading.cancel()
             process.kill()
+            process.close()
             self._process = self._pulse = None
             self._before.add(self._now)
             self._now = _Counts()

@@ -60,10 +60,14 @@ class PerceptionProcess:
         """
         said, saying = socket.socketpair()
         told, telling = socket.socketpair()
-        with saying, told, contextlib.ExitStack() as ours:
-            ours.enter_context(said)
-            ours.enter_context(telling)
+        with saying, told, contextlib.ExitStack() as failing:
+            failing.enter_context(said)
+            failing.enter_context(telling)
             saying.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+            reports = await asyncio.open_connection(sock=said)
+            failing.callback(reports[1].close)
+            orders = await asyncio.open_connection(sock=telling)
+            failing.callback(orders[1].close)
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-P",  # the search path below, and not the working directory, says what is imported
@@ -79,9 +83,7 @@ class PerceptionProcess:
                 # A Ctrl-C in the terminal is for the service, which then asks the worker to end.
                 process_group=0,
             )
-            reports = await asyncio.open_connection(sock=said)
-            orders = await asyncio.open_connection(sock=telling)
-            ours.pop_all()
+            failing.pop_all()
         worker = cls(process, reports, orders)
         worker._put(Begin(settings, first_track_id))
         return worker
@@ -117,6 +119,11 @@ class PerceptionProcess:
     def kill(self) -> None:
         self._signal(signal.SIGKILL)
 
+    def close(self) -> None:
+        """Hear and tell nothing more."""
+        for end in self._ends:
+            end.close()
+
     async def ends_within(self, timeout_s: float) -> bool:
         """Whether it is dead by then."""
         with contextlib.suppress(TimeoutError):
@@ -128,8 +135,8 @@ class PerceptionProcess:
     async def wait(self) -> str:
         """Wait for its death; how it died, in words."""
         code = await self._process.wait()
+        self.close()
         for end in self._ends:
-            end.close()
             with contextlib.suppress(ConnectionError):
                 await end.wait_closed()
         if code >= 0:

@@ -20,18 +20,24 @@ class Section(BaseModel):
 
     @classmethod
     def help_texts(cls) -> dict[str, str]:
-        """Key → the text below it.
+        """Key → the text below it; empty where the program is installed without its source.
 
-        Read when somebody asks for it: pydantic (`use_attribute_docstrings`) would read the source of every
-        section whenever it is imported, which is a tenth of the time that `companion send` takes to start.
+        Read once for all sections of a file: pydantic (`use_attribute_docstrings`) reads it again for each.
         """
-        return _texts_below_keys(cls.__module__)[cls.__name__]
+        texts: dict[str, str] = {}
+        for base in reversed(cls.__mro__):
+            if issubclass(base, Section):
+                texts |= _texts_below_keys(base.__module__).get(base.__name__, {})
+        return texts
 
 
 @functools.cache
 def _texts_below_keys(module: str) -> dict[str, dict[str, str]]:
     """Class → key → the string that stands below it in the source."""
-    classes = ast.parse(inspect.getsource(sys.modules[module])).body
+    try:
+        source = inspect.getsource(sys.modules[module])
+    except OSError:
+        return {}
     return {
         node.name: {
             key.target.id: " ".join(text.value.value.split())
@@ -42,6 +48,6 @@ def _texts_below_keys(module: str) -> dict[str, dict[str, str]]:
             and isinstance(text.value, ast.Constant)
             and isinstance(text.value.value, str)
         }
-        for node in classes
+        for node in ast.parse(source).body
         if isinstance(node, ast.ClassDef)
     }

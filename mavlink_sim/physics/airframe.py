@@ -67,7 +67,7 @@ class Multirotor:
         on_touch: called with that speed at every contact.
         collisions: with things and with others, how many. last_collision: the newest; None before the first.
         on_collision: called with each.
-        floor_down_m: NED z of what it stands on or stood on last; the ground's, unless there are obstacles.
+        floor_down_m: NED z of what it stands on or stood on last; 0 is the ground's.
         wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) come on top.
     """
 
@@ -83,6 +83,7 @@ class Multirotor:
         "acceleration",
         "collisions",
         "crashed",
+        "floor_down_m",
         "gusts_mps",
         "last_collision",
         "on_collision",
@@ -99,8 +100,6 @@ class Multirotor:
         "wind",
     )
 
-    floor_down_m = 0.0
-
     def __init__(self, seed: int = 0, wind: Vector = _STILL, gusts_mps: float = 0.0) -> None:
         self.position: Vector = _STILL
         self.velocity: Vector = _STILL
@@ -113,6 +112,7 @@ class Multirotor:
         self.on_ground = True
         self.crashed = False
         self.touchdown_mps = 0.0
+        self.floor_down_m = 0.0
         self.on_touch: Callable[[float], None] | None = None
         self.collisions = 0
         self.last_collision: Collision | None = None
@@ -369,6 +369,7 @@ class Multirotor:
     def _touch(self, down_mps: float, tilt_cosine: float) -> float:
         """Contact at this downward speed; returns the downward speed after it (negative: it bounces)."""
         self.touchdown_mps = down_mps
+        self.floor_down_m = 0.0
         if down_mps > CRASH_MPS or tilt_cosine < MAX_STANDING_TILT_COSINE:
             self.crashed = True
         if self.on_touch is not None:
@@ -389,7 +390,7 @@ class Multirotor:
             self.acceleration = ((moved[0] - vx) / dt_s, (moved[1] - vy) / dt_s, 0.0)
             self.velocity = moved
             x, y, _ = self.position
-            self.position = (x + moved[0] * dt_s, y + moved[1] * dt_s, 0.0)
+            self.position = (x + moved[0] * dt_s, y + moved[1] * dt_s, self.floor_down_m)
         else:
             self.velocity = self.acceleration = _STILL
         if self._matrix[8] < 1.0 and not self.crashed:

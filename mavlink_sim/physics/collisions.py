@@ -8,11 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mavlink_sim.physics.airframe import MAX_STANDING_TILT_COSINE, Multirotor, Vector
-from mavlink_sim.physics.contact import BOUNCE_MPS, CRASH_MPS, HALF_HEIGHT_M, Collision, after_contact
+from mavlink_sim.physics.contact import (
+    BOUNCE_MPS,
+    CRASH_MPS,
+    HALF_HEIGHT_M,
+    STANDING_COSINE,
+    Collision,
+    after_contact,
+)
 from mavlink_sim.world.obstacles import Gap, Obstacle, Obstacles
 
-# It stands on what slopes by up to 37 degrees.
-STANDING_COSINE = 0.8
 SUPPORT_M = 0.01
 TOUCH_M = 1e-9
 
@@ -28,9 +33,6 @@ class CollidingMultirotor(Multirotor):
         start_ned_m: north and east of the world's origin, where the airframe's own frame begins.
         clock: the scene's time in seconds.
 
-    Attributes:
-        floor_down_m: NED z of what it stands on, or stood on last.
-
     Raises:
         ValueError: something stands where it starts.
     """
@@ -42,7 +44,6 @@ class CollidingMultirotor(Multirotor):
         "_room_m",
         "_start",
         "_support",
-        "floor_down_m",
     )
 
     def __init__(
@@ -58,7 +59,6 @@ class CollidingMultirotor(Multirotor):
         self._start = start_ned_m
         self._clock = clock
         self._support: Obstacle | None = None
-        self.floor_down_m = 0.0
         gap = obstacles.nearest(self.centre_ned_m, 0.0)
         if gap.obstacle is not None and gap.clear_m < 0.0:
             north, east = start_ned_m
@@ -148,7 +148,6 @@ class CollidingMultirotor(Multirotor):
 
     def _touch(self, down_mps: float, tilt_cosine: float) -> float:
         self._support = None
-        self.floor_down_m = 0.0
         return super()._touch(down_mps, tilt_cosine)
 
     def _keep_standing(self, now_s: float) -> None:

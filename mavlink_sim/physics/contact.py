@@ -20,6 +20,8 @@ HARD_LANDING_MPS = 2.0
 CRASH_MPS = 5.0
 # Propeller guards slide along a wall; legs hold on a roof as on the ground.
 SLIDING_FRICTION = 0.3
+# It stands on what slopes by up to 37 degrees.
+STANDING_COSINE = 0.8
 # Away from a thing for so long, it hits it anew.
 NEW_CONTACT_S = 0.5
 
@@ -51,11 +53,14 @@ class Collision:
         return f"hit {self.name} at {self.speed_mps:.1f} m/s"
 
 
-def after_contact(velocity: Vector, normal: Vector) -> tuple[float, Vector]:
+def after_contact(
+    velocity: Vector, normal: Vector, friction: float = SLIDING_FRICTION
+) -> tuple[float, Vector]:
     """What a contact does to a velocity, both against what is touched.
 
     Args:
         velocity: m/s. normal: of the touched surface, of length 1, towards who touches it.
+        friction: what slides along it is slowed by, in what it is pressed with.
 
     Returns:
         The speed at which they meet, m/s, and the velocity afterwards; they part already if it is negative,
@@ -69,5 +74,5 @@ def after_contact(velocity: Vector, normal: Vector) -> tuple[float, Vector]:
     back = RESTITUTION * into if into > BOUNCE_MPS else 0.0
     tx, ty, tz = vx + into * nx, vy + into * ny, vz + into * nz
     sliding = math.sqrt(tx * tx + ty * ty + tz * tz)
-    keep = 1.0 - min(SLIDING_FRICTION * (into + back) / sliding, 1.0) if sliding > 0.0 else 0.0
+    keep = 1.0 - min(friction * (into + back) / sliding, 1.0) if sliding > 0.0 else 0.0
     return into, (keep * tx + back * nx, keep * ty + back * ny, keep * tz + back * nz)

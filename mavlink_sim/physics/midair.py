@@ -1,41 +1,49 @@
-"""Airframes that meet in the air: two upright ellipsoids, of equal mass, that cannot be in one place."""
+"""Airframes that meet: two upright ellipsoids, of equal mass, that cannot be in one place.
+
+Hull slides on hull without friction; one that comes down on another which stands on the ground stands there.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.contact import (
+    BOUNCE_MPS,
     CRASH_MPS,
     HALF_HEIGHT_M,
     RADIUS_M,
+    STANDING_COSINE,
     Collision,
     after_contact,
 )
 
 # Two equal ellipsoids touch where one of twice the size around the first passes through the second's middle.
 REACH_M, REACH_UP_M = 2.0 * RADIUS_M, 2.0 * HALF_HEIGHT_M
-# Those that are apart are not looked at again before they can have come together, and at least this often.
-LONGEST_S = 0.1
-# What both can gain in that time, beyond the speed that they have.
-GAIN_MPS = 4.0
+# Legs reach a little around what they stand on.
+_CARRIED = 1.05
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Body:
     """An airframe in the world.
 
     Attributes:
         start_ned_m: north and east, in the world, of where the airframe's own frame begins.
         identifier, name: what the others' collisions with it are told by.
+        clock: the time that its own are told with, seconds.
+        stands_on: another that carries it.
     """
 
     airframe: Multirotor
     start_ned_m: tuple[float, float]
     identifier: int
     name: str
+    clock: Callable[[], float]
+    stands_on: Body | None = None
 
     @property
     def place_ned_m(self) -> Vector:
@@ -44,88 +52,131 @@ class Body:
         return (x + self.start_ned_m[0], y + self.start_ned_m[1], z)
 
 
+def apart(first: Body, second: Body) -> float:
+    """How far two are apart, by the distance at which they touch: 1 where they do, less if they overlap."""
+    dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
+    return math.sqrt((dx * dx + dy * dy) / REACH_M**2 + dz * dz / REACH_UP_M**2)
+
+
 class Midair:
-    """The airframes of one world. Step all of them, then call `look`; often enough, each 4 ms at best."""
+    """The airframes of one world. Step all of them, then call `look`."""
 
     def __init__(self) -> None:
         self.bodies: list[Body] = []
-        self._until_s = -math.inf
+        # nobody is looked at again before one of them has moved by half of what all were apart then
+        self._looked_at: list[Vector] = []
+        self._free_m = 0.0
 
     def join(self, body: Body) -> None:
-        """From now on it meets the others."""
+        """From now on it meets the others.
+
+        Raises:
+            ValueError: it is in one place with another, or has joined before.
+        """
+        for other in self.bodies:
+            if other.airframe is body.airframe or other.identifier == body.identifier:
+                raise ValueError(f"{body.name} has joined already")
+            if apart(body, other) < 1.0:
+                away_m = math.dist(body.place_ned_m[:2], other.place_ned_m[:2])
+                raise ValueError(
+                    f"{body.name} is {away_m:.2g} m beside {other.name}: they need {REACH_M:g} m from middle "
+                    f"to middle, so one of them must start elsewhere"
+                )
         self.bodies.append(body)
-        self._until_s = -math.inf
+        self._looked_at.append(body.place_ned_m)
+        self._free_m = 0.0
 
-    def look(self, now_s: float) -> None:
-        """Let those meet that touch. `now_s` is the scene's time, at which all of them are."""
-        if now_s < self._until_s or len(self.bodies) < 2:
-            return
-        free_s = LONGEST_S
-        fastest = max(_speed(body.airframe) for body in self.bodies)
-        # nobody farther apart than this can meet before the next look
-        horizon_m = REACH_M + (2.0 * fastest + GAIN_MPS) * LONGEST_S
-        from_the_south = sorted(((body.place_ned_m, body) for body in self.bodies), key=lambda item: item[0])
-        for index, (place, body) in enumerate(from_the_south):
-            for other_place, other in itertools.islice(from_the_south, index + 1, None):
-                if other_place[0] - place[0] > horizon_m:
-                    break
-                clear_m = math.dist(place, other_place) - REACH_M
-                if clear_m <= 0.0 and not (body.airframe.on_ground and other.airframe.on_ground):
-                    self._meet(body, other, now_s)
-                    free_s = 0.0
-                else:
-                    closing = _speed(body.airframe) + _speed(other.airframe) + GAIN_MPS
-                    free_s = min(free_s, max(clear_m, 0.0) / closing)
-        self._until_s = now_s + free_s
+    def look(self, step_s: float) -> None:
+        """Let those meet that touch.
 
-    def _meet(self, first: Body, second: Body, now_s: float) -> None:
-        """Part them if they touch, each by its share, and take what they ran into each other with."""
-        ax, ay, az = first.place_ned_m
-        bx, by, bz = second.place_ned_m
-        dx, dy, dz = ax - bx, ay - by, az - bz
-        apart = math.sqrt((dx * dx + dy * dy) / REACH_M**2 + dz * dz / REACH_UP_M**2)
-        if apart >= 1.0:
+        Args:
+            step_s: since they were looked at before. What moves farther in it than the hulls are thick may be
+                through another unseen.
+        """
+        for body in self.bodies:
+            if body.stands_on is not None:
+                _fall_unless_carried(body, body.stands_on)
+        limit = (0.5 * self._free_m) ** 2
+        for body, (lx, ly, lz) in zip(self.bodies, self._looked_at, strict=True):
+            x, y, z = body.place_ned_m
+            x, y, z = x - lx, y - ly, z - lz
+            if x * x + y * y + z * z >= limit:
+                break
+        else:
             return
-        if apart > 0.0:
-            # out along the line between the middles, to where the hulls touch
-            out = 1.0 / apart - 1.0
-            push = (dx * out, dy * out, dz * out)
-            nx, ny, nz = dx / REACH_M**2, dy / REACH_M**2, dz / REACH_UP_M**2
-            length = math.sqrt(nx * nx + ny * ny + nz * nz)
-            normal = (nx / length, ny / length, nz / length)
-        else:  # in one place there is no side: one of them goes up
-            push, normal = (0.0, 0.0, -REACH_UP_M), (0.0, 0.0, -1.0)
-        # what stands on the ground does not give way
-        share = (
-            0.5 if first.airframe.on_ground == second.airframe.on_ground else float(second.airframe.on_ground)
-        )
+        self._free_m = math.inf
+        for first, second in itertools.combinations(self.bodies, 2):
+            clear_m = math.dist(first.place_ned_m, second.place_ned_m) - REACH_M
+            if clear_m <= 0.0 and apart(first, second) < 1.0:
+                self._meet(first, second, step_s)
+            self._free_m = min(self._free_m, max(clear_m, 0.0))
+        self._looked_at = [body.place_ned_m for body in self.bodies]
+
+    def _meet(self, first: Body, second: Body, step_s: float) -> None:
+        """Part them, each by its share, and take what they ran into each other with."""
+        if first.stands_on is second or second.stands_on is first:
+            return
+        push, normal = _parting(first, second)
+        share = _share(first.airframe, second.airframe)
         before = _difference(first.airframe.velocity, second.airframe.velocity)
-        into, after = after_contact(before, normal)
+        into, after = after_contact(before, normal, friction=0.0)
         change = _difference(after, before)
-        _give(first.airframe, push, change, share)
-        _give(second.airframe, push, change, share - 1.0)
-        if into < 0.0:
+        held_s = (
+            step_s if into <= BOUNCE_MPS else math.inf
+        )  # one leans on the other: what accelerates is held
+        _give(first.airframe, push, change, share, held_s)
+        _give(second.airframe, push, change, share - 1.0, held_s)
+        if into <= 0.0:
             return
-        for one, other in ((first, second), (second, first)):
+        for one, other, up in ((first, second, -normal[2]), (second, first, normal[2])):
+            above = up > STANDING_COSINE
             crashed = into > CRASH_MPS and not one.airframe.crashed
             one.airframe.crashed |= into > CRASH_MPS
-            one.airframe.count(Collision(now_s, other.identifier, other.name, into, False, crashed))
+            one.airframe.count(Collision(one.clock(), other.identifier, other.name, into, above, crashed))
+            if above and other.airframe.on_ground and into <= BOUNCE_MPS:
+                one.airframe.on_ground = True
+                one.airframe.floor_down_m = one.airframe.position[2]
+                one.stands_on = other
 
 
-def _speed(airframe: Multirotor) -> float:
-    vx, vy, vz = airframe.velocity
-    return math.sqrt(vx * vx + vy * vy + vz * vz)
+def _fall_unless_carried(upper: Body, lower: Body) -> None:
+    """It stands no more when it has taken off, or when what carried it is no longer there."""
+    if upper.airframe.on_ground and lower.airframe.on_ground and apart(upper, lower) < _CARRIED:
+        return
+    upper.stands_on = None
+    if upper.airframe.floor_down_m < 0.0:
+        upper.airframe.on_ground = False
+
+
+def _parting(first: Body, second: Body) -> tuple[Vector, Vector]:
+    """How far the first has to go, if it alone goes, until the hulls touch; and the second's normal there."""
+    dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
+    distance = apart(first, second)
+    if distance == 0.0:  # in one place there is no side: one of them goes up
+        return (0.0, 0.0, -REACH_UP_M), (0.0, 0.0, -1.0)
+    out = 1.0 / distance - 1.0
+    nx, ny, nz = dx / REACH_M**2, dy / REACH_M**2, dz / REACH_UP_M**2
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return (dx * out, dy * out, dz * out), (nx / length, ny / length, nz / length)
+
+
+def _share(first: Multirotor, second: Multirotor) -> float:
+    """The first one's part of what parts them: what stands does not give way to what flies."""
+    if first.on_ground == second.on_ground:
+        return 0.5
+    return 0.0 if first.on_ground else 1.0
 
 
 def _difference(first: Vector, second: Vector) -> Vector:
     return (first[0] - second[0], first[1] - second[1], first[2] - second[2])
 
 
-def _give(airframe: Multirotor, push: Vector, change: Vector, share: float) -> None:
+def _give(airframe: Multirotor, push: Vector, change: Vector, share: float, held_s: float) -> None:
     """Move an airframe by its share of a push, and its velocity by its share of a change."""
-    if share == 0.0:
-        return
     x, y, z = airframe.position
     airframe.position = (x + share * push[0], y + share * push[1], min(z + share * push[2], 0.0))
     vx, vy, vz = airframe.velocity
     airframe.velocity = (vx + share * change[0], vy + share * change[1], vz + share * change[2])
+    ax, ay, az = airframe.acceleration
+    share /= held_s
+    airframe.acceleration = (ax + share * change[0], ay + share * change[1], az + share * change[2])

@@ -54,7 +54,7 @@ def test_the_camera_is_on_one_vehicle_and_each_has_its_own_truth_file() -> None:
         (["--vehicles", "10", "--system-id", "250"], ["255"]),
         (["--vehicles", "10", "--onboard-port", "65530"], ["--onboard-port", "65535"]),
         (["--vehicles", "2", "--camera-vehicle", "3"], ["camera", "3"]),
-        (["--spacing", "0"], ["--spacing", "0.5 to 1000"]),
+        (["--spacing", "0"], ["--spacing", "0.6 to 1000"]),
         (["--noise", "some"], ["--noise", "on or off"]),
     ],
     ids=["none", "ids", "ports", "camera", "spacing", "noise"],

@@ -3,60 +3,75 @@
 from __future__ import annotations
 
 import math
+import threading
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim import Flock, LockstepVehicle
 from mavlink_sim.fleet import Fleet, instance_options
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
 from mavlink_sim.physics.contact import CRASH_MPS, Collision
-from mavlink_sim.physics.midair import REACH_M, REACH_UP_M, Body, Midair
+from mavlink_sim.physics.midair import REACH_UP_M, Body, Midair, apart
 from mavlink_sim.simulation import SimulationOptions
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
-from mavlink_sim.world.world import World, WorldObject
 
 speeds = st.floats(-8.0, 8.0, allow_subnormal=False)
 velocities = st.tuples(speeds, speeds, speeds)
 offsets = st.floats(-0.7, 0.7, allow_subnormal=False)
 
 
+class World4ms:
+    """Airframes stepped together, 4 ms a step."""
+
+    def __init__(self, *airframes: Multirotor) -> None:
+        self.airframes = airframes
+        self.midair = Midair()
+        self.now_s = 0.0
+        for number, airframe in enumerate(airframes, start=1):
+            self.midair.join(Body(airframe, (0.0, 0.0), number, f"vehicle {number}", lambda: self.now_s))
+
+    def look(self) -> None:
+        self.midair.look(STEP_S)
+
+    def step(self) -> None:
+        for airframe in self.airframes:
+            airframe.advance(STEP_S)
+        self.now_s += STEP_S
+        self.look()
+
+    def apart(self) -> float:
+        return apart(*self.midair.bodies)
+
+
 def flying(place: Vector, velocity: Vector) -> Multirotor:
     airframe = Multirotor()
-    airframe.on_ground = False
-    airframe.position, airframe.velocity = place, velocity
+    put(airframe, place, velocity)
     return airframe
 
 
-def together(*airframes: Multirotor) -> Midair:
-    midair = Midair()
-    for number, airframe in enumerate(airframes, start=1):
-        midair.join(Body(airframe, (0.0, 0.0), number, f"vehicle {number}"))
-    return midair
-
-
-def apart(first: Multirotor, second: Multirotor) -> float:
-    """1 where their hulls touch, less where they overlap."""
-    dx, dy, dz = (a - b for a, b in zip(first.position, second.position, strict=True))
-    return math.sqrt((dx * dx + dy * dy) / REACH_M**2 + dz * dz / REACH_UP_M**2)
+def put(airframe: Multirotor, place: Vector, velocity: Vector) -> None:
+    airframe.on_ground = False
+    airframe.position, airframe.velocity = place, velocity
 
 
 @given(place=st.tuples(offsets, offsets, offsets), one=velocities, other=velocities)
 def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
     place: Vector, one: Vector, other: Vector
 ) -> None:
-    here = (0.0, 0.0, -5.0)
-    first, second = flying(here, one), flying((place[0], place[1], place[2] - 5.0), other)
-    touching = apart(first, second) < 1.0
-    together(first, second).look(0.0)
+    first, second = flying((0.0, 0.0, -5.0), one), flying((9.0, 0.0, -5.0), other)
+    world = World4ms(first, second)
+    put(second, (place[0], place[1], place[2] - 5.0), other)
+    touching = world.apart() < 1.0
+    world.look()
     if not touching:
         assert (first.velocity, second.velocity) == (one, other)
         assert first.collisions == second.collisions == 0
         return
-    assert apart(first, second) >= 1.0 - 1e-9
+    assert world.apart() >= 1.0 - 1e-9
     # they are of one mass: momentum stays, energy does not grow
     for axis in range(3):
         assert first.velocity[axis] + second.velocity[axis] == pytest.approx(
@@ -70,26 +85,28 @@ def test_those_that_overlap_are_parted_and_nothing_comes_of_nothing(
     assert first.collisions == second.collisions <= 1
 
 
+@settings(max_examples=40)
 @given(
     places=st.lists(st.tuples(*[st.floats(-4.0, 4.0)] * 3), min_size=2, max_size=5),
     ways=st.lists(velocities, min_size=5, max_size=5),
+    thrusts=st.lists(st.floats(0.0, 20.0), min_size=5, max_size=5),
+    tilts=st.lists(st.floats(-1.5, 1.5), min_size=5, max_size=5),
 )
-def test_nobody_passes_by_unseen_between_two_looks(places: list[Vector], ways: list[Vector]) -> None:
-    """Whoever is far enough off is not looked at, and nothing is missed by it."""
+def test_nobody_passes_by_unseen_between_two_looks(
+    places: list[Vector], ways: list[Vector], thrusts: list[float], tilts: list[float]
+) -> None:
+    """Those that are far off are not looked at, however they accelerate, and nothing is missed by it."""
 
     def first_meeting(*, always: bool) -> tuple[int, list[int]] | None:
-        bodies = [
-            flying((x, y, z - 50.0), way) for (x, y, z), way in zip(places, ways[: len(places)], strict=True)
-        ]
-        midair = together(*bodies)
+        bodies = [flying((20.0 * number, 0.0, -50.0), (0.0, 0.0, 0.0)) for number in range(len(places))]
+        world = World4ms(*bodies)
+        for body, (x, y, z), way, thrust, tilt in zip(bodies, places, ways, thrusts, tilts, strict=False):
+            put(body, (x, y, z - 50.0), way)
+            body.command(thrust, tilt, -tilt, 0.0)
         for step in range(150):
-            for body in bodies:
-                body.position = tuple(  # type: ignore[assignment]
-                    p + v * STEP_S for p, v in zip(body.position, body.velocity, strict=True)
-                )
             if always:
-                midair._until_s = -math.inf
-            midair.look(step * STEP_S)
+                world.midair._free_m = 0.0
+            world.step()
             if any(body.collisions for body in bodies):
                 return step, [body.collisions for body in bodies]
         return None
@@ -103,11 +120,10 @@ def test_two_that_meet_head_on_bounce_or_break(speed_mps: float) -> None:
     second = flying((0.601, 0.0, -20.0), (-speed_mps, 0.0, 0.0))
     told: list[Collision] = []
     first.on_collision = second.on_collision = told.append
-    midair = together(first, second)
-    for step in range(50):
-        for one in (first, second):
-            one.advance(STEP_S)
-        midair.look(step * STEP_S)
+    world = World4ms(first, second)
+    for _ in range(50):
+        world.step()
+        assert world.apart() > 0.99
     breaks = 2.0 * speed_mps > CRASH_MPS
     assert [collision.name for collision in told] == ["vehicle 2", "vehicle 1"]
     assert all(collision.speed_mps == pytest.approx(2.0 * speed_mps, rel=0.02) for collision in told)
@@ -116,22 +132,68 @@ def test_two_that_meet_head_on_bounce_or_break(speed_mps: float) -> None:
     assert first.velocity[0] < 0.0 < second.velocity[0]
 
 
-def test_who_stands_on_the_ground_does_not_give_way() -> None:
-    standing = Multirotor()
-    falling = flying((0.1, 0.0, -1.0), (0.0, 0.0, 2.0))
-    midair = together(standing, falling)
-    lowest_m = 1.0
-    for step in range(500):
-        falling.advance(STEP_S)
-        standing.advance(STEP_S)
-        midair.look(step * STEP_S)
-        assert apart(standing, falling) > 0.99
-        lowest_m = min(lowest_m, -falling.position[2])
-    assert standing.position == (0.0, 0.0, 0.0)
-    assert standing.on_ground
-    assert falling.last_collision is not None
-    assert falling.last_collision.name == "vehicle 1"
-    assert lowest_m < 0.3
+def test_one_that_sinks_onto_another_stands_on_it_until_that_one_leaves() -> None:
+    below, above = Multirotor(), flying((0.1, 0.0, -1.0), (0.0, 0.0, 0.4))
+    world = World4ms(below, above)
+    above.thrust_mps2 = GRAVITY_MPS2 - 0.4  # its drag at 0.4 m/s does the rest
+    above.command(GRAVITY_MPS2 - 0.4, 0.0, 0.0, 0.0)
+    while not above.on_ground:
+        world.step()
+        assert world.apart() > 0.99
+        assert world.now_s < 10.0
+    above.command(0.0, 0.0, 0.0, 0.0)
+    for _ in range(250):
+        world.step()
+    assert above.on_ground
+    assert -above.position[2] == pytest.approx(REACH_UP_M, abs=0.02)
+    assert above.acceleration == (0.0, 0.0, 0.0)
+    assert (below.position, below.on_ground) == ((0.0, 0.0, 0.0), True)
+    assert str(above.last_collision) == "touched down on vehicle 1"
+    assert str(below.last_collision) == "hit vehicle 2 at 0.4 m/s"
+    below.position = (5.0, 0.0, 0.0)
+    for _ in range(250):
+        world.step()
+    assert (above.on_ground, above.position[2]) == (True, 0.0)  # it fell
+
+
+def test_one_that_falls_on_another_bounces_off_and_neither_is_pushed_into_the_ground() -> None:
+    below, above = Multirotor(), flying((0.1, 0.0, -1.0), (0.0, 0.0, 2.0))
+    world = World4ms(below, above)
+    for _ in range(500):
+        world.step()
+        assert world.apart() > 0.99
+        assert below.position[2] == 0.0
+        assert above.position[2] <= 0.0
+    assert below.on_ground
+    assert above.last_collision is not None
+    assert above.last_collision.speed_mps > 2.0
+
+
+def test_two_that_slide_into_each_other_on_the_ground_stop_there() -> None:
+    first, second = Multirotor(), Multirotor()
+    second.position = (1.0, 0.0, 0.0)
+    world = World4ms(first, second)
+    first.velocity = (3.5, 0.0, 0.0)
+    for _ in range(250):
+        world.step()
+        assert world.apart() > 0.99
+    assert first.collisions == second.collisions == 1
+    assert first.position[2] == second.position[2] == 0.0
+
+
+def test_in_one_place_two_cannot_begin() -> None:
+    flock = Flock(3)
+    first = LockstepVehicle({"onboard": {}}).vehicle
+    flock.join(first)
+    with pytest.raises(ValueError, match="vehicle 1 has joined already"):
+        flock.join(first)
+    near = LockstepVehicle({"onboard": {}}, system_id=2, start_ned_m=(0.0, 0.5)).vehicle
+    with pytest.raises(ValueError, match=r"vehicle 2 is 0.5 m beside vehicle 1: they need 0.6 m"):
+        flock.join(near)
+    flock.join(LockstepVehicle({"onboard": {}}, system_id=3, start_ned_m=(0.0, 0.6)).vehicle)
+    flock.join(LockstepVehicle({"onboard": {}}, system_id=4, start_ned_m=(0.0, 1.2)).vehicle)
+    with pytest.raises(ValueError, match="vehicle 5: this flock is of 3"):
+        flock.join(LockstepVehicle({"onboard": {}}, system_id=5, start_ned_m=(9.0, 0.0)).vehicle)
 
 
 def place(north: float, east: float, down: float) -> Any:
@@ -141,52 +203,77 @@ def place(north: float, east: float, down: float) -> Any:
 
 
 def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
-    scene = World((WorldObject(9, "box", (30.0, 0.0, 0.0)),))
     pair = [
-        LockstepVehicle({"onboard": {}}, system_id=number, seed=number, start_ned_m=(start, 0.0), scene=scene)
+        LockstepVehicle({"onboard": {}}, system_id=number, seed=number, start_ned_m=(start, 0.0))
         for number, start in ((1, 0.0), (2, 6.0))
     ]
     flock = Flock(2)
     for vehicle in pair:
-        flock.join(vehicle.vehicle)
+        flock.join(vehicle.vehicle, offset=9)
         vehicle.take_off(3.0)
-        vehicle.set_mode("HOLD")
     # each towards where the other is, in its own frame
     for vehicle, north in zip(pair, (6.0, -6.0), strict=True):
         vehicle.repeat(place(north, 0.0, -3.0), 20.0)
         vehicle.step(0.1)
         vehicle.set_mode("OFFBOARD")
-    first, second = (vehicle.vehicle.airframe for vehicle in pair)
-    nearest_m = math.inf
+    first, second = flock._midair.bodies
     for _ in range(1500):
         for vehicle in pair:
             vehicle.step(STEP_S)
         flock.meet()
-        x, y, z = first.position
-        ox, oy, oz = second.position
-        nearest_m = min(nearest_m, math.dist((x, y, z), (ox + 6.0, oy, oz)))
-    assert pair[0].truth.collisions >= 1
+        assert apart(first, second) > 0.95
     assert pair[0].truth.collision is not None
     assert (pair[0].truth.collision.name, pair[0].truth.collision.identifier) == ("vehicle 2", 11)
-    assert nearest_m > REACH_UP_M * 0.95
     assert any("vehicle 1 at" in event for event in pair[1].events)
 
 
-def test_a_fleet_in_real_time_tells_who_ran_into_whom() -> None:
+def test_one_that_lands_on_another_has_landed() -> None:
+    pair = [
+        LockstepVehicle(
+            {"onboard": {}}, system_id=number, start_ned_m=(start, 0.0), noise=False, gusts_mps=0.0
+        )
+        for number, start in ((1, 0.0), (2, 3.0))
+    ]
+    flock = Flock(2)
+    for vehicle in pair:
+        flock.join(vehicle.vehicle)
+    upper = pair[1]
+    upper.take_off(3.0)
+    airframe = upper.vehicle.airframe
+    airframe.position = (
+        -2.95,
+        0.0,
+        airframe.position[2],
+    )  # above the other, a hand's breadth beside its middle
+    upper.send(dialect.MAVLink_command_long_message(2, 1, 21, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan))
+    for _ in range(10_000):
+        upper.step(STEP_S)
+        flock.meet()
+        if not upper.truth.armed:
+            break
+    assert (upper.truth.armed, upper.truth.landed, upper.truth.on_ground) == (False, True, True)
+    assert upper.truth.height_m == pytest.approx(REACH_UP_M, abs=0.03)
+
+
+@pytest.mark.parametrize("speed", [1.0, 20.0])
+def test_a_fleet_in_real_time_tells_who_ran_into_whom(speed: float) -> None:
     said: list[str] = []
-    options = SimulationOptions(onboard_bind=0, gcs_bind=0, noise=False, gusts_mps=0.0)
+    options = SimulationOptions(onboard_bind=0, gcs_bind=0, noise=False, gusts_mps=0.0, speed=speed)
 
     def hear(text: str) -> None:
         said.append(text)
-        if "hit" in text or "crashed into" in text:
+        if "vehicle 2 at" in text:
             fleet.stop()
 
-    with Fleet(instance_options(options, 2, 1.5), hear) as fleet:
-        thrown = fleet.simulations[0].vehicle.airframe
-        thrown.on_ground = False
-        thrown.position, thrown.velocity = (0.0, 0.0, -0.1), (0.0, 4.5, -2.0)
+    with Fleet(instance_options(options, 2, 12.0), hear) as fleet:
+        first, second = (simulation.vehicle.airframe for simulation in fleet.simulations)
+        put(first, (0.0, 0.0, -40.0), (0.0, 15.0, 0.0))
+        put(second, (0.0, 0.0, -40.0), (0.0, -15.0, 0.0))
+        given_up = threading.Timer(30.0, fleet.stop)
+        given_up.start()
         fleet.run()
+        given_up.cancel()
         truth = fleet.simulations[0].truth()
-    assert any(text.startswith("vehicle 1: hit vehicle 2 at ") for text in said)
+    assert any(text.startswith("vehicle 1: crashed into vehicle 2 at ") for text in said), said
     assert truth["collisions"] == 1
-    assert truth["last_collision"]["object"] == "vehicle 2"
+    assert (truth["last_collision"]["object"], truth["crashed"]) == ("vehicle 2", True)
