@@ -160,14 +160,19 @@ def test_a_worker_without_a_service_ends_at_once() -> None:
     assert process.returncode == 1
 
 
-async def test_the_last_words_of_a_worker_are_read_whatever_it_was_told_after_them(
-    pictures: Path, tmp_path: Path
-) -> None:
-    # Three pictures: what is said of them all fits into the socket, where nobody takes it yet.
+@pytest.fixture
+def few_pictures(pictures: Path, tmp_path: Path) -> Path:
+    """So few that what is said of them all fits into the socket, where nobody takes it yet."""
     for picture in sorted(pictures.iterdir())[:3]:
         shutil.copy(picture, tmp_path)
+    return tmp_path
+
+
+async def test_the_last_words_of_a_worker_are_read_whatever_it_was_told_after_them(
+    few_pictures: Path,
+) -> None:
     settings = load_settings(
-        Path(os.devnull), {"source.uri": str(tmp_path), "detector.enabled": "false"}, environment={}
+        Path(os.devnull), {"source.uri": str(few_pictures), "detector.enabled": "false"}, environment={}
     )
     process = await PerceptionProcess.spawn(settings, subprocess.DEVNULL)
     # Nothing is read until it has ended, as when the service's own loop stands still for a moment.
