@@ -181,8 +181,12 @@ def test_the_truth_is_on_record_line_by_line(tmp_path: Path) -> None:
         "mode",
         "armed",
         "landed",
+        "crashed",
+        "collisions",
+        "last_collision",
         "objects",
     }
+    assert (last["crashed"], last["collisions"], last["last_collision"]) == (False, 0, None)
     assert (last["mode"], last["armed"], last["landed"]) == ("HOLD", False, True)
     assert last["objects"]
     assert set(last["objects"][0]) == {"identifier", "class_name", "position_ned_m", "range_m"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -201,7 +202,14 @@ async def test_a_killed_worker_is_replaced_and_the_sequence_goes_on(photos: Path
         await until(lambda: len(heard.results) >= 3)
         pid = keeper.status.pid
         assert pid is not None
+        ended = os.pidfd_open(pid)
         os.kill(pid, signal.SIGKILL)
+        assert select.select([ended], [], [], DEADLINE_S)[0]
+        os.close(ended)
+        # It is told something before the loop can know of its death, as in flight: that must not cost it its
+        # successor.
+        for watched in (True, False, True):
+            keeper.watch(watched)
         await until(lambda: keeper.status.state is PerceptionState.RESTARTING)
         before = len(heard.results)
         await until(lambda: len(heard.results) > before)
