@@ -311,9 +311,8 @@ class AutopilotDriver(ABC):
         if self._link is None or self._system_id is None:
             return
         made_ms = self._boot_ms()
-        if setpoint.expired(
-            time.monotonic_ns()
-        ):  # after the stamp: a stop between the two shows at one of them
+        # after the stamp: a stop between the two shows at one of them
+        if setpoint.expired(time.monotonic_ns()):
             self._say_late()
             return
         zero = (0.0, 0.0, 0.0)  # the type mask says what counts

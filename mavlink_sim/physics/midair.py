@@ -75,7 +75,7 @@ class Midair:
         """
         for other in self.bodies:
             if other.airframe is body.airframe or other.identifier == body.identifier:
-                raise ValueError(f"{body.name} has joined already")
+                raise ValueError(f"{body.name} has joined already: each needs a system id of its own")
             if apart(body, other) < 1.0:
                 away_m = math.dist(body.place_ned_m[:2], other.place_ned_m[:2])
                 raise ValueError(
@@ -121,9 +121,8 @@ class Midair:
         before = _difference(first.airframe.velocity, second.airframe.velocity)
         into, after = after_contact(before, normal, friction=0.0)
         change = _difference(after, before)
-        held_s = (
-            step_s if into <= BOUNCE_MPS else math.inf
-        )  # one leans on the other: what accelerates is held
+        # where they do not bounce one leans on the other, and what would accelerate it is held
+        held_s = step_s if into <= BOUNCE_MPS else math.inf
         _give(first.airframe, push, change, share, held_s)
         _give(second.airframe, push, change, share - 1.0, held_s)
         if into <= 0.0:
