@@ -11,6 +11,7 @@ plugin, which repeats the last setpoint from such a thread, is not used: setpoin
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import json
 import logging
 import time
@@ -53,6 +54,8 @@ class MavsdkDriver(AutopilotDriver):
     """See `companion.vehicle.driver.Driver`."""
 
     _mavsdk: mavsdk.Mavsdk | None = None
+    _search: ctypes.c_void_p | None = None
+    _direct: MavlinkDirect | None = None
 
     async def _attach(self, timeout_s: float) -> None:
         _log_through_python()
@@ -65,19 +68,23 @@ class MavsdkDriver(AutopilotDriver):
         self._mavsdk.add_any_connection_with_handle("raw://")
         self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)
         found: asyncio.Future[Any] = self._loop.create_future()
-        self._mavsdk.first_autopilot_async(timeout_s, lambda system: self._hop(_resolve, found, system))
+        self._search = self._mavsdk.first_autopilot_async(
+            timeout_s, lambda system: self._hop(_resolve, found, system)
+        )
         if self._newest_heartbeat is not None:
             self._take_frames([self._newest_heartbeat])  # the next one may be a second away
         system = await found
         if system is None:
             raise LinkError(f"{self.url}: MAVSDK did not find the autopilot within {timeout_s:g} s")
-        self._direct = MavlinkDirect(system)
+        direct = MavlinkDirect(system)
         for name in _SUBSCRIBED:
-            self._direct.subscribe_message(name, lambda message, _: self._hop(self._message, message))
+            direct.subscribe_message(name, lambda message, _: self._hop(self._message, message))
         self._parameters = Param(system)
+        self._direct = direct
 
     async def _detach(self) -> None:
         library, self._mavsdk = self._mavsdk, None
+        direct, self._direct = self._direct, None
         if library is None:
             return
         for future in list(self._awaited):  # MAVSDK forgets them when it is destroyed
@@ -86,8 +93,17 @@ class MavsdkDriver(AutopilotDriver):
                     CommandRefusedError(f"{self.url}: the link was closed before an answer came")
                 )
         # A parameter request that is under way holds the one thread; destroying waits its turn behind it.
-        await self._loop.run_in_executor(self._blocking, library.destroy)
+        await self._loop.run_in_executor(self._blocking, self._destroy, library, direct)
         self._blocking.shutdown(wait=False)
+
+    def _destroy(self, library: mavsdk.Mavsdk, direct: MavlinkDirect | None) -> None:
+        if self._search is not None:  # first of all: a system found from here on would outlive the library
+            library.cancel_first_autopilot(self._search)
+        # MAVSDK 4.1 frees what its C++ calls back for commands under way before it stops the thread that
+        # calls: an answer in that moment ends the process. They are held until the thread is gone.
+        called_back = list(getattr(direct, "_callbacks", ()))
+        library.destroy()
+        called_back.clear()
 
     # --- between MAVSDK's threads and our loop ------------------------------------------------------
 
@@ -131,7 +147,7 @@ class MavsdkDriver(AutopilotDriver):
     # --- encoding -----------------------------------------------------------------------------------
 
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
-        if self._mavsdk is None:
+        if self._direct is None:
             return
         try:
             self._direct.send_message(self._direct_message(name, fields))
@@ -159,6 +175,8 @@ class MavsdkDriver(AutopilotDriver):
         }
         for number, value in enumerate(parameters, start=1):
             fields[f"param{number}"] = None if value != value else float(value)  # JSON has no NaN
+        if self._direct is None:
+            raise CommandRefusedError(f"{self.url}: not connected, so command {command} is not sent")
         answered: asyncio.Future[tuple[MavlinkDirectResult, MavlinkMessage]] = self._loop.create_future()
         self._awaited.add(answered)
         answered.add_done_callback(self._awaited.discard)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import asyncio
 import math
 import struct
+import weakref
 
+import mavsdk
 import pytest
 from fake_autopilot import wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle import flight_commands
 from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
 from companion.vehicle.state import FlightMode
 
@@ -178,3 +181,26 @@ async def test_a_parameter_that_is_not_there_is_refused_by_name(driver, paramete
         await driver.get_parameter("A_NAME_LONGER_THAN_16")
     with pytest.raises(CommandRefusedError, match=r"is an integer and cannot take 0\.5"):
         await driver.set_parameter("COM_OBL_RC_ACT", 0.5)
+
+
+async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(autopilot, port, monkeypatch) -> None:
+    """MAVSDK calls it from C++: had it been freed before, an answer in that moment ended the process."""
+    autopilot.answers["COMMAND_LONG"] = lambda _: None
+    driver = open_driver("mavsdk", f"udpin://127.0.0.1:{port}")
+    await driver.connect(10.0)
+    arming = asyncio.create_task(driver.arm())
+    await autopilot.hears("COMMAND_LONG")
+    called_back = [weakref.ref(trampoline) for trampoline in driver._direct._callbacks]
+    assert called_back
+    lived: list[bool] = []
+    destroy = mavsdk.Mavsdk.destroy
+
+    def destroy_and_look(library: mavsdk.Mavsdk) -> None:
+        destroy(library)
+        lived.extend(reference() is not None for reference in called_back)
+
+    monkeypatch.setattr(mavsdk.Mavsdk, "destroy", destroy_and_look)
+    await driver.close()
+    with pytest.raises(CommandRefusedError, match="the link was closed before an answer came"):
+        await arming
+    assert lived == [True] * len(called_back)
