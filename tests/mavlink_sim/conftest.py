@@ -6,34 +6,46 @@ import gc
 import math
 import pickle
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
 import pytest
 
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import dialect
-from mavlink_sim.wire.streams import GCS_RATES_HZ
+from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 
 NAN = math.nan
 COMPANION = (1, 191)
 GROUND_STATION = (245, 190)
+# Most of a flight in lockstep is to build these messages, up to a hundred of each a second. A test hears
+# those that it says it reads: `@pytest.mark.hears("ATTITUDE")`, `hears("everything")`.
+FAST_HZ = 5.0
+FAST_STREAMS = {
+    name
+    for rates_hz in (ONBOARD_RATES_HZ, GCS_RATES_HZ)
+    for name, rate_hz in rates_hz.items()
+    if rate_hz > FAST_HZ
+}
+EVERYTHING = "everything"
 
 
 class Cockpit:
     """A vehicle with an onboard and a ground-station link, without sockets and without a clock.
 
-    `inbox[link]` holds every message received since the last `forget`, as (time, message).
+    Args:
+        hears: which of the fast streams it does not switch off at once, or everything.
     """
 
     # Most tests begin in the air: what nobody has touched flies there once, and is copied from then on.
     _in_the_air: ClassVar[dict[str, tuple[bytes, dict[str, list[tuple[float, Any]]]]]] = {}
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, hears: Collection[str] = (), **options: Any) -> None:
+        self._unheard = set() if EVERYTHING in hears else FAST_STREAMS - set(hears)
         self._options = {"gusts_mps": 0.0, "noise": False, **options}
         self._vehicle: Vehicle | None = None
         self._events: list[str] = []
-        self.inbox: dict[str, list[tuple[float, Any]]] = defaultdict(list)
+        self._inbox: dict[str, list[tuple[float, Any]]] = defaultdict(list)
         self.heartbeats: list[tuple[str, tuple[int, int], int]] = []
         self._next_heartbeat_s = 0.0
 
@@ -51,6 +63,10 @@ class Cockpit:
             self._vehicle = Vehicle(on_event=self._events.append, **self._options)
             self._vehicle.add_link("onboard")
             self._vehicle.add_link("gcs", GCS_RATES_HZ)
+            for link in self._vehicle.links.values():
+                for name in self._unheard:
+                    if name in link.streams:
+                        link.streams.set_interval(name, -1, 0)
         return self._vehicle
 
     # ---- time
@@ -97,7 +113,7 @@ class Cockpit:
         for name, link in vehicle.links.items():
             if link.outbox:
                 now_s = vehicle.now_s
-                self.inbox[name] += [(now_s, item) for item in vehicle.outgoing(name)]
+                self._inbox[name] += [(now_s, item) for item in vehicle.outgoing(name)]
 
     # ---- messages
 
@@ -108,10 +124,19 @@ class Cockpit:
         self._take()
 
     def received(self, kind: str, link: str = "onboard") -> list[Any]:
-        return [item.message for _, item in self.inbox[link] if item.message.get_type() == kind]
+        if kind in self._unheard:
+            raise LookupError(f'this cockpit does not hear {kind}: mark the test with hears("{kind}")')
+        return [item.message for _, item in self._inbox[link] if item.message.get_type() == kind]
+
+    @property
+    def inbox(self) -> dict[str, list[tuple[float, Any]]]:
+        """Every message received on each link since the last `forget`, as (time, message)."""
+        if self._unheard:
+            raise LookupError('this cockpit does not hear everything: mark the test with hears("everything")')
+        return self._inbox
 
     def forget(self) -> None:
-        self.inbox.clear()
+        self._inbox.clear()
 
     def command(
         self,
@@ -186,16 +211,16 @@ class Cockpit:
         if self._vehicle is not None or self.heartbeats or not plain:
             self._fly_up(height_m)
             return
-        key = repr((sorted(self._options.items()), height_m))
+        key = repr((sorted(self._options.items()), sorted(self._unheard), height_m))
         if key not in self._in_the_air:
             self._fly_up(height_m)
-            inbox = {link: list(messages) for link, messages in self.inbox.items()}
+            inbox = {link: list(messages) for link, messages in self._inbox.items()}
             self._in_the_air[key] = (pickle.dumps((self._vehicle, self._events)), inbox)
             gc.collect()
             gc.freeze()  # thousands of messages that stay: not to be looked through at every collection
         stored, inbox = self._in_the_air[key]
         self._vehicle, self._events = pickle.loads(stored)
-        self.inbox = defaultdict(list, {link: list(messages) for link, messages in inbox.items()})
+        self._inbox = defaultdict(list, {link: list(messages) for link, messages in inbox.items()})
 
     def _fly_up(self, height_m: float | None) -> None:
         self.wait_ready()
@@ -228,9 +253,10 @@ def position(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
 
 
 @pytest.fixture
-def cockpit() -> Cockpit:
+def cockpit(request: pytest.FixtureRequest) -> Cockpit:
     """A vehicle in still air, on the ground, just booted."""
-    return Cockpit()
+    marker = request.node.get_closest_marker("hears")
+    return Cockpit(hears=() if marker is None else marker.args)
 
 
 @pytest.fixture(scope="session")

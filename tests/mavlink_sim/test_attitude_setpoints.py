@@ -225,6 +225,7 @@ def test_without_the_stream_the_failsafe_flies_home_by_position(cockpit: Any) ->
 # ---- what is echoed
 
 
+@pytest.mark.hears("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
 def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
     cockpit: Any, position_setpoint: Any
 ) -> None:
@@ -253,6 +254,7 @@ def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
     assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 0
 
 
+@pytest.mark.hears("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
 def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_attitude(
     cockpit: Any, position_setpoint: Any
 ) -> None:
@@ -338,7 +340,7 @@ def test_what_is_no_rotation_has_no_unit_quaternion(values: tuple[float, float, 
 def test_no_attitude_target_can_stop_the_vehicle(
     make_cockpit: Any, requests: list[tuple[int, list[float]]]
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0)
+    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     cockpit.offboard(attitude())
     cockpit.command(400, 1)
     for mask, values in requests:

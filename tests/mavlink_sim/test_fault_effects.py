@@ -28,6 +28,7 @@ def begin(cockpit: Any, line: str) -> int:
 # ---- what is said
 
 
+@pytest.mark.hears("everything")
 def test_of_a_vehicle_with_heartbeats_only_answers_still_come(cockpit) -> None:
     cockpit.fly(6.0)  # what a start alone sends is over
     begin(cockpit, "heartbeat_only link=onboard")
@@ -59,6 +60,7 @@ def test_acknowledgements_are_lost_all_or_the_nth(cockpit) -> None:
     assert cockpit.armed
 
 
+@pytest.mark.hears("everything")
 def test_the_boot_clock_jumps_in_every_stamp_and_back(cockpit) -> None:
     cockpit.fly(2.0)
     begin(cockpit, "time_jump 100 for=3")
@@ -79,6 +81,7 @@ def test_the_boot_clock_jumps_in_every_stamp_and_back(cockpit) -> None:
     assert newest(cockpit, "ATTITUDE").time_boot_ms == pytest.approx((cockpit.now_s - 3) * 1000, abs=20)
 
 
+@pytest.mark.hears("everything")
 def test_a_second_autopilot_speaks_and_answers(cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot 9")
@@ -99,6 +102,7 @@ def test_a_second_autopilot_speaks_and_answers(cockpit) -> None:
     assert not [item for _, item in cockpit.inbox["onboard"] if item.forwarded]
 
 
+@pytest.mark.hears("GLOBAL_POSITION_INT")
 def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot")
@@ -111,6 +115,7 @@ def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(cockpit)
     assert {round(east) for _, east, _ in places} == {0, 25}
 
 
+@pytest.mark.hears("everything")
 def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "stall for=2")
@@ -139,6 +144,7 @@ def test_a_slow_vehicle_goes_at_a_part_of_its_pace(cockpit) -> None:
 # ---- position and estimate
 
 
+@pytest.mark.hears("GPS_RAW_INT", "LOCAL_POSITION_NED", "ODOMETRY")
 def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(cockpit, position_setpoint) -> None:
     cockpit.heartbeats = [("gcs", (245, 190), 6)]
     cockpit.take_off(20.0)
@@ -199,6 +205,7 @@ def test_position_mode_falls_to_altitude_where_a_pilot_has_sticks(cockpit) -> No
     assert cockpit.mode == "ALTCTL"
 
 
+@pytest.mark.hears("GLOBAL_POSITION_INT", "GPS_RAW_INT")
 def test_a_drifting_gps_takes_the_vehicle_along(cockpit) -> None:
     cockpit.take_off(10.0)
     begin(cockpit, "gps_drift 0.5 towards=0")
@@ -210,6 +217,7 @@ def test_a_drifting_gps_takes_the_vehicle_along(cockpit) -> None:
     assert fix.fix_type == 3
 
 
+@pytest.mark.hears("LOCAL_POSITION_NED", "ODOMETRY")
 def test_an_estimator_reset_moves_the_estimate_and_not_the_vehicle(cockpit, position_setpoint) -> None:
     cockpit.take_off(10.0)
     setpoint = position_setpoint(0, 0, -10)
@@ -378,6 +386,7 @@ def test_a_mode_is_refused_so_often_and_then_taken(cockpit) -> None:
     assert cockpit.mode == "LAND"
 
 
+@pytest.mark.hears("everything")
 def test_a_reboot_in_flight_is_silent_then_new_and_disarmed(cockpit) -> None:
     cockpit.take_off(30.0)
     assert cockpit.command(511, 30, 50_000) == [0]  # a setting, and settings are forgotten

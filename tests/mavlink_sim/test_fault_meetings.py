@@ -163,6 +163,7 @@ def test_a_mode_that_is_refused_to_clients_is_not_refused_to_the_mission(cockpit
 # ---- reboots
 
 
+@pytest.mark.hears("ATTITUDE", "ODOMETRY")
 def test_a_reboot_begins_a_new_boot(cockpit) -> None:
     cockpit.heartbeats = [("gcs", (245, 190), 6)]
     vehicle = cockpit.vehicle
@@ -224,6 +225,7 @@ def test_a_mission_and_its_place_outlive_a_reboot_but_not_what_was_reached(cockp
     assert not cockpit.received("MISSION_ITEM_REACHED")
 
 
+@pytest.mark.hears("ATTITUDE")
 def test_a_jump_of_the_clock_outlives_a_reboot_and_ends_cleanly(cockpit) -> None:
     cockpit.fly(5.0)
     number = begin(cockpit, "time_jump 100")
@@ -271,6 +273,7 @@ def test_waiting_and_repeating_in_lockstep_go_on_through_a_reboot_and_a_standsti
 # ---- the clock and other voices
 
 
+@pytest.mark.hears("ATTITUDE", "TIMESYNC")
 def test_after_a_standstill_every_clock_tells_the_same_time(cockpit) -> None:
     cockpit.fly(2.0)
     begin(cockpit, "stall for=3")
@@ -281,7 +284,7 @@ def test_after_a_standstill_every_clock_tells_the_same_time(cockpit) -> None:
 
 
 def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(make_cockpit) -> None:
-    cockpit = make_cockpit(start_ned_m=(100.0, 200.0))
+    cockpit = make_cockpit(["GLOBAL_POSITION_INT"], start_ned_m=(100.0, 200.0))
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot 9")
     cockpit.forget()
@@ -313,6 +316,7 @@ def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(cockpit) -> N
     assert len(cockpit.received("COMMAND_ACK")) == 1
 
 
+@pytest.mark.hears("SERVO_OUTPUT_RAW")
 def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(cockpit) -> None:
     cockpit.take_off(20.0)
     begin(cockpit, "motor_failure 2")

@@ -117,6 +117,7 @@ def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit) -> None:
     assert [at for at, _ in one] != [at for at, _ in other]
 
 
+@pytest.mark.hears("everything")
 def test_a_dead_link_carries_nothing_either_way(cockpit) -> None:
     link = LockstepLink(cockpit.vehicle, "onboard")
     assert fly(cockpit, link, 0.5)

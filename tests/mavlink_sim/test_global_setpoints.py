@@ -18,6 +18,8 @@ from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.wire.messages import dialect
 
+pytestmark = pytest.mark.hears("POSITION_TARGET_LOCAL_NED")
+
 NAMES = ("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
 POSITION_ALONE = 0xDF8
 ACCELERATION_ALONE = 0xC3F

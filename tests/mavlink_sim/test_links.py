@@ -2,8 +2,12 @@
 
 from typing import Any
 
+import pytest
+
 from mavlink_sim.wire.announcements import INFO, Text
 from mavlink_sim.wire.messages import dialect
+
+pytestmark = pytest.mark.hears("everything")
 
 GCS = 6
 ONBOARD_CONTROLLER = 18

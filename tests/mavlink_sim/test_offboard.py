@@ -181,6 +181,7 @@ def test_a_position_step_of_ten_metres_is_settled_within_six_seconds(
     assert max(abs(speed) for _, speed in flown[moving:]) < 0.25
 
 
+@pytest.mark.hears("POSITION_TARGET_LOCAL_NED")
 def test_the_position_target_is_echoed_with_the_inner_setpoints(
     cockpit: Any, position_setpoint: Any, velocity_setpoint: Any
 ) -> None:

@@ -164,6 +164,7 @@ def test_a_new_request_changes_the_orbit_that_is_flown(cockpit: Any) -> None:
     assert cockpit.vehicle.autopilot.task.speed_mps == -3.0
 
 
+@pytest.mark.hears("POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED")
 def test_the_execution_is_told_while_it_lasts(cockpit: Any) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     circling(cockpit, radius_m=-8.0, seconds=15.0)
@@ -203,7 +204,7 @@ numbers = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, 5.0, -20.0, 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=4))
 def test_no_request_makes_the_flight_absurd(make_cockpit: Any, requests: list[list[float]]) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0)
+    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     airframe = cockpit.vehicle.airframe
     airframe.position, airframe.on_ground = (0.0, 0.0, -5.0), False
     cockpit.command(400, 1)

@@ -66,6 +66,7 @@ def test_reposition_by_command_long_needs_the_change_of_mode_too(cockpit: Any, f
     assert cockpit.command(192, *values) == [0 if flags else 3]
 
 
+@pytest.mark.hears("everything")
 def test_a_stream_that_stops_is_left_between_1_05_and_1_15_seconds_later(
     cockpit: Any, velocity_setpoint: Any
 ) -> None:

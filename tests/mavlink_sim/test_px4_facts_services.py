@@ -14,6 +14,8 @@ import pytest
 from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
 from mavlink_sim.wire.messages import dialect, parser
 
+pytestmark = pytest.mark.hears("everything")
+
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 PARAMETERS = DATA / "px4" / "parameters.txt"
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)

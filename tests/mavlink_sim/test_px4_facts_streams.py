@@ -11,6 +11,8 @@ from pymavlink.dialects.v20 import common
 
 from mavlink_sim.wire.messages import dialect, parser
 
+pytestmark = pytest.mark.hears("everything")
+
 GCS = 6
 ONBOARD_CONTROLLER = 18
 # Messages of PX4 that pip's pymavlink 2.4.50 does not have in its `common` dialect.
@@ -23,7 +25,7 @@ def names(cockpit: Any, link: str = "onboard") -> Counter[str]:
 
 
 def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockpit: Any) -> None:
-    alone, heard = make_cockpit(), make_cockpit()
+    alone, heard = make_cockpit(["everything"]), make_cockpit(["everything"])
     heard.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
     for cockpit in (alone, heard):
         cockpit.wait_ready()
@@ -35,7 +37,7 @@ def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockp
 @pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])
 def test_the_onboard_link_carries_29_kilobytes_a_second(make_cockpit: Any, flying: bool) -> None:
     """Of whole frames with their signatures, as in the recorded flight: 28.7 kB/s before arming."""
-    cockpit = make_cockpit(noise=True, gusts_mps=None)
+    cockpit = make_cockpit(["everything"], noise=True, gusts_mps=None)
     if flying:
         cockpit.take_off()
     cockpit.fly(6.0)  # until the last PARAM_VALUE that comes unasked

@@ -57,6 +57,7 @@ def top_speed_mps(cockpit: Any, seconds: float) -> float:
 # ---- where to
 
 
+@pytest.mark.hears("POSITION_TARGET_GLOBAL_INT")
 def test_it_flies_there_nose_first_and_holds(cockpit: Any) -> None:
     cockpit.take_off(5.0)
     assert reposition(cockpit, (15.0, 15.0), 8.0) == [0]

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from mavlink_sim.wire.messages import dialect
 
+pytestmark = pytest.mark.hears("everything")
+
 
 @pytest.mark.parametrize(
     ("command", "values", "result"),
@@ -57,7 +59,7 @@ def test_the_protocol_version_is_sent_on_request(cockpit: Any) -> None:
 
 
 def test_another_system_id_is_answered_under_it(make_cockpit: Any) -> None:
-    cockpit = make_cockpit(system_id=7)
+    cockpit = make_cockpit(["everything"], system_id=7)
     cockpit.fly(0.1)
     assert cockpit.command(401, target=(1, 1)) == []
     assert cockpit.command(401, target=(7, 1)) == [0]
@@ -191,7 +193,7 @@ COMMANDS = [16, 20, 21, 22, 176, 178, 179, 185, 192, 193, 245, 300, 400, 401, 51
 def test_no_command_with_any_values_can_stop_the_vehicle(
     make_cockpit: Any, requests: list[tuple[int, list[float]]]
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0)
+    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     cockpit.command(400, 1)
     for command, values in requests:
         for result in cockpit.command(command, *values):

@@ -12,6 +12,8 @@ from pymavlink import mavutil
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import Streams
 
+pytestmark = pytest.mark.hears("everything")
+
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"
 PARAMETERS = DATA / "px4" / "parameters.txt"
