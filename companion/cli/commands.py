@@ -25,6 +25,7 @@ from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.settings import Settings
+from vision.loading import uncollected
 
 if TYPE_CHECKING:
     from companion.service import Service
@@ -67,11 +68,12 @@ def every_command(
 @settings_command(app)
 def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
-    from companion.bus.session import BusError
-    from companion.operator.metrics import MetricsError
-    from companion.perception.keeper import PerceptionStartError
-    from companion.service import Service
-    from companion.vehicle.driver import LinkError
+    with uncollected():
+        from companion.bus.session import BusError
+        from companion.operator.metrics import MetricsError
+        from companion.perception.keeper import PerceptionStartError
+        from companion.service import Service
+        from companion.vehicle.driver import LinkError
 
     logging.basicConfig(
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
@@ -167,13 +169,14 @@ def detect(
     pixel_format: Annotated[str | None, typer.Option(help="bgr24, rgb24, gray8, y4m, mjpeg, YUYV…")] = None,
 ) -> None:
     """Detect objects in every frame of a source; one line a frame on standard output."""
-    from companion.detect import detect_source
-    from vision.detector import Detector
-    from vision.pipeline import FrameDetector
-    from vision.sources import SourceError, SourceSettings, open_source
-    from vision.tiling import TiledDetector
-    from vision.tracking import Tracker, TrackerSettings
-    from vision.yolo.safe_pickle import CheckpointError
+    with uncollected():
+        from companion.detect import detect_source
+        from vision.detector import Detector
+        from vision.pipeline import FrameDetector
+        from vision.sources import SourceError, SourceSettings, open_source
+        from vision.tiling import TiledDetector
+        from vision.tracking import Tracker, TrackerSettings
+        from vision.yolo.safe_pickle import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     following = TrackerSettings(keep_confidence=confidence)

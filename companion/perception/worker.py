@@ -43,6 +43,7 @@ from companion.settings import Settings
 from vision.camera_model import CameraMount
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.loading import uncollected
 from vision.markers import Marker, MarkerDetector
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
@@ -250,7 +251,8 @@ def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | N
 
 def _load(settings: Settings) -> Detector:
     # Only here: a worker that only records needs none of it.
-    from vision.detector import Detector
+    with uncollected():
+        from vision.detector import Detector
 
     wanted = settings.detector
     if wanted.threads is not None:
