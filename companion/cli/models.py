@@ -104,12 +104,12 @@ def export(
     from vision.runtimes.contract import RuntimeUnusableError
     from vision.runtimes.export import export
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
-    from vision.yolo.generation import describe
+    from vision.yolo.generation import generation_of
 
     path = _path(file)
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
-        facts = describe(load_checkpoint(path).model, image_size)
-        written = export(path, to, output, image_size, generation=facts.generation)  # type: ignore[arg-type]
+        generation = generation_of(load_checkpoint(path).model)
+        written = export(path, to, output, image_size, generation=generation)  # type: ignore[arg-type]
     reader = {"onnx": "onnxruntime", "torchscript": "torch"}.get(to, to)
     typer.echo(f"{written} ({written.stat().st_size} bytes), for --model with --runtime {reader}")
 

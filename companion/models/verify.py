@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -65,15 +65,19 @@ class Parity:
         )
 
 
-def sample_pictures(folder: Path | None, count: int) -> list[NDArray[np.uint8]]:
-    """The first pictures of a folder, or as many drawn scenes. Raises `ValueError` for an empty folder."""
+def sample_pictures(folder: Path | None, count: int) -> Iterator[NDArray[np.uint8]]:
+    """The first pictures of a folder, or as many drawn scenes, each made when it is asked for.
+
+    Raises:
+        ValueError: at once, for an empty folder.
+    """
     if folder is None:
         rng = np.random.default_rng(0)
-        return [random_scene(rng, *_SAMPLE_SIZE)[0] for _ in range(count)]
+        return (random_scene(rng, *_SAMPLE_SIZE)[0] for _ in range(count))
     files = image_files(folder)[:count]
     if not files:
         raise ValueError(f"{folder}: has no images")
-    return [read_image(file) for file in files]
+    return (read_image(file) for file in files)
 
 
 def verify(

@@ -48,7 +48,7 @@ def describe(model: YoloModel, image_size: int = 640) -> ModelFacts:
     largest = max(model.strides)
     if image_size < largest or image_size % largest:
         raise ValueError(f"image_size must be a multiple of {largest}, got {image_size}")
-    generation = _generation(model.description, model.strides)
+    generation = generation_of(model)
     return ModelFacts(
         generation=generation,
         scale=_scale(model.description, generation),
@@ -58,7 +58,9 @@ def describe(model: YoloModel, image_size: int = 640) -> ModelFacts:
     )
 
 
-def _generation(description: ModelDescription, strides: tuple[int, ...]) -> str:
+def generation_of(model: YoloModel) -> str:
+    """`ModelFacts.generation` alone, which costs nothing."""
+    description, strides = model.description, model.strides
     layers = {row.layer for row in description.rows}
     if layers & {"v10Detect", "SCDown", "C2fCIB"}:
         generation = "YOLOv10"
