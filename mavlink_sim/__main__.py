@@ -1,6 +1,9 @@
 """`python -m mavlink_sim` is `mavlink-sim`."""
 
-from mavlink_sim.cli import main
+from vision.loading import uncollected
+
+with uncollected():
+    from mavlink_sim.cli import main
 
 if __name__ == "__main__":
     main()

@@ -50,6 +50,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.camera_model",
     "vision.frame",
     "vision.geolocation",
+    "vision.loading",
     "vision.rotation",
     "vision.shared_frame",
 }
