@@ -25,14 +25,16 @@ from companion.rehearsal import (
 )
 from companion.service import Event, Service
 from mavlink_sim.testing import free_port
+from vision.video_encoders import keeps_up
 
 # Where the mission's approach stops.
 STOP_DISTANCE_M = 5.0
 # Arrival counts when the simulator agrees with it to within this.
 RANGE_TOLERANCE_M = 1.0
 VIDEO_NAME = "flight.webm"
-# What two cores draw, look at and film at once. Of an odd number of frames to a picture none is between two.
-_CAMERA_RATE_HZ, _FILM_RATE_HZ = 18.0, 6.0
+# What two cores draw, look at and film at once. A slow encoder films every third frame: of an odd number of
+# frames to a picture none is between two.
+_CAMERA_RATE_HZ, _SLOW_FILM_RATE_HZ = 18.0, 6.0
 
 # What is flown: a mission file that comes with this package. Its steps `find` and `stand` are looked at.
 MISSION = "demo"
@@ -118,7 +120,8 @@ async def _fly(output: Path, truth_path: Path, *, seed: int, limit_s: float, say
     log_path = output / "simulator.log"
     async with simulator(port, camera, truth_path, seed, log_path, camera_rate_hz=_CAMERA_RATE_HZ):
         say("the vehicle and its camera are running")
-        settings = rehearsal_settings(port, camera, video=output / VIDEO_NAME, video_rate_hz=_FILM_RATE_HZ)
+        rate_hz = _CAMERA_RATE_HZ if keeps_up() else _SLOW_FILM_RATE_HZ
+        settings = rehearsal_settings(port, camera, video=output / VIDEO_NAME, video_rate_hz=rate_hz)
         with (output / "events.jsonl").open("w") as events:
 
             def on_event(event: Event) -> None:

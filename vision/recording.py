@@ -17,6 +17,7 @@ import numpy as np
 from vision.annotate import annotate
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.video_encoders import keeps_up
 from vision.video_writer import VideoWriter, VideoWriterError
 
 logger = logging.getLogger(__name__)
@@ -110,9 +111,10 @@ class Recording:
         self._note_lost_before(math.inf)
         if self.skipped:
             logger.warning(
-                "%s: %d pictures are missing, the encoder was slow; a lower rate_hz suits this computer",
+                "%s: %d pictures are missing, the encoder was slow; a lower rate_hz suits this computer%s",
                 self._path,
                 self.skipped,
+                "" if keeps_up() else ", or pip install 'mavlink-companion[film]', five times as fast",
             )
 
     def _run(self) -> None:

@@ -65,8 +65,8 @@ class MavsdkDriver(AutopilotDriver):
         configuration = mavsdk.Configuration.create_manual(self._own_system_id, self._own_component_id, False)
         self._mavsdk = mavsdk.Mavsdk(configuration)
         configuration.destroy()
+        self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)  # first: it complains of no taker
         self._mavsdk.add_any_connection_with_handle("raw://")
-        self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)
         found: asyncio.Future[Any] = self._loop.create_future()
         self._search = self._mavsdk.first_autopilot_async(
             timeout_s, lambda system: self._hop(_resolve, found, system)
