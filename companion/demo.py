@@ -25,7 +25,7 @@ from companion.rehearsal import (
 )
 from companion.service import Event, Service
 from mavlink_sim.testing import free_port
-from vision.video_encoders import keeps_up
+from vision.video_encoders import has_pyav
 
 # Where the mission's approach stops.
 STOP_DISTANCE_M = 5.0
@@ -120,7 +120,7 @@ async def _fly(output: Path, truth_path: Path, *, seed: int, limit_s: float, say
     log_path = output / "simulator.log"
     async with simulator(port, camera, truth_path, seed, log_path, camera_rate_hz=_CAMERA_RATE_HZ):
         say("the vehicle and its camera are running")
-        rate_hz = _CAMERA_RATE_HZ if keeps_up() else _SLOW_FILM_RATE_HZ
+        rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_FILM_RATE_HZ
         settings = rehearsal_settings(port, camera, video=output / VIDEO_NAME, video_rate_hz=rate_hz)
         with (output / "events.jsonl").open("w") as events:
 

@@ -9,6 +9,7 @@ import queue
 import threading
 import time
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,6 @@ import numpy as np
 from vision.annotate import annotate
 from vision.detections import Detections
 from vision.frame import Frame
-from vision.video_encoders import keeps_up
 from vision.video_writer import VideoWriter, VideoWriterError
 
 logger = logging.getLogger(__name__)
@@ -114,7 +114,7 @@ class Recording:
                 "%s: %d pictures are missing, the encoder was slow; a lower rate_hz suits this computer%s",
                 self._path,
                 self.skipped,
-                "" if keeps_up() else ", or pip install 'mavlink-companion[film]', five times as fast",
+                "" if find_spec("av") else ", or pip install 'mavlink-companion[film]', which is faster",
             )
 
     def _run(self) -> None:

@@ -7,6 +7,7 @@ and each empty slot has to be encoded as a repeat of the picture before it.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import tempfile
@@ -14,6 +15,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +26,8 @@ from numpy.typing import NDArray
 
 from vision.sources.opencv import quiet_opencv
 
+logger = logging.getLogger(__name__)
+
 _FOURCC = cv2.VideoWriter.fourcc(*"VP80")
 _HARMLESS = b"is not supported with codec id"  # said of every WebM, which has no such tags at all
 _standard_error_lock = threading.Lock()
@@ -30,11 +35,11 @@ _standard_error_lock = threading.Lock()
 # WebM counts milliseconds.
 _CLOCK_HZ = 1000
 _KEY_FRAME_S = 5.0
-# Constant quality (0..63, less is better), and the most that it may cost: 4 Mbit/s at 640x480 and 10 Hz.
-_QUALITY = 20
+# Constant quality (0..63, less is better), and no picture is left out.
+_OPTIONS = {"deadline": "realtime", "cpu-used": "8", "crf": "20", "drop-threshold": "0"}
+# The most that it may cost: 4 Mbit/s at 640x480 and 10 Hz. Below the least, libvpx counts in nothing.
 _MOST_BITS_PER_PIXEL = 1.3
-_LEAST_BIT_RATE = 200_000
-_OPTIONS = {"deadline": "realtime", "cpu-used": "8", "crf": str(_QUALITY), "drop-threshold": "0"}
+_LEAST_BITS_PER_S = 200_000
 
 
 class Encoder(Protocol):
@@ -44,11 +49,11 @@ class Encoder(Protocol):
         """Add a picture, which may be drawn on again afterwards. Raises OSError."""
 
     def close(self) -> int:
-        """Complete the file; how many slots it holds. Raises OSError."""
+        """Complete the file; the slots up to the last picture that it holds. Raises OSError."""
 
 
-def keeps_up() -> bool:
-    """Whether films are encoded at the pace of a camera here: with PyAV."""
+def has_pyav() -> bool:
+    """Whether PyAV encodes the films here: several times faster."""
     return _pyav() is not None
 
 
@@ -60,12 +65,25 @@ def open_encoder(path: Path, width: int, height: int, rate_hz: float) -> Encoder
     return AvEncoder(av, path, width, height, rate_hz)
 
 
+def _url(path: Path) -> str:
+    """Else FFmpeg takes what stands before a colon in a name for a protocol."""
+    return f"file:{path}"
+
+
+@cache
 def _pyav() -> Any:
+    if find_spec("av") is None:
+        return None
     try:
         import av
-    except ModuleNotFoundError:
-        return None
-    return av if "libvpx" in av.codecs_available else None
+    except ImportError as error:
+        problem = str(error)
+    else:
+        if "libvpx" in av.codecs_available:
+            return av
+        problem = "it was built without libvpx"
+    logger.warning("PyAV is installed and of no use (%s): films are encoded by OpenCV, slowly", problem)
+    return None
 
 
 class AvEncoder:
@@ -73,43 +91,49 @@ class AvEncoder:
 
     def __init__(self, av: Any, path: Path, width: int, height: int, rate_hz: float) -> None:
         self._av = av
-        self._path = path
+        self._url = _url(path)
         self._rate_hz = rate_hz
-        self._begun = False
+        self._empty = True
         with self._plain_errors():
-            self._container = av.open(str(path), "w", format="webm")
-            stream = self._container.add_stream("libvpx", rate=Fraction(rate_hz).limit_denominator(1001))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.bit_rate = max(_LEAST_BIT_RATE, round(_MOST_BITS_PER_PIXEL * width * height * rate_hz))
-        stream.options = {
-            "deadline": "realtime",
-            "cpu-used": "8",
-            "crf": str(_QUALITY),
-            "drop-threshold": "0",
-        }
-        stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
-        stream.codec_context.gop_size = max(1, round(rate_hz * _KEY_FRAME_S))
-        stream.codec_context.thread_count = 1
-        self._stream = stream
+            self._container = av.open(self._url, "w", format="webm")
+            try:
+                self._stream = self._container.add_stream(
+                    "libvpx", rate=Fraction(rate_hz).limit_denominator(1001)
+                )
+                self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+                bits_per_s = round(_MOST_BITS_PER_PIXEL * width * height * rate_hz)
+                self._stream.bit_rate = max(_LEAST_BITS_PER_S, bits_per_s)
+                self._stream.options = _OPTIONS
+                codec = self._stream.codec_context
+                codec.time_base = Fraction(1, _CLOCK_HZ)
+                codec.gop_size = max(1, round(rate_hz * _KEY_FRAME_S))
+                codec.thread_count = 1
+                self._container.start_encoding()  # what cannot be written or encoded fails here
+            except BaseException:
+                self._container.close()
+                raise
 
     def put(self, image: NDArray[np.uint8], slot: int) -> None:
-        picture = self._av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
-        picture.pts, picture.time_base = round(slot * _CLOCK_HZ / self._rate_hz), Fraction(1, _CLOCK_HZ)
-        self._begun = True
         with self._plain_errors():
+            picture = self._av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
+            picture.pts, picture.time_base = round(slot * _CLOCK_HZ / self._rate_hz), Fraction(1, _CLOCK_HZ)
+            self._empty = False
             self._container.mux(self._stream.encode(picture))
 
     def close(self) -> int:
         with self._plain_errors():
             try:
-                if self._begun:
+                if not self._empty:
                     self._container.mux(self._stream.encode(None))
             finally:
                 self._container.close()
-            if not self._begun:
-                return 0
-            with self._av.open(str(self._path)) as film:
-                stamps = [packet.pts * packet.time_base for packet in film.demux() if packet.pts is not None]
+            return 0 if self._empty else self._slots_in_file()
+
+    def _slots_in_file(self) -> int:
+        with self._av.open(self._url) as film:
+            if film.duration:
+                film.seek(film.duration)  # the last pictures tell it: an hour of film is not read again
+            stamps = [packet.pts * packet.time_base for packet in film.demux() if packet.pts is not None]
         return round(float(max(stamps)) * self._rate_hz) + 1 if stamps else 0
 
     @contextmanager
@@ -124,12 +148,12 @@ class OpenCvEncoder:
     """VP8 at FFmpeg's own settings."""
 
     def __init__(self, path: Path, width: int, height: int, rate_hz: float) -> None:
-        self._path = path
+        self._url = _url(path)
         self._slots = 0
         self._image: NDArray[np.uint8] | None = None
         quiet_opencv()
         with _without_harmless_lines():
-            self._writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, _FOURCC, rate_hz, (width, height))
+            self._writer = cv2.VideoWriter(self._url, cv2.CAP_FFMPEG, _FOURCC, rate_hz, (width, height))
         if not self._writer.isOpened():
             raise OSError(
                 0, f"OpenCV's FFmpeg does not begin a VP8 video of {width}x{height} at {rate_hz:g} Hz"
@@ -146,7 +170,7 @@ class OpenCvEncoder:
     def close(self) -> int:
         self._writer.release()
         # OpenCV's write reports no failure, so the file itself has to be asked.
-        capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+        capture = cv2.VideoCapture(self._url, cv2.CAP_FFMPEG)
         readable = capture.isOpened() and capture.grab()
         held = round(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if readable else 0
         capture.release()

@@ -92,6 +92,7 @@ def verify(
 
     Raises:
         CheckpointError, RuntimeUnusableError: one of the two cannot be read or run.
+        Whatever `pictures` raises, which is not asked for any before that is known.
     """
     source, exported = read_source(source_path), read_source(exported_path)
     if exported.kind is None:

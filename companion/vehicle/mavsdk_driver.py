@@ -56,6 +56,7 @@ class MavsdkDriver(AutopilotDriver):
     _mavsdk: mavsdk.Mavsdk | None = None
     _search: ctypes.c_void_p | None = None
     _direct: MavlinkDirect | None = None
+    _parameters: Param | None = None
 
     async def _attach(self, timeout_s: float) -> None:
         _log_through_python()
@@ -79,12 +80,15 @@ class MavsdkDriver(AutopilotDriver):
         direct = MavlinkDirect(system)
         for name in _SUBSCRIBED:
             direct.subscribe_message(name, lambda message, _: self._hop(self._message, message))
+        if not hasattr(direct, "_callbacks"):  # see `_destroy`
+            logger.warning("%s: with this MAVSDK, closing while a command is under way may crash", self.url)
         self._parameters = Param(system)
         self._direct = direct
 
     async def _detach(self) -> None:
         library, self._mavsdk = self._mavsdk, None
-        direct, self._direct = self._direct, None
+        direct, self._direct, self._parameters = self._direct, None, None
+        search, self._search = self._search, None
         if library is None:
             return
         for future in list(self._awaited):  # MAVSDK forgets them when it is destroyed
@@ -93,17 +97,8 @@ class MavsdkDriver(AutopilotDriver):
                     CommandRefusedError(f"{self.url}: the link was closed before an answer came")
                 )
         # A parameter request that is under way holds the one thread; destroying waits its turn behind it.
-        await self._loop.run_in_executor(self._blocking, self._destroy, library, direct)
+        await self._loop.run_in_executor(self._blocking, _destroy, library, search, direct)
         self._blocking.shutdown(wait=False)
-
-    def _destroy(self, library: mavsdk.Mavsdk, direct: MavlinkDirect | None) -> None:
-        if self._search is not None:  # first of all: a system found from here on would outlive the library
-            library.cancel_first_autopilot(self._search)
-        # MAVSDK 4.1 frees what its C++ calls back for commands under way before it stops the thread that
-        # calls: an answer in that moment ends the process. They are held until the thread is gone.
-        called_back = list(getattr(direct, "_callbacks", ()))
-        library.destroy()
-        called_back.clear()
 
     # --- between MAVSDK's threads and our loop ------------------------------------------------------
 
@@ -202,27 +197,38 @@ class MavsdkDriver(AutopilotDriver):
         if isinstance(before, int):
             if not float(value).is_integer() or not -(2**31) <= value < 2**31:
                 raise CommandRefusedError(f"parameter {name} is an integer and cannot take {value}")
-            await self._with_parameters(name, self._parameters.set_param_int, name, int(value))
+            await self._with_parameters(name, Param.set_param_int, name, int(value))
         else:
-            await self._with_parameters(name, self._parameters.set_param_float, name, float(value))
+            await self._with_parameters(name, Param.set_param_float, name, float(value))
 
     async def _read_parameter(self, name: str) -> int | float:
         """An int for an integer parameter, a float for a real one."""
-        if self._mavsdk is None:
-            raise CommandRefusedError(f"{self.url}: not connected, so parameter {name} cannot be reached")
         try:
-            return float(await self._with_parameters(name, self._parameters.get_param_float, name))
+            return float(await self._with_parameters(name, Param.get_param_float, name))
         except _WrongTypeError:
-            return int(await self._with_parameters(name, self._parameters.get_param_int, name))
+            return int(await self._with_parameters(name, Param.get_param_int, name))
 
     async def _with_parameters(self, name: str, call: Callable[..., Any], *arguments: object) -> Any:
+        if self._parameters is None:
+            raise CommandRefusedError(f"{self.url}: not connected, so parameter {name} cannot be reached")
         try:
-            return await self._in_thread(call, *arguments)
+            return await self._in_thread(call, self._parameters, *arguments)
         except ParamError as error:
             if error.result in (ParamResult.WRONG_TYPE, ParamResult.TYPE_MISMATCH):
                 raise _WrongTypeError(f"parameter {name}: its type is another one") from error
             reason = _PARAM_REASONS.get(error.result, error.result.name.lower())
             raise CommandRefusedError(f"parameter {name}: {reason}") from error
+
+
+def _destroy(library: mavsdk.Mavsdk, search: ctypes.c_void_p | None, direct: MavlinkDirect | None) -> None:
+    if search is not None:  # first of all: a system that is found from here on would outlive the library
+        library.cancel_first_autopilot(search)
+    # MAVSDK 4.1 frees what its C++ calls back for commands under way before it stops the thread that calls:
+    # an answer in that moment ends the process. So they are held until the thread is gone. (A driver that is
+    # never closed is destroyed by MAVSDK at exit, without that.)
+    called_back = list(getattr(direct, "_callbacks", ()))
+    library.destroy()
+    called_back.clear()
 
 
 class _WrongTypeError(CommandRefusedError):

@@ -41,6 +41,8 @@ class Cockpit:
     _in_the_air: ClassVar[dict[str, tuple[bytes, dict[str, list[tuple[float, Any]]]]]] = {}
 
     def __init__(self, hears: Collection[str] = (), **options: Any) -> None:
+        if unknown := set(hears) - FAST_STREAMS - {EVERYTHING}:
+            raise ValueError(f"no fast streams: {sorted(unknown)}; there are {sorted(FAST_STREAMS)}")
         self._unheard = set() if EVERYTHING in hears else FAST_STREAMS - set(hears)
         self._options = {"gusts_mps": 0.0, "noise": False, **options}
         self._vehicle: Vehicle | None = None
@@ -125,14 +127,16 @@ class Cockpit:
 
     def received(self, kind: str, link: str = "onboard") -> list[Any]:
         if kind in self._unheard:
-            raise LookupError(f'this cockpit does not hear {kind}: mark the test with hears("{kind}")')
+            raise LookupError(
+                f'{kind} is not heard: mark the test with hears("{kind}"), or make_cockpit(["{kind}"])'
+            )
         return [item.message for _, item in self._inbox[link] if item.message.get_type() == kind]
 
     @property
     def inbox(self) -> dict[str, list[tuple[float, Any]]]:
         """Every message received on each link since the last `forget`, as (time, message)."""
         if self._unheard:
-            raise LookupError('this cockpit does not hear everything: mark the test with hears("everything")')
+            raise LookupError('not all is heard: mark the test with hears("everything"), or make_cockpit so')
         return self._inbox
 
     def forget(self) -> None:

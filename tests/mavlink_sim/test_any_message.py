@@ -3,14 +3,11 @@
 import struct
 from typing import Any
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.wire.messages import dialect, parser
-
-pytestmark = pytest.mark.hears("everything")
 
 HANDLED = {m.id: m for m in dialect.mavlink_map.values() if m.msgname in HANDLERS}
 OTHERS = {m.id: m for m in dialect.mavlink_map.values() if m.msgname not in HANDLERS}

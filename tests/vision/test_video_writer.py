@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import queue
 import re
+import resource
 import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -20,6 +22,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from vision import video_encoders
 from vision.video_writer import VideoWriter, VideoWriterError
 
 SECOND = 1_000_000_000
@@ -44,13 +47,15 @@ def frames_of(path: Path, rate_hz: float) -> list[float]:
 
 
 @pytest.fixture(params=["PyAV", "OpenCV"], autouse=True)
-def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Every film by either."""
     if request.param == "PyAV":
         pytest.importorskip("av", reason="PyAV is an optional extra")
     else:
         monkeypatch.setitem(sys.modules, "av", None)
-    return str(request.param)
+    video_encoders._pyav.cache_clear()
+    yield str(request.param)
+    video_encoders._pyav.cache_clear()
 
 
 def test_a_film_at_its_own_rate_holds_every_image_once(
@@ -160,6 +165,47 @@ def test_a_full_disk_is_told(tmp_path: Path, encoder: str) -> None:
     }
     with pytest.raises(VideoWriterError, match=re.escape(told[encoder])):
         writer.close()
+
+
+def test_a_disk_that_fills_while_filming_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    noise = np.random.default_rng(0).integers(0, 255, (30, 240, 320, 3), dtype=np.uint8)
+
+    def film() -> None:
+        with VideoWriter(path, 320, 240, 30.0) as writer:
+            for index, image in enumerate(noise):
+                writer.write(image, index * SECOND // 30)
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(VideoWriterError, match=re.escape(str(path))):
+            film()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.stat().st_size <= 200_000
+
+
+def test_a_name_with_a_colon_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with VideoWriter("flight-12:30.webm", 64, 48, 10.0) as writer:
+        writer.write(picture(40), 0)
+    assert len(frames_of(Path("file:flight-12:30.webm"), 10.0)) == 1
+
+
+def test_a_pyav_that_cannot_be_loaded_is_told_and_opencv_films(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "av.py").write_text("raise ImportError('libav: wrong version')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "av", raising=False)
+    path = tmp_path / "film.webm"
+    for _ in range(2):
+        with VideoWriter(path, 64, 48, 10.0) as writer:
+            writer.write(picture(40), 0)
+    assert len(frames_of(path, 10.0)) == 1
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert told.startswith("PyAV is installed and of no use (libav: wrong version)")
 
 
 def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import weakref
 
 import mavsdk
 import pytest
-from fake_autopilot import wait_until
+from fake_autopilot import FakeAutopilot, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle import flight_commands
@@ -204,3 +204,40 @@ async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(autopilot, 
     with pytest.raises(CommandRefusedError, match="the link was closed before an answer came"):
         await arming
     assert lived == [True] * len(called_back)
+
+
+async def test_mavsdk_looks_for_no_vehicle_any_more_before_it_is_destroyed(port, monkeypatch) -> None:
+    """One that it found while it was being destroyed would outlive it."""
+    vehicle = FakeAutopilot(port)
+    vehicle.start()
+    order: list[str] = []
+    for name in ("cancel_first_autopilot", "destroy"):
+        method = getattr(mavsdk.Mavsdk, name)
+
+        def noted(*arguments, name=name, method=method):
+            order.append(name)
+            return method(*arguments)
+
+        monkeypatch.setattr(mavsdk.Mavsdk, name, noted)
+    # MAVSDK hears nothing, and searches until it is cancelled.
+    monkeypatch.setattr(mavsdk.Mavsdk, "pass_received_raw_bytes", lambda *_: None)
+    driver = open_driver("mavsdk", f"udpin://127.0.0.1:{port}")
+    connecting = asyncio.create_task(driver.connect(30.0))
+    await wait_until(lambda: driver._search is not None, 10.0)
+    connecting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await connecting
+    assert order == ["cancel_first_autopilot", "destroy"]
+    await vehicle.stop()
+
+
+async def test_what_waits_for_its_turn_when_the_link_is_closed_is_refused(driver, autopilot) -> None:
+    autopilot.answers["COMMAND_LONG"] = lambda _: None
+    arming = [asyncio.create_task(driver.arm()) for _ in range(2)]
+    reading = asyncio.create_task(driver.set_parameter("COM_OF_LOSS_T", 1.0))
+    await wait_until(lambda: any(m.command == 400 for m in autopilot.heard_named("COMMAND_LONG")), 10.0)
+    await driver.close()
+    for outcome in await asyncio.gather(*arming, reading, return_exceptions=True):
+        assert isinstance(outcome, CommandRefusedError), outcome
+    with pytest.raises(CommandRefusedError, match="not connected"):
+        await driver.set_parameter("COM_OF_LOSS_T", 1.0)

@@ -1,0 +1,85 @@
+"""All that a vehicle says, in every kind of flight, can be put on the wire and is finite where it must be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from plan_client import circle, land, rally, takeoff, upload, waypoint
+
+from mavlink_sim.wire.messages import dialect, parser
+
+NAN = math.nan
+HOLD = 0x03040000
+NUMBERS = {
+    "ATTITUDE": ("roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"),
+    "LOCAL_POSITION_NED": ("x", "y", "z", "vx", "vy", "vz"),
+    "ODOMETRY": ("x", "y", "z", "vx", "vy", "vz"),
+    "VFR_HUD": ("groundspeed", "alt", "climb"),
+}
+
+
+def mission(cockpit: Any) -> None:
+    assert upload(cockpit, [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]) == 0
+    assert cockpit.set_mode(4, 4) == [0, 0]
+    cockpit.fly(6.0)
+
+
+def return_to_a_rally_point(cockpit: Any) -> None:
+    assert upload(cockpit, [rally(6, 6)], 2) == 0
+    assert cockpit.set_mode(4, 5) == [0, 0]
+    cockpit.fly(6.0)
+
+
+def precision_landing(cockpit: Any) -> None:
+    seen = dialect.MAVLink_landing_target_message(
+        0, 0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 0.0, [1, 0, 0, 0], 2, 1
+    )
+    cockpit.fly(0.2, seen)
+    assert cockpit.set_mode(4, 9) == [0, 0]
+    cockpit.fly(6.0, seen)
+
+
+def geofence(cockpit: Any) -> None:
+    assert upload(cockpit, [circle(0, 0, 5.0)], 1) == 0
+    forward = dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 1479, 0, 0, 0, 3.0, 0, 0, 0, 0, 0, 0, 0.0
+    )
+    cockpit.offboard(forward)
+    cockpit.fly(6.0, forward)
+
+
+def orbit(cockpit: Any) -> None:
+    assert cockpit.command(34, 5, 2, 0, NAN, NAN, NAN, NAN) == [0]
+    cockpit.fly(6.0)
+
+
+def sticks(cockpit: Any) -> None:
+    pushed = dialect.MAVLink_manual_control_message(1, 500, 0, 500, 0, 0)
+    cockpit.fly(0.3, pushed)
+    assert cockpit.set_mode(3) == [0, 0]
+    cockpit.fly(4.0, pushed)
+
+
+@pytest.mark.parametrize(
+    "flight", [mission, return_to_a_rally_point, precision_landing, geofence, orbit, sticks]
+)
+def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
+    make_cockpit: Any, flight: Callable[[Any], None]
+) -> None:
+    joystick = {"COM_RC_IN_MODE": 1} if flight is sticks else {}
+    cockpit = make_cockpit(["everything"], parameters=joystick)
+    cockpit.take_off(6.0)
+    cockpit.forget()
+    flight(cockpit)
+    assert {told.custom_mode for told in cockpit.received("HEARTBEAT")} - {HOLD}
+    codec = parser(1)
+    for link in ("onboard", "gcs"):
+        for _, item in cockpit.inbox[link]:
+            assert item.pack(codec)
+        for kind, names in NUMBERS.items():
+            for told in cockpit.received(kind, link):
+                assert all(math.isfinite(getattr(told, name)) for name in names), told
+    assert len(cockpit.received("ATTITUDE")) > 300
