@@ -82,6 +82,7 @@ class Path:
         self._points = _spaced(corners, max(SPACING_M, length_m / _MOST_PARTS))
         self._at = list(accumulate((math.dist(a, b) for a, b in pairwise(self._points)), initial=0.0))
         self.length_m = self._at[-1]
+        self._directions = [_direction(a, b) for a, b in pairwise(self._points)]
         self._speeds = self._allowed(speed_mps)
 
     def point(self, along_m: float) -> PathPoint:
@@ -90,7 +91,11 @@ class Path:
         before, after = self._speeds[index], self._speeds[index + 1]
         # Speeds change by acceleration, so it is their squares that lie on a line.
         speed = math.sqrt(before**2 + share * (after**2 - before**2))
-        return PathPoint(self._place(along_m), self._direction(along_m), speed)
+        return PathPoint(self._between(index, share), self._directions[index], speed)
+
+    def direction(self, along_m: float) -> Vector3:
+        """`PathPoint.direction` there, alone."""
+        return self._directions[self._part(along_m)[0]]
 
     def nearest(self, position: Vector3, from_m: float, to_m: float) -> float:
         """How far along the nearest place to `position` is, looked for between two places."""
@@ -113,7 +118,9 @@ class Path:
 
     def _place(self, along_m: float) -> Vector3:
         """The place alone: many are tried at every turn."""
-        index, share = self._part(along_m)
+        return self._between(*self._part(along_m))
+
+    def _between(self, index: int, share: float) -> Vector3:
         start, end = self._points[index], self._points[index + 1]
         return (
             start[0] + share * (end[0] - start[0]),
@@ -143,18 +150,11 @@ class Path:
     def _bend_speed(self, along_m: float) -> float:
         if not self.closed and not BEND_M <= along_m <= self.length_m - BEND_M:
             return math.inf
-        before, after = (self._direction(along_m + side * BEND_M) for side in (-1.0, 1.0))
-        turned = math.acos(min(max(sum(a * b for a, b in zip(before, after, strict=True)), -1.0), 1.0))
+        before, after = self.direction(along_m - BEND_M), self.direction(along_m + BEND_M)
+        turned = math.acos(min(max(_dot(before, after), -1.0), 1.0))
         if turned < 1e-6:
             return math.inf
         return max(SLOWEST_MPS, math.sqrt(ACCELERATION_MPS2 * 2.0 * BEND_M / turned))
-
-    def _direction(self, along_m: float) -> Vector3:
-        index, _ = self._part(along_m)
-        start, end = self._points[index], self._points[index + 1]
-        length = self._at[index + 1] - self._at[index]
-        north, east, down = ((b - a) / length for a, b in zip(start, end, strict=True))
-        return (north, east, down)
 
 
 class PathFollower:
@@ -206,22 +206,36 @@ class PathFollower:
 
     def _before_turning_back(self, reach_m: float) -> float:
         """Where the path turns back on itself both ways look alike: no further before that was flown to."""
-        here, at = self.path.point(self.along_m).direction, self.along_m + CORNER_M
+        here, at = self.path.direction(self.along_m), self.along_m + CORNER_M
         while at < reach_m:
             at += SPACING_M / 2
-            if sum(a * b for a, b in zip(here, self.path.point(at).direction, strict=True)) < -0.1:
+            if _dot(here, self.path.direction(at)) < -0.1:
                 return min(at, reach_m)
         return reach_m
 
     def bearing(self) -> float | None:
         """Where the path leads from here, radians from north; None where it goes straight up or down."""
-        north, east, _ = self.path.point(self.along_m + BEND_M).direction
+        north, east, _ = self.path.direction(self.along_m + BEND_M)
         return math.atan2(east, north) if math.hypot(north, east) > 0.2 else None
 
     @property
     def left_m(self) -> float:
         """Of an open path: how much is left of it."""
         return max(0.0, self.path.length_m - self.along_m)
+
+
+def _dot(one: Vector3, other: Vector3) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def _direction(start: Vector3, end: Vector3) -> Vector3:
+    """Unit vector from one place to another."""
+    length_m = math.dist(start, end)
+    return (
+        (end[0] - start[0]) / length_m,
+        (end[1] - start[1]) / length_m,
+        (end[2] - start[2]) / length_m,
+    )
 
 
 def _spaced(corners: Sequence[Vector3], spacing: float) -> list[Vector3]:
