@@ -28,11 +28,15 @@ from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
 from mavlink_sim.wire.messages import dialect
+from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 from vision.attitude import quaternion_from_euler, wrap_angle
 
 GUIDANCE_HZ = 20.0
 POSES_EVERY = 2  # guidance turns: 10 Hz
 # Where the fleet's common frame has its origin; any place away from the poles would do.
+# Of what PX4 sends a companion by itself, what its state is made of.
+_FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in FOLDED_MESSAGES}
+
 _ORIGIN = Anchor(47.3977, 8.5456, 488.0, (0.0, 0.0, 0.0))
 
 
@@ -70,6 +74,7 @@ class LockstepAirframe:
         wind_mps: tuple[float, float],
     ) -> None:
         self.vehicle = LockstepVehicle(
+            {"onboard": _FOLDED_RATES_HZ},
             system_id=system_id,
             seed=seed,
             parameters={"SIH_WIND_N": wind_mps[0], "SIH_WIND_E": wind_mps[1]},
