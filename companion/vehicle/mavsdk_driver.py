@@ -223,10 +223,10 @@ class MavsdkDriver(AutopilotDriver):
 def _destroy(library: mavsdk.Mavsdk, search: ctypes.c_void_p | None, direct: MavlinkDirect | None) -> None:
     if search is not None:  # first of all: a system that is found from here on would outlive the library
         library.cancel_first_autopilot(search)
-    # MAVSDK 4.1 frees what its C++ calls back for commands under way before it stops the thread that calls:
-    # an answer in that moment ends the process. So they are held until the thread is gone. (A driver that is
-    # never closed is destroyed by MAVSDK at exit, without that.)
-    called_back = list(getattr(direct, "_callbacks", ()))
+    # MAVSDK 4.1 frees what its C++ calls back, for subscriptions and for commands under way, before it stops
+    # the thread that calls: an answer in that moment ends the process. So it is held until the thread ends.
+    # (A driver that is never closed is destroyed by MAVSDK at exit, without that.)
+    called_back = [*getattr(direct, "_callbacks", ()), *getattr(direct, "_subscriptions", {}).values()]
     library.destroy()
     called_back.clear()
 

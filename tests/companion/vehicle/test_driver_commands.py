@@ -190,8 +190,10 @@ async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(autopilot, 
     await driver.connect(10.0)
     arming = asyncio.create_task(driver.arm())
     await autopilot.hears("COMMAND_LONG")
-    called_back = [weakref.ref(trampoline) for trampoline in driver._direct._callbacks]
-    assert called_back
+    subscribed = [trampoline for trampoline, _ in driver._direct._subscriptions.values()]
+    called_back = [weakref.ref(one) for one in [*driver._direct._callbacks, *subscribed]]
+    assert len(called_back) > len(subscribed) > 5
+    del subscribed
     lived: list[bool] = []
     destroy = mavsdk.Mavsdk.destroy
 
