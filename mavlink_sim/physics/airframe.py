@@ -13,7 +13,15 @@ import math
 import random
 from collections.abc import Callable
 
-from mavlink_sim.physics.contact import BOUNCE_MPS, CRASH_MPS, NEW_CONTACT_S, RESTITUTION, Collision
+from mavlink_sim.physics.contact import (
+    BOUNCE_MPS,
+    CRASH_MPS,
+    INERTIA_XY_KGM2,
+    INERTIA_Z_KGM2,
+    NEW_CONTACT_S,
+    RESTITUTION,
+    Collision,
+)
 from mavlink_sim.physics.normal_numbers import BITS, NORMAL
 from mavlink_sim.physics.rate_loop import MAX_YAW_RATE_RADPS, demanded_rates, mixed_thrusts
 
@@ -27,8 +35,6 @@ ROTOR_THRUST_MPS2 = 5.0  # SIH_T_MAX 5 N on SIH_MASS 1 kg
 MAX_THRUST_MPS2 = 4.0 * ROTOR_THRUST_MPS2
 LINEAR_DRAG_PER_S = 1.0  # SIH_KDV / SIH_MASS
 ROTOR_TIME_CONSTANT_S = 0.05  # SIH_T_TAU
-INERTIA_XY_KGM2 = 0.025  # SIH_IXX, SIH_IYY
-INERTIA_Z_KGM2 = 0.030  # SIH_IZZ
 ARM_M = 0.2  # SIH_L_ROLL, SIH_L_PITCH
 ROTOR_TORQUE_NM = 0.1  # SIH_Q_MAX
 ANGULAR_DRAG_NMS = 0.025  # SIH_KDW

@@ -111,10 +111,13 @@ class CollidingMultirotor(Multirotor):
         self.position = (x + px, y + py, min(z + pz, 0.0))
         ux, uy, uz = obstacle.velocity_at(now_s)
         vx, vy, vz = self.velocity
-        into, (rx, ry, rz) = after_contact((vx - ux, vy - uy, vz - uz), gap.normal_ned)
+        into, (rx, ry, rz), rates = after_contact(
+            (vx - ux, vy - uy, vz - uz), self.rates, self.matrix, gap.normal_ned
+        )
         if into < 0.0:
             return
         after = self.velocity = (ux + rx, uy + ry, uz + rz)
+        self.rates = rates
         bounces = into > BOUNCE_MPS
         if not bounces:  # it leans on it: what would accelerate it is held
             ax, ay, az = self.acceleration

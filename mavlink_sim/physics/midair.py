@@ -18,7 +18,7 @@ from mavlink_sim.physics.contact import (
     RADIUS_M,
     STANDING_COSINE,
     Collision,
-    after_contact,
+    back_speed,
 )
 
 # Two equal ellipsoids touch where one of twice the size around the first passes through the second's middle.
@@ -119,8 +119,9 @@ class Midair:
         push, normal = _parting(first, second)
         share = _share(first.airframe, second.airframe)
         before = _difference(first.airframe.velocity, second.airframe.velocity)
-        into, after = after_contact(before, normal, friction=0.0)
-        change = _difference(after, before)
+        into = -(before[0] * normal[0] + before[1] * normal[1] + before[2] * normal[2])
+        lost = max(into + back_speed(into), 0.0)
+        change = (lost * normal[0], lost * normal[1], lost * normal[2])
         # where they do not bounce one leans on the other, and what would accelerate it is held
         held_s = step_s if into <= BOUNCE_MPS else math.inf
         _give(first.airframe, push, change, share, held_s)

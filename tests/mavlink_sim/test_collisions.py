@@ -13,9 +13,17 @@ from hypothesis import strategies as st
 from mavlink_sim.camera.scene import Path, Scene
 from mavlink_sim.cli import main
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.airframe import Multirotor, rotation_matrix
 from mavlink_sim.physics.collisions import CollidingMultirotor
-from mavlink_sim.physics.contact import CRASH_MPS, HALF_HEIGHT_M, RADIUS_M, Collision
+from mavlink_sim.physics.contact import (
+    CRASH_MPS,
+    HALF_HEIGHT_M,
+    INERTIA_XY_KGM2,
+    INERTIA_Z_KGM2,
+    RADIUS_M,
+    Collision,
+    after_contact,
+)
 from mavlink_sim.simulation import Simulation, SimulationOptions
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
@@ -136,6 +144,73 @@ def test_a_bounce_takes_speed_and_friction_slows_along_the_wall() -> None:
     assert -1.0 < north < -0.5  # a quarter of it
     assert 0.5 < east < 1.5
     assert body.collisions == 1
+
+
+LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def test_what_it_slides_along_turns_it() -> None:
+    """A wall to the north, the nose north: going east its nose is held back, so that it turns west."""
+    into, velocity, rates = after_contact((3.0, 2.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (-1.0, 0.0, 0.0))
+    assert into == pytest.approx(3.0)
+    # Friction stops the touching point: by a quarter it slows the middle, by the rest it turns.
+    assert velocity == pytest.approx((-0.75, 1.5, 0.0))
+    assert rates == pytest.approx((0.0, 0.0, -0.5 * RADIUS_M / INERTIA_Z_KGM2))
+    # Faster along it friction is all that it can be: 0.3 of the push of 3.75 Ns.
+    _, velocity, rates = after_contact((3.0, 0.0, 8.0), (0.0, 0.0, 0.0), LEVEL, (-1.0, 0.0, 0.0))
+    assert velocity == pytest.approx((-0.75, 0.0, 8.0 - 1.125))
+    assert rates == pytest.approx((0.0, 1.125 * RADIUS_M / INERTIA_XY_KGM2, 0.0))  # nose up
+    # Turned away by what it looks like from the body: the nose east, the wall on its left.
+    east = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    _, velocity, rates = after_contact((3.0, 2.0, 0.0), (0.0, 0.0, 0.0), east, (-1.0, 0.0, 0.0))
+    assert velocity == pytest.approx((-0.75, 1.5, 0.0))
+    assert rates == pytest.approx((0.0, 0.0, -0.5 * RADIUS_M / INERTIA_Z_KGM2))
+
+
+def test_a_wall_turns_the_vehicle_that_scrapes_along_it() -> None:
+    for east_mps in (-2.0, 2.0):
+        body, clock = airframe(WALL)
+        throw(body, (FACE_M - RADIUS_M - 0.05, 0.0, -2.0), (3.0, east_mps, 0.0))
+        let_pass(body, clock, 0.05)
+        assert body.collisions == 1
+        assert body.rates[2] * east_mps < -1.0
+
+
+def test_a_vehicle_that_a_wall_turns_flies_on() -> None:
+    vehicle = flying(WALL)
+    steer(vehicle, velocity(2.0, 0.6), 6.0)
+    assert vehicle.truth.collisions >= 1
+    steer(vehicle, place(0.0, 0.0, -2.0), 8.0)
+    truth = vehicle.truth
+    assert not truth.crashed
+    assert math.dist(truth.position_ned_m, (0.0, 0.0, -2.0)) < 0.6
+    assert max(abs(truth.roll_rad), abs(truth.pitch_rad)) < 0.2
+
+
+unit = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).filter(lambda v: math.hypot(*v) > 0.1)
+triple = st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-8, 8))
+
+
+@given(triple, triple, unit, st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
+def test_no_contact_gives_energy_and_the_touching_point_does_not_go_in(
+    velocity: Any, rates: Any, normal: Any, quaternion: Any
+) -> None:
+    normal = tuple(value / math.hypot(*normal) for value in normal)
+    w, x, y, z = (value / math.hypot(*quaternion) for value in quaternion)
+    matrix = rotation_matrix((w, x, y, z))
+
+    def energy(velocity: Any, rates: Any) -> float:
+        turning = zip(rates, (INERTIA_XY_KGM2, INERTIA_XY_KGM2, INERTIA_Z_KGM2), strict=True)
+        return sum(v * v for v in velocity) / 2 + sum(i * r * r for r, i in turning) / 2
+
+    into, after, turned_rates = after_contact(velocity, rates, matrix, normal)
+    if into < 0.0:
+        assert (after, turned_rates) == (velocity, rates)
+        return
+    assert energy(after, turned_rates) <= energy(velocity, rates) + 1e-9
+    # Friction may turn what bounced a little back in, by far less than what it came with.
+    again, _, _ = after_contact(after, turned_rates, matrix, normal)
+    assert again <= 0.5 * into + 1e-9
 
 
 @settings(max_examples=25, deadline=None)
