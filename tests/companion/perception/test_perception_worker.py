@@ -171,9 +171,8 @@ def few_pictures(pictures: Path, tmp_path: Path) -> Path:
 async def test_the_last_words_of_a_worker_are_read_whatever_it_was_told_after_them(
     few_pictures: Path,
 ) -> None:
-    settings = load_settings(
-        Path(os.devnull), {"source.uri": str(few_pictures), "detector.enabled": "false"}, environment={}
-    )
+    every_picture = {"source.uri": str(few_pictures), "source.realtime": "false", "detector.enabled": "false"}
+    settings = load_settings(Path(os.devnull), every_picture, environment={})
     process = await PerceptionProcess.spawn(settings, subprocess.DEVNULL)
     # Nothing is read until it has ended, as when the service's own loop stands still for a moment.
     ended = os.pidfd_open(process.pid)
