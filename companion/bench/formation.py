@@ -33,10 +33,9 @@ from vision.attitude import quaternion_from_euler, wrap_angle
 
 GUIDANCE_HZ = 20.0
 POSES_EVERY = 2  # guidance turns: 10 Hz
-# Where the fleet's common frame has its origin; any place away from the poles would do.
 # Of what PX4 sends a companion by itself, what its state is made of.
 _FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in FOLDED_MESSAGES}
-
+# Where the fleet's common frame has its origin; any place away from the poles would do.
 _ORIGIN = Anchor(47.3977, 8.5456, 488.0, (0.0, 0.0, 0.0))
 
 

@@ -96,7 +96,7 @@ def after_contact(
         negative, and both are as they were.
     """
     out = _turned_back(ned_from_body, normal)
-    arm = _turned_back(ned_from_body, touching_point(normal))
+    arm = _turned_back(ned_from_body, _touching_point(normal))
     motion = Motion(_turned_back(ned_from_body, velocity), rates)
     into = -_dot(motion.at(arm), out)
     if into < 0.0:
@@ -109,7 +109,7 @@ def after_contact(
         x, y, z = along
         against = (-x / sliding, -y / sliding, -z / sliding)
         motion.push(arm, against, sliding, SLIDING_FRICTION * pressed)
-    return into, turned(ned_from_body, motion.velocity), motion.rates
+    return into, _turned(ned_from_body, motion.velocity), motion.rates
 
 
 def back_speed(into_mps: float) -> float:
@@ -117,7 +117,7 @@ def back_speed(into_mps: float) -> float:
     return RESTITUTION * into_mps if into_mps > BOUNCE_MPS else 0.0
 
 
-def touching_point(normal: Vector) -> Vector:
+def _touching_point(normal: Vector) -> Vector:
     """From its middle to where an upright ellipsoid touches what has this normal, metres."""
     x, y, z = normal
     flat, high = RADIUS_M * RADIUS_M, HALF_HEIGHT_M * HALF_HEIGHT_M
@@ -125,7 +125,7 @@ def touching_point(normal: Vector) -> Vector:
     return (-flat * x / reach, -flat * y / reach, -high * z / reach)
 
 
-def turned(matrix: Matrix, vector: Vector) -> Vector:
+def _turned(matrix: Matrix, vector: Vector) -> Vector:
     """The vector, turned by a rotation that is given row by row."""
     x, y, z = vector
     a, b, c, d, e, f, g, h, i = matrix
