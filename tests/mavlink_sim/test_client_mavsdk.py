@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
-from typing import Any
+from collections.abc import AsyncIterator
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
 from mavsdk.asyncio.plugins.info import InfoAsync
 from mavsdk.asyncio.plugins.offboard import (
@@ -20,21 +19,11 @@ from mavsdk.asyncio.plugins.offboard import (
 )
 from mavsdk.asyncio.plugins.param import ParamAsync, ParamError
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk_client import MavsdkClient, mavsdk_client, wait_for
 
 from mavlink_sim.testing import RunningSimulator, vehicle
 
 SPEED = 4.0
-
-
-async def first(
-    updates: Any, condition: Callable[[Any], bool] = lambda _: True, limit_s: float = 40.0
-) -> Any:
-    """The first update that meets the condition."""
-    async with asyncio.timeout(limit_s):
-        async for update in updates:
-            if condition(update):
-                return update
-    raise AssertionError("the stream of updates ended")
 
 
 @pytest.fixture
@@ -44,30 +33,28 @@ async def simulator() -> AsyncIterator[RunningSimulator]:
 
 
 @pytest.fixture
-async def system(simulator: RunningSimulator) -> AsyncIterator[Any]:
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(simulator.mavsdk_url)
-        found = await mavsdk.first_autopilot(20.0)
-        assert found is not None
-        yield found
+async def system(simulator: RunningSimulator) -> AsyncIterator[MavsdkClient]:
+    async with mavsdk_client(simulator.mavsdk_url) as client:
+        yield client
 
 
-async def test_it_knows_the_vehicle_its_parameters_and_its_state(system: Any) -> None:
-    information, telemetry, parameters = InfoAsync(system), TelemetryAsync(system), ParamAsync(system)
+async def test_it_knows_the_vehicle_its_parameters_and_its_state(system: MavsdkClient) -> None:
+    information = system.plugin(InfoAsync)
+    telemetry = system.plugin(TelemetryAsync)
+    parameters = system.plugin(ParamAsync)
     version = await information.get_version()
     assert (version.flight_sw_major, version.flight_sw_minor) == (1, 17)
     assert (await information.get_identification()).legacy_uid == 5283920058631409231
 
-    health = await first(telemetry.subscribe_health(), lambda health: health.is_armable)
+    health = await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
     assert health.is_global_position_ok
     assert health.is_home_position_ok
-    assert await first(telemetry.subscribe_health_all_ok(), lambda ok: ok)
-    assert (await first(telemetry.subscribe_gps_info())).num_satellites == 10
-    assert (await first(telemetry.subscribe_home())).absolute_altitude_m == pytest.approx(489.4, abs=0.1)
-    assert (await first(telemetry.subscribe_battery())).remaining_percent == pytest.approx(99.0, abs=1.0)
-    assert not (await first(telemetry.subscribe_rc_status())).is_available
-    down = (await first(telemetry.subscribe_imu())).acceleration_frd.down_m_s2
+    assert await wait_for(telemetry.subscribe_health_all_ok(), lambda ok: ok)
+    assert (await wait_for(telemetry.subscribe_gps_info())).num_satellites == 10
+    assert (await wait_for(telemetry.subscribe_home())).absolute_altitude_m == pytest.approx(489.4, abs=0.1)
+    assert (await wait_for(telemetry.subscribe_battery())).remaining_percent == pytest.approx(99.0, abs=1.0)
+    assert not (await wait_for(telemetry.subscribe_rc_status())).is_available
+    down = (await wait_for(telemetry.subscribe_imu())).acceleration_frd.down_m_s2
     assert down == pytest.approx(-9.81, abs=0.5)
     await telemetry.set_rate_position(10.0)
     assert (await telemetry.get_gps_global_origin()).altitude_m == pytest.approx(489.4, abs=0.1)
@@ -87,9 +74,11 @@ async def test_it_knows_the_vehicle_its_parameters_and_its_state(system: Any) ->
             await request
 
 
-async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, system: Any) -> None:
-    action, telemetry, offboard = ActionAsync(system), TelemetryAsync(system), OffboardAsync(system)
-    await first(telemetry.subscribe_health(), lambda health: health.is_armable)
+async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, system: MavsdkClient) -> None:
+    action = system.plugin(ActionAsync)
+    telemetry = system.plugin(TelemetryAsync)
+    offboard = system.plugin(OffboardAsync)
+    await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
     await action.disarm()  # it is disarmed: no error
     with pytest.raises(OffboardError, match="NO_SETPOINT_SET"):
         await offboard.start()
@@ -98,17 +87,17 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     assert await action.get_return_to_launch_altitude() == 12.0
     await action.arm()
     await action.takeoff()
-    await first(telemetry.subscribe_landed_state(), lambda state: int(state) == 2)  # in the air
+    await wait_for(telemetry.subscribe_landed_state(), lambda state: int(state) == 2)  # in the air
     with pytest.raises(ActionError, match="COMMAND_DENIED"):
         await action.disarm()
 
     await offboard.set_velocity_body(VelocityBodyYawspeed(2.0, 0.0, 0.0, 0.0))
     await offboard.start()
-    await first(telemetry.subscribe_position_velocity_ned(), lambda p: p.velocity.north_m_s > 1.0)
+    await wait_for(telemetry.subscribe_position_velocity_ned(), lambda p: p.velocity.north_m_s > 1.0)
     await offboard.set_velocity_ned(VelocityNedYaw(0.0, 2.0, 0.0, 90.0))
-    await first(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90.0) < 8.0)
+    await wait_for(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90.0) < 8.0)
     await offboard.set_position_ned(PositionNedYaw(0.0, 0.0, -5.0, 0.0))
-    await first(
+    await wait_for(
         telemetry.subscribe_position_velocity_ned(),
         lambda p: math.dist((p.position.north_m, p.position.east_m, p.position.down_m), (0, 0, -5)) < 1.0,
     )
@@ -118,20 +107,19 @@ async def test_it_flies_by_action_and_by_offboard(simulator: RunningSimulator, s
     )
 
     await action.goto_location(47.3978, 8.5455942, 494.4, 0.0)
-    await first(telemetry.subscribe_position(), lambda place: place.latitude_deg > 47.39777)
+    await wait_for(telemetry.subscribe_position(), lambda place: place.latitude_deg > 47.39777)
     await action.return_to_launch()
     await asyncio.to_thread(simulator.wait_for_event, "mode RTL")
     await action.land()
-    await first(telemetry.subscribe_armed(), lambda armed: not armed)
+    await wait_for(telemetry.subscribe_armed(), lambda armed: not armed)
 
 
 async def test_what_the_vehicle_refuses_is_an_error_of_its_own() -> None:
     async with (
         vehicle(speed=SPEED, ready_after=600.0) as simulator,
-        Mavsdk(Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)) as mavsdk,
+        mavsdk_client(simulator.mavsdk_url, ComponentType.COMPANION_COMPUTER) as system,
     ):
-        await mavsdk.add_any_connection(simulator.mavsdk_url)
-        action = ActionAsync(await mavsdk.first_autopilot(20.0))
+        action = system.plugin(ActionAsync)
         with pytest.raises(ActionError, match="COMMAND_DENIED"):
             await action.arm()  # not ready
         with pytest.raises(ActionError, match="UNSUPPORTED"):

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.component_metadata import ComponentMetadataAsync
 from mavsdk.asyncio.plugins.ftp import FtpAsync, FtpError
 from mavsdk.plugins.component_metadata import MetadataType
+from mavsdk_client import mavsdk_client
 from pymavlink import mavftp, mavutil
 
 from mavlink_sim.px4.parameters import INT32, Parameters
@@ -342,11 +342,8 @@ async def test_mavsdk_lists_loads_stores_compares_renames_and_removes(
     content = os.urandom(20_000)
     (tmp_path / "there").mkdir()
     (tmp_path / "file.bin").write_bytes(content)
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.gcs_port}")
-        system = await mavsdk.first_autopilot(20.0)
-        ftp = FtpAsync(system)
+    async with mavsdk_client(f"udpin://127.0.0.1:{simulator.gcs_port}") as system:
+        ftp = system.plugin(FtpAsync)
         root = await ftp.list_directory("/")
         names = {entry.name for entry in root.entries}
         assert names == {"etc", "log", "parameters.bson", "parameters_backup.bson"}
@@ -371,10 +368,8 @@ async def test_mavsdk_lists_loads_stores_compares_renames_and_removes(
 
 
 async def test_mavsdk_finds_the_metadata(simulator: RunningSimulator) -> None:
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.gcs_port}")
-        metadata = ComponentMetadataAsync(await mavsdk.first_autopilot(20.0))
+    async with mavsdk_client(f"udpin://127.0.0.1:{simulator.gcs_port}") as system:
+        metadata = system.plugin(ComponentMetadataAsync)
         updates = metadata.subscribe_metadata_available()
         update = asyncio.ensure_future(anext(updates))
         await asyncio.sleep(0)  # lets it subscribe

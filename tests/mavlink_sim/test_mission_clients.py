@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.action import ActionAsync
 from mavsdk.asyncio.plugins.geofence import GeofenceAsync
 from mavsdk.asyncio.plugins.mission import MissionAsync
@@ -19,6 +18,7 @@ from mavsdk.plugins.geofence.geofence import Circle, FenceType, GeofenceData, Po
 from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
+from mavsdk_client import MavsdkClient, mavsdk_client, wait_for
 from plan_client import item, land, polygon, rally, takeoff, waypoint
 
 from mavlink_sim.physics.geography import geographic
@@ -28,28 +28,15 @@ SPEED = 6.0
 LIMIT_S = 80.0
 
 
-async def wait_for(updates: Any, condition: Callable[[Any], bool]) -> Any:
-    """The first update that meets the condition."""
-    async with asyncio.timeout(LIMIT_S):
-        async for update in updates:
-            if condition(update):
-                return update
-    raise AssertionError("the stream of updates ended")
-
-
 @asynccontextmanager
 async def flown_by_mavsdk(
     speed: float = 1.0, of_ground_station: bool = False
-) -> AsyncIterator[tuple[RunningSimulator, Any]]:
+) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:
     """A vehicle in its process and MAVSDK's view of it, ready to arm, on the onboard link or the other."""
     with running_simulator(speed=speed, parameters={"RTL_RETURN_ALT": 5.0}) as simulator:
-        configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-        async with Mavsdk(configuration) as mavsdk:
-            port = simulator.gcs_port if of_ground_station else simulator.onboard_port
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
-            system = await mavsdk.first_autopilot(20.0)
-            assert system is not None
-            await wait_for(TelemetryAsync(system).subscribe_health(), lambda health: health.is_armable)
+        port = simulator.gcs_port if of_ground_station else simulator.onboard_port
+        async with mavsdk_client(f"udpin://127.0.0.1:{port}") as system:
+            await wait_for(system.plugin(TelemetryAsync).subscribe_health(), lambda health: health.is_armable)
             yield simulator, system
 
 
@@ -86,7 +73,9 @@ def raw(items: list[dict[str, Any]]) -> list[RawItem]:
 
 async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
     async with flown_by_mavsdk(SPEED) as (simulator, system):
-        mission, action, telemetry = MissionAsync(system), ActionAsync(system), TelemetryAsync(system)
+        mission = system.plugin(MissionAsync)
+        action = system.plugin(ActionAsync)
+        telemetry = system.plugin(TelemetryAsync)
         plan = MissionPlan(
             [
                 mission_item(0, 0, vehicle_action=MissionItem.VehicleAction.TAKEOFF),
@@ -123,7 +112,7 @@ async def test_mavsdk_uploads_starts_pauses_and_finishes_a_mission() -> None:
 
 async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
     async with flown_by_mavsdk() as (_, system):
-        missions = MissionRawAsync(system)
+        missions = system.plugin(MissionRawAsync)
         flight = raw([takeoff(4.0), waypoint(5, 5, 4.0), item(93, None, 2.0), land(5, 5)])
         fence = raw(polygon([(-40, -40), (40, -40), (40, 40), (-40, 40)]))
         points = raw([rally(20, 0), rally(0, 20)])
@@ -145,7 +134,7 @@ async def test_mavsdk_brings_raw_plans_and_takes_them_back() -> None:
 
 async def test_mavsdk_sets_and_clears_a_geofence() -> None:
     async with flown_by_mavsdk() as (_, system):
-        fence = GeofenceAsync(system)
+        fence = system.plugin(GeofenceAsync)
         corners = [Point(*place(*corner)) for corner in ((-30, -30), (30, -30), (30, 30), (-30, 30))]
         inside = Polygon(corners, FenceType.INCLUSION)
         around = Circle(Point(*place(0, 0)), 15.0, FenceType.INCLUSION)
@@ -161,8 +150,8 @@ async def test_mavsdk_sets_and_clears_a_geofence() -> None:
 async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> None:
     # in real time: texts go to a ground station whose heartbeat comes often enough
     async with flown_by_mavsdk(1.0, of_ground_station=True) as (simulator, system):
-        fence, telemetry = GeofenceAsync(system), TelemetryAsync(system)
-        action, offboard = ActionAsync(system), OffboardAsync(system)
+        fence, telemetry = system.plugin(GeofenceAsync), system.plugin(TelemetryAsync)
+        action, offboard = system.plugin(ActionAsync), system.plugin(OffboardAsync)
         texts: list[str] = []
 
         async def listen() -> None:

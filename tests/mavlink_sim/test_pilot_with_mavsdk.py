@@ -9,37 +9,22 @@ from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.action import ActionAsync
 from mavsdk.asyncio.plugins.gimbal import ControlMode, GimbalAsync, GimbalMode, SendMode
 from mavsdk.asyncio.plugins.manual_control import ManualControlAsync
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk_client import MavsdkClient, mavsdk_client, wait_for
 
 from mavlink_sim.flight.transmitter import CALIBRATION
 from mavlink_sim.testing import RunningSimulator, running_simulator
 
-LIMIT_S = 60.0
-
-
-async def wait_for(updates: Any, condition: Callable[[Any], bool], limit_s: float = LIMIT_S) -> Any:
-    """The first update that meets the condition."""
-    async with asyncio.timeout(limit_s):
-        async for update in updates:
-            if condition(update):
-                return update
-    raise AssertionError("the stream of updates ended")
-
 
 @asynccontextmanager
-async def connected(**options: Any) -> AsyncIterator[tuple[RunningSimulator, Any]]:
+async def connected(**options: Any) -> AsyncIterator[tuple[RunningSimulator, MavsdkClient]]:
     """A simulator, and MAVSDK as its ground station."""
     with running_simulator(**options) as simulator:
-        configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-        async with Mavsdk(configuration) as mavsdk:
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.gcs_port}")
-            system = await mavsdk.first_autopilot(20.0)
-            assert system is not None
+        async with mavsdk_client(f"udpin://127.0.0.1:{simulator.gcs_port}") as system:
             yield simulator, system
 
 
@@ -65,7 +50,9 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
         simulator,
         system,
     ):
-        action, telemetry, manual = ActionAsync(system), TelemetryAsync(system), ManualControlAsync(system)
+        action = system.plugin(ActionAsync)
+        telemetry = system.plugin(TelemetryAsync)
+        manual = system.plugin(ManualControlAsync)
         sticks = [0.0, 0.0, 0.5, 0.0]
         await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
         async with streaming(lambda: manual.set_manual_control_input(*sticks), 0.05):
@@ -83,7 +70,7 @@ async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:
 
 async def test_the_gimbal_and_the_battery_are_read_and_the_gimbal_is_turned() -> None:
     async with connected(speed=4.0, gimbal=True) as (_, system):
-        gimbal, telemetry = GimbalAsync(system), TelemetryAsync(system)
+        gimbal, telemetry = system.plugin(GimbalAsync), system.plugin(TelemetryAsync)
         listed = await wait_for(gimbal.subscribe_gimbal_list(), lambda update: bool(update.gimbals))
         found = listed.gimbals[0]
         assert found.gimbal_device_id == 1
@@ -105,7 +92,7 @@ async def test_the_gimbal_and_the_battery_are_read_and_the_gimbal_is_turned() ->
 async def test_a_remote_control_is_read() -> None:
     parameters = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_RC_LOSS_T": 5}
     async with connected(speed=1.0, parameters=parameters) as (_, system):
-        direct, telemetry = MavlinkDirectAsync(system), TelemetryAsync(system)
+        direct, telemetry = system.plugin(MavlinkDirectAsync), system.plugin(TelemetryAsync)
         channels = {f"chan{number}_raw": 1500 for number in range(1, 9)}
         fields = {"target_system": 1, "target_component": 1, **channels}
         override = MavlinkMessage("RC_CHANNELS_OVERRIDE", 245, 190, 1, 1, json.dumps(fields))

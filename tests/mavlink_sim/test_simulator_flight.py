@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk_client import mavsdk_client, wait_for
 from pymavlink import mavutil
 
 from mavlink_sim.testing import running_simulator
@@ -120,24 +121,12 @@ def message(name: str, fields: dict[str, float]) -> MavlinkMessage:
     return MavlinkMessage(name, 1, 191, 1, 1, json.dumps(addressed))
 
 
-async def wait_for(updates: Any, condition: Callable[[Any], bool], limit_s: float = 60.0) -> Any:
-    """The first update that meets the condition."""
-    async with asyncio.timeout(limit_s):
-        async for update in updates:
-            if condition(update):
-                return update
-    raise AssertionError("the stream of updates ended")
-
-
 async def test_mavsdk_flies_the_vehicle() -> None:
     with running_simulator(speed=SPEED) as simulator:
-        configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
-        async with Mavsdk(configuration) as mavsdk:
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.onboard_port}")
-            system = await mavsdk.first_autopilot(20.0)
-            assert system is not None
-            action, telemetry = ActionAsync(system), TelemetryAsync(system)
-            direct = MavlinkDirectAsync(system)
+        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+        async with mavsdk_client(url, ComponentType.COMPANION_COMPUTER) as system:
+            action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)
+            direct = system.plugin(MavlinkDirectAsync)
             await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
 
             await action.set_takeoff_altitude(3.0)

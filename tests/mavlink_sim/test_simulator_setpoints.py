@@ -2,14 +2,14 @@
 
 import asyncio
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, OrbitYawBehavior
 from mavsdk.asyncio.plugins.offboard import Attitude, AttitudeRate, OffboardAsync, PositionGlobalYaw
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk_client import mavsdk_client, wait_for
 
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic, local
@@ -19,28 +19,16 @@ SPEED = 3.0  # simulated seconds a second; MAVSDK repeats a setpoint 20 times a 
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2
 
 
-async def wait_for(updates: Any, condition: Callable[[Any], bool], limit_s: float = 60.0) -> Any:
-    """The first update that meets the condition."""
-    async with asyncio.timeout(limit_s):
-        async for update in updates:
-            if condition(update):
-                return update
-    raise AssertionError("the stream of updates ended")
-
-
 def distance_m(update: Any, north: float, east: float) -> float:
     return math.hypot(update.position.north_m - north, update.position.east_m - east)
 
 
 async def test_mavsdk_flies_every_kind_of_setpoint() -> None:
     with running_simulator(speed=SPEED, px4="1.15") as simulator:
-        configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
-        async with Mavsdk(configuration) as mavsdk:
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{simulator.onboard_port}")
-            system = await mavsdk.first_autopilot(20.0)
-            assert system is not None
-            action, telemetry = ActionAsync(system), TelemetryAsync(system)
-            offboard = OffboardAsync(system)
+        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+        async with mavsdk_client(url, ComponentType.COMPANION_COMPUTER) as system:
+            action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)
+            offboard = system.plugin(OffboardAsync)
             await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
             await action.set_takeoff_altitude(8.0)
             await action.arm()

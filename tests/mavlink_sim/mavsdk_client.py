@@ -1,0 +1,71 @@
+"""MAVSDK 4 as a client of a vehicle: connected, and taken apart in an order that it survives.
+
+A plugin of MAVSDK destroys itself where its last reference goes, which may be a thread of the pool in which a
+call was made; while another thread destroys the library, that ends the process. And what C++ calls back is
+freed before the thread that calls has ended. So plugins, and what they are called back by, live until the
+library is gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from contextlib import aclosing, asynccontextmanager
+from typing import Any, TypeVar
+
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+
+Plugin = TypeVar("Plugin")
+
+
+class MavsdkClient:
+    """An autopilot that MAVSDK found."""
+
+    def __init__(self, system: Any) -> None:
+        self._system = system
+        self._plugins: list[Any] = []
+
+    def plugin(self, kind: Callable[[Any], Plugin]) -> Plugin:
+        """One of MAVSDK's plugins, e.g. `ActionAsync`, for this autopilot."""
+        made = kind(self._system)
+        self._plugins.append(made)
+        return made
+
+    def called_back(self) -> list[Any]:
+        """What MAVSDK may call, in all plugins."""
+        inner = [plugin._plugin for plugin in self._plugins]
+        return [[*one._callbacks, *one._subscriptions.values()] for one in inner]
+
+
+@asynccontextmanager
+async def mavsdk_client(
+    url: str, component_type: ComponentType = ComponentType.GROUND_STATION
+) -> AsyncIterator[MavsdkClient]:
+    """MAVSDK, connected to the first autopilot that it finds at `url`."""
+    library = Mavsdk(Configuration.create_with_component_type(component_type))
+    called_back: list[Any] = []
+    try:
+        await library.add_any_connection(url)
+        system = await library.first_autopilot(20.0)
+        assert system is not None, f"MAVSDK found no autopilot at {url} within 20 s"
+        client = MavsdkClient(system)
+        try:
+            yield client
+        finally:
+            called_back = client.called_back()
+    finally:
+        library.destroy()
+        called_back.clear()
+
+
+async def wait_for(
+    updates: AsyncGenerator[Any, None],
+    condition: Callable[[Any], bool] = lambda _: True,
+    limit_s: float = 80.0,
+) -> Any:
+    """The first update of a subscription that meets the condition."""
+    async with aclosing(updates), asyncio.timeout(limit_s):
+        async for update in updates:
+            if condition(update):
+                return update
+    raise AssertionError("the stream of updates ended")
