@@ -7,7 +7,6 @@ level follows the area of a pixel's footprint on the ground.
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -38,6 +37,7 @@ NEAREST_INVERSE = 1e-4
 """Reciprocal depth below which ground counts as the horizon: 10 km."""
 DETAIL_REACH_M = 6.0
 DITHER = 0.5
+STRIP_ROWS = 64
 HAZE_FROM = 0.03
 """Share of the visibility up to which haze is too thin to be drawn."""
 
@@ -62,33 +62,53 @@ class View:
     height: int
 
 
+class Strip:
+    """Some rows of the image, with scratch arrays for them that all strips share.
+
+    Attributes:
+        where: the rows.
+        columns, rows: (h, W) float32, each pixel's column, and its row counted from the strip's first.
+        dither: (h, W) float32, factors of the pixels' footprints.
+        depth, map_x, map_y, work, scale, weight: (h, W) float32. level: (h, W) int32. flat: (h, W, 3) uint8.
+    """
+
+    def __init__(self, where: slice, buffers: Buffers) -> None:
+        self._buffers = buffers
+        self.where = where
+        height = where.stop - where.start
+        self.columns, self.rows = buffers.columns[:height], buffers.rows[:height]
+        self.dither = buffers.dither[where]
+        planes = buffers.planes[:, :height]
+        self.depth, self.map_x, self.map_y, self.work, self.scale, self.weight = planes[:6]
+        self.level = planes[6].view(np.int32)
+        self.flat = buffers.flat[:height]
+
+    def part(self, rows: slice) -> Strip:
+        """Some of its rows, counted from its first; the scratch arrays are empty."""
+        return Strip(slice(self.where.start + rows.start, self.where.start + rows.stop), self._buffers)
+
+
 class Buffers:
-    """Scratch arrays of one image size, so that no frame allocates them anew."""
+    """Scratch arrays for one image size, so that no frame allocates them anew.
+
+    A picture is worked on in strips: what the many passes over one go through stays in the processor's cache.
+
+    Attributes:
+        width, height: of the image.
+        strips: of all its rows, from the top.
+    """
 
     def __init__(self, width: int, height: int) -> None:
-        shape = (height, width)
-        self.columns = np.arange(width, dtype=np.float32)[None, :]
-        self.rows = np.arange(height, dtype=np.float32)[:, None]
-        self.depth = np.empty(shape, np.float32)
-        self.map_x = np.empty(shape, np.float32)
-        self.map_y = np.empty(shape, np.float32)
-        self.work = np.empty(shape, np.float32)
-        self.scale = np.empty(shape, np.float32)
-        self.level = np.empty(shape, np.int32)
-        self.bits = np.empty(shape, np.int32)
-        self.weight = np.empty(shape, np.float32)
-        self.flat = np.empty((height, width, 3), np.uint8)
+        self.width, self.height = width, height
+        strip = (min(STRIP_ROWS, height), width)
+        self.rows, self.columns = np.indices(strip, np.float32)
         rng = np.random.default_rng(3)
         # Half an octave of fixed dither hides the lines at which the mip level changes.
-        self.dither = np.exp2(rng.uniform(-DITHER, DITHER, shape)).astype(np.float32)
-
-    def band(self, rows: slice) -> Buffers:
-        """Those of some rows of the image: the same memory."""
-        part = copy.copy(self)
-        for name, whole in vars(self).items():
-            if name != "columns":
-                setattr(part, name, whole[rows])
-        return part
+        self.dither = np.exp2(rng.uniform(-DITHER, DITHER, (height, width))).astype(np.float32)
+        self.planes = np.empty((7, *strip), np.float32)
+        self.flat = np.empty((*strip, 3), np.uint8)
+        tops = range(0, height, STRIP_ROWS)
+        self.strips = [Strip(slice(top, min(top + STRIP_ROWS, height)), self) for top in tops]
 
 
 def ground_atlas(ground: Ground) -> MipAtlas:
@@ -194,15 +214,17 @@ def _pad(colours: Plane, north: Plane, east: Plane) -> Plane:
 
 def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane) -> Image:
     """(H, W, 3) ground, not yet in haze; where the sky is, anything. Fills `inverse_depth` (0 = sky)."""
-    # 1/depth of the ground, negative above the horizon.
-    _linear(view.ned_from_pixel[2] / _height_m(view), buffers, inverse_depth)
-    # It is linear along a row, so a row's ends tell whether there is any ground in it.
-    rows = np.flatnonzero(np.maximum(inverse_depth[:, 0], inverse_depth[:, -1]) > NEAREST_INVERSE)
     image = np.empty((view.height, view.width, 3), np.uint8)
-    if len(rows):
-        band = slice(int(rows[0]), int(rows[-1]) + 1)
-        _draw_band(world.ground, view, buffers.band(band), inverse_depth[band], image[band])
-    np.copyto(inverse_depth, 0.0, where=inverse_depth <= NEAREST_INVERSE)
+    ground, atlas = world.ground, ground_atlas(world.ground)
+    # 1/depth of the ground, negative above the horizon.
+    reciprocal = view.ned_from_pixel[2] / _height_m(view)
+    for strip in buffers.strips:
+        inverse = inverse_depth[strip.where]
+        _linear(reciprocal, strip, inverse)
+        # It is linear, so the corners tell whether there is any ground.
+        if inverse[:: len(inverse) - 1 or 1, :: view.width - 1 or 1].max() > NEAREST_INVERSE:
+            _draw_strip(ground, atlas, view, strip, inverse, image[strip.where])
+        cv2.threshold(inverse, NEAREST_INVERSE, 0.0, cv2.THRESH_TOZERO, dst=inverse)
     return image
 
 
@@ -210,85 +232,84 @@ def _height_m(view: View) -> float:
     return max(float(-view.eye[2]), 1e-3)
 
 
-def _draw_band(ground: Ground, view: View, buffers: Buffers, inverse_depth: Plane, image: Image) -> None:
-    """The rows of the picture in which there is ground, into `image`."""
-    atlas = ground_atlas(ground)
+def _draw_strip(
+    ground: Ground, atlas: MipAtlas, view: View, strip: Strip, inverse_depth: Plane, image: Image
+) -> None:
+    """A strip of the picture in which there is ground, into `image`."""
     height_m = _height_m(view)
     down = view.ned_from_pixel[2]
-    depth = buffers.depth
-    np.maximum(inverse_depth, NEAREST_INVERSE, out=buffers.work)
-    np.divide(1.0, buffers.work, out=depth)
+    depth = strip.depth
+    np.maximum(inverse_depth, NEAREST_INVERSE, out=strip.work)
+    np.divide(1.0, strip.work, out=depth)
 
     period = atlas.size * ground.texel_m
     c, s = math.cos(ground.yaw_rad) / period, math.sin(ground.yaw_rad) / period
     north, east = view.ned_from_pixel[0], view.ned_from_pixel[1]
     eye_n, eye_e = view.eye[0] - ground.origin_m[0], view.eye[1] - ground.origin_m[1]
-    _fraction(c * east - s * north, c * eye_e - s * eye_n, buffers, buffers.map_x)
-    _fraction(c * north + s * east, c * eye_n + s * eye_e, buffers, buffers.map_y)
+    map_x, map_y, work, scale = strip.map_x, strip.map_y, strip.work, strip.scale
+    _fraction(c * east - s * north, c * eye_e - s * eye_n, strip, map_x)
+    _fraction(c * north + s * east, c * eye_n + s * eye_e, strip, map_y)
 
     # Mean footprint squared, in texels: across d/f, along d/f · (1 + slope · d).
     slope = math.hypot(float(down[0]), float(down[1])) * view.focal_px / height_m
-    per_texel = 1.0 / (view.focal_px * ground.texel_m) ** 2
-    np.multiply(depth, np.float32(slope), out=buffers.work)
-    buffers.work += 1.0
-    buffers.work *= depth
-    buffers.work *= depth
-    buffers.work *= buffers.dither
-    buffers.work *= np.float32(per_texel * 0.8)
+    per_texel = 0.8 / (view.focal_px * ground.texel_m) ** 2
+    np.multiply(depth, np.float32(per_texel * slope), out=work)
+    work += np.float32(per_texel)
+    work *= depth
+    work *= depth
+    work *= strip.dither
     # The exponent of a float is its logarithm to base 2; half of it, as the area is squared length.
-    level, bits = buffers.level, buffers.bits
-    np.subtract(buffers.work.view(np.int32), 127 << 23, out=level)
+    level = strip.level
+    np.subtract(work.view(np.int32), 127 << 23, out=level)
     np.right_shift(level, 24, out=level)
     np.clip(level, 0, atlas.levels - 1, out=level)
-    np.subtract(127, level, out=bits)
-    np.left_shift(bits, 23, out=bits)
-    scale = np.multiply(bits.view(np.float32), np.float32(atlas.size), out=buffers.scale)
-    buffers.map_x *= scale
-    buffers.map_x += np.float32(2 * atlas.size + GUTTER - 0.5)
-    scale *= 2.0
-    buffers.map_x -= scale
-    np.multiply(level, np.float32(2 * GUTTER), out=buffers.work)
-    buffers.map_x += buffers.work
-    scale *= 0.5
-    buffers.map_y *= scale
-    buffers.map_y += np.float32(GUTTER - 0.5)
-    cv2.remap(atlas.pixels, buffers.map_x, buffers.map_y, cv2.INTER_LINEAR, dst=image)
-    _add_detail(view, height_m, buffers, image)
+    # And back: the level's side, a power of two.
+    np.subtract(126 + atlas.size.bit_length(), level, out=level)
+    np.left_shift(level, 23, out=scale.view(np.int32))
+    map_x += 2.0
+    map_x *= scale
+    map_x -= 0.5
+    map_y *= scale
+    map_y += np.float32(GUTTER - 0.5)
+    found = cv2.remap(atlas.pixels, map_x, map_y, cv2.INTER_LINEAR)
+    cv2.cvtColor(found, cv2.COLOR_BGRA2BGR, dst=image)
+    _add_detail(view, height_m, strip, image)
     if ground.gain != (1.0, 1.0, 1.0):
         steps = np.arange(256, dtype=np.float32)[:, None] * _colour(*ground.gain)
         cv2.LUT(image, np.clip(steps, 0, 255).astype(np.uint8)[None], dst=image)
 
 
-def _linear(row: Matrix, buffers: Buffers, out: Plane) -> None:
+def _linear(row: Matrix, strip: Strip, out: Plane) -> None:
     """out[v, u] = row · (u, v, 1)."""
-    down = buffers.rows * np.float32(row[1]) + np.float32(row[2])
-    np.add(buffers.columns * np.float32(row[0]), down, out=out)
+    start = float(row[1]) * strip.where.start + float(row[2])
+    cv2.addWeighted(strip.columns, float(row[0]), strip.rows, float(row[1]), start, dst=out)
 
 
-def _fraction(row: Matrix, start: float, buffers: Buffers, out: Plane) -> None:
+def _fraction(row: Matrix, start: float, strip: Strip, out: Plane) -> None:
     """The fractional part of start + depth · (row · pixel): where in the tile the ground point lies, 0..1."""
-    _linear(row, buffers, out)
-    out *= buffers.depth
+    _linear(row, strip, out)
+    out *= strip.depth
     out += np.float32(start - math.floor(start))
-    np.floor(out, out=buffers.work)
-    out -= buffers.work
+    np.floor(out, out=strip.work)
+    out -= strip.work
 
 
-def _add_detail(view: View, height_m: float, buffers: Buffers, image: Image) -> None:
+def _add_detail(view: View, height_m: float, strip: Strip, image: Image) -> None:
     """Fine structure on ground that is close, where the tile's own texels are larger than pixels."""
     if height_m > DETAIL_REACH_M:
         return
-    near_rows = np.flatnonzero(buffers.depth.min(axis=1) < DETAIL_REACH_M)
-    if not len(near_rows):
+    near = np.flatnonzero(strip.depth.min(axis=1) < DETAIL_REACH_M)
+    if not len(near):
         return
-    near = slice(int(near_rows[0]), int(near_rows[-1]) + 1)
-    buffers = buffers.band(near)
+    rows = slice(int(near[0]), int(near[-1]) + 1)
+    depth, image = strip.depth[rows], image[rows]
+    strip = strip.part(rows)
     tile = detail_tile()
     side = tile.shape[0]
-    depth, map_x, map_y, work = buffers.depth, buffers.map_x, buffers.map_y, buffers.work
+    map_x, map_y, work = strip.map_x, strip.map_y, strip.work
     for axis, out in ((0, map_y), (1, map_x)):
         row = view.ned_from_pixel[axis] * (100.0 / side)
-        _linear(row, buffers, out)
+        _linear(row, strip, out)
         out *= depth
         out += np.float32((view.eye[axis] * 100.0 / side) % 1.0)
         np.floor(out, out=work)
@@ -297,11 +318,9 @@ def _add_detail(view: View, height_m: float, buffers: Buffers, image: Image) -> 
     detail = cv2.remap(tile, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     # Fades out towards the reach: beyond it the detail is finer than a pixel.
     share = np.clip(1.4 - depth * np.float32(1.4 / DETAIL_REACH_M), 0.0, 1.0, out=work)
-    rest = np.subtract(1.0, share, out=buffers.weight)
-    buffers.flat[:] = 128
-    faded = cv2.blendLinear(detail, buffers.flat, share, rest)
-    part = image[near]
-    cv2.multiply(part, faded, dst=part, scale=1 / 128)
+    rest = np.subtract(1.0, share, out=strip.weight)
+    faded = cv2.blendLinear(detail, np.full_like(detail, 128), share, rest)
+    cv2.multiply(image, cv2.cvtColor(faded, cv2.COLOR_GRAY2BGR), dst=image, scale=1 / 128)
 
 
 def draw_sky(sky: Sky, light: Light, view: View, inverse_depth: Plane, image: Image) -> None:
@@ -342,14 +361,18 @@ def draw_sky(sky: Sky, light: Light, view: View, inverse_depth: Plane, image: Im
 
 def add_haze(sky: Sky, inverse_depth: Plane, buffers: Buffers, image: Image) -> None:
     """Fade everything into the horizon's colour with distance, in place. The sky is to be painted after."""
-    farthest = np.flatnonzero(inverse_depth.min(axis=1) < 1.0 / (HAZE_FROM * sky.visibility_m))
-    if not len(farthest):
-        return
-    rows = slice(int(farthest[0]), int(farthest[-1]) + 1)
-    share = np.maximum(inverse_depth[rows], NEAREST_INVERSE, out=buffers.weight[rows])
-    np.divide(np.float32(-1.0 / sky.visibility_m), share, out=share)
-    cv2.exp(share, dst=share)
-    rest = np.subtract(1.0, share, out=buffers.work[rows])
-    flat, part = buffers.flat[rows], image[rows]
-    flat[:] = np.clip(sky.horizon, 0, 255)
-    cv2.blendLinear(part, flat, share, rest, dst=part)
+    # OpenCV fills an image with a colour thirty times as fast as an assignment does.
+    blue, green, red = (int(min(max(channel, 0.0), 255.0)) for channel in sky.horizon)
+    cv2.rectangle(buffers.flat, (0, 0, buffers.width, STRIP_ROWS), (blue, green, red), cv2.FILLED)
+    clear = 1.0 / (HAZE_FROM * sky.visibility_m)
+    for strip in buffers.strips:
+        hazy = np.flatnonzero(inverse_depth[strip.where].min(axis=1) < clear)
+        if not len(hazy):
+            continue
+        part = strip.part(slice(int(hazy[0]), int(hazy[-1]) + 1))
+        share = np.maximum(inverse_depth[part.where], NEAREST_INVERSE, out=part.weight)
+        np.divide(np.float32(-1.0 / sky.visibility_m), share, out=share)
+        cv2.exp(share, dst=share)
+        rest = np.subtract(1.0, share, out=part.work)
+        pixels = image[part.where]
+        cv2.blendLinear(pixels, part.flat, share, rest, dst=pixels)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -100,8 +99,7 @@ class Lens:
         self.drawn = CameraModel(width, height, camera.fx, camera.fy, camera.cx + left, camera.cy + top)
         still_x = self._x * np.float32(camera.fx) + np.float32(self.drawn.cx)
         still_y = self._y * np.float32(camera.fy) + np.float32(self.drawn.cy)
-        # OpenCV's own fixed-point form: a lens that does not move looks up twice as fast
-        self._still_map: tuple[NDArray[Any], NDArray[Any]] = cv2.convertMaps(still_x, still_y, cv2.CV_16SC2)
+        self._still_map = (still_x, still_y)
         self._still_index = self._nearest(still_x, still_y)
         self._still_seen = self._seen(self._still_index)
 
@@ -125,13 +123,16 @@ class Lens:
                 seen = self._seen(index)
             if shutter.exposure_s > 0.0:
                 times = self._exposures(motion, still_inverse)
+        # OpenCV looks four channels up far faster than three.
+        four = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), np.uint8)
         if len(times) == 1:
-            exposed = _look_up(image, map_x, map_y)
+            exposed = _look_up(four, map_x, map_y)
         else:
-            total = np.zeros((*self._x.shape, 3), np.float32)
+            total = np.zeros((*self._x.shape, 4), np.float32)
             for time_s in times:
-                cv2.accumulate(_look_up(image, *self._moved(motion, time_s, still_inverse)), total)
+                cv2.accumulate(_look_up(four, *self._moved(motion, time_s, still_inverse)), total)
             exposed = np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / len(times)), np.uint8)
+        exposed = np.asarray(cv2.cvtColor(exposed, cv2.COLOR_BGRA2BGR), np.uint8)
         return exposed, inverse_depth.reshape(-1).take(index), labels.reshape(-1).take(index), seen
 
     def _seen(self, index: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -179,7 +180,7 @@ class Lens:
         return [half * (2 * (number + 0.5) / count - 1.0) for number in range(count)]
 
 
-def _look_up(image: Image, map_x: NDArray[Any], map_y: NDArray[Any]) -> Image:
+def _look_up(image: Image, map_x: Plane, map_y: Plane) -> Image:
     looked = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(looked, np.uint8)
 

@@ -102,10 +102,10 @@ class Renderer:
         self._lens = Lens(camera, shutter) if any(camera.distortion) or shutter is not None else None
         self._drawn = camera if self._lens is None else self._lens.drawn
         self._buffers = buffers or Buffers(self._drawn.width, self._drawn.height)
-        if self._buffers.work.shape != (self._drawn.height, self._drawn.width):
+        if (self._buffers.width, self._buffers.height) != (self._drawn.width, self._drawn.height):
             raise ValueError(
                 f"buffers must have the drawn picture's size {self._drawn.width}x{self._drawn.height}, "
-                f"got {self._buffers.work.shape[1]}x{self._buffers.work.shape[0]}"
+                f"got {self._buffers.width}x{self._buffers.height}"
             )
         self._placed = [PlacedObject(item, world.light, world.sky) for item in world.objects]
         self._middles = np.array([placed.middle for placed in self._placed]).reshape(-1, 3)
