@@ -6,6 +6,7 @@ import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.choosing import Choice
+from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import (
     correction,
     ground_speed,
@@ -17,6 +18,7 @@ from companion.guidance.motion import (
 )
 from companion.guidance.target import DOUBTED, Target
 from companion.guidance.track import ObjectTrack
+from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
@@ -51,6 +53,9 @@ class ApproachBehaviour(Behaviour):
     It begins with the true object of the class before the nose (see `Choice`) and stays with it.
     Lost, it brakes and looks for `lost_timeout_s` before it gives up.
 
+    Args:
+        tracking: keeps the camera's gimbal on the object; None: it is left alone.
+
     Attributes:
         lost_at: where the object was last known to be, if losing it ended the approach.
     """
@@ -68,7 +73,11 @@ class ApproachBehaviour(Behaviour):
         speed_mps: float = 2.0,
         confidence: float = 0.3,
         lost_timeout_s: float = 5.0,
+        tracking: GimbalTracking | None = None,
     ) -> None:
+        self._tracking = tracking
+        if tracking is not None:
+            self.requirements = ApproachBehaviour.requirements | {Requirement.GIMBAL}
         self.class_names = (class_name,)
         self.lost_at: Vector3 | None = None
         self._class_name = class_name
@@ -99,6 +108,8 @@ class ApproachBehaviour(Behaviour):
         self.lost_at = None
         self._arrived_since_ns = [None] * len(ARRIVALS)
         self._range_m = math.nan
+        if self._tracking is not None:
+            self._tracking.begin(situation.now_ns)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         now_ns, state = situation.now_ns, situation.state
@@ -109,6 +120,9 @@ class ApproachBehaviour(Behaviour):
         if track is not None:
             north, east, _ = track.position_ned_m
             self._range_m = math.hypot(north - position[0], east - position[1])
+        tracking = self._tracking
+        if tracking and (why := tracking.keep_on(track, self._range_m, position, situation)):
+            return Outcome(False, f"{self.name} lost the gimbal: {why}")
         if now_ns > self._until_ns:
             away = f"still {self._range_m:.1f} m away" if track else "its range never became known"
             took_s = (now_ns - self._started_ns) / 1e9
@@ -135,6 +149,10 @@ class ApproachBehaviour(Behaviour):
         north_mps, east_mps = pressed(wanted, state, self._speed_mps)
         velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        return None if self._tracking is None else self._tracking.aim
 
     @property
     def status(self) -> str:

@@ -10,6 +10,7 @@ from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
 from companion.guidance.motion import position_and_yaw, stay_at
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.sighting import Sightings
+from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
@@ -29,7 +30,6 @@ class PersistentApproach(Behaviour):
     """
 
     name = "approach"
-    requirements = ApproachBehaviour.requirements
 
     def __init__(
         self, approach: Callable[[], ApproachBehaviour], class_name: str, *, retries: int, confidence: float
@@ -38,6 +38,8 @@ class PersistentApproach(Behaviour):
         self._make, self._class_name = approach, class_name
         self._retries, self._confidence = retries, confidence
         self._approach: ApproachBehaviour | None = approach()
+        self.requirements = self._approach.requirements
+        self._aim: GimbalAim | None = None
         self._seek: SeekBehaviour | None = None
         self._sightings = Sightings((class_name,), confidence)
         self._lost_at: Vector3 | None = None
@@ -49,13 +51,14 @@ class PersistentApproach(Behaviour):
         self._notes: list[str] = []
 
     def on_activate(self, situation: Situation) -> None:
-        self._tried, self._why, self._seek = 0, "", None
+        self._tried, self._why, self._seek, self._aim = 0, "", None, None
         self._approach = self._make()
         self._approach.on_activate(situation)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         if self._approach is not None:
             step = self._approach.update(dt_s, situation)
+            self._aim = self._approach.gimbal_aim or self._aim
             lost_at = self._approach.lost_at
             if not isinstance(step, Outcome) or step.success or lost_at is None:
                 return step
@@ -72,6 +75,11 @@ class PersistentApproach(Behaviour):
         if not situation.perception_fresh:
             return Outcome(False, f"{self._why}; {step.reason}")
         return self._look_again(situation)
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        """Until the object is seen again the gimbal looks where it was."""
+        return self._aim
 
     def take_notes(self) -> tuple[str, ...]:
         notes, self._notes = tuple(self._notes), []

@@ -121,6 +121,9 @@ class Approach(Command):
         float,
         Number("retries", "", 0.0, 20.0, "how often a lost object is looked for, where it was and around"),
     ] = 2.0
+    gimbal: Annotated[
+        str, Choice("gimbal", ("still", "track"), "leave the camera's gimbal, or keep it on the object")
+    ] = "still"
 
     def __post_init__(self) -> None:
         super(Approach, self).__post_init__()
@@ -155,6 +158,9 @@ class Follow(Command):
     duration_s: Annotated[
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
+    gimbal: Annotated[
+        str, Choice("gimbal", ("still", "track"), "leave the camera's gimbal, or keep it on the object")
+    ] = "still"
 
     @property
     def endless(self) -> bool:

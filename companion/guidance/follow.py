@@ -6,9 +6,11 @@ import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.choosing import Choice
+from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
 from companion.guidance.moving_track import MovingTrack
 from companion.guidance.target import DOUBTED
+from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
@@ -41,6 +43,7 @@ class FollowBehaviour(Behaviour):
             direction of motion (π is behind it).
         speed_mps: at most, the object's own speed included.
         duration_s: ends after this, successfully; 0: until another command.
+        tracking: keeps the camera's gimbal on the object; None: it is left alone.
     """
 
     name = "follow"
@@ -65,7 +68,11 @@ class FollowBehaviour(Behaviour):
         confidence: float = 0.3,
         occlusion_s: float = 3.0,
         duration_s: float = 0.0,
+        tracking: GimbalTracking | None = None,
     ) -> None:
+        self._tracking = tracking
+        if tracking is not None:
+            self.requirements = FollowBehaviour.requirements | {Requirement.GIMBAL}
         self.class_names = (class_name,)
         self._class_name = class_name
         self._distance_m, self._speed_mps = distance_m, speed_mps
@@ -88,6 +95,8 @@ class FollowBehaviour(Behaviour):
     def on_activate(self, situation: Situation) -> None:
         position, _ = position_and_yaw(situation.state)
         self._forget(situation.now_ns, position[2])
+        if self._tracking is not None:
+            self._tracking.begin(situation.now_ns)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         now_ns, state = situation.now_ns, situation.state
@@ -101,16 +110,20 @@ class FollowBehaviour(Behaviour):
             return Outcome(True, f"followed the {self._class_name} for {self._duration_s:g} s")
         if self._unseen_s > self._occlusion_s:
             return Outcome(False, self._lost(situation))
+        towards_rad = 0.0
+        if track is not None:
+            place = track.place(now_ns)
+            north, east = place[0] - position[0], place[1] - position[1]
+            self._range_m, towards_rad = math.hypot(north, east), math.atan2(east, north)
+        tracking = self._tracking
+        if tracking and (why := tracking.keep_on(track, self._range_m, position, situation)):
+            return Outcome(False, f"{self.name} lost the gimbal: {why}")
         height_mps = correction(self._down_m - position[2])
         if track is None:
             if self._yaw_rad is None:
                 return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rate_radps=0.0)
             return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rad=self._yaw_rad)
 
-        place = track.place(now_ns)
-        north, east = place[0] - position[0], place[1] - position[1]
-        self._range_m = math.hypot(north, east)
-        towards_rad = math.atan2(east, north)
         self._yaw_rad = towards_rad
         wanted = self._wanted(track, towards_rad, dt_s)
         north_mps, east_mps = pressed(wanted, state, self._speed_mps, PRESS)
@@ -192,6 +205,10 @@ class FollowBehaviour(Behaviour):
         else:
             why = "it was never seen with a known range"
         return f"lost the {self._class_name} for {self._unseen_s:.1f} s: {why}"
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        return None if self._tracking is None else self._tracking.aim
 
     @property
     def status(self) -> str:

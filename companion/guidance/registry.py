@@ -14,6 +14,7 @@ from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.formation import FormationBehaviour
 from companion.guidance.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.gimbal_sweep import GimbalSweep
+from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
@@ -132,6 +133,7 @@ def _approach(command: commands.Approach) -> PersistentApproach:
             speed_mps=command.speed_mps,
             confidence=command.confidence,
             lost_timeout_s=command.lost_timeout_s,
+            tracking=_tracking(command),
         ),
         command.class_name,
         retries=int(command.retries),
@@ -161,7 +163,12 @@ def _follow(command: commands.Follow) -> FollowBehaviour:
         confidence=command.confidence,
         occlusion_s=command.occlusion_s,
         duration_s=command.duration_s,
+        tracking=_tracking(command),
     )
+
+
+def _tracking(command: commands.Approach | commands.Follow) -> GimbalTracking | None:
+    return GimbalTracking() if command.gimbal == "track" else None
 
 
 def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:

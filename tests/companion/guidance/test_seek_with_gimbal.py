@@ -10,57 +10,33 @@ import math
 
 import numpy as np
 import pytest
+from gimbal_flight import CAMERA, FOOTPRINT, HEIGHT_M, PERSON_M, gimbal_flight, person
 
-from companion.bench.drawn_detector import DrawnDetector, Faults, Pose, Thing
-from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment, Sight
+from companion.bench.drawn_detector import Thing
+from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
-from companion.guidance.search_pattern import Footprint
 from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.target import Target
 from companion.missions.mission_file import plan_from
-from vision.attitude import Quaternion
-from vision.camera_model import CameraModel, CameraMount
 
-CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
-ON_GIMBAL = CameraMount(forward_m=0.1, on_gimbal=True)
-FOOTPRINT = Footprint(math.radians(80.0), 0.0)
-HEIGHT_M = 10.0
-PERSON_M = (0.5, 0.6, 1.7)
 # Two axes and an estimate: what the picture, the gimbal and the estimator are off by together.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
-
-
-def person(bearing_deg: float, distance_m: float = 4.0) -> Thing:
-    bearing = math.radians(bearing_deg)
-    pose = Pose(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
-    return Thing("person", PERSON_M, lambda _: pose)
 
 
 def fly(
     command: str, thing: Thing, *, seed: int = 5, limit_s: float = 90.0, **options: object
 ) -> tuple[LockstepFlight, FlightLog, list[Target]]:
     """The flight, its log, and every target that was seen, once."""
-    flights: list[LockstepFlight] = []
-
-    def looks() -> Quaternion:
-        # The first frame comes after the take-off, when the flight is there.
-        return flights[0].vehicle.vehicle.gimbal.quaternion
-
-    # A box that shakes is the detector's fault, and is measured elsewhere.
-    detector = DrawnDetector(
-        [thing], CAMERA, ON_GIMBAL, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=looks
-    )
-    sight = Sight(CAMERA, ON_GIMBAL, detector)
-    flights.append(LockstepFlight(seed=seed, height_m=HEIGHT_M, sight=sight, gimbal=True, **options))
+    flight = gimbal_flight(thing, seed=seed, **options)
     seen: dict[int, Target] = {}
 
     def each(moment: Moment) -> None:
         for target in moment.situation.targets:
             seen.setdefault(target.captured_ns, target)
 
-    log = flights[0].fly(behaviour_for(parse(command), FOOTPRINT), limit_s, each=each)
-    return flights[0], log, list(seen.values())
+    log = flight.fly(behaviour_for(parse(command), FOOTPRINT), limit_s, each=each)
+    return flight, log, list(seen.values())
 
 
 def direction(target: Target) -> np.ndarray:
