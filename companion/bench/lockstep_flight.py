@@ -267,7 +267,11 @@ class LockstepFlight:
             self._targets if fresh else (),
             age_s,
             fresh,
-            gimbal=GimbalSight(carried, problem=problem),
+            gimbal=GimbalSight(
+                carried,
+                problem=problem,
+                camera_pitch_rad=0.0 if self._sight is None else self._sight.mount.pitch_rad,
+            ),
         )
 
     def _move_gimbal(self, now_ns: int, behaviour: Behaviour, ended: bool) -> None:

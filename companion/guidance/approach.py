@@ -109,7 +109,7 @@ class ApproachBehaviour(Behaviour):
         self._arrived_since_ns = [None] * len(ARRIVALS)
         self._range_m = math.nan
         if self._tracking is not None:
-            self._tracking.begin(situation.now_ns)
+            self._tracking.begin(situation)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         now_ns, state = situation.now_ns, situation.state
@@ -120,9 +120,11 @@ class ApproachBehaviour(Behaviour):
         if track is not None:
             north, east, _ = track.position_ned_m
             self._range_m = math.hypot(north - position[0], east - position[1])
-        tracking = self._tracking
-        if tracking and (why := tracking.keep_on(track, self._range_m, position, situation)):
-            return Outcome(False, f"{self.name} lost the gimbal: {why}")
+        if self._tracking is not None:
+            newest = None if track is None else track.newest
+            why = self._tracking.keep_on(newest, self._range_m, position, situation)
+            if why is not None:
+                return Outcome(False, f"approach lost the gimbal: {why}")
         if now_ns > self._until_ns:
             away = f"still {self._range_m:.1f} m away" if track else "its range never became known"
             took_s = (now_ns - self._started_ns) / 1e9
@@ -182,6 +184,8 @@ class ApproachBehaviour(Behaviour):
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._bearing_rad = chosen.bearing_rad
+            if self._tracking is not None:
+                self._tracking.turn_to(chosen, situation)
             return
         self._begin(chosen, position, situation.now_ns)
 

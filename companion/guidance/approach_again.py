@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.gimbal_sweep import GimbalSweep
+from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import position_and_yaw, stay_at
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.sighting import Sightings
@@ -19,6 +21,8 @@ LOOK_BACK_S = 3.0
 # Half a turn at the envelope's slowest useful rate.
 LOOK_BACK_LIMIT_S = 12.0
 POINTED_RAD = math.radians(6.0)
+# While it turns, the gimbal goes up and down so fast; nearer to level than this it need not.
+SWEEP_RATE_RADPS, LEAST_SWEEP_RAD = math.radians(20.0), math.radians(5.0)
 
 
 class PersistentApproach(Behaviour):
@@ -27,19 +31,28 @@ class PersistentApproach(Behaviour):
     Args:
         approach: makes a new approach. retries: how often it is looked for again.
         confidence: least that counts, of what is looked for.
+        tracking: what the approaches keep the camera's gimbal on the object with; None: it is left alone.
+        field_rad: what the camera sees from its left edge to its right.
     """
 
     name = "approach"
 
     def __init__(
-        self, approach: Callable[[], ApproachBehaviour], class_name: str, *, retries: int, confidence: float
+        self,
+        approach: Callable[[], ApproachBehaviour],
+        class_name: str,
+        *,
+        retries: int,
+        confidence: float,
+        tracking: GimbalTracking | None = None,
+        field_rad: float,
     ) -> None:
         self.class_names = (class_name,)
         self._make, self._class_name = approach, class_name
         self._retries, self._confidence = retries, confidence
         self._approach: ApproachBehaviour | None = approach()
         self.requirements = self._approach.requirements
-        self._aim: GimbalAim | None = None
+        self._tracking, self._field_rad = tracking, field_rad
         self._seek: SeekBehaviour | None = None
         self._sightings = Sightings((class_name,), confidence)
         self._lost_at: Vector3 | None = None
@@ -51,19 +64,20 @@ class PersistentApproach(Behaviour):
         self._notes: list[str] = []
 
     def on_activate(self, situation: Situation) -> None:
-        self._tried, self._why, self._seek, self._aim = 0, "", None, None
+        self._tried, self._why, self._seek = 0, "", None
         self._approach = self._make()
         self._approach.on_activate(situation)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         if self._approach is not None:
             step = self._approach.update(dt_s, situation)
-            self._aim = self._approach.gimbal_aim or self._aim
             lost_at = self._approach.lost_at
             if not isinstance(step, Outcome) or step.success or lost_at is None:
                 return step
             self._why, self._lost_at, self._approach = step.reason, lost_at, None
             return self._look_again(situation)
+        if self._tracking is not None and (why := self._tracking.taken(situation)) is not None:
+            return Outcome(False, f"approach lost the gimbal: {why}")
         if self._seek is None:
             return self._look_back(situation)
         step = self._seek.update(dt_s, situation)
@@ -78,8 +92,10 @@ class PersistentApproach(Behaviour):
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
-        """Until the object is seen again the gimbal looks where it was."""
-        return self._aim
+        if self._tracking is None:
+            return None
+        swept = None if self._seek is None else self._seek.gimbal_aim
+        return swept or self._tracking.aim
 
     def take_notes(self) -> tuple[str, ...]:
         notes, self._notes = tuple(self._notes), []
@@ -119,10 +135,19 @@ class PersistentApproach(Behaviour):
             self._looked_since_ns = now_ns
         looked_ns = now_ns - (now_ns if self._looked_since_ns is None else self._looked_since_ns)
         if looked_ns > LOOK_BACK_S * 1e9 or now_ns - self._begun_ns > LOOK_BACK_LIMIT_S * 1e9:
-            self._seek = SeekBehaviour(self._class_name, laps=1.0, confidence=self._confidence)
+            self._seek = SeekBehaviour(
+                self._class_name, laps=1.0, confidence=self._confidence, sweep=self._sweep()
+            )
             self._seek.on_activate(situation)
             return self._seek.update(0.0, situation)
         return Setpoint.velocity(stay_at(self._place, position), now_ns, yaw_rad=bearing_rad)
+
+    def _sweep(self) -> GimbalSweep | None:
+        """Who has walked on stands between the pitch at which he was lost and level."""
+        aim = None if self._tracking is None else self._tracking.aim
+        if aim is None or abs(aim.pitch_rad) < LEAST_SWEEP_RAD:
+            return None
+        return GimbalSweep(aim.pitch_rad, SWEEP_RATE_RADPS, self._field_rad)
 
     def _go_there(self, situation: Situation, told: str) -> Step:
         self._notes.append(f"approach: {told}")

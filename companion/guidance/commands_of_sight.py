@@ -16,6 +16,10 @@ MAX_CENTRIPETAL_MPS2 = 2.0
 # A shorter way up and down shows nothing that a camera at rest does not.
 LEAST_SWEEP_DEG = 5.0
 
+GimbalUse = Annotated[
+    str, Choice("gimbal", ("leave", "track"), "leave it alone, or keep its camera on the object")
+]
+
 
 @dataclass(frozen=True, slots=True)
 class Orbit(Command):
@@ -121,9 +125,7 @@ class Approach(Command):
         float,
         Number("retries", "", 0.0, 20.0, "how often a lost object is looked for, where it was and around"),
     ] = 2.0
-    gimbal: Annotated[
-        str, Choice("gimbal", ("still", "track"), "leave the camera's gimbal, or keep it on the object")
-    ] = "still"
+    gimbal: GimbalUse = "leave"
 
     def __post_init__(self) -> None:
         super(Approach, self).__post_init__()
@@ -158,9 +160,7 @@ class Follow(Command):
     duration_s: Annotated[
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
-    gimbal: Annotated[
-        str, Choice("gimbal", ("still", "track"), "leave the camera's gimbal, or keep it on the object")
-    ] = "still"
+    gimbal: GimbalUse = "leave"
 
     @property
     def endless(self) -> bool:

@@ -96,7 +96,7 @@ class FollowBehaviour(Behaviour):
         position, _ = position_and_yaw(situation.state)
         self._forget(situation.now_ns, position[2])
         if self._tracking is not None:
-            self._tracking.begin(situation.now_ns)
+            self._tracking.begin(situation)
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         now_ns, state = situation.now_ns, situation.state
@@ -115,9 +115,11 @@ class FollowBehaviour(Behaviour):
             place = track.place(now_ns)
             north, east = place[0] - position[0], place[1] - position[1]
             self._range_m, towards_rad = math.hypot(north, east), math.atan2(east, north)
-        tracking = self._tracking
-        if tracking and (why := tracking.keep_on(track, self._range_m, position, situation)):
-            return Outcome(False, f"{self.name} lost the gimbal: {why}")
+        if self._tracking is not None:
+            newest = None if track is None else track.newest
+            why = self._tracking.keep_on(newest, self._range_m, position, situation)
+            if why is not None:
+                return Outcome(False, f"follow lost the gimbal: {why}")
         height_mps = correction(self._down_m - position[2])
         if track is None:
             if self._yaw_rad is None:
@@ -188,6 +190,8 @@ class FollowBehaviour(Behaviour):
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._yaw_rad = chosen.bearing_rad
+            if self._tracking is not None:
+                self._tracking.turn_to(chosen, situation)
             return
         self._track, self._seen_ns = MovingTrack(chosen, position), chosen.captured_ns
 

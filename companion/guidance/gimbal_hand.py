@@ -50,7 +50,7 @@ class GimbalHand:
     Args:
         on_event: called with (level, text) for what a person should know.
         carries_camera: a camera sits on it (`camera.gimbal`), so it is looked for until it is heard.
-        carries_steering: the camera that steers does.
+        carries_steering: the camera that steers does. camera_pitch_rad: how far above its axis that looks.
     """
 
     def __init__(
@@ -60,9 +60,11 @@ class GimbalHand:
         *,
         carries_camera: bool = False,
         carries_steering: bool = False,
+        camera_pitch_rad: float = 0.0,
     ) -> None:
         self._driver, self._on_event = driver, on_event
         self._carries_camera, self._carries_steering = carries_camera, carries_steering
+        self._camera_pitch_rad = camera_pitch_rad
         self._control = GimbalControl(driver.own_address)
         self._asking: asyncio.Task[None] | None = None
         self._asked_ns = 0
@@ -86,6 +88,7 @@ class GimbalHand:
             undirected,
             "" if elsewhere is None or self._control.holds(now_ns, state.gimbal) else address_text(elsewhere),
             self._control.problem if self._errand is None else "",
+            self._camera_pitch_rad,
         )
 
     def update(self, now_ns: int, state: VehicleState, behaviour: Behaviour | None) -> None:

@@ -18,12 +18,14 @@ class GimbalSight:
         undirected: why it is not known where that camera looks; empty: it is, or it sits on no gimbal.
         elsewhere: who else has control of the gimbal; empty: nobody from whom it may not be taken.
         problem: why it is not moved any more for what flies now; empty: it is.
+        camera_pitch_rad: how far above the gimbal's axis that camera looks.
     """
 
     carries_camera: bool = False
     undirected: str = ""
     elsewhere: str = ""
     problem: str = ""
+    camera_pitch_rad: float = 0.0
 
 
 NO_GIMBAL = GimbalSight()

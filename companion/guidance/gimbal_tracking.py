@@ -3,74 +3,98 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 from companion.guidance.behaviour import Situation
+from companion.guidance.gimbal_sweep import BEHIND_RAD, PATIENCE_S
+from companion.guidance.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
 
 # Straight below, an elevation says nothing of a height.
 STEEPEST_RAD = math.radians(89.0)
+# Nearer than this it is above or below, and its direction swings with every centimetre.
 NEAREST_M = 0.1
-
-
-class Tracked(Protocol):
-    """An object that is followed from frame to frame."""
-
-    @property
-    def captured_ns(self) -> int:
-        """Capture stamp of its newest detection."""
-
-    @property
-    def elevation_rad(self) -> float:
-        """Of its middle in that, above the horizon."""
+# The object's height stays: of each detection's word of it, so much is believed.
+NEWEST_SHARE = 0.5
 
 
 class GimbalTracking:
     """Where the gimbal looks so that an object stays in the middle of the picture's height.
 
-    A detection tells the object's height, by its elevation and how far away it is thought to be. At that
-    height it is looked at until the next one, while the vehicle flies on and while the object is hidden.
+    A detection tells the object's height, by its elevation and its range. At that height it is looked at
+    while the vehicle flies on and while the object is hidden.
 
     Attributes:
-        aim: where the gimbal is to look; None: nothing was seen yet.
+        aim: where the gimbal is to look; None: not begun, or nobody knows where it looks.
     """
 
     def __init__(self) -> None:
         self.aim: GimbalAim | None = None
-        self._begun_ns = self._seen_ns = 0
-        self._down_m = 0.0
+        self._begun_ns = 0
+        self._seen: Target | None = None
+        self._down_m: float | None = None
+        self._behind_since_ns: int | None = None
 
-    def begin(self, now_ns: int) -> None:
-        """What was seen before is another object."""
-        self.aim, self._begun_ns, self._seen_ns = None, now_ns, 0
+    def begin(self, situation: Situation) -> None:
+        """Stay where the gimbal looks, so that control of it is had when the object is seen."""
+        gimbal = situation.state.gimbal
+        self.aim = self._seen = self._down_m = self._behind_since_ns = None
+        self._begun_ns = situation.now_ns
+        if gimbal is not None and gimbal.pitch_rad is not None:
+            self.aim = GimbalAim(gimbal.nearest_pitch_rad(gimbal.pitch_rad))
+
+    def taken(self, situation: Situation) -> str | None:
+        """Why the gimbal is not moved any more, in words; None: it is."""
+        # At the first turn it is still told of what came before.
+        return situation.gimbal.problem or None if situation.now_ns > self._begun_ns else None
+
+    def turn_to(self, target: Target, situation: Situation) -> None:
+        """Look at what has no range yet: it may come fully into the picture, and its range with it."""
+        self._look(target.elevation_rad, situation)
 
     def keep_on(
-        self, track: Tracked | None, range_m: float, position: Vector3, situation: Situation
+        self, newest: Target | None, range_m: float, position: Vector3, situation: Situation
     ) -> str | None:
-        """Look at the object where it is now, as far as the gimbal reaches.
+        """Look at the object where it is thought to be now, as far as the gimbal reaches.
 
         Args:
-            track: what is known of it; None: nothing yet.
-            range_m: how far away it is thought to be, horizontally.
-            position: the vehicle's, local NED.
+            newest: its newest detection; None: there was none with a range.
+            range_m: how far away it is thought to be now, horizontal metres.
+            position: the vehicle's, local NED metres.
+            situation: tells of the gimbal.
 
         Returns:
-            Why the gimbal is not moved any more, in words; None: it is.
+            Why there is no use in going on, in words; None: the gimbal follows.
         """
-        # At the first turn it is still told of what came before.
-        if situation.gimbal.problem and situation.now_ns > self._begun_ns:
-            return situation.gimbal.problem
-        if track is None:
-            return None
-        range_m = max(range_m, NEAREST_M)
-        if track.captured_ns != self._seen_ns:
-            self._seen_ns = track.captured_ns
-            elevation_rad = max(-STEEPEST_RAD, min(STEEPEST_RAD, track.elevation_rad))
-            self._down_m = position[2] - range_m * math.tan(elevation_rad)
-        pitch_rad = math.atan2(position[2] - self._down_m, range_m)
+        if newest is not None:
+            range_m = max(range_m, NEAREST_M)
+            if newest is not self._seen:
+                self._seen = newest
+                then_m = newest.range_m if math.isfinite(newest.range_m) else range_m
+                elevation_rad = max(-STEEPEST_RAD, min(STEEPEST_RAD, newest.elevation_rad))
+                down_m = position[2] - max(then_m, NEAREST_M) * math.tan(elevation_rad)
+                before_m = down_m if self._down_m is None else self._down_m
+                self._down_m = before_m + NEWEST_SHARE * (down_m - before_m)
+            assert self._down_m is not None
+            self._look(math.atan2(position[2] - self._down_m, range_m), situation)
+        return self.taken(situation) or self._stuck(situation)
+
+    def _look(self, elevation_rad: float, situation: Situation) -> None:
+        pitch_rad = elevation_rad - situation.gimbal.camera_pitch_rad
         gimbal = situation.state.gimbal
-        if gimbal is not None:
-            pitch_rad = max(gimbal.lowest_pitch_rad, min(gimbal.highest_pitch_rad, pitch_rad))
-        self.aim = GimbalAim(pitch_rad)
-        return None
+        if gimbal is not None:  # else it is lost, and told so
+            self.aim = GimbalAim(gimbal.nearest_pitch_rad(pitch_rad))
+
+    def _stuck(self, situation: Situation) -> str | None:
+        """It does not go where it is asked to, for longer than a gimbal may take."""
+        gimbal, now_ns = situation.state.gimbal, situation.now_ns
+        measured_rad = None if gimbal is None else gimbal.pitch_rad
+        if self.aim is None or measured_rad is None or abs(self.aim.pitch_rad - measured_rad) <= BEHIND_RAD:
+            self._behind_since_ns = None
+            return None
+        if self._behind_since_ns is None:
+            self._behind_since_ns = now_ns
+        if now_ns - self._behind_since_ns <= PATIENCE_S * 1e9:
+            return None
+        asked, is_at = math.degrees(self.aim.pitch_rad), math.degrees(measured_rad)
+        return f"it does not follow: asked for {asked:.0f}°, it is at {is_at:.0f}°"

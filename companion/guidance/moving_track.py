@@ -57,7 +57,7 @@ class MovingTrack:
         self._class_name = target.class_name
         self._estimate = MovingEstimate.begun(target, vehicle)
         self._track_id = target.track_id
-        self._elevation_rad = target.elevation_rad
+        self._newest = target
         self._others: set[int] = set()
         self._parting: _Parting | None = None
         self._intervals_s: deque[float] = deque(maxlen=5)
@@ -68,9 +68,9 @@ class MovingTrack:
         return self._estimate.captured_ns
 
     @property
-    def elevation_rad(self) -> float:
-        """Above the horizon, of its middle in the newest detection, seen from where the vehicle was then."""
-        return self._elevation_rad
+    def newest(self) -> Target:
+        """The newest detection of this object."""
+        return self._newest
 
     @property
     def track_id(self) -> int | None:
@@ -118,7 +118,7 @@ class MovingTrack:
             and unseen_s > max(PARTED_S, PARTED_FRAMES * self._interval_s)
         ):
             self._parting = _Parting(self._estimate, frozenset(self._others), now_ns + DOUBT_S * 1e9)
-        self._estimate, self._elevation_rad = expected.taking(own), own.target.elevation_rad
+        self._estimate, self._newest = expected.taking(own), own.target
         self._intervals_s.append(unseen_s)
         if own.target.track_id is not None:
             self._track_id = own.target.track_id
@@ -181,7 +181,7 @@ class MovingTrack:
         if taken <= bar or any(rival.squared <= bar for rival in rivals[1:]):
             return False
         self._estimate, self._track_id, self._parting = expected.taking(best), best.target.track_id, None
-        self._elevation_rad = best.target.elevation_rad
+        self._newest = best.target
         self._others = set(parting.others)
         if followed is not None and followed.track_id is not None:
             self._others.add(followed.track_id)

@@ -72,7 +72,7 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
         case commands.Gimbal():
             return PointGimbalBehaviour(command.aim)
         case commands.Approach():
-            return _approach(command)
+            return _approach(command, footprint)
         case commands.Follow():
             return _follow(command)
         case commands.Patrol():
@@ -113,8 +113,8 @@ def behaviour_for(command: commands.Command, footprint: Footprint | None = None)
 def _seek(command: commands.Seek, footprint: Footprint | None) -> SeekBehaviour:
     sweep = None
     if command.sweep_deg is not None:
-        field_rad = NARROW_FIELD_RAD if footprint is None else footprint.horizontal_fov_rad
-        sweep = GimbalSweep(math.radians(command.sweep_deg), math.radians(command.sweep_rate_dps), field_rad)
+        sweep_rad, rate_radps = math.radians(command.sweep_deg), math.radians(command.sweep_rate_dps)
+        sweep = GimbalSweep(sweep_rad, rate_radps, _field_rad(footprint))
     return SeekBehaviour(
         command.class_name,
         laps=command.laps,
@@ -125,7 +125,12 @@ def _seek(command: commands.Seek, footprint: Footprint | None) -> SeekBehaviour:
     )
 
 
-def _approach(command: commands.Approach) -> PersistentApproach:
+def _field_rad(footprint: Footprint | None) -> float:
+    return NARROW_FIELD_RAD if footprint is None else footprint.horizontal_fov_rad
+
+
+def _approach(command: commands.Approach, footprint: Footprint | None) -> PersistentApproach:
+    tracking = _tracking(command)
     return PersistentApproach(
         lambda: ApproachBehaviour(
             command.class_name,
@@ -133,11 +138,13 @@ def _approach(command: commands.Approach) -> PersistentApproach:
             speed_mps=command.speed_mps,
             confidence=command.confidence,
             lost_timeout_s=command.lost_timeout_s,
-            tracking=_tracking(command),
+            tracking=tracking,
         ),
         command.class_name,
         retries=int(command.retries),
         confidence=command.confidence,
+        tracking=tracking,
+        field_rad=_field_rad(footprint),
     )
 
 
@@ -168,6 +175,7 @@ def _follow(command: commands.Follow) -> FollowBehaviour:
 
 
 def _tracking(command: commands.Approach | commands.Follow) -> GimbalTracking | None:
+    """One for all of a command's approaches: they look for the same object."""
     return GimbalTracking() if command.gimbal == "track" else None
 
 

@@ -177,12 +177,10 @@ def _gimbal_pitch(situation: Situation) -> float:
 
 
 def _within_reach(target: Target, situation: Situation) -> float:
-    """The pitch nearest to a target's that the gimbal has, radians above the horizon."""
+    """The pitch that brings the camera nearest to a target, radians above the horizon."""
     gimbal = situation.state.gimbal
-    low, high = (-math.pi / 2, math.pi / 2)
-    if gimbal is not None:
-        low, high = max(low, gimbal.lowest_pitch_rad), min(high, gimbal.highest_pitch_rad)
-    return max(low, min(high, target.elevation_rad))
+    pitch_rad = target.elevation_rad - situation.gimbal.camera_pitch_rad
+    return pitch_rad if gimbal is None else gimbal.nearest_pitch_rad(pitch_rad)
 
 
 def found_text(target: Target) -> str:

@@ -47,7 +47,7 @@ class ObjectTrack:
         self._down_m = target.position_ned_m[2]
         self._covariance = measurement_noise(target, self._place - vehicle[:2])
         self._captured_ns = target.captured_ns
-        self._elevation_rad = target.elevation_rad
+        self._newest = target
         self._track_id = target.track_id
         self._others: set[int] = set()
         self.confidence = target.confidence
@@ -58,9 +58,9 @@ class ObjectTrack:
         return self._captured_ns
 
     @property
-    def elevation_rad(self) -> float:
-        """Above the horizon, of its middle in the newest detection, seen from where the vehicle was then."""
-        return self._elevation_rad
+    def newest(self) -> Target:
+        """The newest detection of this object."""
+        return self._newest
 
     @property
     def track_id(self) -> int | None:
@@ -114,7 +114,7 @@ class ObjectTrack:
         if target.position_ned_m is not None:
             self._down_m = target.position_ned_m[2]
         self._captured_ns, self.confidence = target.captured_ns, target.confidence
-        self._elevation_rad = target.elevation_rad
+        self._newest = target
         if target.track_id is not None:
             self._track_id = target.track_id
         return True

@@ -103,6 +103,7 @@ class Service:
             self._event,
             carries_camera=any(view.settings.camera.gimbal for view in self.views),
             carries_steering=self.steering.settings.camera.gimbal,
+            camera_pitch_rad=self.steering.settings.camera.mount().pitch_rad,
         )
         self._commands = CommandDesk(self.pilot, self.steering, self.gimbal, self._event, self._camera_pitch)
         self.poses = PoseSharing(settings.vehicle.name, self._event)

@@ -112,6 +112,13 @@ class GimbalState:
             return f"its attitude is {(now_ns - self.attitude_ns) / 1e9:.1f} s old"
         return None
 
+    def nearest_pitch_rad(self, pitch_rad: float) -> float:
+        """The pitch between its stops that is nearest to this one, and that can be asked for."""
+        low, high = self.lowest_pitch_rad, self.highest_pitch_rad
+        if low <= high:  # else its stops make no sense, and bound nothing
+            pitch_rad = max(low, min(high, pitch_rad))
+        return max(-math.pi / 2, min(math.pi / 2, pitch_rad))
+
     def reaches(self, pitch_rad: float) -> bool:
         """Whether a pitch lies between its stops, to half a degree."""
         slack = math.radians(0.5)

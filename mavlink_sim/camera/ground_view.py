@@ -1,13 +1,15 @@
 """The ground and the sky as a camera sees them, and how far the ground is.
 
 Over level ground the reciprocal of the depth is linear in the pixel: 1/depth = (a·u + b·v + c) / height, and
-the point seen is eye + depth · ray. So every pixel's texel comes from a few passes over whole arrays. The mip
-level follows the area of a pixel's footprint on the ground.
+the point seen is eye + depth · ray. So every pixel's texel comes from a few passes over arrays: over a strip
+of the picture at a time, so that what they go through stays in the processor's cache. The mip level follows
+the area of a pixel's footprint on the ground.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -38,6 +40,7 @@ NEAREST_INVERSE = 1e-4
 DETAIL_REACH_M = 6.0
 DITHER = 0.5
 STRIP_ROWS = 64
+"""With 640 columns what a strip needs is 1.5 MB; of 32 to 96 rows none was faster."""
 HAZE_FROM = 0.03
 """Share of the visibility up to which haze is too thin to be drawn."""
 
@@ -63,7 +66,7 @@ class View:
 
 
 class Strip:
-    """Some rows of the image, with scratch arrays for them that all strips share.
+    """Some rows of the image, with scratch arrays for them: the same memory for every strip.
 
     Attributes:
         where: the rows.
@@ -72,10 +75,9 @@ class Strip:
         depth, map_x, map_y, work, scale, weight: (h, W) float32. level: (h, W) int32. flat: (h, W, 3) uint8.
     """
 
-    def __init__(self, where: slice, buffers: Buffers) -> None:
-        self._buffers = buffers
-        self.where = where
+    def __init__(self, buffers: Buffers, where: slice) -> None:
         height = where.stop - where.start
+        self.where = where
         self.columns, self.rows = buffers.columns[:height], buffers.rows[:height]
         self.dither = buffers.dither[where]
         planes = buffers.planes[:, :height]
@@ -83,20 +85,9 @@ class Strip:
         self.level = planes[6].view(np.int32)
         self.flat = buffers.flat[:height]
 
-    def part(self, rows: slice) -> Strip:
-        """Some of its rows, counted from its first; the scratch arrays are empty."""
-        return Strip(slice(self.where.start + rows.start, self.where.start + rows.stop), self._buffers)
-
 
 class Buffers:
-    """Scratch arrays for one image size, so that no frame allocates them anew.
-
-    A picture is worked on in strips: what the many passes over one go through stays in the processor's cache.
-
-    Attributes:
-        width, height: of the image.
-        strips: of all its rows, from the top.
-    """
+    """Scratch arrays for one image size, so that frames need not allocate them anew."""
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
@@ -107,8 +98,16 @@ class Buffers:
         self.dither = np.exp2(rng.uniform(-DITHER, DITHER, (height, width))).astype(np.float32)
         self.planes = np.empty((7, *strip), np.float32)
         self.flat = np.empty((*strip, 3), np.uint8)
-        tops = range(0, height, STRIP_ROWS)
-        self.strips = [Strip(slice(top, min(top + STRIP_ROWS, height)), self) for top in tops]
+
+    def strips(self) -> Iterator[Strip]:
+        """The whole image, from the top."""
+        most = len(self.rows)
+        for top in range(0, self.height, most):
+            yield Strip(self, slice(top, min(top + most, self.height)))
+
+    def part(self, strip: Strip, rows: slice) -> Strip:
+        """Some rows of a strip, counted from its first; what its scratch arrays held is not in theirs."""
+        return Strip(self, slice(strip.where.start + rows.start, strip.where.start + rows.stop))
 
 
 def ground_atlas(ground: Ground) -> MipAtlas:
@@ -218,12 +217,12 @@ def draw_ground(world: World, view: View, buffers: Buffers, inverse_depth: Plane
     ground, atlas = world.ground, ground_atlas(world.ground)
     # 1/depth of the ground, negative above the horizon.
     reciprocal = view.ned_from_pixel[2] / _height_m(view)
-    for strip in buffers.strips:
+    for strip in buffers.strips():
         inverse = inverse_depth[strip.where]
         _linear(reciprocal, strip, inverse)
         # It is linear, so the corners tell whether there is any ground.
         if inverse[:: len(inverse) - 1 or 1, :: view.width - 1 or 1].max() > NEAREST_INVERSE:
-            _draw_strip(ground, atlas, view, strip, inverse, image[strip.where])
+            _draw_strip(ground, atlas, view, buffers, strip, inverse, image[strip.where])
         cv2.threshold(inverse, NEAREST_INVERSE, 0.0, cv2.THRESH_TOZERO, dst=inverse)
     return image
 
@@ -233,7 +232,13 @@ def _height_m(view: View) -> float:
 
 
 def _draw_strip(
-    ground: Ground, atlas: MipAtlas, view: View, strip: Strip, inverse_depth: Plane, image: Image
+    ground: Ground,
+    atlas: MipAtlas,
+    view: View,
+    buffers: Buffers,
+    strip: Strip,
+    inverse_depth: Plane,
+    image: Image,
 ) -> None:
     """A strip of the picture in which there is ground, into `image`."""
     height_m = _height_m(view)
@@ -273,7 +278,7 @@ def _draw_strip(
     map_y += np.float32(GUTTER - 0.5)
     found = cv2.remap(atlas.pixels, map_x, map_y, cv2.INTER_LINEAR)
     cv2.cvtColor(found, cv2.COLOR_BGRA2BGR, dst=image)
-    _add_detail(view, height_m, strip, image)
+    _add_detail(view, height_m, buffers, strip, image)
     if ground.gain != (1.0, 1.0, 1.0):
         steps = np.arange(256, dtype=np.float32)[:, None] * _colour(*ground.gain)
         cv2.LUT(image, np.clip(steps, 0, 255).astype(np.uint8)[None], dst=image)
@@ -294,7 +299,7 @@ def _fraction(row: Matrix, start: float, strip: Strip, out: Plane) -> None:
     out -= strip.work
 
 
-def _add_detail(view: View, height_m: float, strip: Strip, image: Image) -> None:
+def _add_detail(view: View, height_m: float, buffers: Buffers, strip: Strip, image: Image) -> None:
     """Fine structure on ground that is close, where the tile's own texels are larger than pixels."""
     if height_m > DETAIL_REACH_M:
         return
@@ -303,7 +308,7 @@ def _add_detail(view: View, height_m: float, strip: Strip, image: Image) -> None
         return
     rows = slice(int(near[0]), int(near[-1]) + 1)
     depth, image = strip.depth[rows], image[rows]
-    strip = strip.part(rows)
+    strip = buffers.part(strip, rows)
     tile = detail_tile()
     side = tile.shape[0]
     map_x, map_y, work = strip.map_x, strip.map_y, strip.work
@@ -365,11 +370,11 @@ def add_haze(sky: Sky, inverse_depth: Plane, buffers: Buffers, image: Image) -> 
     blue, green, red = (int(min(max(channel, 0.0), 255.0)) for channel in sky.horizon)
     cv2.rectangle(buffers.flat, (0, 0, buffers.width, STRIP_ROWS), (blue, green, red), cv2.FILLED)
     clear = 1.0 / (HAZE_FROM * sky.visibility_m)
-    for strip in buffers.strips:
+    for strip in buffers.strips():
         hazy = np.flatnonzero(inverse_depth[strip.where].min(axis=1) < clear)
         if not len(hazy):
             continue
-        part = strip.part(slice(int(hazy[0]), int(hazy[-1]) + 1))
+        part = buffers.part(strip, slice(int(hazy[0]), int(hazy[-1]) + 1))
         share = np.maximum(inverse_depth[part.where], NEAREST_INVERSE, out=part.weight)
         np.divide(np.float32(-1.0 / sky.visibility_m), share, out=share)
         cv2.exp(share, dst=share)

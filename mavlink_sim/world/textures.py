@@ -25,10 +25,12 @@ GUTTER = 2
 class MipAtlas:
     """A square tile and its mip levels in one image.
 
-    Level k, `side = size / 2**k` texels wide, begins at x = 2 * side and y = GUTTER.
+    Level k, `side = size / 2**k` texels wide, begins at x = 2 * side and y = GUTTER: where a multiple of its
+    side says, and 2 is the least that leaves room for gutters between the levels, down to 4 texels. The room
+    to their left is never touched, so it takes no memory.
 
     Attributes:
-        pixels: (size + 2 GUTTER, 3 size + GUTTER, 4) uint8, BGR and a channel of no meaning: OpenCV looks
+        pixels: (size + 2 GUTTER, 3 size + GUTTER, 4) uint8, BGR and a channel of no meaning: OpenCV 5.0 looks
             four channels up almost three times as fast as three.
         size: texels along a side of level 0.
         levels: number of levels.

@@ -9,13 +9,14 @@ library is gone.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
-from contextlib import aclosing, asynccontextmanager
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine
+from contextlib import aclosing, asynccontextmanager, suppress
 from typing import Any, TypeVar
 
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 
 Plugin = TypeVar("Plugin")
+LIMIT_S = 80.0
 
 
 class MavsdkClient:
@@ -31,10 +32,12 @@ class MavsdkClient:
         self._plugins.append(made)
         return made
 
-    def called_back(self) -> list[Any]:
-        """What MAVSDK may call, in all plugins."""
+    def trampolines(self) -> list[Any]:
+        """What C++ calls back, in all plugins: copies, as a plugin clears its own when it is destroyed."""
         inner = [plugin._plugin for plugin in self._plugins]
-        return [[*one._callbacks, *one._subscriptions.values()] for one in inner]
+        return [
+            [*getattr(one, "_callbacks", ()), *getattr(one, "_subscriptions", {}).values()] for one in inner
+        ]
 
 
 @asynccontextmanager
@@ -43,7 +46,7 @@ async def mavsdk_client(
 ) -> AsyncIterator[MavsdkClient]:
     """MAVSDK, connected to the first autopilot that it finds at `url`."""
     library = Mavsdk(Configuration.create_with_component_type(component_type))
-    called_back: list[Any] = []
+    held: list[Any] = []
     try:
         await library.add_any_connection(url)
         system = await library.first_autopilot(20.0)
@@ -52,19 +55,29 @@ async def mavsdk_client(
         try:
             yield client
         finally:
-            called_back = client.called_back()
+            held = client.trampolines()
     finally:
         library.destroy()
-        called_back.clear()
+        held.clear()
+
+
+@asynccontextmanager
+async def meanwhile(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """Let this go on beside; at the end it is cancelled and over. Raises what it raised."""
+    task = asyncio.create_task(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
 
 
 async def wait_for(
-    updates: AsyncGenerator[Any, None],
-    condition: Callable[[Any], bool] = lambda _: True,
-    limit_s: float = 80.0,
+    updates: AsyncGenerator[Any, None], condition: Callable[[Any], bool] = lambda _: True
 ) -> Any:
     """The first update of a subscription that meets the condition."""
-    async with aclosing(updates), asyncio.timeout(limit_s):
+    async with aclosing(updates), asyncio.timeout(LIMIT_S):
         async for update in updates:
             if condition(update):
                 return update

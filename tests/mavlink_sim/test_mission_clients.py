@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import aclosing, asynccontextmanager
 from typing import Any
 
 import pytest
@@ -18,14 +18,13 @@ from mavsdk.plugins.geofence.geofence import Circle, FenceType, GeofenceData, Po
 from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
-from mavsdk_client import MavsdkClient, mavsdk_client, wait_for
+from mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
 from plan_client import item, land, polygon, rally, takeoff, waypoint
 
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.testing import RunningSimulator, running_simulator
 
 SPEED = 6.0
-LIMIT_S = 80.0
 
 
 @asynccontextmanager
@@ -155,31 +154,33 @@ async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> Non
         texts: list[str] = []
 
         async def listen() -> None:
-            async for status in telemetry.subscribe_status_text():
-                texts.append(status.text)
+            async with aclosing(telemetry.subscribe_status_text()) as statuses:
+                async for status in statuses:
+                    texts.append(status.text)
 
         def told(words: str) -> bool:
             return any(words in text for text in texts)
 
-        listening = asyncio.create_task(listen())
-        await fence.upload_geofence(GeofenceData([], [Circle(Point(*place(0, 0)), 8.0, FenceType.INCLUSION)]))
-        await action.arm()
-        await action.takeoff()
-        await asyncio.to_thread(simulator.wait_for_event, "mode HOLD", LIMIT_S)
-        await offboard.set_velocity_ned(VelocityNedYaw(3.0, 0.0, 0.0, 0.0))
-        await offboard.start()
-        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
-        assert not told("Geofence")
-        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
-        outside = await wait_for(telemetry.subscribe_position_velocity_ned(), lambda _: True)
-        assert outside.position.north_m > 7.0
-        async with asyncio.timeout(LIMIT_S):
-            while not told("Geofence: approaching or outside geofence") or not told("Failsafe activated"):
-                await asyncio.sleep(0.05)
-        assert "failsafe: geofence breached, HOLD" in simulator.events
-        stopped = await wait_for(
-            telemetry.subscribe_position_velocity_ned(), lambda seen: abs(seen.velocity.north_m_s) < 0.3
-        )
-        assert stopped.position.north_m < 20.0
-        assert not await offboard.is_active()
-        listening.cancel()
+        async with meanwhile(listen()):
+            await fence.upload_geofence(
+                GeofenceData([], [Circle(Point(*place(0, 0)), 8.0, FenceType.INCLUSION)])
+            )
+            await action.arm()
+            await action.takeoff()
+            await asyncio.to_thread(simulator.wait_for_event, "mode HOLD", LIMIT_S)
+            await offboard.set_velocity_ned(VelocityNedYaw(3.0, 0.0, 0.0, 0.0))
+            await offboard.start()
+            await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
+            assert not told("Geofence")
+            await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
+            outside = await wait_for(telemetry.subscribe_position_velocity_ned())
+            assert outside.position.north_m > 7.0
+            async with asyncio.timeout(LIMIT_S):
+                while not told("Geofence: approaching or outside geofence") or not told("Failsafe activated"):
+                    await asyncio.sleep(0.05)
+            assert "failsafe: geofence breached, HOLD" in simulator.events
+            stopped = await wait_for(
+                telemetry.subscribe_position_velocity_ned(), lambda seen: abs(seen.velocity.north_m_s) < 0.3
+            )
+            assert stopped.position.north_m < 20.0
+            assert not await offboard.is_active()

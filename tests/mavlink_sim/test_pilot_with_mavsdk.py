@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
 import pytest
@@ -14,7 +14,7 @@ from mavsdk.asyncio.plugins.gimbal import ControlMode, GimbalAsync, GimbalMode, 
 from mavsdk.asyncio.plugins.manual_control import ManualControlAsync
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
-from mavsdk_client import MavsdkClient, mavsdk_client, wait_for
+from mavsdk_client import MavsdkClient, mavsdk_client, meanwhile, wait_for
 
 from mavlink_sim.flight.transmitter import CALIBRATION
 from mavlink_sim.testing import RunningSimulator, running_simulator
@@ -28,20 +28,13 @@ async def connected(**options: Any) -> AsyncIterator[tuple[RunningSimulator, Mav
             yield simulator, system
 
 
-@asynccontextmanager
-async def streaming(send: Callable[[], Any], period_s: float) -> AsyncIterator[None]:
+def streaming(send: Callable[[], Any], period_s: float) -> AbstractAsyncContextManager[None]:
     async def stream() -> None:
         while True:
             await send()
             await asyncio.sleep(period_s)
 
-    task = asyncio.create_task(stream())
-    try:
-        yield
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
+    return meanwhile(stream())
 
 
 async def test_a_joystick_flies_the_vehicle_in_position_mode() -> None:

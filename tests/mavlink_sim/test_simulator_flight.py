@@ -11,7 +11,7 @@ from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
-from mavsdk_client import mavsdk_client, wait_for
+from mavsdk_client import mavsdk_client, meanwhile, wait_for
 from pymavlink import mavutil
 
 from mavlink_sim.testing import running_simulator
@@ -143,17 +143,14 @@ async def test_mavsdk_flies_the_vehicle() -> None:
                     await direct.send_message(message("SET_POSITION_TARGET_LOCAL_NED", AHEAD))
                     await asyncio.sleep(0.02)
 
-            streaming = asyncio.create_task(stream())
-            try:
-                await wait_for(direct.subscribe_message("POSITION_TARGET_LOCAL_NED"), lambda _: True)
+            async with meanwhile(stream()):
+                await wait_for(direct.subscribe_message("POSITION_TARGET_LOCAL_NED"))
                 answer = await direct.send_command(message("COMMAND_LONG", TO_OFFBOARD))
                 assert json.loads(answer.fields_json)["result"] == 0
                 await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
                 await wait_for(
                     telemetry.subscribe_position_velocity_ned(), lambda p: p.position.north_m > 3.0
                 )
-            finally:
-                streaming.cancel()
             await action.hold()
             await action.land()
             await asyncio.to_thread(simulator.wait_for_event, "mode LAND")

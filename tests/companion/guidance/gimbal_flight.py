@@ -24,7 +24,9 @@ def person(bearing_deg: float, distance_m: float = 4.0) -> Thing:
     return Thing("person", PERSON_M, lambda _: pose)
 
 
-def gimbal_flight(thing: Thing, *, seed: int = 5, **options: object) -> LockstepFlight:
+def gimbal_flight(
+    thing: Thing, *, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: object
+) -> LockstepFlight:
     """In the air, with a detector that sees the thing where the gimbal looks at it."""
     flights: list[LockstepFlight] = []
 
@@ -34,8 +36,8 @@ def gimbal_flight(thing: Thing, *, seed: int = 5, **options: object) -> Lockstep
 
     # A box that shakes is the detector's fault, and is measured elsewhere.
     detector = DrawnDetector(
-        [thing], CAMERA, ON_GIMBAL, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=looks
+        [thing], CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=looks
     )
-    sight = Sight(CAMERA, ON_GIMBAL, detector)
+    sight = Sight(CAMERA, mount, detector)
     flights.append(LockstepFlight(seed=seed, height_m=HEIGHT_M, sight=sight, gimbal=True, **options))
     return flights[0]

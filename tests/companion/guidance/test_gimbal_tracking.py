@@ -7,10 +7,11 @@ pointed at it in the beginning has long lost it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from gimbal_flight import FOOTPRINT, PERSON_M, gimbal_flight, person
+from gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,178 +24,287 @@ from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.grammar import parse
 from companion.guidance.refusal import refusal
 from companion.guidance.registry import behaviour_for
+from companion.guidance.sequence import SequenceBehaviour
+from companion.guidance.target import Target
+from companion.missions.mission_file import plan_from
 from companion.vehicle.gimbal import GimbalAim, GimbalState
 from companion.vehicle.state import VehicleState
 from mavlink_sim.wire.messages import dialect
+from vision.camera_model import CameraMount
 
 MIDDLE_M = PERSON_M[2] / 2
 # The picture is 64° high; how far from its middle the object may be while vehicle and gimbal move.
 IN_THE_MIDDLE_RAD = math.radians(6.0)
+SECOND_NS = 1_000_000_000
 STATION = (245, 190)
+NOBODY = (0, 0)
 DO_GIMBAL_MANAGER_CONFIGURE = 1001
 
-
-def walker(speed_mps: float) -> Thing:
-    """Somebody who crosses before the vehicle."""
-    return Thing("person", PERSON_M, lambda seconds: Pose(8.0, speed_mps * seconds))
+Each = Callable[[LockstepFlight, Moment], None]
 
 
-def fly(command: str, thing: Thing, each=None) -> tuple[LockstepFlight, FlightLog, Behaviour]:
-    """With the gimbal pointed at the object in the beginning."""
-    flight = gimbal_flight(thing)
-    pointed = flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(-37.0))), 20.0)
+def fly(
+    behaviour: Behaviour,
+    thing: Thing,
+    each: Each = lambda flight, moment: None,
+    *,
+    begin_deg: float = -37.0,
+    mount: CameraMount = ON_GIMBAL,
+) -> tuple[LockstepFlight, FlightLog]:
+    """With the gimbal pointed somewhere in the beginning, by default at somebody 12 m away."""
+    flight = gimbal_flight(thing, mount=mount)
+    pointed = flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(begin_deg))), 20.0)
     assert pointed.outcome is not None
     assert pointed.outcome.success, pointed.outcome.reason
     flight.move_gimbal_on()
-    behaviour = behaviour_for(parse(command), FOOTPRINT)
-    log = flight.fly(behaviour, 90.0, each=None if each is None else lambda moment: each(flight, moment))
-    return flight, log, behaviour
+    return flight, flight.fly(behaviour, 150.0, each=lambda moment: each(flight, moment))
 
 
-def off_rad(moment: Moment, thing: Thing) -> float:
-    """Between the gimbal's pitch and the object's true elevation."""
+def command(text: str) -> Behaviour:
+    return behaviour_for(parse(text), FOOTPRINT)
+
+
+def reason(log: FlightLog, success: bool) -> str:
+    assert log.outcome is not None
+    assert log.outcome.success is success, log.outcome.reason
+    return log.outcome.reason
+
+
+def off_rad(moment: Moment, thing: Thing, camera_rad: float = 0.0) -> float:
+    """Between where the camera looks and the object's true elevation."""
     pose, (north, east, down) = thing.pose(moment.seconds), moment.truth.position_ned_m
     range_m = math.hypot(pose.north_m - north, pose.east_m - east)
     gimbal = moment.situation.state.gimbal
     assert gimbal is not None
     assert gimbal.pitch_rad is not None
-    return abs(gimbal.pitch_rad - math.atan2(down + MIDDLE_M, range_m))
+    return abs(gimbal.pitch_rad + camera_rad - math.atan2(down + MIDDLE_M, range_m))
+
+
+def take(flight: LockstepFlight) -> None:
+    """A ground station takes control of the gimbal."""
+    flight.vehicle.send(
+        dialect.MAVLink_command_long_message(1, 1, DO_GIMBAL_MANAGER_CONFIGURE, 0, *STATION, -1, -1, 0, 0, 0),
+        source=STATION,
+    )
+
+
+def primary(flight: LockstepFlight) -> tuple[int, int]:
+    """Who has it."""
+    who: tuple[int, int] = flight.vehicle.vehicle.gimbal_manager.primary
+    return who
 
 
 def test_an_approach_keeps_what_a_camera_at_rest_loses():
     thing = person(0.0, 12.0)
-    _, still, _ = fly("approach person distance=2 retries=0", thing)
-    assert still.outcome is not None
-    assert not still.outcome.success
-    assert "lost the person" in still.outcome.reason
+    _, still = fly(command("approach person distance=2 retries=0"), thing)
+    assert "lost the person" in reason(still, False)
 
-    flight, log, _ = fly("approach person distance=2 retries=0 gimbal=track", thing)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    flight, log = fly(command("approach person distance=2 retries=0 gimbal=track"), thing)
+    assert reason(log, True)
     assert not log.violations
     assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(2.0, abs=0.6)
     assert max(off_rad(moment, thing) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
     # Nobody holds it any more, and it stays as it was pointed.
     flight.move_gimbal_on()
-    assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
+    assert primary(flight) == NOBODY
     assert math.degrees(flight.state.gimbal.pitch_rad) < -70.0
 
 
 def test_somebody_who_walks_is_followed_from_nearly_above():
-    thing = walker(1.0)
-    _, still, _ = fly("follow person distance=2 duration=20", thing)
-    assert still.outcome is not None
-    assert not still.outcome.success
+    thing = Thing("person", PERSON_M, lambda seconds: Pose(8.0, seconds))
+    _, still = fly(command("follow person distance=2 duration=20"), thing)
+    assert "lost the person" in reason(still, False)
 
-    _, log, _ = fly("follow person distance=2 duration=20 gimbal=track", thing)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    _, log = fly(command("follow person distance=2 duration=20 gimbal=track"), thing)
+    assert reason(log, True)
     assert max(off_rad(moment, thing) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
 
 
-@pytest.mark.parametrize("command", ["approach person distance=2", "follow person distance=2"])
-def test_who_takes_the_gimbal_meanwhile_wins(command):
-    def take(flight: LockstepFlight, moment: Moment) -> None:
-        if 3.0 <= moment.seconds < 3.04:
-            flight.vehicle.send(
-                dialect.MAVLink_command_long_message(
-                    1, 1, DO_GIMBAL_MANAGER_CONFIGURE, 0, *STATION, -1, -1, 0, 0, 0
-                ),
-                source=STATION,
-            )
+def test_a_camera_that_is_mounted_askew_is_brought_to_the_object():
+    down_rad = math.radians(-15.0)
+    thing = person(0.0, 12.0)
+    _, log = fly(
+        command("approach person distance=3 retries=0 gimbal=track"),
+        thing,
+        begin_deg=-22.0,
+        mount=replace(ON_GIMBAL, pitch_rad=down_rad),
+    )
+    assert reason(log, True)
+    assert max(off_rad(moment, thing, down_rad) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
 
-    flight, log, behaviour = fly(f"{command} gimbal=track", person(0.0, 12.0), each=take)
-    assert log.outcome is not None
-    assert not log.outcome.success
+
+@pytest.mark.parametrize("word", ["approach", "follow"])
+def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word):
+    """The picture ends 45° down, above its wheels: it has no range until the gimbal looks at it."""
+    thing = Thing("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
+    flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-13.0)
+    first = next(seen for moment in log.moments for seen in moment.situation.targets)
+    assert first.position_ned_m is None
+    assert math.degrees(flight.state.gimbal.pitch_rad) < -40.0
+    assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(4.0, abs=1.0)
+
+
+@pytest.mark.parametrize("word", ["approach", "follow"])
+def test_who_takes_the_gimbal_meanwhile_wins(word):
+    def at_three(flight: LockstepFlight, moment: Moment) -> None:
+        if 3.0 <= moment.seconds < 3.04:
+            take(flight)
+
+    flight, log = fly(command(f"{word} person distance=2 gimbal=track"), person(0.0, 12.0), at_three)
     # What comes first: the manager's word of who has it, or its answer to the next aim.
-    assert log.outcome.reason in (
-        f"{behaviour.name} lost the gimbal: 245/190 has taken control of it",
-        f"{behaviour.name} lost the gimbal: result 2",
+    assert reason(log, False) in (
+        f"{word} lost the gimbal: 245/190 has taken control of it",
+        f"{word} lost the gimbal: result 2",
     )
     flight.move_gimbal_on(3.0)
-    assert flight.vehicle.vehicle.gimbal_manager.primary == STATION
+    assert primary(flight) == STATION
 
 
-def test_until_it_is_seen_again_the_gimbal_looks_where_it_was():
-    """Gone after 4 s: the approach waits, looks back and turns once, and lets go of the gimbal only then."""
-    gone = Pose(-200.0, 0.0)
-    at_hand = Pose(12.0, 0.0)
-    thing = Thing("person", PERSON_M, lambda seconds: at_hand if seconds < 4.0 else gone)
-    aims: list[GimbalAim | None] = []
+GONE_AFTER_S = 4.0
+
+
+def who_leaves() -> Thing:
+    """Somebody who is gone at once."""
+    near, gone = Pose(12.0, 0.0), Pose(-200.0, 0.0)
+    return Thing("person", PERSON_M, lambda seconds: near if seconds < GONE_AFTER_S else gone)
+
+
+def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_given_back():
+    seen: list[tuple[str, float, tuple[int, int]]] = []
+    behaviour = command("approach person retries=1 gimbal=track")
 
     def note(flight: LockstepFlight, moment: Moment) -> None:
-        aims.append(behaviours[0].gimbal_aim)
-        pitches.append(moment.situation.state.gimbal.pitch_rad)
+        gimbal = moment.situation.state.gimbal
+        seen.append((behaviour.status, math.degrees(gimbal.pitch_rad), primary(flight)))
 
-    behaviours: list[Behaviour] = [behaviour_for(parse("approach person retries=1 gimbal=track"), FOOTPRINT)]
-    pitches: list[float] = []
-    flight = gimbal_flight(thing)
-    flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(-37.0))), 20.0)
+    flight, log = fly(behaviour, who_leaves(), note)
+    assert "looked for it again once" in reason(log, False)
+    assert {who for _, _, who in seen[10:]} == {(1, 191)}
+    lost_deg = next(pitch for status, pitch, _ in seen if "where it was" in status)
+    around = [pitch for status, pitch, _ in seen if "all around" in status]
+    assert max(around) > -6.0, "up to level"
+    assert min(around) == pytest.approx(lost_deg, abs=6.0)
     flight.move_gimbal_on()
-    log = flight.fly(behaviours[0], 120.0, each=lambda moment: note(flight, moment))
-    assert log.outcome is not None
-    assert not log.outcome.success
-    assert "looked for it again once" in log.outcome.reason
-    begun = next(index for index, aim in enumerate(aims) if aim is not None)
-    assert None not in aims[begun:]
-    assert len(aims) > 400, "it turned once"
-    assert pitches[-1] == pytest.approx(aims[-1].pitch_rad, abs=math.radians(3.0))
+    assert primary(flight) == NOBODY
 
 
-def situation(gimbal: GimbalState | None, sight: GimbalSight) -> Situation:
-    """Flying, with everything that an approach wants but, perhaps, a gimbal."""
+@pytest.mark.parametrize("phase", ["where it was", "all around"])
+def test_taken_while_it_is_looked_for_it_ends_too(phase):
+    behaviour = command("approach person retries=2 gimbal=track")
+    taken_s: list[float] = []
+
+    def in_phase(flight: LockstepFlight, moment: Moment) -> None:
+        if not taken_s and phase in behaviour.status:
+            take(flight)
+            taken_s.append(moment.seconds)
+
+    flight, log = fly(behaviour, who_leaves(), in_phase)
+    assert "approach lost the gimbal: " in reason(log, False)
+    assert flight.seconds - taken_s[0] < 4.0
+    assert primary(flight) == STATION
+
+
+def test_a_gimbal_that_does_not_follow_ends_it():
+    def stick(flight: LockstepFlight, moment: Moment) -> None:
+        flight.vehicle.vehicle.parameters.set("MNT_MIN_PITCH", -37.0)  # a stop that it has not told of
+
+    behaviour = command("follow person distance=2 duration=60 occlusion=60 gimbal=track")
+    _, log = fly(behaviour, person(0.0, 12.0), stick)
+    assert "follow lost the gimbal: it does not follow: asked for -" in reason(log, False)
+
+
+def test_the_steps_of_a_mission_hand_it_on():
+    table = "".join(
+        f'[[step]]\ndo = "approach person distance={distance} gimbal=track"\n' for distance in (6, 3)
+    )
+    thing = person(0.0, 12.0)
+    mission = SequenceBehaviour(plan_from(table, "nearer"), lambda behaviour: None)
+    flight, log = fly(mission, thing)
+    assert reason(log, True)
+    assert [step.reason[:14] for step in mission.records] == ["reached person"] * 2
+    assert off_rad(log.moments[-1], thing) < IN_THE_MIDDLE_RAD
+    flight.move_gimbal_on()
+    assert primary(flight) == NOBODY
+
+
+def flying(gimbal: GimbalState | None, sight: GimbalSight) -> Situation:
+    """With everything that an approach wants but, perhaps, a gimbal."""
+    situations: list[Situation] = []
     flight = gimbal_flight(person(0.0, 12.0))
-    flight.move_gimbal_on(2.0)
-    known = flight._situation(flight.now_ns)
-    return replace(known, state=replace(known.state, gimbal=gimbal), gimbal=sight)
+    flight.fly(command("hold"), 2.0, each=lambda moment: situations.append(moment.situation))
+    now = situations[-1]
+    return replace(now, state=replace(now.state, gimbal=gimbal or now.state.gimbal), gimbal=sight)
 
 
-@pytest.mark.parametrize("command", ["approach person", "follow person"])
-def test_without_a_gimbal_or_a_camera_on_it_tracking_is_refused_and_the_rest_is_not(command):
-    names = ("person",)
-    now = situation(None, GimbalSight(carries_camera=False))
-    assert refusal(behaviour_for(parse(command), FOOTPRINT), now, names) is None
-    refused = refusal(behaviour_for(parse(f"{command} gimbal=track"), FOOTPRINT), now, names)
-    assert refused is not None
-    assert "a gimbal (none answers)" in refused
-    assert "the camera on the gimbal (camera.gimbal is not set)" in refused
+@pytest.mark.parametrize("word", ["approach", "follow"])
+def test_without_a_camera_on_a_gimbal_tracking_is_refused_and_the_rest_is_not(word):
+    now = flying(None, GimbalSight(carries_camera=False))
+    assert refusal(command(f"{word} person"), now, ("person",)) is None
+    refused = refusal(command(f"{word} person gimbal=track"), now, ("person",))
+    assert refused == f"{word} needs the camera on the gimbal (camera.gimbal is not set)"
+    nobody = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalSight(carries_camera=True))
+    refused = refusal(command(f"{word} person gimbal=track"), nobody, ("person",))
+    assert refused == f"{word} needs a gimbal (none answers)"
 
 
-class Seen:
-    """A detection of an object."""
+def target(elevation_rad: float, range_m: float) -> Target:
+    return Target("person", 0.9, 1, 0.0, elevation_rad, range_m)
 
-    def __init__(self, captured_ns: int, elevation_rad: float) -> None:
-        self.captured_ns, self.elevation_rad = captured_ns, elevation_rad
+
+def situation(gimbal: GimbalState, now_ns: int = 1, **sight: object) -> Situation:
+    return Situation(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=GimbalSight(True, **sight))
+
+
+FREE = GimbalState()
 
 
 @given(
     elevation_deg=st.floats(-89.0, 40.0),
-    range_m=st.floats(0.2, 80.0),
+    then_m=st.floats(0.2, 80.0),
     later_m=st.floats(0.2, 80.0),
     climbed_m=st.floats(-20.0, 20.0),
 )
-def test_it_looks_at_the_height_that_the_detection_told(elevation_deg, range_m, later_m, climbed_m):
+def test_it_looks_at_the_height_that_the_detection_told(elevation_deg, then_m, later_m, climbed_m):
     tracking = GimbalTracking()
-    tracking.begin(0)
-    now = Situation(1, VehicleState())
-    seen = Seen(1, math.radians(elevation_deg))
+    now = situation(FREE)
+    seen = target(math.radians(elevation_deg), then_m)
     assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), now) is None
     assert tracking.aim is None
-    tracking.keep_on(seen, range_m, (0.0, 0.0, -10.0), now)
+    # What was seen from farther away than the vehicle is by now: the height is what counts.
+    tracking.keep_on(seen, later_m, (0.0, 0.0, -10.0), now)
+    above_m = then_m * math.tan(math.radians(elevation_deg))
     assert tracking.aim is not None
-    assert tracking.aim.pitch_rad == pytest.approx(math.radians(elevation_deg), abs=1e-6)
-    # The same detection, from elsewhere: the object has stayed at its height.
-    tracking.keep_on(seen, later_m, (0.0, 0.0, -10.0 - climbed_m), now)
-    above_m = range_m * math.tan(math.radians(elevation_deg)) - climbed_m
     assert tracking.aim.pitch_rad == pytest.approx(math.atan2(above_m, later_m), abs=1e-6)
+    # The same detection, from another height: the object has stayed at its own.
+    tracking.keep_on(seen, later_m, (0.0, 0.0, -10.0 - climbed_m), now)
+    assert tracking.aim.pitch_rad == pytest.approx(math.atan2(above_m - climbed_m, later_m), abs=1e-6)
 
 
-@given(elevation_deg=st.floats(-90.0, 90.0), range_m=st.floats(0.0, 200.0))
-def test_it_asks_for_nothing_beyond_the_stops(elevation_deg, range_m):
-    low, high = math.radians(-60.0), math.radians(20.0)
-    gimbal = GimbalState(lowest_pitch_rad=low, highest_pitch_rad=high)
+@given(
+    elevation_deg=st.floats(-90.0, 90.0),
+    range_m=st.floats(0.0, 200.0) | st.just(math.nan),
+    low_deg=st.floats(-200.0, 200.0) | st.just(-math.inf),
+    high_deg=st.floats(-200.0, 200.0) | st.just(math.inf),
+)
+def test_it_asks_for_nothing_beyond_the_stops(elevation_deg, range_m, low_deg, high_deg):
+    low, high = math.radians(low_deg), math.radians(high_deg)
+    now = situation(GimbalState(lowest_pitch_rad=low, highest_pitch_rad=high), camera_pitch_rad=-0.3)
     tracking = GimbalTracking()
-    now = Situation(1, replace(VehicleState(), gimbal=gimbal))
-    tracking.keep_on(Seen(1, math.radians(elevation_deg)), range_m, (0.0, 0.0, -10.0), now)
+    seen = target(math.radians(elevation_deg), range_m)
+    tracking.keep_on(seen, 5.0, (0.0, 0.0, -10.0), now)
     assert tracking.aim is not None
-    assert low <= tracking.aim.pitch_rad <= high
+    pitch_rad = tracking.aim.pitch_rad
+    assert abs(pitch_rad) <= math.pi / 2
+    if -math.pi / 2 <= low <= high <= math.pi / 2:
+        assert low <= pitch_rad <= high
+    tracking.turn_to(seen, now)
+    assert tracking.aim is not None
+
+
+def test_what_hindered_the_one_before_is_no_hindrance_in_the_first_turn():
+    tracking = GimbalTracking()
+    first = situation(FREE, 5 * SECOND_NS, problem="245/190 has taken control of it")
+    tracking.begin(first)
+    assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), first) is None
+    later = replace(first, now_ns=6 * SECOND_NS)
+    assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), later) == "245/190 has taken control of it"
