@@ -215,6 +215,25 @@ def _replace_dead(draft: Path, path: Path) -> bool:
     return True
 
 
+def remove_leavings(name: str) -> bool:
+    """Take away what a writer that was killed has left; True if there was something. A living one's stays."""
+    path = segment_path(name)
+    try:
+        left = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(left, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        dead = _same_file(path, left)
+        if dead:
+            path.unlink()
+        return dead
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(left)
+
+
 def _same_file(path: Path, descriptor: int) -> bool:
     try:
         named = os.stat(path)

@@ -33,6 +33,7 @@ from mavlink_sim.world.aircraft import Aircraft
 from mavlink_sim.world.world import World
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
+from vision.shared_frame import remove_leavings
 
 logger = logging.getLogger(__name__)
 
@@ -268,3 +269,5 @@ class CameraProcess:
             logger.warning("the camera process did not end in %.1f s; killing it", timeout_s)
             self._process.kill()
             self._process.join()
+        if self.shared_name is not None:
+            remove_leavings(self.shared_name)  # of one that was killed: they are memory

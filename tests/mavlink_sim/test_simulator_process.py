@@ -18,7 +18,7 @@ from mavlink_sim.cli import main
 from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
 from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
-from vision.shared_frame import SharedFrameReader
+from vision.shared_frame import SharedFrameReader, segment_path
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -219,6 +219,7 @@ def test_the_camera_is_announced_and_its_loss_told_while_the_vehicle_flies_on(tm
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)
         assert link.wait_heartbeat(timeout=20) is not None
         link.close()
+    assert not segment_path(name).exists(), "what was killed could not clean up: the simulator did"
 
 
 def test_ctrl_c_right_after_the_start_with_a_camera_is_quiet(tmp_path: Path) -> None:

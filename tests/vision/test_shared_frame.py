@@ -23,6 +23,7 @@ from vision.shared_frame import (
     SHARED_MEMORY_DIRECTORY,
     SharedFrameReader,
     SharedFrameWriter,
+    remove_leavings,
     segment_path,
 )
 
@@ -214,6 +215,19 @@ def test_a_killed_writers_segment_is_taken_over_and_its_reader_follows(
         assert again.sequence == 0
         assert reader.reopened == 1
         assert reader.latest(0) is None
+
+
+def test_only_what_a_killed_writer_left_is_removed(
+    name: str, start_writer: Callable[..., subprocess.Popen[str]]
+) -> None:
+    assert not remove_leavings(name), "nothing is there"
+    writer = start_writer(0, 1, 0.0)
+    assert not remove_leavings(name), "its writer lives"
+    assert segment_path(name).exists()
+    writer.send_signal(signal.SIGKILL)
+    writer.wait(DEADLINE_S)
+    assert remove_leavings(name)
+    assert not segment_path(name).exists()
 
 
 def test_a_reader_follows_a_writer_of_another_size(name: str) -> None:
