@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
-from companion.guidance.gimbal_sweep import GimbalSweep
+from companion.guidance.gimbal_sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import position_and_yaw, stay_at
 from companion.guidance.seek import SeekBehaviour
@@ -21,8 +21,6 @@ LOOK_BACK_S = 3.0
 # Half a turn at the envelope's slowest useful rate.
 LOOK_BACK_LIMIT_S = 12.0
 POINTED_RAD = math.radians(6.0)
-# While it turns, the gimbal goes up and down so fast; nearer to level than this it need not.
-SWEEP_RATE_RADPS, LEAST_SWEEP_RAD = math.radians(20.0), math.radians(5.0)
 
 
 class PersistentApproach(Behaviour):
@@ -145,9 +143,9 @@ class PersistentApproach(Behaviour):
     def _sweep(self) -> GimbalSweep | None:
         """Who has walked on stands between the pitch at which he was lost and level."""
         aim = None if self._tracking is None else self._tracking.aim
-        if aim is None or abs(aim.pitch_rad) < LEAST_SWEEP_RAD:
+        if aim is None or abs(math.degrees(aim.pitch_rad)) < LEAST_SWEEP_DEG:
             return None
-        return GimbalSweep(aim.pitch_rad, SWEEP_RATE_RADPS, self._field_rad)
+        return GimbalSweep(aim.pitch_rad, math.radians(USUAL_RATE_DPS), self._field_rad)
 
     def _go_there(self, situation: Situation, told: str) -> Step:
         self._notes.append(f"approach: {told}")

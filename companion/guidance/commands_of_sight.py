@@ -9,12 +9,11 @@ from typing import Annotated, ClassVar
 from companion.geometry.points import points_from
 from companion.guidance.arguments import Choice, ClassName, ClassNames, GrammarError, Number, Points, names_in
 from companion.guidance.command import Command
+from companion.guidance.gimbal_sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS
 from companion.vehicle.gimbal import GimbalAim
 
 # What a circle may ask of the vehicle sideways; the envelope's default acceleration.
 MAX_CENTRIPETAL_MPS2 = 2.0
-# A shorter way up and down shows nothing that a camera at rest does not.
-LEAST_SWEEP_DEG = 5.0
 
 GimbalUse = Annotated[
     str, Choice("gimbal", ("leave", "track"), "leave it alone, or keep its camera on the object")
@@ -82,7 +81,7 @@ class Seek(Command):
     ] = None
     sweep_rate_dps: Annotated[
         float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower, the turn is slower too")
-    ] = 20.0
+    ] = USUAL_RATE_DPS
 
     def __post_init__(self) -> None:
         super(Seek, self).__post_init__()
@@ -92,7 +91,7 @@ class Seek(Command):
             )
         if self.sweep_deg is not None and self.pattern != "turn":
             raise GrammarError(f"seek: pattern={self.pattern} takes no sweep")
-        if self.sweep_deg is None and self.sweep_rate_dps != 20.0:
+        if self.sweep_deg is None and self.sweep_rate_dps != USUAL_RATE_DPS:
             raise GrammarError("seek: sweep_rate needs sweep")
         given = {
             "radius": self.radius_m,

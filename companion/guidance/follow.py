@@ -110,11 +110,10 @@ class FollowBehaviour(Behaviour):
             return Outcome(True, f"followed the {self._class_name} for {self._duration_s:g} s")
         if self._unseen_s > self._occlusion_s:
             return Outcome(False, self._lost(situation))
-        towards_rad = 0.0
         if track is not None:
             place = track.place(now_ns)
             north, east = place[0] - position[0], place[1] - position[1]
-            self._range_m, towards_rad = math.hypot(north, east), math.atan2(east, north)
+            self._range_m = math.hypot(north, east)
         if self._tracking is not None:
             newest = None if track is None else track.newest
             why = self._tracking.keep_on(newest, self._range_m, position, situation)
@@ -126,7 +125,7 @@ class FollowBehaviour(Behaviour):
                 return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rate_radps=0.0)
             return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rad=self._yaw_rad)
 
-        self._yaw_rad = towards_rad
+        self._yaw_rad = towards_rad = math.atan2(east, north)
         wanted = self._wanted(track, towards_rad, dt_s)
         north_mps, east_mps = pressed(wanted, state, self._speed_mps, PRESS)
         return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)

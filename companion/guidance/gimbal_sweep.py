@@ -10,6 +10,9 @@ import math
 
 from companion.vehicle.gimbal import GimbalAim
 
+# A shorter way up and down shows nothing that a camera at rest does not.
+LEAST_SWEEP_DEG = 5.0
+USUAL_RATE_DPS = 20.0
 # Of the picture's width a fifth is not counted on: boxes at its edge are cut.
 COUNTED_ON = 0.8
 # So far the gimbal may be behind what it is asked before it is waited for: in angle, and in time.
@@ -83,5 +86,9 @@ class GimbalSweep:
         """Why there is no use in going on, in words; None: the gimbal follows."""
         if self._waited_s <= PATIENCE_S or self._pitch_rad is None:
             return None
-        asked, is_at = math.degrees(self._pitch_rad), math.degrees(measured_rad)
-        return f"the gimbal does not follow: asked for {asked:.0f}°, it is at {is_at:.0f}°"
+        return f"the gimbal does not follow: {gap_text(self._pitch_rad, measured_rad)}"
+
+
+def gap_text(asked_rad: float, measured_rad: float) -> str:
+    """What was asked of a gimbal and where it is, for people."""
+    return f"asked for {math.degrees(asked_rad):.0f}°, it is at {math.degrees(measured_rad):.0f}°"

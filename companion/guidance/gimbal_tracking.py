@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Situation
-from companion.guidance.gimbal_sweep import BEHIND_RAD, PATIENCE_S
+from companion.guidance.gimbal_sweep import BEHIND_RAD, PATIENCE_S, gap_text
 from companion.guidance.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
@@ -45,8 +45,9 @@ class GimbalTracking:
 
     def taken(self, situation: Situation) -> str | None:
         """Why the gimbal is not moved any more, in words; None: it is."""
-        # At the first turn it is still told of what came before.
-        return situation.gimbal.problem or None if situation.now_ns > self._begun_ns else None
+        if situation.now_ns <= self._begun_ns:  # at the first turn it is still told of what came before
+            return None
+        return situation.gimbal.problem or None
 
     def turn_to(self, target: Target, situation: Situation) -> None:
         """Look at what has no range yet: it may come fully into the picture, and its range with it."""
@@ -96,5 +97,4 @@ class GimbalTracking:
             self._behind_since_ns = now_ns
         if now_ns - self._behind_since_ns <= PATIENCE_S * 1e9:
             return None
-        asked, is_at = math.degrees(self.aim.pitch_rad), math.degrees(measured_rad)
-        return f"it does not follow: asked for {asked:.0f}°, it is at {is_at:.0f}°"
+        return f"it does not follow: {gap_text(self.aim.pitch_rad, measured_rad)}"
