@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
 
@@ -52,7 +53,7 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot
 
             stopped = await service.fly("stop")
             assert stopped.success, stopped.reason
-            assert "mode BRAKE" in simulator.events
+            await asyncio.to_thread(simulator.wait_for_event, "mode BRAKE")  # its words come by a thread
             landed = await service.fly("land")
             assert landed.success, landed.reason
             assert not driver.state.armed
