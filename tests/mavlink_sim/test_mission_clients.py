@@ -178,7 +178,7 @@ async def test_mavsdk_flies_out_of_its_geofence_and_is_stopped_and_told() -> Non
             async with asyncio.timeout(LIMIT_S):
                 while not told("Geofence: approaching or outside geofence") or not told("Failsafe activated"):
                     await asyncio.sleep(0.05)
-            assert "failsafe: geofence breached, HOLD" in simulator.events
+            await asyncio.to_thread(simulator.wait_for_event, "failsafe: geofence breached, HOLD")
             stopped = await wait_for(
                 telemetry.subscribe_position_velocity_ned(), lambda seen: abs(seen.velocity.north_m_s) < 0.3
             )
