@@ -3,6 +3,7 @@
 import gc
 import os
 import zlib
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
@@ -28,10 +29,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: zlib.crc32(item.path.relative_to(item.config.rootpath).as_posix().encode()))
 
 
-def pytest_collection_finish() -> None:
-    """What was imported stays: the garbage collector need not look through a million objects again and again.
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """What is imported stays: the garbage collector need not look through a million objects again and again.
 
-    That was an eighth of the tests' time.
+    Neither while they are imported (a tenth of the time that takes) nor in the tests (an eighth).
     """
+    gc.disable()
+    collected = yield
     gc.collect()
     gc.freeze()
+    gc.enable()
+    return collected

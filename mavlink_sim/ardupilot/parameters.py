@@ -154,7 +154,8 @@ class CopterParameters(Parameters):
             for name, kind, value in _DEFAULTS
         }
         self._parameters = dict(self._defaults)
-        self._names = list(self._parameters)
+        self._unused = set()
+        self._number_listed()
         self.revision = 0
         for name, value in (values or {}).items():
             self._set_own(name, value)

@@ -39,6 +39,7 @@ def complaints(
     """
     if not items:
         return False, []
+    parameters.use("MIS_DIST_1WP", "MIS_TKO_LAND_REQ")
     said: list[str] = []
     for index, item in enumerate(items):
         broken = _broken_item(index, item, landed=landed)

@@ -1,6 +1,7 @@
 """The vehicle's parameters: PX4's names, types and values, with integers sent bytewise in the float field.
 
-`parameters.txt` beside this file is the selection this vehicle has, one `NAME TYPE VALUE` a line.
+`parameters.txt` beside this file holds all that a PX4 lists, one `NAME TYPE VALUE` a line. As there, one
+that no part of the vehicle has used yet (`parameters_mission.txt`) can be read and set, but is not listed.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
 
 INT32 = 6  # MAV_PARAM_TYPE_INT32
 REAL32 = 9  # MAV_PARAM_TYPE_REAL32
 UINT32 = 5  # MAV_PARAM_TYPE_UINT32, of _HASH_CHECK alone
 HASH_CHECK = "_HASH_CHECK"
-HASH_CHECK_INDEX = 65535
-_FILES = ("parameters.txt", "parameters_pilot.txt")
+NO_INDEX = 65535  # of what is not listed: _HASH_CHECK, and a parameter that nothing has used yet
+_FILE = "parameters.txt"
+_MISSION_FILE = "parameters_mission.txt"
 _GIMBAL_FILE = "parameters_gimbal.txt"
 _TYPES = {"INT32": INT32, "REAL32": REAL32}
 # PX4's `volatile` parameters: the vehicle itself changes them, so they are no part of _HASH_CHECK.
@@ -77,21 +80,28 @@ def decode_wire_value(kind: int, wire_value: float) -> int | float:
 
 def default_parameters(gimbal: bool = False) -> list[Parameter]:
     """`parameters.txt` and its additions, with `gimbal` those of one too, in alphabetical order."""
-    folder = resources.files(__package__)
-    files = (*_FILES, _GIMBAL_FILE) if gimbal else _FILES
-    text = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in files)
+    found = [*_read(_FILE), *_read(_MISSION_FILE), *(_read(_GIMBAL_FILE) if gimbal else ())]
+    unique = {parameter.name: parameter for parameter in found}  # the last of a name counts
+    return sorted(unique.values(), key=lambda parameter: parameter.name)
+
+
+@cache
+def _read(file_name: str) -> tuple[Parameter, ...]:
+    text = resources.files(__package__).joinpath(file_name).read_text(encoding="utf-8")
     found = []
     for line in text.splitlines():
         if line and not line.startswith("#"):
             name, kind, value = line.split()
             number = int(value) if kind == "INT32" else _single(float(value))
             found.append(Parameter(name, _TYPES[kind], number))
-    unique = {parameter.name: parameter for parameter in found}  # the last of a name counts
-    return sorted(unique.values(), key=lambda parameter: parameter.name)
+    return tuple(found)
 
 
 class Parameters:
-    """The parameter set of one vehicle, in alphabetical order. `revision` grows with every change."""
+    """The parameter set of one vehicle. `revision` grows with every change.
+
+    Its length, its iteration and its indices are those of the list that clients get, in alphabetical order.
+    """
 
     def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
         """With `gimbal`, the parameters of one are among them.
@@ -100,16 +110,21 @@ class Parameters:
         """
         self._defaults = {parameter.name: parameter for parameter in default_parameters(gimbal)}
         self._parameters = dict(self._defaults)
-        self._names = list(self._parameters)
+        self._unused = {parameter.name for parameter in _read(_MISSION_FILE)}
+        self._number_listed()
         self.revision = 0
         for name, value in (values or {}).items():
             self.set(name, value)
+
+    def _number_listed(self) -> None:
+        self._names = [name for name in self._parameters if name not in self._unused]
+        self._index = {name: index for index, name in enumerate(self._names)}
 
     def __len__(self) -> int:
         return len(self._names)
 
     def __iter__(self) -> Iterator[Parameter]:
-        return iter(self._parameters.values())
+        return (self._parameters[name] for name in self._names)
 
     def __contains__(self, name: str) -> bool:
         return name in self._parameters
@@ -136,12 +151,19 @@ class Parameters:
         value = self.number(name)
         return value if value > 0.01 else 0.01
 
+    def use(self, *names: str) -> None:
+        """List parameters from now on: a part of the vehicle that reads them has begun its work."""
+        if not self._unused.isdisjoint(names):
+            self._unused.difference_update(names)
+            self._number_listed()
+
     def at(self, index: int) -> Parameter | None:
         """The parameter at an index of the list, None outside it."""
         return self._parameters[self._names[index]] if 0 <= index < len(self._names) else None
 
     def index(self, name: str) -> int:
-        return self._names.index(name)
+        """Its place in the list, NO_INDEX if it is not there."""
+        return self._index.get(name, NO_INDEX)
 
     def set(self, name: str, value: float) -> Parameter:
         """Set a value; PX4 checks no range. Raises UnknownParameterError or ValueError."""
@@ -171,7 +193,7 @@ class Parameters:
 
     def customised(self) -> list[Parameter]:
         """The parameters whose value is not that of `parameters.txt`: what PX4 keeps in its file."""
-        return [item for item in self if item.value != self._defaults[item.name].value]
+        return [item for name, item in self._parameters.items() if item.value != self._defaults[name].value]
 
     def hash(self) -> int:
         """The set's _HASH_CHECK."""

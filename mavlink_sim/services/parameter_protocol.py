@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.px4.parameters import (
     HASH_CHECK,
-    HASH_CHECK_INDEX,
     INT32,
+    NO_INDEX,
     REAL32,
     UINT32,
     Parameter,
@@ -140,7 +140,7 @@ def _send(link: Link, parameters: Parameters, parameter: Parameter) -> None:
 def _send_hash(link: Link, parameters: Parameters) -> None:
     link.send(
         dialect.MAVLink_param_value_message(
-            HASH_CHECK.encode(), parameters.hash_wire_value(), UINT32, len(parameters), HASH_CHECK_INDEX
+            HASH_CHECK.encode(), parameters.hash_wire_value(), UINT32, len(parameters), NO_INDEX
         )
     )
 

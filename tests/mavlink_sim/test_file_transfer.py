@@ -20,7 +20,7 @@ from mavsdk.plugins.component_metadata import MetadataType
 from mavsdk_client import mavsdk_client
 from pymavlink import mavftp, mavutil
 
-from mavlink_sim.px4.parameters import INT32, Parameters
+from mavlink_sim.px4.parameters import INT32, Parameters, default_parameters
 from mavlink_sim.services.file_system import FileSystem, resolve
 from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Packet, Server
 from mavlink_sim.services.vehicle_files import bson, offer_packed_parameters, packed_parameters
@@ -320,7 +320,7 @@ def test_the_metadata_is_found_through_component_metadata(cockpit: Any) -> None:
     for entry in types:
         assert entry["fileCrc"] == crc(content(entry["uri"]))
     listed = json.loads(content(types[0]["uri"]))["parameters"]
-    assert [entry["name"] for entry in listed] == [parameter.name for parameter in cockpit.vehicle.parameters]
+    assert [entry["name"] for entry in listed] == [parameter.name for parameter in default_parameters()]
 
 
 # ---- clients nobody here wrote
@@ -379,7 +379,7 @@ async def test_mavsdk_finds_the_metadata(simulator: RunningSimulator) -> None:
         await updates.aclose()
         found = await metadata.get_metadata(1, MetadataType.PARAMETER)
         names = [entry["name"] for entry in json.loads(found.json_metadata)["parameters"]]
-        assert names == [parameter.name for parameter in Parameters()]
+        assert names == [parameter.name for parameter in default_parameters()]
         events = await metadata.get_metadata(1, MetadataType.EVENTS)
         assert "components" in json.loads(events.json_metadata)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from plan_client import upload, waypoint
 
 from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
 from mavlink_sim.wire.messages import dialect, parser
@@ -277,6 +278,32 @@ def test_hash_check__is_reproduced_from_the_887_recorded_parameters() -> None:
     assert parameter_hash(parameters) == told == 0x6AF5A894
 
 
+def test_hash_check__the_vehicle_itself_answers_what_px4_answered(ready: Any) -> None:
+    (answer,) = read(ready, b"_HASH_CHECK")
+    assert struct.unpack("<I", struct.pack("<f", answer.param_value))[0] == 0x6AF5A894
+    assert (answer.param_type, answer.param_index, answer.param_count) == (5, 65535, 887)
+
+
+def test_request_list__887_parameters_604_real32_283_int32_888_messages_in_0_89_s(ready: Any) -> None:
+    ready.send(dialect.MAVLink_param_request_list_message(1, 1))
+    ready.fly(2.0)
+    stamped = [
+        (time, item.message)
+        for time, item in ready.inbox["onboard"]
+        if item.message.get_type() == "PARAM_VALUE"
+    ]
+    assert len(stamped) == 888
+    assert stamped[-1][0] - stamped[0][0] == pytest.approx(0.89, abs=0.02)
+    assert {message.param_count for _, message in stamped} == {887}
+    kinds = [message.param_type for _, message in stamped[1:]]
+    assert (kinds.count(REAL32), kinds.count(INT32)) == (604, 283)
+
+
+def test_names_types_and_values_are_those_recorded(ready: Any) -> None:
+    _, parameters = recorded_parameters()
+    assert list(ready.vehicle.parameters) == parameters
+
+
 def test_source_hash_check__volatile_parameters_do_not_count(cockpit: Any) -> None:
     told, parameters = recorded_parameters()
     changed = [
@@ -353,6 +380,16 @@ def test_unknown__param_error_345_1_does_not_exist(ready: Any) -> None:
         (error,) = answers
         assert (error.get_msgId(), error.error) == (345, DOES_NOT_EXIST)
         assert (error.target_system, error.target_component) == (1, 191)
+
+
+def test_a_parameter_of_missions_is_listed_once_a_mission_was_checked(ready: Any) -> None:
+    (unlisted,) = read(ready, b"MIS_DIST_1WP")
+    assert (unlisted.param_value, unlisted.param_index, unlisted.param_count) == (10_000.0, 65535, 887)
+    assert upload(ready, [waypoint(10.0, 0.0, 5.0)]) == 0
+    (listed,) = read(ready, b"MIS_DIST_1WP")
+    assert listed.param_count == 889
+    (by_index,) = read(ready, b"", listed.param_index)
+    assert name_of(by_index) == "MIS_DIST_1WP"
 
 
 def test_set__param_value_twice_at_0_and_10_to_20_ms(ready: Any) -> None:
