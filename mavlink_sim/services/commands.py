@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
 from mavlink_sim.physics.geography import geographic, local
-from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, mode_of
+from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.telemetry import MESSAGE_IDS
@@ -18,6 +18,7 @@ from mavlink_sim.wire.announcements import CRITICAL, Text
 from mavlink_sim.wire.messages import dialect, protocol_version
 
 if TYPE_CHECKING:
+    from mavlink_sim.physics.airframe import Vector
     from mavlink_sim.services.links import Link
     from mavlink_sim.vehicle import Vehicle
 
@@ -121,21 +122,19 @@ def _return_to_launch(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 
 def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
-    flags = command.parameters[1]
-    if not math.isfinite(flags) or int(flags) != 1:  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other
-        return UNSUPPORTED
-    speed, yaw = command.parameters[0], command.parameters[3]
-    latitude, longitude, altitude = command.parameters[4:7]
-    if not _is_on_earth(latitude, longitude, altitude):
-        return DENIED
-    return vehicle.autopilot.reposition(local(latitude, longitude, altitude), yaw, speed)
+    speed, flags, _, yaw = command.parameters[:4]
+    goal = _place(*command.parameters[4:7])
+    # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
+    # does not look at the flags, so a vehicle that holds flies there whatever the answer says.
+    supported = math.isfinite(flags) and int(flags) == 1
+    if supported or (vehicle.autopilot.armed and vehicle.autopilot.mode is Mode.HOLD):
+        vehicle.autopilot.reposition(goal, yaw, speed)
+    return ACCEPTED if supported else UNSUPPORTED
 
 
 def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
     altitude = command.parameters[0]  # AMSL; PX4 looks at no frame here either
-    if not _is_on_earth(0.0, 0.0, altitude):
-        return DENIED
-    return vehicle.autopilot.reposition(local(math.nan, math.nan, altitude), math.nan)
+    return vehicle.autopilot.reposition(_place(math.nan, math.nan, altitude), math.nan)
 
 
 def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -146,16 +145,19 @@ def _change_speed(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _orbit(vehicle: Vehicle, link: Link, command: Command) -> int:
     radius, speed, yaw_behaviour = command.parameters[:3]
-    latitude, longitude, altitude = command.parameters[4:7]
-    if not _is_on_earth(latitude, longitude, altitude):
-        return DENIED
-    centre = local(latitude, longitude, altitude)
+    centre = _place(*command.parameters[4:7])
     return vehicle.autopilot.orbit(OrbitRequest(radius, speed, yaw_behaviour, centre))
 
 
-def _is_on_earth(latitude: float, longitude: float, altitude: float) -> bool:
-    """False for a place that cannot be; NaN, "as it is now", can."""
-    return not (abs(latitude) > 90.0 or abs(longitude) > 180.0 or abs(altitude) > MAX_ALTITUDE_M)
+def _place(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector:
+    """Local NED, NaN for what is no number. PX4 takes a place not on Earth too; here it lies at the edge."""
+    return local(
+        _within(latitude_deg, 90.0), _within(longitude_deg, 180.0), _within(altitude_m, MAX_ALTITUDE_M)
+    )
+
+
+def _within(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit) if math.isfinite(value) else math.nan
 
 
 def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -167,14 +169,15 @@ def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 
 def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
-    if command.parameters[0] == 1.0:
-        vehicle.autopilot.home = vehicle.estimate.position
-        return ACCEPTED
+    autopilot, (use_current, *_) = vehicle.autopilot, command.parameters
     place = command.parameters[4:7]
-    if not _is_on_earth(*place):
+    if not vehicle.parameters.number("COM_HOME_EN"):
         return DENIED
-    if all(math.isfinite(value) for value in place):
-        vehicle.autopilot.home = local(*place)
+    if not use_current > 0.5 and not all(map(math.isfinite, place)):
+        return DENIED
+    if not autopilot.position_valid:
+        return TEMPORARILY_REJECTED
+    autopilot.home = vehicle.estimate.position if use_current > 0.5 else _place(*place)
     return ACCEPTED
 
 

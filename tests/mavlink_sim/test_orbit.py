@@ -188,10 +188,10 @@ def test_the_execution_is_told_while_it_lasts(cockpit: Any) -> None:
     assert cockpit.command(512, 360) == [2]
 
 
-def test_a_place_that_is_not_on_earth_is_denied(cockpit: Any) -> None:
+def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Any) -> None:
     cockpit.take_off(6.0)
-    assert cockpit.command(34, 8, 3, 0, NAN, 91.0, 8.0, NAN) == [2]
-    assert cockpit.mode == "HOLD"
+    assert cockpit.command(34, 8, 3, 0, NAN, 91.0, 8.0, NAN) == [0]
+    assert cockpit.mode == "ORBIT"
 
 
 def test_turning_by_condition_yaw_is_unsupported(cockpit: Any) -> None:

@@ -121,17 +121,33 @@ def test_with_nothing_given_it_stops(cockpit: Any) -> None:
 
 
 @pytest.mark.parametrize("flags", [0.0, 2.0, 3.0, NAN])
-def test_without_the_mode_flag_or_with_others_it_is_unsupported(cockpit: Any, flags: float) -> None:
+def test_without_the_mode_flag_or_with_others_it_is_unsupported_and_flown_in_hold(
+    cockpit: Any, flags: float
+) -> None:
+    """As a PX4 v1.17 in SIH did: its commander refuses, and its navigator flies."""
     cockpit.take_off(5.0)
     assert reposition(cockpit, (9.0, 0.0), 5.0, flags=flags) == [3]
-    cockpit.fly(3.0)
-    assert abs(cockpit.vehicle.airframe.position[0]) < 0.3
+    cockpit.fly(12.0)
+    assert cockpit.mode == "HOLD"
+    assert cockpit.vehicle.airframe.position[0] == pytest.approx(9.0, abs=0.3)
 
 
-def test_a_place_that_cannot_be_is_denied(cockpit: Any) -> None:
+def test_without_the_mode_flag_another_mode_flies_on(cockpit: Any, velocity_setpoint: Any) -> None:
     cockpit.take_off(5.0)
-    assert cockpit.command(192, -1, 1, 0, NAN, 91.0, 8.0, 500.0) == [2]
-    assert cockpit.command_int(192, (-1.0, 1.0, 0.0, NAN), NOT_GIVEN, 85_000_000, 500.0) == [2]
+    stream = velocity_setpoint(0, 1, 0)
+    cockpit.offboard(stream)
+    assert reposition(cockpit, (9.0, 0.0), 5.0, flags=0.0) == [3]
+    cockpit.fly(4.0, stream)
+    assert cockpit.mode == "OFFBOARD"
+    assert abs(cockpit.vehicle.airframe.position[0]) < 0.5
+
+
+def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Any) -> None:
+    cockpit.take_off(5.0)
+    assert cockpit.command(192, -1, 1, 0, NAN, 91.0, 8.0, 500.0) == [0]
+    cockpit.fly(5.0)
+    assert cockpit.vehicle.airframe.velocity[0] > 2.0
+    assert cockpit.command_int(192, (-1.0, 1.0, 0.0, NAN), NOT_GIVEN, 85_000_000, 500.0) == [0]
 
 
 def test_a_nan_put_into_integers_by_accident_is_denied_whatever_the_command(cockpit: Any) -> None:

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.hears("everything")
     [
         (178, (1, 5, -1, 0), 0),
         (179, (1,), 0),
+        (179, (0, 0, 0, 0, 47.4, 8.5, float("nan")), 2),
         (401, (), 0),
         (245, (1,), 0),
         (185, (0,), 2),
@@ -44,6 +45,12 @@ def test_only_what_is_addressed_to_the_autopilot_is_answered(
 ) -> None:
     cockpit.fly(0.1)
     assert len(cockpit.command(401, target=target)) == answers
+
+
+def test_home_is_not_set_while_its_parameter_forbids_it(make_cockpit: Any) -> None:
+    cockpit = make_cockpit(["everything"], parameters={"COM_HOME_EN": 0})
+    cockpit.wait_ready()
+    assert cockpit.command(179, 1) == [2]
 
 
 def test_command_zero_is_not_answered(cockpit: Any) -> None:
