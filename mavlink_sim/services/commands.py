@@ -26,7 +26,7 @@ DENIED = 2  # MAV_RESULT
 UNSUPPORTED = 3
 FAILED = 4
 
-FORCE_DISARM = 21196.0
+FORCE_DISARM = 21196
 SPEED_TYPE_GROUNDSPEED = 1
 MAX_ALTITUDE_M = 100_000.0
 MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL carries an int32
@@ -84,12 +84,15 @@ def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 
 
-def _arm(vehicle: Vehicle, link: Link, command: Command) -> int:
-    if command.parameters[0] == 1.0:
+def _arm(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+    wanted, force = command.parameters[:2]
+    action = _identifier(wanted)
+    if action == 1:
         return vehicle.autopilot.arm()
-    if command.parameters[0] == 0.0:
-        return vehicle.autopilot.disarm(force=command.parameters[1] == FORCE_DISARM)
-    return UNSUPPORTED
+    if action == 0:
+        return vehicle.autopilot.disarm(force=_identifier(force) == FORCE_DISARM)
+    vehicle.autopilot.texts.append(Text(CRITICAL, f"Unsupported ARM_DISARM param: {wanted:.3f}\t"))
+    return None  # it says so in words, and PX4 does not answer
 
 
 def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -221,7 +224,7 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
 def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
     identifier = _identifier(command.parameters[0])
     name = MESSAGE_IDS.get(identifier)
-    interval = 0 if name is None else link.streams.interval_us(name)  # 0: no such stream, -1: off
+    interval = -1 if name is None else link.streams.interval_us(name)  # -1: no such stream, or off
     link.send(dialect.MAVLink_message_interval_message(identifier & 0xFFFF, interval))
     return ACCEPTED
 

@@ -93,8 +93,9 @@ class Session:
         self.partner = source
         try:
             self._type = PlanType(_plan_type(message))
-        except ValueError:
-            self._acknowledge(source, mission_items.INVALID, _plan_type(message))
+        except ValueError:  # a kind that PX4 does not know has room for nothing
+            result = mission_items.NO_SPACE if message.count else mission_items.ACCEPTED
+            self._acknowledge(source, result, _plan_type(message))
             return
         if self._type is PlanType.MISSION:
             self._navigator.forget_reached()
@@ -289,7 +290,7 @@ class Session:
         self.state = State.IDLE
 
     def _say(self, severity: int, text: str) -> None:
-        self._link.send_text(Text(severity, text), self._vehicle.now_s)
+        self._vehicle.autopilot.texts.append(Text(severity, text))  # to every link, as all of PX4's texts
 
 
 def _source(message: Any) -> tuple[int, int]:

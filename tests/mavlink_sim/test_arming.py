@@ -1,5 +1,6 @@
 """Arming, disarming, readiness, and what HEARTBEAT and SYS_STATUS tell of them."""
 
+import math
 from typing import Any
 
 import pytest
@@ -56,9 +57,21 @@ def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Any) 
     assert cockpit.height_m == 0.0
 
 
-def test_a_strange_arming_value_is_unsupported(cockpit: Any) -> None:
+def test_a_strange_arming_value_is_told_in_words_and_not_answered(cockpit: Any) -> None:
+    cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.wait_ready()
-    assert cockpit.command(400, 2) == [3]
+    for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (math.nan, "nan")):
+        assert cockpit.command(400, value) == []
+        assert cockpit.texts()[-1] == f"Unsupported ARM_DISARM param: {told}\t"
+    assert not cockpit.armed
+
+
+def test_the_arming_value_is_rounded(cockpit: Any) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(400, 0.7) == [0]
+    assert cockpit.armed
+    assert cockpit.command(400, 0.4) == [0]
+    assert not cockpit.armed
 
 
 def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(cockpit: Any) -> None:

@@ -144,7 +144,7 @@ def test_an_interval_set_on_one_link_leaves_the_other_alone(cockpit: Any) -> Non
 def test_the_interval_can_be_read_back(cockpit: Any) -> None:
     cockpit.fly(0.1)
     cockpit.command(511, 32, 250_000)
-    for identifier, interval in ((32, 250_000), (30, 10_000), (27, 0)):
+    for identifier, interval in ((32, 250_000), (30, 10_000), (27, -1)):
         assert cockpit.command(510, identifier) == [0]
         answer = cockpit.received("MESSAGE_INTERVAL")[-1]
         assert (answer.message_id, answer.interval_us) == (identifier, interval)
