@@ -89,6 +89,11 @@ class Autopilot:
         self.landed = airframe.on_ground  # it may boot while it falls
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
         self.home: Vector = airframe.position
+        self.home_attitude_rad: Vector = (
+            0.0,
+            0.0,
+            airframe.yaw_rad,
+        )  # roll, pitch, yaw there; NaN: not known
         self.texts: deque[Text] = deque()
         self.supervision = Supervision(self, parameters)
         self.gimbal_commands: deque[GimbalCommand] = deque()
@@ -197,7 +202,7 @@ class Autopilot:
         self._has_flown = False
         self._armed_since_s = self.now_s
         self._lifting_since_s = None
-        self.home = self._airframe.position
+        self._home_is_here()
         self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
         self._on_event("armed")
         self._start_task()
@@ -444,7 +449,7 @@ class Autopilot:
         self._contact_since_s = None
         self.landed = True
         if not self.armed:  # it fell
-            self.home = self._airframe.position
+            self._home_is_here()
         self._landed_since_s = self.now_s
         self._say(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
@@ -530,6 +535,11 @@ class Autopilot:
         else:
             self.task = flight.Hold(airframe, parameters)
 
+    def _home_is_here(self) -> None:
+        airframe = self._airframe
+        self.home = airframe.position
+        self.home_attitude_rad = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
+
     def _takeoff_height(self) -> float:
         height = self._takeoff_height_m
         return self._parameters.number("MIS_TAKEOFF_ALT") if height is None else height
@@ -540,7 +550,7 @@ class Autopilot:
         self.task = None
         self._takeoff_height_m = None
         if self.landed:
-            self.home = self._airframe.position
+            self._home_is_here()
         code = REASONS.get(reason.removeprefix("by "), 6 if reason == "after landing" else 4)
         self._say(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
         self.supervision.disarmed()

@@ -166,11 +166,18 @@ class Land(TrajectoryTask):
 
     landing = True
 
-    def __init__(self, airframe: Multirotor, parameters: Parameters, place: Vector | None = None) -> None:
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        place: Vector | None = None,
+        yaw_rad: float = NAN,
+    ) -> None:
         self._airframe = airframe
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
         self.goal = self._trajectory.stopping_point() if place is None else place
+        self._yaw_rad = yaw_rad
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
         assert self.goal is not None
@@ -183,7 +190,7 @@ class Land(TrajectoryTask):
         if height < value("MPC_LAND_ALT3"):
             speed = value("MPC_LAND_CRWL")
         place = (self.goal[0], self.goal[1], self._airframe.position[2])
-        level = self._trajectory.towards(place, dt_s)
+        level = self._trajectory.towards(place, dt_s, self._yaw_rad)
         return TrajectorySetpoint(
             (level.position[0], level.position[1], NAN),
             (level.velocity[0], level.velocity[1], speed),
@@ -193,17 +200,26 @@ class Land(TrajectoryTask):
 
 
 class Return(Task):
-    """RTL of type 0: climb to the return altitude, fly home, descend to RTL_DESCEND_ALT, land."""
+    """RTL of type 0: climb to the return altitude, fly home, descend to RTL_DESCEND_ALT, land.
 
-    def __init__(self, airframe: Multirotor, parameters: Parameters, home: Vector) -> None:
+    It flies nose first and turns to `yaw_rad` there, or at once within RTL_MIN_DIST; with WV_EN, or to NaN,
+    it does not turn.
+    """
+
+    def __init__(
+        self, airframe: Multirotor, parameters: Parameters, home: Vector, yaw_rad: float = NAN
+    ) -> None:
         self._airframe = airframe
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
         self._home = home
         self._land: TrajectoryTask | None = None
         self._phase = "climb"
+        self._yaw_rad = NAN if parameters.number("WV_EN") else yaw_rad
         x, y, z = self._trajectory.stopping_point()
-        self.return_height_m = self._return_height(math.hypot(x - home[0], y - home[1]), home[2] - z)
+        distance = math.hypot(x - home[0], y - home[1])
+        self._is_close = distance < parameters.number("RTL_MIN_DIST")
+        self.return_height_m = self._return_height(distance, home[2] - z)
         self.goal = (x, y, home[2] - self.return_height_m)
 
     def _return_height(self, distance_m: float, height_m: float) -> float:
@@ -231,22 +247,26 @@ class Return(Task):
             self.goal = (home_x, home_y, self.goal[2])
         if self._phase == "return":
             distance = math.hypot(home_x - x, home_y - y)
-            if distance > value("NAV_ACC_RAD"):
+            if self._is_close:
+                yaw = self._yaw_rad
+            elif distance > value("NAV_ACC_RAD"):
                 yaw = math.atan2(home_y - y, home_x - x)
-            elif distance < 1.0:
+            if distance < 1.0:
                 self._phase = "descend"
                 descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
                 self.goal = (home_x, home_y, home_z - descend)
+        if self._phase == "descend":
+            yaw = self._yaw_rad
         if self._phase == "descend" and self.goal[2] - z < value("NAV_MC_ALT_RAD"):
-            self._land = self.landing_task((home_x, home_y, home_z))
+            self._land = self.landing_task((home_x, home_y, home_z), self._yaw_rad)
             self.goal = self._land.goal
             self.landing = True
             return self._land.update(dt_s)
         return self._trajectory.towards(self.goal, dt_s, yaw)
 
-    def landing_task(self, place: Vector) -> TrajectoryTask:
-        """The descent at a place."""
-        return Land(self._airframe, self._parameters, place)
+    def landing_task(self, place: Vector, yaw_rad: float) -> TrajectoryTask:
+        """The descent at a place, turned to a heading; NaN: as it is."""
+        return Land(self._airframe, self._parameters, place, yaw_rad)
 
 
 class Offboard(Task):

@@ -6,6 +6,7 @@ What clients are to hear of it waits in `announcements`, what other components a
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -287,7 +288,8 @@ class Navigator:
         found, words = destination(rally, self.mission, self._parameters, self.home, position)
         for text in words:
             self.say(CRITICAL, text)
-        direct = ReturnFlight(self._airframe, self._parameters, found.position, landing)
+        yaw_rad = self._autopilot.home_attitude_rad[2] if found.kind is Goal.HOME else math.nan
+        direct = ReturnFlight(self._airframe, self._parameters, found.position, yaw_rad, landing)
         height = direct.return_height_m
         above_sea = geographic(found.position)[2] + height
         self.say(INFO, f"RTL: start return at {above_sea:.0f} m ({height:.0f} m above destination)\t")
@@ -297,13 +299,13 @@ class Navigator:
         climb_to_z = found.position[2] - height
         return RouteReturn(self._airframe, self._parameters, *last, landing, climb_to_z)
 
-    def _return_landing(self) -> Callable[[Vector], flight.TrajectoryTask]:
+    def _return_landing(self) -> Callable[[Vector, float], flight.TrajectoryTask]:
         """Makes the task of RTL's last descent."""
         return partial(self._descent, int(self._parameters.number("RTL_PLD_MD")))
 
-    def _descent(self, mode: int, place: Vector) -> flight.TrajectoryTask:
+    def _descent(self, mode: int, place: Vector, yaw_rad: float) -> flight.TrajectoryTask:
         if mode not in (Precision.OPPORTUNISTIC, Precision.REQUIRED):
-            return flight.Land(self._airframe, self._parameters, place)
+            return flight.Land(self._airframe, self._parameters, place, yaw_rad)
         z = self._airframe.position[2]
         return self.precision_landing(Precision(mode), (place[0], place[1], z))
 

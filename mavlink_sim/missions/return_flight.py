@@ -124,14 +124,15 @@ class ReturnFlight(flight.Return):
         airframe: Multirotor,
         parameters: Parameters,
         place: Vector,
-        make_landing: Callable[[Vector], flight.TrajectoryTask],
+        yaw_rad: float,
+        make_landing: Callable[[Vector, float], flight.TrajectoryTask],
     ) -> None:
-        super().__init__(airframe, parameters, place)
+        super().__init__(airframe, parameters, place, yaw_rad)
         self._make_landing = make_landing
 
-    def landing_task(self, place: Vector) -> flight.TrajectoryTask:
-        """The descent at a place."""
-        return self._make_landing(place)
+    def landing_task(self, place: Vector, yaw_rad: float) -> flight.TrajectoryTask:
+        """The descent at a place, turned to a heading; NaN: as it is."""
+        return self._make_landing(place, yaw_rad)
 
 
 class RouteReturn(flight.TrajectoryTask):
@@ -148,7 +149,7 @@ class RouteReturn(flight.TrajectoryTask):
         parameters: Parameters,
         places: list[Vector],
         landing: Vector,
-        make_landing: Callable[[Vector], flight.TrajectoryTask],
+        make_landing: Callable[[Vector, float], flight.TrajectoryTask],
         climb_to_z: float | None = None,
     ) -> None:
         self._airframe = airframe
@@ -182,7 +183,7 @@ class RouteReturn(flight.TrajectoryTask):
             if self._ahead:
                 self._next()
             else:
-                self._descent = self._make_landing(self._landing)
+                self._descent = self._make_landing(self._landing, math.nan)
                 self.landing = True
                 return self._descent.update(dt_s)
         far = away > self._parameters.number("NAV_ACC_RAD")

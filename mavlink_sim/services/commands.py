@@ -172,7 +172,8 @@ def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 
 def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
-    autopilot, (use_current, *_) = vehicle.autopilot, command.parameters
+    autopilot, estimate = vehicle.autopilot, vehicle.estimate
+    use_current, *attitude_deg = command.parameters[:4]
     place = command.parameters[4:7]
     if not vehicle.parameters.number("COM_HOME_EN"):
         return DENIED
@@ -180,7 +181,13 @@ def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
         return DENIED
     if not autopilot.position_valid:
         return TEMPORARILY_REJECTED
-    autopilot.home = vehicle.estimate.position if use_current > 0.5 else _place(*place)
+    if use_current > 0.5:
+        autopilot.home = estimate.position
+        autopilot.home_attitude_rad = (estimate.roll_rad, estimate.pitch_rad, estimate.yaw_rad)
+    else:
+        autopilot.home = _place(*place)
+        roll, pitch, yaw = (math.radians(angle) if math.isfinite(angle) else None for angle in attitude_deg)
+        autopilot.home_attitude_rad = (roll or 0.0, pitch or 0.0, math.nan if yaw is None else yaw)
     return ACCEPTED
 
 

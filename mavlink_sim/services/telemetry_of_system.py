@@ -9,6 +9,7 @@ from mavlink_sim.physics.geography import geographic
 from mavlink_sim.services import pilot_link
 from mavlink_sim.wire.messages import current_event_sequence as event_sequence_message
 from mavlink_sim.wire.messages import dialect, time_estimate_to_target
+from vision.attitude import quaternion_from_euler
 
 if TYPE_CHECKING:
     from mavlink_sim.vehicle import Vehicle
@@ -130,7 +131,7 @@ def home_position(vehicle: Vehicle) -> Any:
         round(longitude * 1e7),
         round(altitude * 1000),
         *home,
-        [1.0, 0.0, 0.0, 0.0],
+        quaternion_from_euler(*vehicle.autopilot.home_attitude_rad),
         0.0,
         0.0,
         0.0,

@@ -5,6 +5,8 @@ from typing import Any
 
 import pytest
 
+from mavlink_sim.physics.geography import geographic
+
 NAN = math.nan
 
 
@@ -150,6 +152,8 @@ def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(make_c
     cockpit.fly(14.0)
     assert math.dist(cockpit.vehicle.airframe.position, (28.5, 0.0, -5.0)) < 1.5
     cockpit.command(20)
+    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] < 15.0, 40.0)
+    assert abs(math.degrees(cockpit.vehicle.airframe.yaw_rad)) > 150.0  # it flies nose first
     highest = 0.0
 
     def done() -> bool:
@@ -160,7 +164,28 @@ def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(make_c
     cockpit.until(done, 90.0)
     assert 11.5 < highest < 13.0
     assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 1.0
-    assert abs(math.degrees(cockpit.vehicle.airframe.yaw_rad)) > 150.0  # it flew nose first
+    # and lands as it stood when it was armed: so did a real PX4
+    assert cockpit.vehicle.airframe.yaw_rad == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "heading_deg", "landed_deg"),
+    [({}, 70.0, 70.0), ({"WV_EN": 1}, 70.0, 120.0), ({}, math.nan, 120.0)],
+)
+def test_close_to_home_a_return_turns_to_the_heading_of_home(
+    make_cockpit: Any, parameters: dict[str, float], heading_deg: float, landed_deg: float
+) -> None:
+    cockpit = make_cockpit(parameters=parameters)
+    cockpit.take_off(5.0)
+    latitude, longitude, altitude = geographic((0.0, 0.0, 0.0))
+    assert cockpit.command(179, 0, 0, 0, heading_deg, latitude, longitude, altitude) == [0]
+    at, above = (round(latitude * 1e7) + 540, round(longitude * 1e7)), altitude + 5.0  # 6 m north
+    assert cockpit.command_int(192, (-1, 1, 0, math.radians(120.0)), *at, above) == [0]
+    cockpit.fly(8.0)
+    assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(120.0, abs=2.0)
+    cockpit.command(20)
+    cockpit.until(lambda: not cockpit.armed, 60.0)
+    assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(landed_deg, abs=3.0)
 
 
 @pytest.mark.parametrize(("seed", "wind_mps"), [(0, 0.0), (1, 0.0), (2, 5.0)])
