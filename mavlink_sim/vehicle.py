@@ -434,7 +434,8 @@ class Vehicle:
             if link.streams.next_us <= self._boot_us:
                 estimate.look()
                 for name in link.streams.due(self._boot_us):
-                    self.send_built(link, name)
+                    if name != "CURRENT_MODE" or link.are_news(self.autopilot.modes, self.now_s):
+                        self.send_built(link, name)
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
             if link.file_transfer is not None:

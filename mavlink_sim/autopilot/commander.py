@@ -320,6 +320,11 @@ class Autopilot:
 
     # ---- one step ---------------------------------------------------------------------------------------
 
+    @property
+    def modes(self) -> tuple[Mode, Mode]:
+        """The mode it is in and the one that was asked for."""
+        return self.mode, self.intended_mode
+
     def update(self, dt_s: float) -> None:
         """Check failsafes and detectors, run the flight task, move the airframe."""
         self.now_s += dt_s

@@ -16,6 +16,8 @@ from mavlink_sim.wire.streams import Streams
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 GROUND_STATION_TIMEOUT_S = 2.5
+# PX4's CURRENT_MODE tells of its vehicle_status, which is published when it changes and every half second.
+STATUS_PERIOD_S = 0.5
 STATUS_TEXT_LENGTH = 50
 
 
@@ -38,6 +40,8 @@ class Link:
         self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
         self._system_id = system_id
         self._text_identifier = 0
+        self._modes_told: object = None
+        self._modes_told_s = -math.inf
 
     def send(self, message: Any) -> None:
         """Queue a message of the vehicle's own."""
@@ -47,6 +51,13 @@ class Link:
                 return
         self.sent += 1
         self.outbox.append(Outgoing(message, self._system_id, AUTOPILOT_COMPONENT))
+
+    def are_news(self, modes: object, now_s: float) -> bool:
+        """Whether CURRENT_MODE has something to tell of these modes here, however often it is asked for."""
+        if modes == self._modes_told and now_s - self._modes_told_s < STATUS_PERIOD_S - 1e-6:
+            return False
+        self._modes_told, self._modes_told_s = modes, now_s
+        return True
 
     def send_text(self, text: Text, now_s: float) -> None:
         """STATUSTEXT, in chunks where it is long, if a ground station's heartbeat arrives on this link."""
@@ -67,6 +78,7 @@ class Link:
         """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
         self.streams.restart(0)
         self.sent = self.received = self._text_identifier = 0
+        self._modes_told = None
         self.parameter_credit = 0.0
         self.outbox.clear()
         self.components.clear()

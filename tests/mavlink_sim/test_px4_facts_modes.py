@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
 
 PREARM_CHECK = 0x10000000
@@ -120,11 +121,16 @@ def test_a_stream_of_0_9_hertz_is_lost_for_some_fifty_milliseconds_at_a_time(
     cockpit.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
     cockpit.offboard(stream)
-    cockpit.command(511, 436, 8_000)
-    cockpit.forget()
-    cockpit.fly(9.0, stream, 0.9)
-    lost = [message.custom_mode != 0x00060000 for message in cockpit.received("CURRENT_MODE")]
-    stretches = [len(list(group)) * 0.008 for away, group in itertools.groupby(lost) if away]
+    cockpit.command(511, 436, 4_000)  # told when it changes
+    cockpit.until(lambda: bool(cockpit.received("CURRENT_MODE")), 1.0, stream)
+    lost = []
+
+    def look() -> bool:
+        lost.append(cockpit.received("CURRENT_MODE")[-1].custom_mode != 0x00060000)
+        return False
+
+    cockpit.until(look, 9.0, stream, 0.9, must=False)
+    stretches = [len(list(group)) * STEP_S for away, group in itertools.groupby(lost) if away]
     assert len(stretches) >= 5
     assert all(0.02 <= stretch <= 0.1 for stretch in stretches)
 
