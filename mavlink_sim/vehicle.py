@@ -434,8 +434,13 @@ class Vehicle:
             if link.streams.next_us <= self._boot_us:
                 estimate.look()
                 for name in link.streams.due(self._boot_us):
-                    if name != "CURRENT_MODE" or link.are_news(self.autopilot.modes, self.now_s):
+                    if name == "CURRENT_MODE":
+                        link.status_is_due = True
+                    else:
                         self.send_built(link, name)
+            if link.status_is_due and link.is_news(self.autopilot.status, self.now_s):
+                link.status_is_due = False
+                self.send_built(link, "CURRENT_MODE")
             if link.parameters_left:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
             if link.file_transfer is not None:

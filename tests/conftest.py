@@ -36,8 +36,9 @@ def pytest_collection() -> Iterator[None]:
     Neither while they are imported (a tenth of the time that takes) nor in the tests (an eighth).
     """
     gc.disable()
-    collected = yield
-    gc.collect()
-    gc.freeze()
-    gc.enable()
-    return collected
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()

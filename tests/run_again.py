@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.standstill import Watch, longest_standstill_s
+from tests.standstill import Watch, longest_standstill_s, visit_all_processors
 
 RUNS_AGAIN = 2
 # Where a run notes its standstills; its workers, and a pytest that a test starts, read them there.
@@ -24,23 +24,26 @@ NOTES = "COMPANION_TEST_STANDSTILLS"
 BEGAN_NS = pytest.StashKey[int]()
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_configure(config: pytest.Config) -> None:
     """The first pytest keeps watch."""
+    if hasattr(config, "workerinput"):
+        # What kills a worker is no standstill: the controller, which would start its test anew whatever our
+        # condition says, is not told that it may be run again.
+        config.failures_db.set_test_reruns = lambda nodeid, reruns: None  # type: ignore[attr-defined]
     if NOTES in os.environ or config.option.collectonly:
         return
     folder = tempfile.TemporaryDirectory(prefix="standstills-")
+    config.add_cleanup(folder.cleanup)
     watch = Watch(Path(folder.name) / "notes")
+    config.add_cleanup(watch.close)
     os.environ[NOTES] = str(watch.notes)
-
-    def close() -> None:
-        del os.environ[NOTES]
-        watch.close()
-        folder.cleanup()
-
-    config.add_cleanup(close)
+    config.add_cleanup(lambda: os.environ.pop(NOTES))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.option.usepdb:  # somebody looks at the failure, and it cannot be run again
+        return
     for item in items:
         item.add_marker(pytest.mark.flaky(reruns=RUNS_AGAIN, condition=partial(stood_still, item)))
 
@@ -51,8 +54,11 @@ def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
     return (yield)
 
 
-def stood_still(item: pytest.Item) -> bool:
-    """Whether a processor did since this item's run began."""
+def stood_still(item: pytest.Item, error: BaseException | None) -> bool:
+    """Whether a processor did since this item's run began. It is asked about what passed too: no error."""
+    if error is None:
+        return False
+    visit_all_processors()
     return longest_standstill_s(Path(os.environ[NOTES]), item.stash[BEGAN_NS]) > 0.0
 
 

@@ -25,23 +25,37 @@ class Watch:
     def __init__(self, notes: Path) -> None:
         self.notes = notes
         notes.touch()
-        processors = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
         self.processes = [
             subprocess.Popen(
                 [sys.executable, "-I", "-S", __file__, str(notes), str(processor)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
             )
-            for processor in processors
+            for processor in _processors()
         ]
         for process in self.processes:
             assert process.stdout is not None
             if not process.stdout.readline():
-                raise RuntimeError(f"the watch for standstills did not start: code {process.wait()}")
+                self.close()
+                raise RuntimeError(f"the watch for standstills did not start: code {process.returncode}")
 
     def close(self) -> None:
         for process in self.processes:
             process.communicate()
+
+
+def _processors() -> list[int]:
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+
+
+def visit_all_processors() -> None:
+    """Run a moment on each: a standstill that has begun is then over, and noted."""
+    allowed = _processors()
+    if hasattr(os, "sched_setaffinity"):
+        for processor in allowed:
+            os.sched_setaffinity(0, {processor})
+        os.sched_setaffinity(0, allowed)
+    time.sleep(2 * PERIOD_S)  # the sleepers wake, too
 
 
 def longest_standstill_s(notes: Path, since_ns: int) -> float:

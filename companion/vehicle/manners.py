@@ -71,7 +71,7 @@ class Px4Manners(Manners):
         33: 5.0,  # GLOBAL_POSITION_INT
         1: 2.0,  # SYS_STATUS
         245: 5.0,  # EXTENDED_SYS_STATE
-        CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late
+        CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late; this comes when it changes
     }
 
     def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:

@@ -94,6 +94,8 @@ class Autopilot:
             0.0,
             airframe.yaw_rad,
         )  # roll, pitch, yaw there; NaN: not known
+        self.home_is_manual = False  # set by a command: arming and landing leave it
+        self.commands_handled = 0
         self.texts: deque[Text] = deque()
         self.supervision = Supervision(self, parameters)
         self.gimbal_commands: deque[GimbalCommand] = deque()
@@ -266,17 +268,28 @@ class Autopilot:
 
     def reposition(self, goal: Vector, yaw_rad: float, speed_mps: float = math.nan) -> int:
         """Fly to a local NED position and hold there; NaN components as in `reposition_goal`."""
-        airframe, parameters = self._airframe, self._parameters
-        former = None if self.task is None else self.task.goal
+        former = self._goal()
         self._intend(Mode.HOLD)
-        if self.armed and self.mode is Mode.HOLD:  # no failsafe has it
-            goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
-            if not self.navigator.allows_goal(goal):
-                self._say(CRITICAL, "Reposition is outside geofence\t")
-                return ACCEPTED
-            self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
-            self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
+        self._move_hold(goal, yaw_rad, speed_mps, former)
         return ACCEPTED
+
+    def move_hold_to(self, goal: Vector, yaw_rad: float, speed_mps: float) -> None:
+        """The same if this is HOLD already, whoever wanted it: neither mode nor intention changes."""
+        self._move_hold(goal, yaw_rad, speed_mps, self._goal())
+
+    def _move_hold(self, goal: Vector, yaw_rad: float, speed_mps: float, former: Vector | None) -> None:
+        if not (self.armed and self.mode is Mode.HOLD):  # not armed, or a failsafe has it
+            return
+        airframe, parameters = self._airframe, self._parameters
+        goal = reposition.reposition_goal(goal, yaw_rad, airframe, parameters, former)
+        if not self.navigator.allows_goal(goal):
+            self._say(CRITICAL, "Reposition is outside geofence\t")
+            return
+        self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
+        self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
+
+    def _goal(self) -> Vector | None:
+        return None if self.task is None else self.task.goal
 
     def change_speed(self, speed_mps: float, at_once: bool) -> None:
         """Another cruise speed for auto modes until the mode ends; zero or less: MPC_XY_CRUISE again.
@@ -321,9 +334,9 @@ class Autopilot:
     # ---- one step ---------------------------------------------------------------------------------------
 
     @property
-    def modes(self) -> tuple[Mode, Mode]:
-        """The mode it is in and the one that was asked for."""
-        return self.mode, self.intended_mode
+    def status(self) -> tuple[object, ...]:
+        """When this changes PX4 publishes its vehicle_status at once; each command counts as a change."""
+        return self.mode, self.intended_mode, self.armed, self.failsafe, self.commands_handled
 
     def update(self, dt_s: float) -> None:
         """Check failsafes and detectors, run the flight task, move the airframe."""
@@ -541,6 +554,10 @@ class Autopilot:
             self.task = flight.Hold(airframe, parameters)
 
     def _home_is_here(self) -> None:
+        """Home is where it is now, unless a command has set it or COM_HOME_EN forbids (Copter has none)."""
+        enabled = self._parameters.get("COM_HOME_EN")
+        if self.home_is_manual or (enabled is not None and not enabled.value):
+            return
         airframe = self._airframe
         self.home = airframe.position
         self.home_attitude_rad = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)

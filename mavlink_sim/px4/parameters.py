@@ -182,7 +182,7 @@ class Parameters:
         return changed
 
     def reset(self, keep: Collection[str] = ()) -> list[Parameter]:
-        """Back to the values of `parameters.txt`, except those to keep. Returns what changed."""
+        """Back to the values of `default_parameters`, except those to keep. Returns what changed."""
         changed = []
         for name, default in self._defaults.items():
             if name not in keep and self._parameters[name].value != default.value:
@@ -192,7 +192,7 @@ class Parameters:
         return changed
 
     def customised(self) -> list[Parameter]:
-        """The parameters whose value is not that of `parameters.txt`: what PX4 keeps in its file."""
+        """The parameters whose value is not the default: what PX4 keeps in its file."""
         return [item for name, item in self._parameters.items() if item.value != self._defaults[name].value]
 
     def hash(self) -> int:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
 from mavlink_sim.physics.geography import geographic, local
-from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
+from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.telemetry import MESSAGE_IDS
@@ -46,6 +46,7 @@ ARM_DISARM = 400
 GET_MESSAGE_INTERVAL = 510
 SET_MESSAGE_INTERVAL = 511
 REQUEST_MESSAGE = 512
+MESSAGE_INTERVAL = 244  # a message, which REQUEST_MESSAGE asks for with another's number
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,16 +82,18 @@ def execute(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     if command.identifier == 0:
         return None
     handler = _HANDLERS.get(command.identifier)
+    if command.identifier not in ANSWERED_BY_RECEIVER:
+        vehicle.autopilot.commands_handled += 1
     return UNSUPPORTED if handler is None else handler(vehicle, link, command)
 
 
 def _arm(vehicle: Vehicle, link: Link, command: Command) -> int | None:
     wanted, force = command.parameters[:2]
-    action = _identifier(wanted)
+    action = _nearest(wanted) & 0xFF  # PX4 keeps it in a byte
     if action == 1:
         return vehicle.autopilot.arm()
     if action == 0:
-        return vehicle.autopilot.disarm(force=_identifier(force) == FORCE_DISARM)
+        return vehicle.autopilot.disarm(force=_nearest(force) == FORCE_DISARM)
     vehicle.autopilot.texts.append(Text(CRITICAL, f"Unsupported ARM_DISARM param: {wanted:.3f}\t"))
     return None  # it says so in words, and PX4 does not answer
 
@@ -129,10 +132,10 @@ def _reposition(vehicle: Vehicle, link: Link, command: Command) -> int:
     goal = _place(*command.parameters[4:7])
     # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, and no other: the commander refuses the rest. The navigator of PX4
     # does not look at the flags, so a vehicle that holds flies there whatever the answer says.
-    supported = math.isfinite(flags) and int(flags) == 1
-    if supported or (vehicle.autopilot.armed and vehicle.autopilot.mode is Mode.HOLD):
-        vehicle.autopilot.reposition(goal, yaw, speed)
-    return ACCEPTED if supported else UNSUPPORTED
+    if math.isfinite(flags) and int(flags) == 1:
+        return vehicle.autopilot.reposition(goal, yaw, speed)
+    vehicle.autopilot.move_hold_to(goal, yaw, speed)
+    return UNSUPPORTED
 
 
 def _change_altitude(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -179,8 +182,9 @@ def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
         return DENIED
     if not use_current > 0.5 and not all(map(math.isfinite, place)):
         return DENIED
-    if not autopilot.position_valid:
+    if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason
         return TEMPORARILY_REJECTED
+    autopilot.home_is_manual = not use_current > 0.5
     if use_current > 0.5:
         autopilot.home = estimate.position
         autopilot.home_attitude_rad = (estimate.roll_rad, estimate.pitch_rad, estimate.yaw_rad)
@@ -201,6 +205,8 @@ def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 
 def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if _identifier(command.parameters[0]) == MESSAGE_INTERVAL:
+        return _tell_interval(vehicle, link, command.parameters[1])
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     if name is None or not vehicle.send_built(link, name):
         return DENIED
@@ -224,12 +230,18 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
     interval = command.parameters[1]
     if name is None or name == "HEARTBEAT" or name not in link.streams or not math.isfinite(interval):
         return FAILED
+    if name == "CURRENT_MODE":
+        link.status_is_due = False
     link.streams.set_interval(name, min(round(interval), MAX_INTERVAL_US), vehicle.boot_us)
     return ACCEPTED
 
 
 def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
-    identifier = _identifier(command.parameters[0])
+    return _tell_interval(vehicle, link, command.parameters[0])
+
+
+def _tell_interval(vehicle: Vehicle, link: Link, message_id: float) -> int:
+    identifier = _identifier(message_id)
     name = MESSAGE_IDS.get(identifier)
     interval = -1 if name is None else link.streams.interval_us(name)  # -1: no such stream, or off
     link.send(dialect.MAVLink_message_interval_message(identifier & 0xFFFF, interval))
@@ -238,6 +250,11 @@ def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
 
 def _identifier(value: float) -> int:
     return round(value) if math.isfinite(value) else -1
+
+
+def _nearest(value: float) -> int:
+    """C's lroundf: a half away from zero; of what is no number the lowest byte is 0."""
+    return math.floor(abs(value) + 0.5) * (1 if value > 0.0 else -1) if math.isfinite(value) else 0
 
 
 _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {

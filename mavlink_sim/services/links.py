@@ -40,8 +40,9 @@ class Link:
         self.gate: Callable[[Link, Any], Any] | None = None  # may change or swallow what is sent
         self._system_id = system_id
         self._text_identifier = 0
-        self._modes_told: object = None
-        self._modes_told_s = -math.inf
+        self.status_is_due = False  # CURRENT_MODE has been asked for, and had nothing to tell yet
+        self._status_told: object = None
+        self._status_told_s = -math.inf
 
     def send(self, message: Any) -> None:
         """Queue a message of the vehicle's own."""
@@ -52,11 +53,11 @@ class Link:
         self.sent += 1
         self.outbox.append(Outgoing(message, self._system_id, AUTOPILOT_COMPONENT))
 
-    def are_news(self, modes: object, now_s: float) -> bool:
-        """Whether CURRENT_MODE has something to tell of these modes here, however often it is asked for."""
-        if modes == self._modes_told and now_s - self._modes_told_s < STATUS_PERIOD_S - 1e-6:
+    def is_news(self, status: object, now_s: float) -> bool:
+        """Whether CURRENT_MODE has something to tell of this status here, however often it is asked for."""
+        if status == self._status_told and now_s - self._status_told_s < STATUS_PERIOD_S - 1e-6:
             return False
-        self._modes_told, self._modes_told_s = modes, now_s
+        self._status_told, self._status_told_s = status, now_s
         return True
 
     def send_text(self, text: Text, now_s: float) -> None:
@@ -78,7 +79,7 @@ class Link:
         """A reboot: nothing was heard, nothing is under way, the streams have their default rates."""
         self.streams.restart(0)
         self.sent = self.received = self._text_identifier = 0
-        self._modes_told = None
+        self.status_is_due, self._status_told = False, None
         self.parameter_credit = 0.0
         self.outbox.clear()
         self.components.clear()

@@ -91,14 +91,13 @@ class Session:
             self._acknowledge(source, mission_items.ERROR)
             return
         self.partner = source
+        self._navigator.forget_reached()
         try:
             self._type = PlanType(_plan_type(message))
         except ValueError:  # a kind that PX4 does not know has room for nothing
             result = mission_items.NO_SPACE if message.count else mission_items.ACCEPTED
             self._acknowledge(source, result, _plan_type(message))
             return
-        if self._type is PlanType.MISSION:
-            self._navigator.forget_reached()
         if message.count > MAX_COUNT[self._type]:
             self._acknowledge(source, mission_items.NO_SPACE)
         elif message.count == 0:

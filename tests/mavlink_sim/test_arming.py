@@ -60,17 +60,18 @@ def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Any) 
 def test_a_strange_arming_value_is_told_in_words_and_not_answered(cockpit: Any) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.wait_ready()
-    for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (math.nan, "nan")):
+    for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
         assert cockpit.command(400, value) == []
         assert cockpit.texts()[-1] == f"Unsupported ARM_DISARM param: {told}\t"
     assert not cockpit.armed
 
 
-def test_the_arming_value_is_rounded(cockpit: Any) -> None:
+@pytest.mark.parametrize(("arms", "disarms"), [(0.5, 0.4), (257.0, 256.0), (1.4, math.nan), (1.0, math.inf)])
+def test_the_arming_value_is_rounded_and_kept_in_a_byte(cockpit: Any, arms: float, disarms: float) -> None:
     cockpit.wait_ready()
-    assert cockpit.command(400, 0.7) == [0]
+    assert cockpit.command(400, arms) == [0]
     assert cockpit.armed
-    assert cockpit.command(400, 0.4) == [0]
+    assert cockpit.command(400, disarms) == [0]
     assert not cockpit.armed
 
 

@@ -134,11 +134,16 @@ def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: An
     lands_at(cockpit, 20, 12)
 
 
-def test_rtl_leads_to_where_home_was_set(make: Any) -> None:
+@pytest.mark.parametrize("before", [True, False])
+def test_rtl_leads_to_where_home_was_set_before_arming_or_after(make: Any, before: bool) -> None:
     cockpit = make()
-    cockpit.take_off(4.0)
+    if not before:
+        cockpit.take_off(4.0)
+    cockpit.wait_ready()
     latitude, longitude, altitude = geographic((0.0, 8.0, 0.0))
     assert cockpit.command(179, 0, 0, 0, 0, latitude, longitude, altitude) == [0]
+    if before:
+        cockpit.take_off(4.0)
     cockpit.fly(2.1)
     home = cockpit.received("HOME_POSITION")[-1]
     assert home.longitude == pytest.approx(longitude * 1e7, abs=200)  # COMMAND_LONG carries floats

@@ -148,6 +148,9 @@ def test_the_interval_can_be_read_back(cockpit: Any) -> None:
         assert cockpit.command(510, identifier) == [0]
         answer = cockpit.received("MESSAGE_INTERVAL")[-1]
         assert (answer.message_id, answer.interval_us) == (identifier, interval)
+    assert cockpit.command(512, 244, 32) == [0]
+    answer = cockpit.received("MESSAGE_INTERVAL")[-1]
+    assert (answer.message_id, answer.interval_us) == (32, 250_000)
 
 
 def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(cockpit: Any) -> None:
