@@ -114,12 +114,12 @@ async def test_a_lost_acknowledgement_costs_a_repetition_and_all_of_them_an_answ
 
 
 async def test_a_refused_mode_is_told_of_at_once(kind: str) -> None:
-    with simulated(faults=["refuse_mode HOLD"]) as simulator:
+    with simulated(faults=["refuse_mode LAND"]) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
             asked_s = time.monotonic()
-            with pytest.raises(CommandRefusedError, match=r"refused mode hold \(temporarily rejected\)"):
-                await driver.set_mode(FlightMode.HOLD)
+            with pytest.raises(CommandRefusedError, match=r"refused mode land \(temporarily rejected\)"):
+                await driver.set_mode(FlightMode.LAND)
             assert time.monotonic() - asked_s < 2.5  # not by the timeout of 3 s
 
 
