@@ -89,11 +89,8 @@ class Autopilot:
         self.landed = airframe.on_ground  # it may boot while it falls
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
         self.home: Vector = airframe.position
-        self.home_attitude_rad: Vector = (
-            0.0,
-            0.0,
-            airframe.yaw_rad,
-        )  # roll, pitch, yaw there; NaN: not known
+        # Roll, pitch, yaw there; NaN: not known.
+        self.home_attitude_rad: Vector = (0.0, 0.0, airframe.yaw_rad)
         self.home_is_manual = False  # set by a command: arming and landing leave it
         self.commands_handled = 0
         self.texts: deque[Text] = deque()
