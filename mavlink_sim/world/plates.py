@@ -133,14 +133,20 @@ def reflectance(
     total = np.zeros(len(x), np.float32)
     flat = cells.ravel()
     u, v = x.astype(np.float64), y.astype(np.float64)
+    # At the pixels' middles; each point in them adds a constant.
+    depth = below[0] * u + below[1] * v + below[2]
+    column_depth = columns[0] * u + columns[1] * v + columns[2]
+    row_depth = rows[0] * u + rows[1] * v + rows[2]
+    last = count - 1
     with np.errstate(divide="ignore", invalid="ignore"):
         for right in offsets:
             for lower in offsets:
-                scale = 1.0 / (below[0] * (u + right) + below[1] * (v + lower) + below[2])
-                column = (columns[0] * (u + right) + columns[1] * (v + lower) + columns[2]) * scale
-                row = (rows[0] * (u + right) + rows[1] * (v + lower) + rows[2]) * scale
-                column = np.nan_to_num(np.clip(column, 0, count - 1)).astype(np.intp)
-                row = np.nan_to_num(np.clip(row, 0, count - 1)).astype(np.intp)
-                total += flat.take(row * count + column)
+                scale = 1.0 / (depth + (below[0] * right + below[1] * lower))
+                column = (column_depth + (columns[0] * right + columns[1] * lower)) * scale
+                row = (row_depth + (rows[0] * right + rows[1] * lower)) * scale
+                # fmax takes the other one where there is no number: a ray along the face
+                column = np.fmin(np.fmax(column, 0.0), last).astype(np.int32)
+                row = np.fmin(np.fmax(row, 0.0), last).astype(np.int32)
+                total += flat.take(row * np.int32(count) + column)
     total /= np.float32(grid * grid)
     return total
