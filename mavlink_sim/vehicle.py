@@ -209,7 +209,7 @@ class Vehicle:
     @property
     def home_altitude_m(self) -> float:
         """Of home above mean sea level."""
-        return geographic(self.autopilot.home)[2]
+        return geographic(self.autopilot.home.position)[2]
 
     @property
     def gimbal(self) -> Gimbal | None:

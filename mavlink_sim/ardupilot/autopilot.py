@@ -169,7 +169,7 @@ class CopterAutopilot(Autopilot):
         self._has_flown = False
         self._armed_since_s = self._landed_since_s = self.now_s
         self._lifting_since_s = None
-        self.home = self._airframe.position
+        self.home.follow(self._airframe, self._parameters)
         self._say(INFO, "Arming motors")
         self._on_event("armed")
         self._start_task()
@@ -221,7 +221,7 @@ class CopterAutopilot(Autopilot):
         guided = self.guided
         if guided is None or not self.armed or not self.landed:
             return FAILED
-        down = self.home[2] - height_m
+        down = self.home.position[2] - height_m
         if not down < self._airframe.position[2]:
             return FAILED
         guided.take_off(down)
@@ -294,7 +294,7 @@ class CopterAutopilot(Autopilot):
     def _detect_flight(self, wanted_down_mps: float) -> None:
         frame = self._airframe
         if self.landed:
-            if self.home[2] - frame.position[2] > TAKEOFF_DETECTION_HEIGHT_M and not frame.on_ground:
+            if self.home.position[2] - frame.position[2] > TAKEOFF_DETECTION_HEIGHT_M and not frame.on_ground:
                 self.landed, self._has_flown = False, True
                 self._on_event("takeoff")
             return
@@ -339,7 +339,7 @@ class CopterAutopilot(Autopilot):
         elif mode is CopterMode.LAND:
             self.task = self.landing_task() if self.position_valid else self._descent()
         elif mode is CopterMode.RTL:
-            self.task = ReturnToLaunch(airframe, parameters, self.home, self.landing_task)
+            self.task = ReturnToLaunch(airframe, parameters, self.home.position, self.landing_task)
         else:
             self.task = flight.Hold(airframe, parameters)
 

@@ -177,7 +177,7 @@ def _place(vehicle: CopterVehicle, command: Command, frame: int) -> Vector | Non
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and math.isfinite(altitude)):
         return None
     if frame in _ABOVE_HOME:
-        altitude += HOME_ALTITUDE_M - vehicle.copter.home[2]
+        altitude += HOME_ALTITUDE_M - vehicle.copter.home.position[2]
     return local(latitude, longitude, altitude)
 
 
@@ -185,12 +185,13 @@ def _set_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) 
     if command.parameters[0] == 1.0:
         if not vehicle.copter.position_valid:
             return FAILED
-        vehicle.copter.home = vehicle.copter.position
+        place = vehicle.copter.position
+    elif (named := _place(vehicle, command, frame)) is None:
+        return DENIED
     else:
-        place = _place(vehicle, command, frame)
-        if place is None:
-            return DENIED
-        vehicle.copter.home = place
+        place = named
+    # ArduPilot locks it either way: arming elsewhere does not move it.
+    vehicle.copter.home.is_at(place, (math.nan,) * 3)
     vehicle.tell_home()
     return ACCEPTED
 

@@ -53,7 +53,7 @@ def _home_position(vehicle: CopterVehicle) -> Any:
     """The local position in it is always zero with ArduPilot, wherever home is."""
     if not vehicle.copter.sensors_ready:
         return None
-    latitude, longitude, altitude = geographic(vehicle.copter.home)
+    latitude, longitude, altitude = geographic(vehicle.copter.home.position)
     return dialect.MAVLink_home_position_message(
         round(latitude * 1e7),
         round(longitude * 1e7),

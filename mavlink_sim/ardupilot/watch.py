@@ -123,7 +123,7 @@ class FailsafeWatch:
         autopilot, value = self._autopilot, self._parameters.number
         kinds = int(value("FENCE_TYPE"))
         north, east, down = (
-            place - home for place, home in zip(autopilot.position, autopilot.home, strict=True)
+            place - home for place, home in zip(autopilot.position, autopilot.home.position, strict=True)
         )
         if kinds & FENCE_ALTITUDE and -down > value("FENCE_ALT_MAX"):
             return "Max Alt"

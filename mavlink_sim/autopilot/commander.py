@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 
 from mavlink_sim.autopilot import position_failsafe
+from mavlink_sim.autopilot.home import Home
 from mavlink_sim.autopilot.supervision import REASONS, Supervision
 from mavlink_sim.flight import manual_flight, reposition
 from mavlink_sim.flight import tasks as flight
@@ -88,10 +89,7 @@ class Autopilot:
         self.failsafe = False
         self.landed = airframe.on_ground  # it may boot while it falls
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
-        self.home: Vector = airframe.position
-        # Roll, pitch, yaw there; NaN: not known.
-        self.home_attitude_rad: Vector = (0.0, 0.0, airframe.yaw_rad)
-        self.home_is_manual = False  # set by a command: arming and landing leave it
+        self.home = Home(airframe)
         self.commands_handled = 0
         self.texts: deque[Text] = deque()
         self.supervision = Supervision(self, parameters)
@@ -201,7 +199,7 @@ class Autopilot:
         self._has_flown = False
         self._armed_since_s = self.now_s
         self._lifting_since_s = None
-        self._home_is_here()
+        self.home.follow(self._airframe, self._parameters)
         self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
         self._on_event("armed")
         self._start_task()
@@ -246,7 +244,7 @@ class Autopilot:
                 f"Using default takeoff altitude: {altitude_m:.1f} m\t",
                 (DEFAULT_ALTITUDE_EVENT, 0x66, struct.pack("<f", altitude_m)),
             )
-        elif altitude_m < self.home[2] - self._airframe.position[2]:
+        elif altitude_m < self.home.position[2] - self._airframe.position[2]:
             # what becomes of a height above ground in a field that is above the sea; it does not descend
             self._say(CRITICAL, "Already higher than takeoff altitude\t")
         self._takeoff_height_m = altitude_m
@@ -282,7 +280,7 @@ class Autopilot:
         if not self.navigator.allows_goal(goal):
             self._say(CRITICAL, "Reposition is outside geofence\t")
             return
-        self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home)
+        self.task = reposition.Reposition(airframe, parameters, goal, yaw_rad, self.home.position)
         self.task.cruise_at(speed_mps if speed_mps > 0.0 else self.cruise_mps)
 
     def _goal(self) -> Vector | None:
@@ -464,7 +462,7 @@ class Autopilot:
         self._contact_since_s = None
         self.landed = True
         if not self.armed:  # it fell
-            self._home_is_here()
+            self.home.follow(self._airframe, self._parameters)
         self._landed_since_s = self.now_s
         self._say(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
@@ -538,7 +536,7 @@ class Autopilot:
                 self.mode, airframe, parameters, self.supervision.read_sticks, self.stick_guard
             )
         elif self.mode is Mode.TAKEOFF:
-            self.task = flight.Takeoff(airframe, parameters, self.home[2] - self._takeoff_height())
+            self.task = flight.Takeoff(airframe, parameters, self.home.position[2] - self._takeoff_height())
         elif self.mode is Mode.MISSION:
             self.task = self.navigator.mission_task()
         elif self.mode is Mode.PRECLAND:
@@ -550,15 +548,6 @@ class Autopilot:
         else:
             self.task = flight.Hold(airframe, parameters)
 
-    def _home_is_here(self) -> None:
-        """Home is where it is now, unless a command has set it or COM_HOME_EN forbids (Copter has none)."""
-        enabled = self._parameters.get("COM_HOME_EN")
-        if self.home_is_manual or (enabled is not None and not enabled.value):
-            return
-        airframe = self._airframe
-        self.home = airframe.position
-        self.home_attitude_rad = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
-
     def _takeoff_height(self) -> float:
         height = self._takeoff_height_m
         return self._parameters.number("MIS_TAKEOFF_ALT") if height is None else height
@@ -569,7 +558,7 @@ class Autopilot:
         self.task = None
         self._takeoff_height_m = None
         if self.landed:
-            self._home_is_here()
+            self.home.follow(self._airframe, self._parameters)
         code = REASONS.get(reason.removeprefix("by "), 6 if reason == "after landing" else 4)
         self._say(INFO, text, (DISARMED_EVENT, 0x66, bytes([code])))
         self.supervision.disarmed()

@@ -115,7 +115,7 @@ class Navigator:
 
     @property
     def home(self) -> Vector:
-        return self._autopilot.home
+        return self._autopilot.home.position
 
     @property
     def is_breached(self) -> bool:
@@ -288,7 +288,7 @@ class Navigator:
         found, words = destination(rally, self.mission, self._parameters, self.home, position)
         for text in words:
             self.say(CRITICAL, text)
-        yaw_rad = self._autopilot.home_attitude_rad[2] if found.kind is Goal.HOME else math.nan
+        yaw_rad = self._autopilot.home.attitude_rad[2] if found.kind is Goal.HOME else math.nan
         direct = ReturnFlight(self._airframe, self._parameters, found.position, yaw_rad, landing)
         height = direct.return_height_m
         above_sea = geographic(found.position)[2] + height

@@ -115,7 +115,7 @@ def _takeoff(vehicle: Vehicle, link: Link, command: Command) -> int:
     if not math.isfinite(altitude):
         return vehicle.autopilot.takeoff(None)
     altitude = min(max(altitude, -MAX_ALTITUDE_M), MAX_ALTITUDE_M)
-    home_altitude = geographic(vehicle.autopilot.home)[2]
+    home_altitude = geographic(vehicle.autopilot.home.position)[2]
     return vehicle.autopilot.takeoff(altitude - home_altitude)
 
 
@@ -184,14 +184,12 @@ def _set_home(vehicle: Vehicle, link: Link, command: Command) -> int:
         return DENIED
     if not autopilot.sensors_ready:  # no origin yet; with one, a lost position is no reason
         return TEMPORARILY_REJECTED
-    autopilot.home_is_manual = not use_current > 0.5
     if use_current > 0.5:
-        autopilot.home = estimate.position
-        autopilot.home_attitude_rad = (estimate.roll_rad, estimate.pitch_rad, estimate.yaw_rad)
+        autopilot.home.is_here(estimate)
     else:
-        autopilot.home = _place(*place)
         roll, pitch, yaw = (math.radians(angle) if math.isfinite(angle) else None for angle in attitude_deg)
-        autopilot.home_attitude_rad = (roll or 0.0, pitch or 0.0, math.nan if yaw is None else yaw)
+        attitude_rad = (roll or 0.0, pitch or 0.0, math.nan if yaw is None else yaw)
+        autopilot.home.is_at(_place(*place), attitude_rad)
     return ACCEPTED
 
 

@@ -102,7 +102,7 @@ def _setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
 
 def _global_setpoint(vehicle: Vehicle, link: Link, message: Any) -> None:
     autopilot = vehicle.autopilot
-    home_altitude = geographic(autopilot.home)[2] if autopilot.sensors_ready else None
+    home_altitude = geographic(autopilot.home.position)[2] if autopilot.sensors_ready else None
     try:
         setpoint = global_trajectory_setpoint(message, home_altitude)
     except SetpointRejectedError as error:

@@ -46,7 +46,7 @@ def _carry_out(vehicle: Vehicle, item: MissionItem) -> None:
     """An item that is a command: told on every link, as PX4 does, and obeyed if it is the vehicle's own."""
     command, values = item.command, item.parameters
     if item.frame != mission_items.FRAME_MISSION:
-        values = (*values[:6], geographic(item.place(vehicle.autopilot.home))[2])
+        values = (*values[:6], geographic(item.place(vehicle.autopilot.home.position))[2])
     target = 0
     if goes_to_camera(command):
         target = CAMERA_COMPONENT

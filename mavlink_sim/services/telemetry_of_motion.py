@@ -39,7 +39,7 @@ def global_position_int(vehicle: Vehicle) -> Any:
         round(latitude * 1e7),
         round(longitude * 1e7),
         round(altitude * 1000),
-        round((vehicle.autopilot.home[2] - frame.position[2]) * 1000),
+        round((vehicle.autopilot.home.position[2] - frame.position[2]) * 1000),
         round(vx * 100),
         round(vy * 100),
         round(vz * 100),
@@ -100,7 +100,7 @@ def odometry(vehicle: Vehicle) -> Any:
 
 def altitude(vehicle: Vehicle) -> Any:
     height = -vehicle.estimate.position[2]
-    relative = height + vehicle.autopilot.home[2]
+    relative = height + vehicle.autopilot.home.position[2]
     return packing.altitude(
         vehicle.boot_us, HOME_ALTITUDE_M + height, HOME_ALTITUDE_M + height, height, relative, 0.0, height
     )

@@ -66,7 +66,7 @@ def estimator_status(vehicle: Vehicle) -> Any:
 
 
 def open_drone_id_system(vehicle: Vehicle) -> Any:
-    latitude, longitude, altitude = geographic(vehicle.autopilot.home)
+    latitude, longitude, altitude = geographic(vehicle.autopilot.home.position)
     since_2019 = max(vehicle.utc_ns() // 10**9 - 1546300800, 0)  # the standard counts from 2019-01-01
     return dialect.MAVLink_open_drone_id_system_message(
         0,
@@ -125,13 +125,13 @@ def home_position(vehicle: Vehicle) -> Any:
     if not vehicle.autopilot.sensors_ready:
         return None  # there is no home before there is a position
     home = vehicle.autopilot.home
-    latitude, longitude, altitude = geographic(home)
+    latitude, longitude, altitude = geographic(home.position)
     return dialect.MAVLink_home_position_message(
         round(latitude * 1e7),
         round(longitude * 1e7),
         round(altitude * 1000),
-        *home,
-        quaternion_from_euler(*vehicle.autopilot.home_attitude_rad),
+        *home.position,
+        quaternion_from_euler(*home.attitude_rad),
         0.0,
         0.0,
         0.0,
@@ -146,7 +146,7 @@ def vibration(vehicle: Vehicle) -> Any:
 def time_estimate(vehicle: Vehicle) -> Any:
     if vehicle.autopilot.landed:
         return time_estimate_to_target(-1, -1)
-    home = vehicle.autopilot.home
+    home = vehicle.autopilot.home.position
     position = vehicle.estimate.position
     away = math.hypot(position[0] - home[0], position[1] - home[1])
     positive = vehicle.parameters.positive

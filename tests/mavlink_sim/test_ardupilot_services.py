@@ -146,6 +146,19 @@ def test_home_is_where_it_was_armed_and_its_local_position_is_always_zero(copter
     assert (home.x, home.y, home.z) == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("place", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])
+def test_a_home_that_was_set_stays_when_it_is_armed_elsewhere(
+    copter: LockstepVehicle, place: tuple[float, ...]
+) -> None:
+    """ArduPilot locks it, whether a place was named or "here"."""
+    assert copter.command(179, *place) == "ACCEPTED"
+    copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
+    copter.step(0.1)
+    assert copter.command(400, 1) == "ACCEPTED"
+    copter.step(0.02)
+    assert copter.newest["onboard"]["HOME_POSITION"].latitude == pytest.approx(473977432, abs=40)
+
+
 def test_texts_have_no_tab_and_go_to_everyone_who_speaks(copter: LockstepVehicle) -> None:
     copter.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     copter.command(400, 1)

@@ -141,7 +141,7 @@ def test_home_here_is_where_the_vehicle_believes_to_be(cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "ekf_reset 3 0 0")
     assert cockpit.command(SET_HOME, 1) == [0]
-    assert cockpit.vehicle.autopilot.home[0] == pytest.approx(3.0, abs=0.01)
+    assert cockpit.vehicle.autopilot.home.position[0] == pytest.approx(3.0, abs=0.01)
     cockpit.vehicle.faults.end()
     assert cockpit.vehicle.estimate.position[0] == pytest.approx(0.0, abs=0.01)
 
@@ -184,7 +184,7 @@ def test_a_reboot_begins_a_new_boot(cockpit) -> None:
     assert cockpit.received("CURRENT_EVENT_SEQUENCE") == []
     cockpit.until(lambda: bool(cockpit.received("HOME_POSITION")), 5.0)
     assert vehicle.autopilot.landed
-    assert vehicle.autopilot.home[2] == pytest.approx(0.0, abs=0.01)
+    assert vehicle.autopilot.home.position[2] == pytest.approx(0.0, abs=0.01)
 
 
 def test_a_vehicle_that_boots_while_it_falls_is_in_the_air(cockpit) -> None:
