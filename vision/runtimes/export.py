@@ -17,6 +17,7 @@ import torch
 from vision.runtimes.contract import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
+from vision.runtimes.torch_runtime import traced
 from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.checkpoint_pair import weights_sha256
 
@@ -127,9 +128,10 @@ def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
             "exporting needs the package onnx: pip install 'mavlink-companion[onnxruntime]', or [tensorrt]"
         ) from error
     with _quietly():
+        example = _example(facts.image_size)
         torch.onnx.export(
-            network,
-            (_example(facts.image_size),),
+            traced(network, example),
+            (example,),
             str(path),
             input_names=[INPUT],
             output_names=network.names,
@@ -149,8 +151,9 @@ def _write_openvino(network: Network, facts: ExportedFacts, path: Path) -> None:
     openvino = required("openvino")
     with _quietly():
         any_size = openvino.PartialShape([1, -1, -1, 3])
-        example = (_example(facts.image_size),)
-        made = openvino.convert_model(network, example_input=example, input=[any_size])
+        example = _example(facts.image_size)
+        # Traced here: OpenVINO would trace the network as a module, twice, in several times the time.
+        made = openvino.convert_model(traced(network, example), example_input=(example,), input=[any_size])
     made.inputs[0].get_tensor().set_names({INPUT})
     for output, name in zip(made.outputs, network.names, strict=True):
         output.get_tensor().set_names({name})
