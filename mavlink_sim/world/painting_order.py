@@ -57,12 +57,12 @@ def painting_tree(solids: list[Solid]) -> PaintingTree:
     """The partition tree of convex solids. Raises ValueError if there are none."""
     if not solids:
         raise ValueError("an object needs at least one solid")
+    extents = _Extents(solids)
     normals: list[Points] = []
     offsets: list[float] = []
     front: list[int] = []
     behind: list[int] = []
     leaf: list[int] = []
-    planes = [[face.plane() for face in solid.faces] for solid in solids]
     tasks: list[tuple[list[int], list[int] | None, int]] = [(list(range(len(solids))), None, 0)]
     while tasks:
         group, slot, position = tasks.pop()
@@ -76,9 +76,7 @@ def painting_tree(solids: list[Solid]) -> PaintingTree:
             normals.append(np.zeros(3))
             offsets.append(0.0)
             continue
-        normal, offset, ahead = _best_plane(
-            [solids[index] for index in group], [plane for index in group for plane in planes[index]]
-        )
+        normal, offset, ahead = extents.best_plane(group)
         normals.append(normal)
         offsets.append(offset)
         tasks.append(([index for index, side in zip(group, ahead, strict=True) if side], front, node))
@@ -86,40 +84,57 @@ def painting_tree(solids: list[Solid]) -> PaintingTree:
     return PaintingTree(np.array(normals), np.array(offsets), front, behind, leaf)
 
 
-def _best_plane(group: list[Solid], planes: list[tuple[Points, float]]) -> tuple[Points, float, list[bool]]:
-    """The plane that parts a group with the least overlap, and which solids lie on its normal's side."""
-    corners = np.concatenate([solid.corners for solid in group])
-    starts = np.cumsum([0] + [len(solid.corners) for solid in group[:-1]])
-    normals, offsets = _candidates(planes, corners, starts)
-    distance = corners @ normals.T - offsets
-    low: Points = np.minimum.reduceat(distance, starts)
-    high: Points = np.maximum.reduceat(distance, starts)
-    ahead: NDArray[np.bool_] = low + high >= 0.0
-    overlap = np.maximum(np.where(ahead, -low, high), 0.0)
-    tolerated = np.maximum(TOLERATED_OVERLAP_M, TOLERATED_OVERLAP_SHARE * (high - low))
-    count = ahead.sum(axis=0)
-    cost = 10.0 * np.maximum(overlap - tolerated, 0.0).sum(axis=0) + 0.3 * overlap.sum(axis=0)
-    cost += 0.01 * np.abs(2 * count - len(group))
-    cost[(count == 0) | (count == len(group))] = np.inf
-    best = int(np.argmin(cost))
-    if not np.isfinite(cost[best]):
-        # Solids around one common middle: no plane parts them, so part them by number.
-        half = [index >= len(group) // 2 for index in range(len(group))]
-        return np.array([0.0, 0.0, -1.0]), float(-corners[:, 2].mean()), half
-    return normals[best], float(offsets[best]), ahead[:, best].tolist()
+class _Extents:
+    """How far each solid reaches on either side of each plane that may part them; worked out once.
 
+    The planes are those of all faces, and those across the axes where a solid begins, ends or is halved.
+    """
 
-def _candidates(
-    planes: list[tuple[Points, float]], corners: Points, starts: NDArray[np.int64]
-) -> tuple[Points, NDArray[np.float64]]:
-    """All planes of the solids' faces, and planes across the axes where a solid begins, ends or is halved."""
-    lows: Points = np.minimum.reduceat(corners, starts)
-    highs: Points = np.maximum.reduceat(corners, starts)
-    levels = np.concatenate([lows, highs, (lows + highs) / 2])
-    axes = np.repeat(np.eye(3), len(levels), axis=0)
-    normals = np.concatenate([axes, np.array([normal for normal, _ in planes])])
-    offsets = np.concatenate([levels.T.ravel(), np.array([offset for _, offset in planes])])
-    return normals, offsets
+    def __init__(self, solids: list[Solid]) -> None:
+        count = len(solids)
+        corners = [solid.corners for solid in solids]
+        self._corners = corners
+        lows = np.array([points.min(axis=0) for points in corners])
+        highs = np.array([points.max(axis=0) for points in corners])
+        # (S, 3 axes, 3 levels, S): along an axis a solid's reach is its own, less the level of each.
+        levels = np.stack([lows, highs, (lows + highs) / 2]).transpose(2, 0, 1)
+        across_low = lows[:, :, None, None] - levels
+        across_high = highs[:, :, None, None] - levels
+        planes = [[face.plane() for face in solid.faces] for solid in solids]
+        every = [plane for of_solid in planes for plane in of_solid]
+        faces = np.array([normal for normal, _ in every])
+        offsets = np.array([offset for _, offset in every])
+        reach = [faces @ points.T for points in corners]
+        face_low = np.array([along.min(axis=1) for along in reach]) - offsets
+        face_high = np.array([along.max(axis=1) for along in reach]) - offsets
+        # Planes in columns: those across the axes first.
+        self._low = np.concatenate([across_low.reshape(count, -1), face_low], axis=1)
+        self._high = np.concatenate([across_high.reshape(count, -1), face_high], axis=1)
+        self._normals = np.concatenate([np.repeat(np.eye(3), 3 * count, axis=0), faces])
+        self._offsets = np.concatenate([levels.ravel(), offsets])
+        of_faces = np.repeat(np.arange(count), [len(of_solid) for of_solid in planes])
+        self._solid_of = np.concatenate([np.tile(np.arange(count), 9), of_faces])
+
+    def best_plane(self, group: list[int]) -> tuple[Points, float, list[bool]]:
+        """The plane that parts a group with the least overlap, and which solids lie on its normal's side."""
+        columns = np.flatnonzero(np.isin(self._solid_of, group))
+        rows = np.array(group)[:, None]
+        low, high = self._low[rows, columns], self._high[rows, columns]
+        ahead: NDArray[np.bool_] = low + high >= 0.0
+        overlap = np.maximum(np.where(ahead, -low, high), 0.0)
+        tolerated = np.maximum(TOLERATED_OVERLAP_M, TOLERATED_OVERLAP_SHARE * (high - low))
+        count = ahead.sum(axis=0)
+        cost = 10.0 * np.maximum(overlap - tolerated, 0.0).sum(axis=0) + 0.3 * overlap.sum(axis=0)
+        cost += 0.01 * np.abs(2 * count - len(group))
+        cost[(count == 0) | (count == len(group))] = np.inf
+        best = int(np.argmin(cost))
+        if not np.isfinite(cost[best]):
+            # Solids around one common middle: no plane parts them, so part them by number.
+            half = [index >= len(group) // 2 for index in range(len(group))]
+            middle = np.concatenate([self._corners[index] for index in group])[:, 2].mean()
+            return np.array([0.0, 0.0, -1.0]), float(-middle), half
+        plane = columns[best]
+        return self._normals[plane], float(self._offsets[plane]), ahead[:, best].tolist()
 
 
 def clip_polygon(points: Points, normal: Points, offset: float) -> Points:

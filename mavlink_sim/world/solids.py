@@ -62,11 +62,24 @@ class Solid:
         return np.concatenate([face.points for face in self.faces])
 
 
+class _Surface:
+    """All faces of some solids in arrays: their planes, (F, 3) and (F,), whose they are, what solids span."""
+
+    def __init__(self, solids: list[Solid]) -> None:
+        planes = [[face.plane() for face in solid.faces] for solid in solids]
+        self.normals = np.array([normal for of_solid in planes for normal, _ in of_solid]).reshape(-1, 3)
+        self.offsets = np.array([offset for of_solid in planes for _, offset in of_solid])
+        self.solid = np.repeat(np.arange(len(solids)), [len(of_solid) for of_solid in planes])
+        self.low = np.array([solid.corners.min(axis=0) for solid in solids]).reshape(-1, 3)
+        self.high = np.array([solid.corners.max(axis=0) for solid in solids]).reshape(-1, 3)
+
+
 @dataclass(slots=True)
 class Body:
     """An object under construction."""
 
     solids: list[Solid] = field(default_factory=list)
+    _surface: _Surface | None = field(default=None, init=False, repr=False)
 
     def add_solid(
         self, polygons: Sequence[Points], slots: str | Sequence[str], shades: Points | None = None
@@ -94,19 +107,20 @@ class Body:
         if float(decal.plane()[0] @ direction) < 0.0:
             decal.points = decal.points[::-1]
         middle, facing = decal.points.mean(axis=0), decal.plane()[0]
-        nearest: tuple[float, Solid] | None = None
-        for solid in self.solids:
-            corners = solid.corners
-            beside = np.maximum(corners.min(axis=0) - middle, middle - corners.max(axis=0)).max()
-            for face in solid.faces:
-                normal, offset = face.plane()
-                if float(normal @ facing) > 0.7:
-                    distance = abs(float(normal @ middle) - offset) + max(float(beside), 0.0)
-                    if nearest is None or distance < nearest[0]:
-                        nearest = (distance, solid)
-        if nearest is None:
+        surface = self._seen_surface()
+        beside = np.maximum(surface.low - middle, middle - surface.high).max(axis=1)
+        distance = np.abs(surface.normals @ middle - surface.offsets) + np.maximum(beside, 0.0)[surface.solid]
+        distance[surface.normals @ facing <= 0.7] = np.inf
+        nearest = int(np.argmin(distance)) if len(distance) else -1
+        if nearest < 0 or not math.isfinite(distance[nearest]):
             raise ValueError(f"no solid has a face looking along {direction.tolist()} for a decal {slot!r}")
-        nearest[1].decals.append(decal)
+        self.solids[surface.solid[nearest]].decals.append(decal)
+
+    def _seen_surface(self) -> _Surface:
+        """That of all solids so far."""
+        if self._surface is None or len(self._surface.low) < len(self.solids):
+            self._surface = _Surface(self.solids)
+        return self._surface
 
     def add_sheet(self, polygon: Points, slot: str, back_slot: str | None = None) -> None:
         """Add a thin sheet seen from both sides."""

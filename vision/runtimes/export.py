@@ -129,8 +129,9 @@ def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
         ) from error
     with _quietly():
         example = _example(facts.image_size)
+        graph: Any = traced(network, example)
         torch.onnx.export(
-            traced(network, example),
+            graph,
             (example,),
             str(path),
             input_names=[INPUT],
