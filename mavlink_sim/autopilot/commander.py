@@ -56,6 +56,7 @@ PREFLIGHT_DISARM_MARGIN_S = 1.2
 OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
+REFUSALS_APART_S = 1.0
 TAKEOFF_DETECTION_HEIGHT_M = 0.12
 # As recorded: the vehicle creeps up while the ramp is still raising the thrust to hover, then climbs.
 RAMP_THRUST_SHARE = 0.9
@@ -99,7 +100,7 @@ class Autopilot:
         self._takeoff_height_m: float | None = None
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
-        self._last_setpoint_s = -math.inf
+        self._last_setpoint_s = self._refusal_told_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
         self._armed_since_s = 0.0
@@ -220,10 +221,28 @@ class Autopilot:
         """MAV_RESULT of a request for a mode; with `tell`, a refusal is also a text."""
         if self.armed and not self.can_run(mode):
             if tell:
-                self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
+                self.tell_unavailable(mode)
             return TEMPORARILY_REJECTED
         self._intend(mode)
         return ACCEPTED
+
+    def force_mode(self, mode: Mode) -> int:
+        """The same for one that is always taken: LAND, which without a position is a blind descent."""
+        self._intend(mode)
+        return ACCEPTED
+
+    def _refuses(self, mode: Mode) -> bool:
+        """Whether a command that would switch to this mode is refused; if so, that is told."""
+        refused = self.armed and not self.can_run(mode)
+        if refused:
+            self.tell_unavailable(mode)
+        return refused
+
+    def tell_unavailable(self, mode: Mode) -> None:
+        """A mode was refused: PX4 says so at most once a second, whatever the mode."""
+        if self.now_s - self._refusal_told_s > REFUSALS_APART_S:
+            self._refusal_told_s = self.now_s
+            self._say(CRITICAL, f"Switching to {mode.title} is currently not available\t")
 
     def can_run(self, mode: Mode) -> bool:
         """Whether an armed vehicle may fly in this mode now."""
@@ -237,6 +256,8 @@ class Autopilot:
 
     def takeoff(self, altitude_m: float | None) -> int:
         """Mode TAKEOFF to a height above home (None: MIS_TAKEOFF_ALT). It never arms."""
+        if self._refuses(Mode.TAKEOFF):
+            return TEMPORARILY_REJECTED
         if altitude_m is None:
             altitude_m = self._parameters.number("MIS_TAKEOFF_ALT")
             self._say(
@@ -252,17 +273,21 @@ class Autopilot:
         return ACCEPTED
 
     def land(self) -> int:
+        """Always taken: without a position it comes down all the same."""
         self._say(INFO, "Landing at current position\t", LANDING_EVENT)
-        self._intend(Mode.LAND)
-        return ACCEPTED
+        return self.force_mode(Mode.LAND)
 
     def return_home(self) -> int:
+        if self._refuses(Mode.RTL):
+            return TEMPORARILY_REJECTED
         self._say(INFO, "Returning to launch\t")
         self._intend(Mode.RTL)
         return ACCEPTED
 
     def reposition(self, goal: Vector, yaw_rad: float, speed_mps: float = math.nan) -> int:
         """Fly to a local NED position and hold there; NaN components as in `reposition_goal`."""
+        if self._refuses(Mode.HOLD):
+            return TEMPORARILY_REJECTED
         former = self._goal()
         self._intend(Mode.HOLD)
         self._move_hold(goal, yaw_rad, speed_mps, former)
@@ -297,6 +322,9 @@ class Autopilot:
 
     def orbit(self, request: OrbitRequest) -> int:
         """Mode ORBIT; a radius that cannot be is accepted too, and then the vehicle hovers in that mode."""
+        if self.armed and not self.can_run(Mode.ORBIT):
+            self._say(CRITICAL, "Orbit command rejected")
+            return TEMPORARILY_REJECTED
         if self.mode is not Mode.ORBIT or not isinstance(self.task, Orbit):
             self._intend(Mode.ORBIT)
         if isinstance(self.task, Orbit) and not self.task.apply(request):

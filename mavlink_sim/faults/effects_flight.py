@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
-from mavlink_sim.autopilot.position_failsafe import needs_position
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.flight.tasks import Trajectory
 from mavlink_sim.physics.estimate_errors import ZERO
@@ -246,14 +245,6 @@ def requested_mode(command: int, parameters: tuple[float, ...]) -> Mode | None:
         return _MODE_OF_COMMAND.get(command)
     main, sub = parameters[1:3]
     return mode_of(int(main), int(sub)) if math.isfinite(main) and math.isfinite(sub) else None
-
-
-def refused_for_position(vehicle: Vehicle, command: int, parameters: tuple[float, ...]) -> int | None:
-    """An armed vehicle without a valid position takes no mode that needs one."""
-    mode = requested_mode(command, parameters)
-    if mode is None or vehicle.autopilot.position_valid or not vehicle.autopilot.armed:
-        return None
-    return TEMPORARILY_REJECTED if needs_position(mode) else None
 
 
 def refuse_mode(vehicle: Vehicle, one: ActiveFault) -> None:

@@ -20,7 +20,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.faults.effects_flight import refused_for_position
 from mavlink_sim.faults.effects_link import chosen_links
 from mavlink_sim.faults.effects_messages import shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
@@ -292,9 +291,6 @@ class Faults:
 
     def refuses(self, command: int, parameters: tuple[float, ...]) -> int | None:
         """The MAV_RESULT that a command is refused with before anybody looks at it."""
-        refused = refused_for_position(self.vehicle, command, parameters)
-        if refused is not None:
-            return refused
         for refusal in list(self.refusals.values()):
             result = refusal(command, parameters)
             if result is not None:

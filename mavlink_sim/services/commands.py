@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
 from mavlink_sim.physics.geography import geographic, local
-from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, mode_of
+from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.telemetry import MESSAGE_IDS
@@ -107,6 +107,8 @@ def _do_set_mode(vehicle: Vehicle, link: Link, command: Command) -> int:
     if mode is None:
         autopilot.texts.append(Text(CRITICAL, "Unsupported main mode\t"))
         return TEMPORARILY_REJECTED
+    if mode is Mode.LAND:
+        return autopilot.force_mode(mode)
     return autopilot.set_mode(mode, tell=command.source_component == GROUND_STATION_COMPONENT)
 
 

@@ -26,6 +26,5 @@ def mission_start(autopilot: Autopilot, first: float) -> int:
         autopilot.navigator.set_current(int(first))
     if autopilot.set_mode(Mode.MISSION) == ACCEPTED and autopilot.arm() == ACCEPTED:
         return ACCEPTED
-    text = f"Switching to {Mode.MISSION.title} is currently not available\t"
-    autopilot.texts.append(Text(CRITICAL, text))
+    autopilot.tell_unavailable(Mode.MISSION)
     return TEMPORARILY_REJECTED

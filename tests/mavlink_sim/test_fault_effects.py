@@ -165,7 +165,7 @@ def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(cockpit, p
     cockpit.fly(1.5, setpoint)
     assert cockpit.vehicle.airframe.velocity[2] == pytest.approx(0.7, abs=0.2)  # MPC_LAND_SPEED
     assert cockpit.set_mode(4, 3) == [0, 1]
-    assert cockpit.command(LAND) == [1]
+    assert cockpit.command(20) == [1]  # return to launch
     assert newest(cockpit, "ESTIMATOR_STATUS").flags & (2 | 8 | 16) == 0
     # PX4 goes on sending positions that stand still
     cockpit.forget()
@@ -411,6 +411,32 @@ def test_a_reboot_on_the_ground_is_ready_again(cockpit) -> None:
     assert not cockpit.vehicle.autopilot.can_arm
     cockpit.fly(3.0)
     assert cockpit.command(ARM, 1) == [0]
+
+
+def test_what_needs_a_position_is_refused_without_one_and_land_is_not(cockpit) -> None:
+    cockpit.heartbeats.append(("gcs", (245, 190), 6))
+    cockpit.take_off(8.0)
+    begin(cockpit, "gps_loss")
+    cockpit.until(lambda: not cockpit.vehicle.autopilot.position_valid, 10.0)
+    cockpit.fly(0.1)
+    assert type(cockpit.vehicle.autopilot.task).__name__ == "Descend"
+    cockpit.forget()
+    nan = float("nan")
+    for name, command in (
+        ("Hold", (192, -1, 1, 0, nan, 47.3977, 8.5456, 495)),  # DO_REPOSITION
+        ("Hold", (186, 500)),  # DO_CHANGE_ALTITUDE
+        ("Takeoff", (22, nan, 0, 0, nan, nan, nan, 500)),
+        ("Return", (20,)),
+    ):
+        assert cockpit.command(*command) == [1]
+        assert cockpit.texts()[-1] == f"Switching to {name} is currently not available\t"
+        cockpit.fly(1.0)
+    assert cockpit.command(34, 5, 2, 0, 0, nan, nan, nan) == [1]  # DO_ORBIT
+    assert cockpit.texts()[-1] == "Orbit command rejected"
+    assert len(cockpit.texts()) == 5
+    assert cockpit.command(LAND) == [0]
+    assert cockpit.set_mode(4, 6) == [0, 0]  # AUTO_LAND
+    assert type(cockpit.vehicle.autopilot.task).__name__ == "Descend"
 
 
 def test_a_landing_goes_on_blindly_when_gps_is_lost(cockpit) -> None:
