@@ -182,14 +182,12 @@ def _place(vehicle: CopterVehicle, command: Command, frame: int) -> Vector | Non
 
 
 def _set_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
-    if command.parameters[0] == 1.0:
-        if not vehicle.copter.position_valid:
-            return FAILED
-        place = vehicle.copter.position
-    elif (named := _place(vehicle, command, frame)) is None:
+    here = command.parameters[0] == 1.0
+    if here and not vehicle.copter.position_valid:
+        return FAILED
+    place = vehicle.copter.position if here else _place(vehicle, command, frame)
+    if place is None:
         return DENIED
-    else:
-        place = named
     # ArduPilot locks it either way: arming elsewhere does not move it.
     vehicle.copter.home.is_at(place, (math.nan,) * 3)
     vehicle.tell_home()

@@ -56,8 +56,9 @@ PREFLIGHT_DISARM_MARGIN_S = 1.2
 OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
-REFUSALS_APART_S = 1.0
 TAKEOFF_DETECTION_HEIGHT_M = 0.12
+# At least so long between two texts that say a mode is not available.
+REFUSALS_APART_S = 1.0
 # As recorded: the vehicle creeps up while the ramp is still raising the thrust to hover, then climbs.
 RAMP_THRUST_SHARE = 0.9
 RAMP_CREEP_MPS = 0.2
