@@ -308,6 +308,11 @@ def _run(fleet: Fleet, ready_file: Path | None) -> None:
     _say("stopped")
 
 
+def load() -> None:
+    """Import what would be imported only when arguments are read (by typer: pydantic)."""
+    typer.main.get_command(app).make_context("mavlink-sim", [])
+
+
 def main() -> None:
     """The console script's entry: what cannot be is said in one line, with exit code 2."""
     try:

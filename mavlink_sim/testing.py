@@ -1,4 +1,4 @@
-"""A vehicle in a process of its own, for integration tests.
+"""A vehicle in a process of its own, for integration tests. All of a program end with it.
 
 >>> with running_simulator(seed=3, speed=4.0) as simulator:      # doctest: +SKIP
 ...     connect(simulator.mavsdk_url)
@@ -9,13 +9,11 @@ In asyncio code `async with vehicle(seed=3) as simulator:` does the same without
 from __future__ import annotations
 
 import asyncio
-import os
 import random
 import re
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,6 +21,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from mavlink_sim.launched import LaunchedProcess, launched
 
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
 
@@ -100,7 +100,7 @@ class FleetMember:
 
 
 class RunningSimulator:
-    """A `python -m mavlink_sim` that is up.
+    """A `mavlink-sim` that is up.
 
     Attributes:
         onboard_port: the UDP port a companion listens on (`udpin:127.0.0.1:<port>`); the vehicle sends there.
@@ -111,7 +111,7 @@ class RunningSimulator:
         transcript: every line it printed, each after the seconds since it was started.
     """
 
-    def __init__(self, process: subprocess.Popen[str], count: int = 1) -> None:
+    def __init__(self, process: LaunchedProcess | subprocess.Popen[str], count: int = 1) -> None:
         self.process = process
         self.vehicles: list[FleetMember] = []
         self._count = count
@@ -202,10 +202,10 @@ class RunningSimulator:
         self.process.wait()
 
     def suspend(self) -> None:
-        os.kill(self.pid, signal.SIGSTOP)
+        self.process.send_signal(signal.SIGSTOP)
 
     def resume(self) -> None:
-        os.kill(self.pid, signal.SIGCONT)
+        self.process.send_signal(signal.SIGCONT)
 
     def fault(self, line: str) -> None:
         """Type a line of the faults' grammar on the simulator's console: `link_loss for=3`, `end all`…"""
@@ -264,7 +264,7 @@ def running_simulator(
     }
     if isinstance(options.get("noise"), bool):  # the one option whose value is a word for yes or no
         arguments["noise"] = "on" if options["noise"] else "off"
-    command = [sys.executable, "-m", "mavlink_sim"]
+    command = []
     for name, value in arguments.items():
         if value is None or value is False:
             continue
@@ -274,20 +274,16 @@ def running_simulator(
     for fault in faults:
         command += ["--fault", fault]
     command += ["--console"]
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    simulator = RunningSimulator(process, count)
-    try:
-        simulator.wait_until_ready(timeout_s)
-        yield simulator
-    finally:
-        simulator.stop()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        with suppress(BrokenPipeError):
-            process.stdin.close()
-        process.stdout.close()
+    with launched(command) as process:
+        simulator = RunningSimulator(process, count)
+        try:
+            simulator.wait_until_ready(timeout_s)
+            yield simulator
+        finally:
+            simulator.stop()
+            assert process.stdin is not None
+            with suppress(BrokenPipeError):
+                process.stdin.close()
 
 
 class vehicle:  # noqa: N801 - it is used as a function, like the context managers of the standard library
