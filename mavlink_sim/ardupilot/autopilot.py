@@ -21,12 +21,13 @@ from mavlink_sim.ardupilot.modes import (
 )
 from mavlink_sim.ardupilot.return_to_launch import ReturnToLaunch
 from mavlink_sim.ardupilot.watch import FailsafeWatch
-from mavlink_sim.autopilot.commander import ACCEPTED, IDLE_THRUST_MPS2, TAKEOFF_DETECTION_HEIGHT_M, Autopilot
+from mavlink_sim.autopilot.commander import ACCEPTED, IDLE_THRUST_MPS2, Autopilot
+from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M
 from mavlink_sim.autopilot.position_failsafe import Descend
 from mavlink_sim.flight import manual_flight
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import TrajectorySetpoint
-from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.modes import (
     CUSTOM_MODE_ENABLED,
     GUIDED_ENABLED,
@@ -79,6 +80,7 @@ class CopterAutopilot(Autopilot):
 
     mode: Any
     intended_mode: Any
+    _land_detection_s = LAND_DETECTION_S
 
     def __init__(
         self,
@@ -166,9 +168,7 @@ class CopterAutopilot(Autopilot):
     def force_arm(self) -> None:
         """Arm without any check (COMPONENT_ARM_DISARM's magic number)."""
         self.armed = True
-        self._has_flown = False
-        self._armed_since_s = self._landed_since_s = self.now_s
-        self._lifting_since_s = None
+        self.ground.arm(self.now_s)
         self.home.follow(self._airframe, self._parameters)
         self._say(INFO, "Arming motors")
         self._on_event("armed")
@@ -269,7 +269,7 @@ class CopterAutopilot(Autopilot):
             frame = self._airframe
             demand = self.demand = self.controller.update(
                 dt_s, setpoint, frame.position, frame.velocity, frame.acceleration, frame.yaw_rad,
-                self._climb_limit(),
+                self.ground.climb_limit_mps(self.now_s),
             )  # fmt: skip
             frame.step(dt_s, demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, demand.yaw_rate_radps)
         else:
@@ -279,51 +279,37 @@ class CopterAutopilot(Autopilot):
 
     def _stays_on_ground(self, task: flight.Task) -> bool:
         """A landed vehicle leaves the ground by a take-off or by its pilot's throttle, by nothing else."""
-        if not self.landed:
-            return False
         rises = isinstance(task, Guided) and task.starting
         if self.mode in _BY_STICKS:
             rises = self.supervision.sticks.throttle > manual_flight.TAKEOFF_THROTTLE
-        if not rises or self.now_s - self._armed_since_s < SPOOL_UP_S:
-            self._lifting_since_s = None
-            return True
-        if self._lifting_since_s is None:
-            self._lifting_since_s = self.now_s
-        return False
+        spooling = self.ground.armed_for_s(self.now_s) < SPOOL_UP_S
+        return self.ground.rests(self.now_s, rises=rises and not spooling)
 
     def _detect_flight(self, wanted_down_mps: float) -> None:
-        frame = self._airframe
-        if self.landed:
+        frame, ground = self._airframe, self.ground
+        if ground.landed:
             if self.home.position[2] - frame.position[2] > TAKEOFF_DETECTION_HEIGHT_M and not frame.on_ground:
-                self.landed, self._has_flown = False, True
+                ground.leave()
                 self._on_event("takeoff")
-            return
-        sinking = wanted_down_mps > 0.05 or frame.thrust_mps2 < 0.5 * GRAVITY_MPS2
-        if not frame.on_ground or not sinking:
-            self._contact_since_s = None
-        elif self._contact_since_s is None:
-            self._contact_since_s = self.now_s
-        elif self.now_s - self._contact_since_s >= LAND_DETECTION_S:
+        elif ground.presses(self.now_s, wanted_down_mps):
             self._has_landed()
 
     def _has_landed(self) -> None:
-        self._contact_since_s = None
-        self.landed = True
-        self._landed_since_s = self.now_s
+        self.ground.touch_down(self.now_s)
         self._on_event("landed")
-        guided = self.guided
-        if guided is not None:
+        if self.guided is not None:
             self._start_task()  # what it was told in the air does not lift it off again
 
     def _disarm_automatically(self) -> None:
         if not self.landed or not self.armed:
             return
-        if self.task is not None and self.task.landing and self._has_flown:
+        if self.task is not None and self.task.landing and self.ground.has_flown:
             self._disarm("Disarming motors", "after landing")
             return
         delay = self._parameters.number("DISARM_DELAY")
         starting = self.guided is not None and self.guided.starting
-        if delay > 0.0 and not starting and self.now_s - self._landed_since_s >= delay:
+        idle_s = min(self.ground.landed_for_s(self.now_s), self.ground.armed_for_s(self.now_s))
+        if delay > 0.0 and not starting and idle_s >= delay:
             self._disarm("Disarming motors", "no takeoff")
 
     # ---- transitions ------------------------------------------------------------------------------------

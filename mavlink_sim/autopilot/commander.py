@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 
 from mavlink_sim.autopilot import position_failsafe
+from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M, GroundContact, asks_to_rise
 from mavlink_sim.autopilot.home import Home
 from mavlink_sim.autopilot.supervision import REASONS, Supervision
 from mavlink_sim.flight import manual_flight, reposition
@@ -21,7 +22,7 @@ from mavlink_sim.flight.orbit import Orbit, OrbitRequest
 from mavlink_sim.flight.position_control import Demand, PositionController, TrajectorySetpoint
 from mavlink_sim.flight.precision_landing import Precision
 from mavlink_sim.missions.navigator import Navigator
-from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.px4.modes import (
     MANUAL_MODES,
     MODES_PREVENTING_ARMING,
@@ -56,17 +57,15 @@ PREFLIGHT_DISARM_MARGIN_S = 1.2
 OFFBOARD_LOSS_MARGIN_S = 0.06
 # PX4's land detector needs ground contact, then "maybe landed", then "landed": together about this long.
 LAND_DETECTION_S = 1.5
-TAKEOFF_DETECTION_HEIGHT_M = 0.12
 # At least so long between two texts that say a mode is not available.
 REFUSALS_APART_S = 1.0
-# As recorded: the vehicle creeps up while the ramp is still raising the thrust to hover, then climbs.
-RAMP_THRUST_SHARE = 0.9
-RAMP_CREEP_MPS = 0.2
 IDLE_THRUST_MPS2 = 0.6
 
 
 class Autopilot:
     """The decisions of one vehicle. `now_s` is the time since boot, advanced by `update`."""
+
+    _land_detection_s = LAND_DETECTION_S
 
     def __init__(
         self,
@@ -89,7 +88,7 @@ class Autopilot:
         self.mode = Mode.HOLD
         self.intended_mode = Mode.HOLD
         self.failsafe = False
-        self.landed = airframe.on_ground  # it may boot while it falls
+        self.ground = GroundContact(airframe, parameters, self._land_detection_s)
         self.position_valid = True  # horizontally; without it PX4 refuses and leaves most modes
         self.home = Home(airframe)
         self.commands_handled = 0
@@ -104,16 +103,16 @@ class Autopilot:
         self._last_setpoint_s = self._refusal_told_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
-        self._armed_since_s = 0.0
-        self._landed_since_s = 0.0
-        self._contact_since_s: float | None = None
-        self._lifting_since_s: float | None = None
-        self._has_flown = False
         self.navigator = Navigator(self, airframe, parameters, on_event)
         # collision prevention: it may reduce what the sticks ask for in Position mode
         self.stick_guard: manual_flight.AccelerationGuard | None = self.navigator.guard_sticks
 
     # ---- what others read -------------------------------------------------------------------------------
+
+    @property
+    def landed(self) -> bool:
+        """It stands on the ground."""
+        return self.ground.landed
 
     @property
     def has_setpoints(self) -> bool:
@@ -198,9 +197,7 @@ class Autopilot:
             self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
             return TEMPORARILY_REJECTED
         self.armed = True
-        self._has_flown = False
-        self._armed_since_s = self.now_s
-        self._lifting_since_s = None
+        self.ground.arm(self.now_s)
         self.home.follow(self._airframe, self._parameters)
         self._say(INFO, f"Armed by {by}\t", (*ARMED_EVENT[:2], bytes([REASONS[by]])))
         self._on_event("armed")
@@ -392,7 +389,7 @@ class Autopilot:
             self._idle(dt_s, IDLE_THRUST_MPS2)
         elif not isinstance(setpoint, TrajectorySetpoint):
             self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
-        elif self._on_ground_and_idle(setpoint):
+        elif self._rests(task, setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
             self.attitude.release()
@@ -403,10 +400,10 @@ class Autopilot:
                 airframe.velocity,
                 airframe.acceleration,
                 airframe.yaw_rad,
-                self._climb_limit(),
+                self.ground.climb_limit_mps(self.now_s),
             )
             airframe.step(dt_s, demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, demand.yaw_rate_radps)
-        self._detect_landing(setpoint)
+        self._detect_landing()
         self._disarm_automatically()
         if self.armed and task is self.task and task.finished and self.mode is Mode.TAKEOFF:
             goal = task.goal
@@ -432,82 +429,45 @@ class Autopilot:
         )
 
     def _spooling(self) -> bool:
-        spool = self._parameters.number("COM_SPOOLUP_TIME")
-        return self.now_s - self._armed_since_s < spool
+        return self.ground.armed_for_s(self.now_s) < self._parameters.number("COM_SPOOLUP_TIME")
 
-    def _on_ground_and_idle(self, setpoint: TrajectorySetpoint) -> bool:
-        """Landed with a setpoint that does not ask to climb. Also starts the take-off ramp's clock."""
-        if not self.landed:
+    def _rests(self, task: flight.Task, setpoint: TrajectorySetpoint) -> bool:
+        """Landed with a setpoint that does not ask to climb."""
+        if not self.ground.landed:
             return False
-        airframe = self._airframe
-        rise = setpoint.velocity[2] < -0.05
-        if setpoint.position[2] == setpoint.position[2]:
-            rise = rise or setpoint.position[2] < airframe.position[2] - 0.1
-        if setpoint.acceleration[2] == setpoint.acceleration[2]:
-            rise = rise or setpoint.acceleration[2] < -0.3
-        if isinstance(self.task, flight.Takeoff):
-            rise = True
-        elif isinstance(self.task, flight.Hold | flight.Land | flight.Return):
-            rise = False
-        if not rise or self._spooling():
-            self._lifting_since_s = None
-            return True
-        if self._lifting_since_s is None:
-            self._lifting_since_s = self.now_s
-        return False
+        rises = asks_to_rise(task, setpoint, self._airframe.position[2]) and not self._spooling()
+        return self.ground.rests(self.now_s, rises=rises)
 
-    def _climb_limit(self) -> float:
-        """PX4's take-off ramp: hardly any climb while thrust builds up, up to MPC_TKO_SPEED, then free."""
-        if self._lifting_since_s is None:
-            return math.inf
-        ramp = max(self._parameters.number("MPC_TKO_RAMP_T"), 0.01)
-        progress = (self.now_s - self._lifting_since_s) / ramp
-        if progress >= 1.0 and not self.landed:
-            self._lifting_since_s = None
-            return math.inf
-        speed = self._parameters.number("MPC_TKO_SPEED")
-        rise = (progress - RAMP_THRUST_SHARE) / (1.0 - RAMP_THRUST_SHARE)
-        return min(max(speed * rise, RAMP_CREEP_MPS), speed)
-
-    def _detect_landing(self, setpoint: flight.Setpoint) -> None:
+    def _detect_landing(self) -> None:
         airframe = self._airframe
-        if self.landed:
+        if self.ground.landed:
             if airframe.floor_down_m - airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
-                self.landed = False
-                self._has_flown = True
+                self.ground.leave()
                 self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
                 self._on_event("takeoff")
-            return
-        sinking = self.controller.velocity[2] > 0.05 or airframe.thrust_mps2 < 0.5 * GRAVITY_MPS2
-        if not airframe.on_ground or not sinking:
-            self._contact_since_s = None
-            return
-        if self._contact_since_s is None:
-            self._contact_since_s = self.now_s
-        elif self.now_s - self._contact_since_s >= LAND_DETECTION_S:
+        elif self.ground.presses(self.now_s, self.controller.velocity[2]):
             self._has_landed()
 
     def _has_landed(self) -> None:
-        self._contact_since_s = None
-        self.landed = True
+        self.ground.touch_down(self.now_s)
         if not self.armed:  # it fell
             self.home.follow(self._airframe, self._parameters)
-        self._landed_since_s = self.now_s
         self._say(INFO, "Landing detected\t", LANDED_EVENT)
         self._on_event("landed")
 
     def _disarm_automatically(self) -> None:
-        if not self.landed:
+        ground = self.ground
+        if not ground.landed:
             return
-        if self._has_flown and self.navigator.in_progress and not self.terminated:
+        if ground.has_flown and self.navigator.in_progress and not self.terminated:
             return
-        if self._has_flown:
+        if ground.has_flown:
             delay = self._parameters.number("COM_DISARM_LAND")
-            if delay >= 0.0 and self.now_s - self._landed_since_s >= delay:
+            if delay >= 0.0 and ground.landed_for_s(self.now_s) >= delay:
                 self._disarm("Disarmed by landing\t", "after landing")
         else:
             delay = self._parameters.number("COM_DISARM_PRFLT")
-            if delay > 0.0 and self.now_s - self._armed_since_s >= delay + PREFLIGHT_DISARM_MARGIN_S:
+            if delay > 0.0 and ground.armed_for_s(self.now_s) >= delay + PREFLIGHT_DISARM_MARGIN_S:
                 self._disarm("Disarmed by auto preflight disarming\t", "no takeoff")
 
     # ---- transitions ------------------------------------------------------------------------------------

@@ -208,7 +208,7 @@ def test_no_request_makes_the_flight_absurd(make_cockpit: Any, requests: list[li
     airframe = cockpit.vehicle.airframe
     airframe.position, airframe.on_ground = (0.0, 0.0, -5.0), False
     cockpit.command(400, 1)
-    cockpit.vehicle.autopilot.landed = False
+    cockpit.vehicle.autopilot.ground.landed = False
     for values in requests:
         assert cockpit.command(34, *values) in ([0], [2])
         cockpit.fly(0.5)
