@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.midair import Body, Midair
+from mavlink_sim.physics.neighbours import Neighbours
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from mavlink_sim.world.aircraft import Aircraft, aircraft_objects
 
@@ -52,7 +53,7 @@ class Flock:
         self._seen: tuple[int, int, tuple[WorldObject, ...]] | None = None
 
     def join(self, vehicle: Vehicle, offset: int = 0) -> None:
-        """From now on the others see it, and run into it.
+        """From now on the others see and measure it, and run into it.
 
         Args:
             offset: from a system id to its identifier among the world's things (`identifier_offset`), by
@@ -65,15 +66,15 @@ class Flock:
         if len(self._vehicles) == self.size:
             raise ValueError(f"vehicle {number}: this flock is of {self.size}, and all have joined")
         faults = vehicle.faults
-        self._midair.join(
-            Body(
-                vehicle.airframe,
-                vehicle.start_ned_m,
-                offset + number,
-                f"vehicle {number}",
-                lambda: faults.now_s,
-            )
+        body = Body(
+            vehicle.airframe,
+            vehicle.start_ned_m,
+            offset + number,
+            f"vehicle {number}",
+            lambda: faults.now_s,
         )
+        self._midair.join(body)
+        vehicle.neighbours = Neighbours(self._midair.bodies, body)
         self._vehicles.append(vehicle)
         self._seen = None
 

@@ -10,7 +10,14 @@ from mavlink_sim.camera.scene_file import load_scene
 from mavlink_sim.flight.collision_prevention import FRAME_BODY_FRD, ObstacleMap
 from mavlink_sim.physics.collisions import CollidingMultirotor
 from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
-from mavlink_sim.physics.obstacle_sensor import MAXIMUM_CM, MINIMUM_CM, SECTOR_DEG, ObstacleSensor
+from mavlink_sim.physics.neighbours import Neighbours
+from mavlink_sim.physics.obstacle_sensor import (
+    MAXIMUM_CM,
+    MAXIMUM_M,
+    MINIMUM_CM,
+    SECTOR_DEG,
+    ObstacleSensor,
+)
 from mavlink_sim.world.obstacles import Obstacles
 from mavlink_sim.world.world import World
 
@@ -58,12 +65,16 @@ class Surroundings:
         found = self._obstacles.range_along(self.airframe.centre_ned_m, (x, y, z), self._clock())
         return max(found - HALF_HEIGHT_M, 0.0)
 
-    def sense_obstacles(self, into: ObstacleMap, yaw_rad: float, now_s: float) -> None:
+    def sense_obstacles(
+        self, into: ObstacleMap, yaw_rad: float, now_s: float, neighbours: Neighbours | None = None
+    ) -> None:
         """Let the obstacle sensor measure, for collision prevention.
 
         Args:
             into: the vehicle's map. yaw_rad: the heading it believes in. now_s: seconds since its boot.
+            neighbours: what flies beside it.
         """
         airframe = self.airframe
-        ranges_cm = self._sensor.measure(airframe.centre_ned_m, airframe.yaw_rad, self._clock())
+        beside = [] if neighbours is None else neighbours.outlines(MAXIMUM_M)
+        ranges_cm = self._sensor.measure(airframe.centre_ned_m, airframe.yaw_rad, self._clock(), beside)
         into.add(ranges_cm, SECTOR_DEG, 0.0, MINIMUM_CM, MAXIMUM_CM, FRAME_BODY_FRD, yaw_rad, now_s)

@@ -41,6 +41,7 @@ from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_C
 
 if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
+    from mavlink_sim.physics.neighbours import Neighbours
     from mavlink_sim.surroundings import Surroundings
     from mavlink_sim.world.world import World
 
@@ -85,7 +86,8 @@ class Vehicle:
         SceneError: the scene cannot be used.
 
     Attributes:
-        airframe: the motion (truth). surroundings: the scene, None without one.
+        airframe: the motion (truth). surroundings: the scene, None without one. neighbours: the others of its
+            flock, None in none.
         estimate: what the vehicle knows of it. faults: what goes wrong.
         autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
@@ -134,6 +136,7 @@ class Vehicle:
         if obstacle_sensor and scene is None:
             raise ValueError("an obstacle sensor has nothing to measure without a scene: give it one")
         self.surroundings: Surroundings | None = None
+        self.neighbours: Neighbours | None = None
         self._obstacle_sensor = obstacle_sensor
         if scene is None:
             self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
@@ -167,6 +170,10 @@ class Vehicle:
         self._wind_revision = -1
         self._boot()
         self.gimbal_manager = GimbalManager(self) if gimbal else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy of it is made of: that is in no flock."""
+        return {**vars(self), "neighbours": None}
 
     def _boot(self) -> None:
         """Everything that begins with power: whatever is set here does not survive a reboot."""
@@ -364,7 +371,7 @@ class Vehicle:
         self.estimate.look()
         autopilot = self.autopilot
         self.surroundings.sense_obstacles(
-            autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s
+            autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s, self.neighbours
         )
         self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
 

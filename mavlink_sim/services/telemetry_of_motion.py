@@ -111,6 +111,8 @@ def distance_sensor(vehicle: Vehicle) -> Any:
     slant = -vehicle.airframe.position[2] / max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.1)
     if vehicle.surroundings is not None:
         slant = min(slant, vehicle.surroundings.range_below_m())
+    if vehicle.neighbours is not None:
+        slant = min(slant, vehicle.neighbours.range_below_m())
     return packing.distance_sensor(
         vehicle.boot_ms, 0, 10000, min(round(max(slant, 0.0) * 100), 65534), 0, 0, 25, 0
     )

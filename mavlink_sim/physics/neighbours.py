@@ -1,0 +1,73 @@
+"""The other vehicles of a flock as the range sensors of one of them meet them: upright ellipsoids.
+
+Everything is NED metres in the world's frame.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
+from mavlink_sim.physics.midair import Body
+
+if TYPE_CHECKING:
+    from mavlink_sim.world.obstacles import Segment
+
+# The ellipse that a level cuts is as good as this many sides: 3 mm, where the sensor errs by 20.
+_CORNERS = [(math.cos(number * math.tau / 24), math.sin(number * math.tau / 24)) for number in range(25)]
+
+
+class Neighbours:
+    """All bodies of a world but one.
+
+    Args:
+        bodies: all, as they are at any time; one that joins later is among them then.
+        own: the one that looks.
+    """
+
+    def __init__(self, bodies: Sequence[Body], own: Body) -> None:
+        self._bodies = bodies
+        self._own = own
+
+    def _others(self) -> Iterator[Vector]:
+        """From one's own middle to the middle of each of the others."""
+        x, y, z = self._own.place_ned_m
+        for body in self._bodies:
+            if body is not self._own:
+                north, east, down = body.place_ned_m
+                yield north - x, east - y, down - z
+
+    def range_below_m(self) -> float:
+        """From one's own legs along one's own down axis to the first of them; inf: none."""
+        _, _, x, _, _, y, _, _, z = self._own.airframe.matrix
+        found = min((_along(middle, (x, y, z)) for middle in self._others()), default=math.inf)
+        return max(found - HALF_HEIGHT_M, 0.0)
+
+    def outlines(self, range_m: float) -> list[Segment]:
+        """What one's own level cuts of those within a range: sides, (north, east) from one's own middle."""
+        sides: list[Segment] = []
+        for north, east, down in self._others():
+            if abs(down) >= HALF_HEIGHT_M or math.hypot(north, east) - RADIUS_M > range_m:
+                continue
+            radius = RADIUS_M * math.sqrt(1.0 - (down / HALF_HEIGHT_M) ** 2)
+            corners = [(north + radius * x, east + radius * y) for x, y in _CORNERS]
+            sides += itertools.pairwise(corners)
+        return sides
+
+
+def _along(middle: Vector, direction: Vector) -> float:
+    """How far along a unit vector the ellipsoid around a point begins; 0 inside it, inf where it is not."""
+    x, y, z = middle[0] / RADIUS_M, middle[1] / RADIUS_M, middle[2] / HALF_HEIGHT_M
+    dx, dy, dz = direction[0] / RADIUS_M, direction[1] / RADIUS_M, direction[2] / HALF_HEIGHT_M
+    # |t d - m| = 1
+    square = dx * dx + dy * dy + dz * dz
+    half = x * dx + y * dy + z * dz
+    outside = x * x + y * y + z * z - 1.0
+    if outside <= 0.0:
+        return 0.0
+    root = half * half - square * outside
+    return (half - math.sqrt(root)) / square if root >= 0.0 and half > 0.0 else math.inf
