@@ -298,7 +298,13 @@ class Vehicle:
 
     def handle(self, link_name: str, message: Any) -> None:
         """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
-        start_of_vehicle.set(self.start_ned_m)
+        turn = start_of_vehicle.set(self.start_ned_m)
+        try:
+            self._take_in(link_name, message)
+        finally:
+            start_of_vehicle.reset(turn)
+
+    def _take_in(self, link_name: str, message: Any) -> None:
         link = self.links[link_name]
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source == (self.system_id, AUTOPILOT_COMPONENT):
@@ -331,12 +337,15 @@ class Vehicle:
 
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
-        start_of_vehicle.set(self.start_ned_m)
-        self._leftover_s += dt_s
-        while self._leftover_s >= STEP_S - 1e-9:
-            self._leftover_s -= STEP_S
-            self._step()
-        self.estimate.look()
+        turn = start_of_vehicle.set(self.start_ned_m)
+        try:
+            self._leftover_s += dt_s
+            while self._leftover_s >= STEP_S - 1e-9:
+                self._leftover_s -= STEP_S
+                self._step()
+            self.estimate.look()
+        finally:
+            start_of_vehicle.reset(turn)
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Do something in a later step."""

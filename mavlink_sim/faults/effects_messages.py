@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.faults.effects_link import chosen_links
-from mavlink_sim.physics.geography import start_of_vehicle
 from mavlink_sim.wire.messages import Outgoing, parser
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 
@@ -148,7 +147,6 @@ def second_autopilot(vehicle: Vehicle, one: ActiveFault) -> None:
 
     def speak(dt_s: float) -> None:
         other.step(dt_s)
-        start_of_vehicle.set(vehicle.start_ned_m)
         for name, codec in codecs.items():
             for item in other.outgoing(name):
                 if not item.forwarded:  # what it would pass on has been on these links already

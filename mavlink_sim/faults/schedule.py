@@ -25,7 +25,6 @@ from mavlink_sim.faults.effects_messages import shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
 from mavlink_sim.physics.estimate_errors import as_told
-from mavlink_sim.physics.geography import start_of_vehicle
 from mavlink_sim.wire.link_faults import LinkStage
 
 if TYPE_CHECKING:
@@ -257,8 +256,6 @@ class Faults:
         if not self._reads_held:  # the others have heard those
             for other in self.second.values():
                 other.handle(link, message)
-            if self.second:
-                start_of_vehicle.set(self.vehicle.start_ned_m)
         if self.deaf:
             return True
         if self.pace == 0.0:

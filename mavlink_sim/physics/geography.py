@@ -1,7 +1,8 @@
 """Between the local NED frame and latitude, longitude, altitude: a flat earth around PX4's SIH home.
 
 Vehicles of a fleet start in different places, and each has its local frame's origin at its own. Which one is
-meant is a context variable that a vehicle sets when its turn comes, so that the many callers need not know.
+meant is a context variable that a vehicle sets for its turn, so that the many callers need not know; outside
+any turn it is SIH's home.
 """
 
 from __future__ import annotations

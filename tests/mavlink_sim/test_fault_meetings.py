@@ -10,7 +10,7 @@ from plan_client import land, takeoff, upload, waypoint
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.missions.items import MissionItem
-from mavlink_sim.physics.geography import local, start_of_vehicle
+from mavlink_sim.physics.geography import local
 from mavlink_sim.wire.messages import dialect
 
 ORBIT, CHANGE_ALTITUDE, SET_HOME = 34, 186, 179
@@ -289,7 +289,6 @@ def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(ma
     begin(cockpit, "second_autopilot 9")
     cockpit.forget()
     cockpit.fly(1.0)
-    start_of_vehicle.set((0.0, 0.0))
     places = {
         message.get_srcSystem() if hasattr(message, "_system") else 1: local(
             message.lat / 1e7, message.lon / 1e7, 0.0

@@ -13,7 +13,7 @@ from mavsdk_client import mavsdk_client, wait_for
 
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic, local
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import RunningSimulator
 
 SPEED = 3.0  # simulated seconds a second; MAVSDK repeats a setpoint 20 times a real second
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2
@@ -23,77 +23,74 @@ def distance_m(update: Any, north: float, east: float) -> float:
     return math.hypot(update.position.north_m - north, update.position.east_m - east)
 
 
-async def test_mavsdk_flies_every_kind_of_setpoint() -> None:
-    with running_simulator(speed=SPEED, px4="1.15") as simulator:
-        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
-        async with mavsdk_client(url, ComponentType.COMPANION_COMPUTER) as system:
-            action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)
-            offboard = system.plugin(OffboardAsync)
-            await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
-            await action.set_takeoff_altitude(8.0)
-            await action.arm()
-            await action.takeoff()
-            await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
+@pytest.mark.vehicle(speed=SPEED, px4="1.15")
+async def test_mavsdk_flies_every_kind_of_setpoint(vehicle: RunningSimulator) -> None:
+    async with mavsdk_client(vehicle.mavsdk_url, ComponentType.COMPANION_COMPUTER) as system:
+        action, telemetry = system.plugin(ActionAsync), system.plugin(TelemetryAsync)
+        offboard = system.plugin(OffboardAsync)
+        await wait_for(telemetry.subscribe_health(), lambda health: health.is_armable)
+        await action.set_takeoff_altitude(8.0)
+        await action.arm()
+        await action.takeoff()
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
 
-            # attitude: nose down goes north, the heading is taken
-            await offboard.set_attitude(Attitude(0.0, -6.0, 0.0, HOVER / math.cos(math.radians(6.0))))
-            await offboard.start()
-            await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
-            leaning = await wait_for(
-                telemetry.subscribe_attitude_euler(), lambda attitude: attitude.pitch_deg < -5.5
-            )
-            assert abs(leaning.roll_deg) < 2.0
-            await wait_for(
-                telemetry.subscribe_position_velocity_ned(), lambda now: now.velocity.north_m_s > 0.5
-            )
+        # attitude: nose down goes north, the heading is taken
+        await offboard.set_attitude(Attitude(0.0, -6.0, 0.0, HOVER / math.cos(math.radians(6.0))))
+        await offboard.start()
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "OFFBOARD")
+        leaning = await wait_for(
+            telemetry.subscribe_attitude_euler(), lambda attitude: attitude.pitch_deg < -5.5
+        )
+        assert abs(leaning.roll_deg) < 2.0
+        await wait_for(telemetry.subscribe_position_velocity_ned(), lambda now: now.velocity.north_m_s > 0.5)
 
-            # body rates: turning on the spot
-            await offboard.set_attitude_rate(AttitudeRate(0.0, 0.0, 30.0, HOVER))
-            await wait_for(
-                telemetry.subscribe_attitude_angular_velocity_body(), lambda rate: rate.yaw_rad_s > 0.45
-            )
+        # body rates: turning on the spot
+        await offboard.set_attitude_rate(AttitudeRate(0.0, 0.0, 30.0, HOVER))
+        await wait_for(
+            telemetry.subscribe_attitude_angular_velocity_body(), lambda rate: rate.yaw_rad_s > 0.45
+        )
 
-            # a global position, relative to home
-            latitude, longitude, _ = geographic((-6.0, 4.0, 0.0))
-            relative = PositionGlobalYaw.AltitudeType.REL_HOME
-            await offboard.set_position_global(PositionGlobalYaw(latitude, longitude, 10.0, 90.0, relative))
-            await wait_for(
-                telemetry.subscribe_position_velocity_ned(),
-                lambda now: distance_m(now, -6.0, 4.0) < 0.6 and abs(now.position.down_m + 10.0) < 0.6,
-            )
-            await wait_for(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90) < 5)
+        # a global position, relative to home
+        latitude, longitude, _ = geographic((-6.0, 4.0, 0.0))
+        relative = PositionGlobalYaw.AltitudeType.REL_HOME
+        await offboard.set_position_global(PositionGlobalYaw(latitude, longitude, 10.0, 90.0, relative))
+        await wait_for(
+            telemetry.subscribe_position_velocity_ned(),
+            lambda now: distance_m(now, -6.0, 4.0) < 0.6 and abs(now.position.down_m + 10.0) < 0.6,
+        )
+        await wait_for(telemetry.subscribe_heading(), lambda heading: abs(heading.heading_deg - 90) < 5)
 
-            # round a place at a radius
-            centre = geographic((4.0, 4.0, 0.0))
-            await action.do_orbit(
-                6.0,
-                2.0,
-                OrbitYawBehavior.HOLD_FRONT_TO_CIRCLE_CENTER,
-                centre[0],
-                centre[1],
-                HOME_ALTITUDE_M + 9.0,
-            )
-            await asyncio.to_thread(simulator.wait_for_event, "mode ORBIT")
-            await wait_for(
-                telemetry.subscribe_position_velocity_ned(),
-                lambda now: now.position.north_m > 8.0 and abs(distance_m(now, 4.0, 4.0) - 6.0) < 1.0,
-            )
+        # round a place at a radius
+        centre = geographic((4.0, 4.0, 0.0))
+        await action.do_orbit(
+            6.0,
+            2.0,
+            OrbitYawBehavior.HOLD_FRONT_TO_CIRCLE_CENTER,
+            centre[0],
+            centre[1],
+            HOME_ALTITUDE_M + 9.0,
+        )
+        await asyncio.to_thread(vehicle.wait_for_event, "mode ORBIT")
+        await wait_for(
+            telemetry.subscribe_position_velocity_ned(),
+            lambda now: now.position.north_m > 8.0 and abs(distance_m(now, 4.0, 4.0) - 6.0) < 1.0,
+        )
 
-            # and straight to another
-            goal = geographic((0.0, -8.0, 0.0))
-            await action.set_current_speed(3.0)
-            await action.goto_location(goal[0], goal[1], HOME_ALTITUDE_M + 7.0, 0.0)
-            reached = await wait_for(
-                telemetry.subscribe_position(),
-                lambda place: (
-                    math.dist(
-                        local(place.latitude_deg, place.longitude_deg, place.absolute_altitude_m),
-                        (0.0, -8.0, -7.0),
-                    )
-                    < 0.7
-                ),
-            )
-            assert reached.relative_altitude_m == pytest.approx(7.0, abs=0.8)
-            await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
-    modes = [event for event in simulator.events if event.startswith("mode ")]
+        # and straight to another
+        goal = geographic((0.0, -8.0, 0.0))
+        await action.set_current_speed(3.0)
+        await action.goto_location(goal[0], goal[1], HOME_ALTITUDE_M + 7.0, 0.0)
+        reached = await wait_for(
+            telemetry.subscribe_position(),
+            lambda place: (
+                math.dist(
+                    local(place.latitude_deg, place.longitude_deg, place.absolute_altitude_m),
+                    (0.0, -8.0, -7.0),
+                )
+                < 0.7
+            ),
+        )
+        assert reached.relative_altitude_m == pytest.approx(7.0, abs=0.8)
+        await wait_for(telemetry.subscribe_flight_mode(), lambda mode: mode.name == "HOLD")
+    modes = [event for event in vehicle.events if event.startswith("mode ")]
     assert modes == ["mode TAKEOFF", "mode HOLD", "mode OFFBOARD", "mode ORBIT", "mode HOLD"]
