@@ -6,8 +6,8 @@ TORCH_INDEX ?=
 # Gigabytes of CUDA come only when asked for: ALLOW_CUDA=1.
 ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-# Flights in real time mostly wait: one test more at once than there are cores.
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+# How many processors the tests may take. Empty: all.
+PROCESSORS ?=
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -21,14 +21,10 @@ demo: $(READY)
 	$(BIN)/companion demo --output demo-output
 
 # The tests start hundreds of processes, in workers that all read all tests: not each is to compile them anew.
-# So bytecode is kept, whatever the environment says, and made while what must run alone leaves some of the
-# machine idle. (What cannot be collected is told by the run that follows.)
+# So bytecode is kept, whatever the environment says.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	nice -n 19 $(BIN)/python -m pytest --collect-only --quiet >/dev/null 2>&1 & reading=$$!; \
-	trap 'kill $$reading 2>/dev/null' EXIT; trap 'exit 130' INT TERM; \
-	$(BIN)/python -m pytest tests/alone && { wait $$reading || true; }
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --ignore tests/alone
+	PROCESSORS=$(PROCESSORS) $(BIN)/python tests/side_by_side.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -136,7 +136,7 @@ def test_a_vehicle_outlives_a_launcher_that_is_killed_and_the_next_has_another()
 @pytest.mark.usefixtures("own_launchers")
 def test_pythons_own_variables_count_from_the_next_vehicle_on(monkeypatch: pytest.MonkeyPatch) -> None:
     with vehicle() as one:
-        monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
+        monkeypatch.setenv("PYTHONUNBUFFERED", "1" if os.environ.get("PYTHONUNBUFFERED") == "" else "")
         with vehicle() as other:
             assert parent_of(one.pid) != parent_of(other.pid)
             assert one.process.poll() is None
