@@ -6,8 +6,8 @@ TORCH_INDEX ?=
 # Gigabytes of CUDA come only when asked for: ALLOW_CUDA=1.
 ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-# How many processors the tests may take. Empty: all.
-PROCESSORS ?=
+# How many tests run at once that fly, and as many that compute. Empty: one for each processor.
+WORKERS ?=
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -24,7 +24,7 @@ demo: $(READY)
 # So bytecode is kept, whatever the environment says.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	PROCESSORS=$(PROCESSORS) $(BIN)/python tests/side_by_side.py
+	WORKERS=$(WORKERS) $(BIN)/python -m tests.side_by_side
 
 lint: $(READY)
 	$(BIN)/ruff check .

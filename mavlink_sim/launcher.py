@@ -1,18 +1,21 @@
-"""Vehicles from a process that has everything imported: forks of it, each up in a fraction of the time.
+"""Vehicles from a process that has imported all that they take: forks of it, ready in a fraction of the time.
 
-To start Python and to import the simulator takes most of the time until a vehicle is ready. A test run that
-starts hundreds pays it once: with the first, `mavlink_sim.testing` starts `python -m mavlink_sim.launcher`,
-which imports, and forks a process for each vehicle that is wanted: in everything but its command line what
-`python -m mavlink_sim` is. The launcher ends with the program that started it, however that ends, and its
-vehicles with it. It takes Linux.
+To start Python and to import the simulator is most of what it takes until a vehicle is ready. A test run that
+starts hundreds pays it once: `mavlink_sim.launching` starts `python -m mavlink_sim.launcher`, which imports,
+and forks a process for each vehicle that is wanted. That does what `python -m mavlink_sim` does, in the
+folder, with the variables, standard input and output of who wants it; what Python or a library reads of them
+at its start is the launcher's. It takes Linux.
 
-A request is a JSON object after its length, on a stream socket. With the length come the new process's
-standard input, its standard output, and the end of a socket for the answers: the process's id, with a
-descriptor of the process (pidfd); and its exit code when it has ended.
+The launcher ends with the program that started it, however that ends, and a vehicle with its launcher.
+
+A request is one packet with a JSON object, and with it come three descriptors: the new process's standard
+input and output, and the end of a socket for the answers. Those are the process's id, with a descriptor of it
+(pidfd), and its exit code when it has ended.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import selectors
@@ -20,14 +23,20 @@ import signal
 import socket
 import struct
 import sys
+import time
+import traceback
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 
 from vision.loading import uncollected
 
-LENGTH = struct.Struct("!I")
+LARGEST_REQUEST = 1 << 20
 STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
 ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
+# How long vehicles have to end in order once nobody is there who wants them.
+FAREWELL_S = 3.0
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_GONE = (BrokenPipeError, ConnectionResetError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,36 +54,36 @@ class Request:
     environment: dict[str, str]
 
     def send(self, connection: socket.socket, descriptors: list[int]) -> None:
-        """Ask for it; `descriptors` are its standard input, its standard output, and where to answer."""
-        body = json.dumps(asdict(self)).encode()
-        socket.send_fds(connection, [LENGTH.pack(len(body))], descriptors)
-        connection.sendall(body)
+        """Ask for it; `descriptors` are its standard input, its standard output, and where to answer.
+
+        Raises:
+            OSError: the launcher is gone, or this is more than fits into a packet (EMSGSIZE).
+        """
+        socket.send_fds(connection, [json.dumps(asdict(self)).encode()], descriptors)
 
 
 @dataclass(frozen=True, slots=True)
 class _Child:
-    """A process that was forked: `descriptor` is its pidfd, `answers` the socket of whoever wanted it."""
+    """A process that was forked: `descriptor` is its pidfd, `answers` the socket of who wanted it."""
 
     pid: int
     descriptor: int
     answers: socket.socket
 
     def tell_start(self) -> None:
-        with suppress(BrokenPipeError, ConnectionResetError):  # who asked does not want to know any more
+        with suppress(*_GONE):  # who asked does not want to know any more
             socket.send_fds(self.answers, [STARTED.pack(self.pid)], [self.descriptor])
 
-    def tell_end(self) -> None:
+    def take_end(self) -> None:
         """It has ended: take its exit code, and pass that on."""
         _, status = os.waitpid(self.pid, 0)
-        with suppress(BrokenPipeError, ConnectionResetError):
+        with suppress(*_GONE):
             self.answers.sendall(ENDED.pack(os.waitstatus_to_exitcode(status)))
         self.close()
 
-    def end(self) -> None:
-        """Ask it to end, suspended or not."""
+    def send(self, number: int) -> None:
         with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self.descriptor, signal.SIGTERM)
-            signal.pidfd_send_signal(self.descriptor, signal.SIGCONT)
+            signal.pidfd_send_signal(self.descriptor, number)
 
     def close(self) -> None:
         os.close(self.descriptor)
@@ -85,85 +94,133 @@ def main(descriptor: int) -> None:
     """Be the launcher with the requests of the socket `descriptor`; and in every fork be the simulator."""
     # A Ctrl-C reaches every process of a terminal; this one ends with the program that started it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     with uncollected():
         from mavlink_sim import cli
 
         cli.load()
-    with socket.socket(fileno=descriptor) as requests:
-        arguments = _launch(requests)
+    with socket.socket(fileno=descriptor) as requests, selectors.DefaultSelector() as selector:
+        arguments = _Launcher(requests, selector).run()
     if arguments is not None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.argv = ["mavlink-sim", *arguments]
         cli.main()
 
 
-def _launch(requests: socket.socket) -> list[str] | None:
-    """Fork as often as asked. Returns in each fork its arguments, and None once nobody can ask any more."""
-    children: list[_Child] = []
-    with selectors.DefaultSelector() as selector:
+class _Launcher:
+    """Forks as often as asked."""
+
+    def __init__(self, requests: socket.socket, selector: selectors.BaseSelector) -> None:
+        self._requests = requests
+        self._selector = selector
+        self._children: list[_Child] = []
+        self._pid = os.getpid()
+        # A fork of the program may hold the other end of the socket when the program is long gone.
+        self._program = os.pidfd_open(os.getppid())
         selector.register(requests, selectors.EVENT_READ)
-        while True:
-            for key, _ in selector.select():
-                if key.data is not None:
-                    selector.unregister(key.data.descriptor)
-                    children.remove(key.data)
-                    key.data.tell_end()
-                    continue
-                taken = _take(requests)
-                if taken is None:
-                    for child in children:
-                        child.end()
-                    return None
-                request, standard, answers = taken
-                try:
-                    pid = os.fork()
-                except OSError as error:
-                    answers.sendall(STARTED.pack(-(error.errno or 1)))
-                    answers.close()
-                else:
-                    if pid == 0:
-                        # What is open here is the launcher's, and not this process's to keep open.
-                        for child in children:
-                            child.close()
-                        answers.close()
-                        _become(request, standard)
-                        return request.arguments
-                    child = _Child(pid, os.pidfd_open(pid), answers)
-                    child.tell_start()
-                    children.append(child)
-                    selector.register(child.descriptor, selectors.EVENT_READ, child)
-                for number in standard:
-                    os.close(number)
+        selector.register(self._program, selectors.EVENT_READ)
 
+    def run(self) -> list[str] | None:
+        """Returns in each fork its arguments; and None once nobody is there to ask for more."""
+        try:
+            while True:
+                for key, _ in self._selector.select():
+                    if key.data is not None:
+                        self._take_end(key.data)
+                    elif key.fileobj == self._program:
+                        return None
+                    else:
+                        packet, descriptors, _, _ = socket.recv_fds(
+                            self._requests, LARGEST_REQUEST, 3, socket.MSG_CMSG_CLOEXEC
+                        )
+                        if not packet:
+                            return None
+                        arguments = self._serve(packet, descriptors)
+                        if arguments is not None:
+                            return arguments
+        finally:
+            if os.getpid() == self._pid:
+                self._end_all()
 
-def _take(requests: socket.socket) -> tuple[Request, list[int], socket.socket] | None:
-    """The next request, its process's standard input and output, and the socket for the answers.
+    def _serve(self, packet: bytes, descriptors: list[int]) -> list[str] | None:
+        """Fork for a request. Returns its arguments in the fork, None in the launcher.
 
-    None when the other end is closed.
-    """
-    header, descriptors, _, _ = socket.recv_fds(requests, LENGTH.size, 3)
-    if not header:
+        Who asked for what cannot be sees the end of the answers.
+        """
+        try:
+            request = Request(**json.loads(packet))
+            *standard, answers = descriptors
+            pid = self._fork(answers)
+        except (OSError, TypeError, ValueError):
+            traceback.print_exc()
+            pid = None
+        if pid == 0:
+            self._become(request, standard)
+            return request.arguments
+        for descriptor in descriptors:
+            os.close(descriptor)
         return None
-    body = bytearray()
-    wanted: int = LENGTH.unpack(header)[0]
-    while len(body) < wanted:
-        part = requests.recv(wanted - len(body))
-        if not part:
+
+    def _fork(self, answers: int) -> int | None:
+        """0 in the new process; in the launcher its id, None if there is none."""
+        connection = socket.socket(fileno=os.dup(answers))
+        try:
+            pid = os.fork()
+        except OSError as error:
+            with connection, suppress(*_GONE):
+                connection.sendall(STARTED.pack(-(error.errno or 1)))
             return None
-        body += part
-    *standard, answers = descriptors
-    return Request(**json.loads(body)), standard, socket.socket(fileno=answers)
+        if pid == 0:
+            connection.close()
+            os.close(answers)
+            return 0
+        try:
+            child = _Child(pid, os.pidfd_open(pid), connection)
+        except OSError:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            connection.close()
+            raise
+        child.tell_start()
+        self._children.append(child)
+        self._selector.register(child.descriptor, selectors.EVENT_READ, child)
+        return pid
 
+    def _become(self, request: Request, standard: list[int]) -> None:
+        """Be the process that is wanted: nothing that is the launcher's stays open."""
+        for child in self._children:
+            child.close()
+        os.close(self._program)
+        for number, descriptor in enumerate(standard):
+            os.dup2(descriptor, number)
+            os.close(descriptor)
+        os.dup2(1, 2)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != self._pid:  # the launcher ended before the kernel was asked to tell
+            os._exit(-signal.SIGTERM)
+        os.chdir(request.folder)
+        if not sys.flags.safe_path:
+            sys.path[0] = request.folder
+        os.environ.clear()
+        os.environ.update(request.environment)
 
-def _become(request: Request, standard: list[int]) -> None:
-    """Be the process that is wanted, from its descriptors to its folder."""
-    for number, descriptor in enumerate(standard):
-        os.dup2(descriptor, number)
-        os.close(descriptor)
-    os.dup2(1, 2)
-    os.chdir(request.folder)
-    os.environ.clear()
-    os.environ.update(request.environment)
+    def _take_end(self, child: _Child) -> None:
+        self._selector.unregister(child.descriptor)
+        self._children.remove(child)
+        child.take_end()
+
+    def _end_all(self) -> None:
+        for child in self._children:
+            child.send(signal.SIGTERM)
+            child.send(signal.SIGCONT)  # it may be suspended
+        self._selector.unregister(self._requests)
+        self._selector.unregister(self._program)
+        until_s = time.monotonic() + FAREWELL_S
+        while self._children and (left_s := until_s - time.monotonic()) > 0.0:
+            for key, _ in self._selector.select(left_s):
+                self._take_end(key.data)
+        for child in self._children:
+            child.send(signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A vehicle in a process of its own, for integration tests. All of a program end with it.
+"""A vehicle in a process of its own, for integration tests.
 
 >>> with running_simulator(seed=3, speed=4.0) as simulator:      # doctest: +SKIP
 ...     connect(simulator.mavsdk_url)
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavlink_sim.launched import LaunchedProcess, launched
+from mavlink_sim.launching import LaunchedProcess, start_simulator
 
 READY = re.compile(r"^ready: system (\d+), onboard \S+:(\d+) -> (\d+), ground station \S+:(\d+) -> (\d+)")
 
@@ -239,7 +239,7 @@ def running_simulator(
     timeout_s: float = 60.0,
     **options: float | str | Path | None,
 ) -> Iterator[RunningSimulator]:
-    """Start a vehicle, wait until it is up, end it afterwards.
+    """Start a vehicle, wait until it is up, end it afterwards; on Linux at the latest when this program ends.
 
     Args:
         onboard_port, gcs_port: where it sends to; None for ports that are free now.
@@ -274,8 +274,12 @@ def running_simulator(
     for fault in faults:
         command += ["--fault", fault]
     command += ["--console"]
-    with launched(command) as process:
-        simulator = RunningSimulator(process, count)
+    with start_simulator(command) as process:
+        try:
+            simulator = RunningSimulator(process, count)
+        except BaseException:
+            process.kill()
+            raise
         try:
             simulator.wait_until_ready(timeout_s)
             yield simulator

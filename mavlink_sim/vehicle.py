@@ -10,7 +10,8 @@ import heapq
 import itertools
 import math
 import random
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -298,11 +299,8 @@ class Vehicle:
 
     def handle(self, link_name: str, message: Any) -> None:
         """Take in one MAVLink message (of any pymavlink dialect) that arrived on a link."""
-        turn = start_of_vehicle.set(self.start_ned_m)
-        try:
+        with self.turn():
             self._take_in(link_name, message)
-        finally:
-            start_of_vehicle.reset(turn)
 
     def _take_in(self, link_name: str, message: Any) -> None:
         link = self.links[link_name]
@@ -337,15 +335,21 @@ class Vehicle:
 
     def step(self, dt_s: float) -> None:
         """Advance time by any amount, in physics steps of 4 ms; a remainder waits for the next call."""
-        turn = start_of_vehicle.set(self.start_ned_m)
-        try:
+        with self.turn():
             self._leftover_s += dt_s
             while self._leftover_s >= STEP_S - 1e-9:
                 self._leftover_s -= STEP_S
                 self._step()
             self.estimate.look()
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Meanwhile places are reckoned in its local frame (`physics.geography`)."""
+        before = start_of_vehicle.set(self.start_ned_m)
+        try:
+            yield
         finally:
-            start_of_vehicle.reset(turn)
+            start_of_vehicle.reset(before)
 
     def after(self, delay_s: float, action: Callable[[], object]) -> None:
         """Do something in a later step."""

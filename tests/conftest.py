@@ -20,35 +20,27 @@ pytest_plugins = ["tests.run_again"]
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-# What a test knows that runs by the clock: by names in its file, or of its fixtures.
-CLOCKED = frozenset(
-    (
-        "time",
-        "socket",
-        "zenoh",
-        "running_simulator",
-        "vehicle",
-        "make_vehicle",
-        "running_service",
-        "open_driver",
-    )
-)
+# What a test knows that runs by the clock: a name in its file, or of one of its fixtures.
+CLOCKED = {
+    *("time", "socket", "zenoh", "mavutil", "Fleet", "pytester"),
+    *("running_simulator", "vehicle", "make_vehicle", "running_service", "open_driver"),
+}
 
 
 def runs_by_the_clock(item: pytest.Item) -> bool:
     """Whether a test flies, listens or waits in real time, so that a busy machine disturbs it."""
-    assert isinstance(item, pytest.Function)
+    if not isinstance(item, pytest.Function):
+        return True
     return not CLOCKED.isdisjoint({*vars(item.module), *item.fixturenames})
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` leaves out what does not run by the clock, or what does
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what runs by the clock: `make test` gives it the processors first.
+    """Mark what runs by the clock, which `make test` gives the processors first; and scatter the files.
 
-    Scatter the files: those that wait for flights in real time stand next to each other by their names.
-
-    Workers that run side by side take what is neighbouring; so while some wait, others compute. The order is
-    the same every time, and within a file it stays.
+    Those that wait for flights in real time stand next to each other by their names. Workers that run side by
+    side take what is neighbouring; so while some wait, others compute. The order is the same every time, and
+    within a file it stays.
     """
     for item in items:
         if runs_by_the_clock(item):

@@ -1,37 +1,90 @@
 """`make test`: what runs by the clock, and beside it, on what it leaves of the processors, what computes.
 
-Flights in real time mostly wait, and must not be made to. So what only computes runs at the lowest priority:
-it fills every pause and takes nothing. The demonstration comes first, with no other flight beside it.
+Flights in real time mostly wait, and must not be made to. So what only computes runs at the lowest priority,
+in their pauses. The demonstration comes first: no other flight is beside it, only what computes.
+
+Everything is run, whatever fails. The report on what computed comes last.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+from tests.run_again import NOTES
+from tests.standstill import Watch
 
 PYTEST = [sys.executable, "-m", "pytest"]
 ALONE = "tests/alone"
 # What computes stands still while others need the processors; what hangs is found all the same.
 COMPUTING_TIMEOUT_S = 480
+LOOKS_EVERY_S = 0.5
+INTERRUPTED = 130
 
 
-def main(processors: int) -> int:
-    """The first exit code that is not 0; 0 if all have passed. The report on what computed comes last."""
-    parts = [*PYTEST, "--ignore", ALONE, "-n", str(processors), "--dist", "worksteal"]
-    clocked = [*parts, "-m", "clocked"]
-    computing = [*parts, "-m", "not clocked", "--timeout", str(COMPUTING_TIMEOUT_S)]
-    with tempfile.TemporaryFile() as said:
-        with subprocess.Popen(["nice", "-n", "19", *computing], stdout=said, stderr=said) as beside:
-            try:
-                codes = [subprocess.call([*PYTEST, ALONE]), subprocess.call(clocked), beside.wait()]
-            finally:
-                beside.terminate()
-        said.seek(0)
-        sys.stdout.write(said.read().decode(errors="replace"))
+def main(workers: int) -> int:
+    """The first exit code that is not 0; 0 if all have passed.
+
+    Args:
+        workers: how many tests run at once, of each kind.
+    """
+    parts = [*PYTEST, "--ignore", ALONE, "-n", str(workers), "--dist", "worksteal"]
+    # the failures that `--lf` knows are those of the clock: two at once cannot write them down
+    beside = ["nice", "-n", "19", *parts, "-m", "not clocked", "-p", "no:cacheprovider"]
+    beside += ["--timeout", str(COMPUTING_TIMEOUT_S)]
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    with tempfile.TemporaryDirectory(prefix="tests-") as folder:
+        # one watch for all: what runs at the lowest priority would take the others for a standstill
+        watch = Watch(Path(folder) / "standstills")
+        os.environ[NOTES] = str(watch.notes)
+        report = Path(folder) / "computing"
+        try:
+            with (
+                report.open("wb") as said,
+                report.open("rb") as heard,
+                subprocess.Popen(beside, stdout=said, stderr=said) as computing,
+            ):
+                try:
+                    codes = [_run([*PYTEST, ALONE]), _run([*parts, "-m", "clocked"])]
+                    codes.append(_follow(computing, heard))
+                finally:
+                    computing.terminate()
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        finally:
+            watch.close()
     return next((code for code in codes if code != 0), 0)
 
 
+def _run(command: list[str]) -> int:
+    with subprocess.Popen(command) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:  # it has heard of that too, and sums up
+            process.wait()
+            raise
+        except BaseException:
+            process.terminate()
+            raise
+
+
+def _follow(process: subprocess.Popen[bytes], heard: BinaryIO) -> int:
+    """Show what it says, and has said, until it ends."""
+    while True:
+        code = process.poll()
+        shutil.copyfileobj(heard, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+        if code is not None:
+            return code
+        time.sleep(LOOKS_EVERY_S)
+
+
 if __name__ == "__main__":
-    sys.exit(main(int(os.environ.get("PROCESSORS") or os.cpu_count() or 1)))
+    sys.exit(main(int(os.environ.get("WORKERS") or len(os.sched_getaffinity(0)))))

@@ -65,6 +65,7 @@ IDLE_THRUST_MPS2 = 0.6
 class Autopilot:
     """The decisions of one vehicle. `now_s` is the time since boot, advanced by `update`."""
 
+    # so long it presses on the ground until it has landed
     _land_detection_s = LAND_DETECTION_S
 
     def __init__(
@@ -111,7 +112,7 @@ class Autopilot:
 
     @property
     def landed(self) -> bool:
-        """It stands on the ground."""
+        """It has landed, as far as it can tell."""
         return self.ground.landed
 
     @property
@@ -389,7 +390,7 @@ class Autopilot:
             self._idle(dt_s, IDLE_THRUST_MPS2)
         elif not isinstance(setpoint, TrajectorySetpoint):
             self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)
-        elif self._rests(task, setpoint):
+        elif self._rests(setpoint):
             self._idle(dt_s, IDLE_THRUST_MPS2)
         else:
             self.attitude.release()
@@ -431,11 +432,11 @@ class Autopilot:
     def _spooling(self) -> bool:
         return self.ground.armed_for_s(self.now_s) < self._parameters.number("COM_SPOOLUP_TIME")
 
-    def _rests(self, task: flight.Task, setpoint: TrajectorySetpoint) -> bool:
+    def _rests(self, setpoint: TrajectorySetpoint) -> bool:
         """Landed with a setpoint that does not ask to climb."""
         if not self.ground.landed:
             return False
-        rises = asks_to_rise(task, setpoint, self._airframe.position[2]) and not self._spooling()
+        rises = asks_to_rise(self.task, setpoint, self._airframe.position[2]) and not self._spooling()
         return self.ground.rests(self.now_s, rises=rises)
 
     def _detect_landing(self) -> None:

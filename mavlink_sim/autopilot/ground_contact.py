@@ -1,6 +1,6 @@
 """Whether a vehicle stands or flies: the ramp of a take-off, and what counts as a landing.
 
-Times are seconds since boot. Names in capitals are PX4's parameters.
+Times are seconds since boot. MPC_TKO_* are parameters.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class GroundContact:
         detection_s: so long it must press on the ground to have landed.
 
     Attributes:
-        landed: it stands.
-        has_flown: since it was armed.
+        landed: it stands, as far as it can tell: from `touch_down` to `leave`.
+        has_flown: it has been in the air since it was armed.
     """
 
     def __init__(self, airframe: Multirotor, parameters: Parameters, detection_s: float) -> None:
@@ -50,11 +50,11 @@ class GroundContact:
         return now_s - self._armed_since_s
 
     def landed_for_s(self, now_s: float) -> float:
-        """Since it landed last."""
+        """Since it landed last; before that since boot."""
         return now_s - self._landed_since_s
 
     def rests(self, now_s: float, *, rises: bool) -> bool:
-        """Whether it stays where it stands, with idling motors; if not, the take-off's ramp is under way.
+        """Whether it stays where it stands, with idling motors; if it is to leave that, the ramp begins.
 
         Args:
             rises: it may leave the ground, and is to.
@@ -108,13 +108,13 @@ class GroundContact:
         self._landed_since_s = now_s
 
 
-def asks_to_rise(task: flight.Task, setpoint: TrajectorySetpoint, down_m: float) -> bool:
+def asks_to_rise(task: flight.Task | None, setpoint: TrajectorySetpoint, down_m: float) -> bool:
     """Whether a vehicle that stands at `down_m` (NED) is to leave the ground."""
     if isinstance(task, flight.Takeoff):
         return True
     if isinstance(task, flight.Hold | flight.Land | flight.Return):
         return False
-    # NaN, for nothing wanted, is less than nothing
+    # where nothing is wanted (NaN) every comparison is False
     return (
         setpoint.velocity[2] < -0.05 or setpoint.position[2] < down_m - 0.1 or setpoint.acceleration[2] < -0.3
     )

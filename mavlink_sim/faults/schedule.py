@@ -313,7 +313,8 @@ class Faults:
         if one.fault.duration_s is not None:
             one.ends_s = self.now_s + one.fault.duration_s
         try:
-            EFFECTS[one.fault.kind.name](self.vehicle, one)
+            with self.vehicle.turn():
+                EFFECTS[one.fault.kind.name](self.vehicle, one)
         except FaultError:
             del self.known[one.number]
             raise
@@ -326,8 +327,9 @@ class Faults:
             return
         if one.active:
             one.active = False
-            for undo in reversed(one.undo):
-                undo()
+            with self.vehicle.turn():
+                for undo in reversed(one.undo):
+                    undo()
             self._on_event(f"fault {one} ends")
 
 

@@ -268,6 +268,20 @@ def test_rtl_climbs_returns_waits_and_lands_at_home() -> None:
     assert vehicle.truth.mode == "RTL"
 
 
+def test_one_that_landed_long_ago_has_the_whole_disarm_delay_when_it_is_armed_again(
+    flying: LockstepVehicle,
+) -> None:
+    flying.set_mode("LAND")
+    flying.run_until(lambda truth: not truth.armed, 60.0)
+    flying.step(15.0)
+    flying.set_mode("GUIDED")
+    flying.arm()
+    flying.step(9.5)
+    assert flying.truth.armed
+    flying.step(1.0)  # DISARM_DELAY is 10 s
+    assert flying.events[-1] == "disarmed (no takeoff)"
+
+
 def test_disarming_in_the_air_needs_the_magic_number(flying: LockstepVehicle) -> None:
     assert flying.command(ARM, 0) == "FAILED"
     assert flying.command(ARM, 0, 21196) == "ACCEPTED"

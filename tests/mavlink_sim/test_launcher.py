@@ -9,19 +9,20 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from mavlink_sim import launched as launching
-from mavlink_sim.launched import LaunchedProcess, launched
+from mavlink_sim import launching
+from mavlink_sim.launching import LaunchedProcess, can_launch, start_simulator
 from mavlink_sim.testing import vehicle
 
 ROOT = Path(__file__).parents[2]
 # Of a vehicle that nobody speaks to.
-ENDS = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", "9", "--gcs-port", "9", "--no-console"]
+SILENT = ["--onboard-bind", "0", "--gcs-bind", "0", "--onboard-port", "9", "--gcs-port", "9", "--no-console"]
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a launcher takes Linux")
+pytestmark = pytest.mark.skipif(not can_launch(), reason="a launcher takes Linux with pidfd_open")
 
 
 def parent_of(pid: int) -> int:
@@ -44,7 +45,7 @@ def ends(pid: int, timeout_s: float = 20.0) -> bool:
 @pytest.fixture
 def own_launchers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Launchers of this test alone: they may be killed, or start with other variables."""
-    launchers: list[launching._Launcher] = []
+    launchers: list[launching._LauncherOfOurs] = []
     monkeypatch.setattr(launching, "_launchers", launchers)
     yield
     for launcher in launchers:
@@ -82,7 +83,7 @@ def test_a_vehicle_runs_in_the_folder_and_with_the_variables_of_who_wants_it(
 
 
 def test_what_cannot_start_says_so_and_has_its_exit_code() -> None:
-    with launched([*ENDS, "--wind", "99"]) as process:
+    with start_simulator([*SILENT, "--wind", "99"]) as process:
         assert process.stdout is not None
         assert process.stdout.read() == "mavlink-sim: --wind 99: expected 0 to 8\n"
         assert process.wait(20.0) == 2
@@ -91,7 +92,7 @@ def test_what_cannot_start_says_so_and_has_its_exit_code() -> None:
 
 
 def test_waiting_for_one_that_flies_on_takes_no_longer_than_told() -> None:
-    with launched(ENDS) as process:
+    with start_simulator(SILENT) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: ")
         with pytest.raises(subprocess.TimeoutExpired):
@@ -101,36 +102,85 @@ def test_waiting_for_one_that_flies_on_takes_no_longer_than_told() -> None:
         assert process.wait(20.0) == 0
 
 
-def test_with_the_program_that_started_them_all_vehicles_end() -> None:
+KILL = "os.kill(os.getpid(), signal.SIGKILL)"
+HOW_IT_ENDS = {
+    "killed": KILL,
+    "killed, and its launcher before it": f"os.kill(launcher, signal.SIGKILL); {KILL}",
+    "killed, but for a fork of it": f"os.fork() or os._exit(len(os.read(0, 1))); {KILL}",
+    "in order, with vehicles in flight": "pass",
+}
+
+
+@pytest.mark.parametrize("how", HOW_IT_ENDS)
+def test_with_the_program_that_started_them_all_vehicles_end(how: str) -> None:
     code = (
         "import os, signal, time; from mavlink_sim.testing import vehicle\n"
-        "one, other = vehicle().__enter__(), vehicle().__enter__(); other.suspend()\n"
-        "print(one.pid, other.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+        "starting = vehicle(), vehicle(); one, other = (each.__enter__() for each in starting)\n"
+        "other.suspend()\n"
+        "with open(f'/proc/{one.pid}/stat') as file: launcher = int(file.read().split()[3])\n"
+        "assert one.process.poll() is other.process.poll() is None\n"
+        f"print(one.pid, other.pid, launcher, flush=True); {HOW_IT_ENDS[how]}"
     )
-    killed = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    pids = [int(word) for word in killed.stdout.split()]
-    assert len(pids) == 2
-    assert all(ends(pid) for pid in pids)
+    command, pipe = [sys.executable, "-c", code], subprocess.PIPE
+    with subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, text=True) as program:
+        assert program.stdout is not None
+        one, other, launcher = map(int, program.stdout.readline().split())
+        assert ends(launcher)
+        assert ends(one)
+        if "launcher" in how:  # a suspended one, whose launcher could not wake it
+            os.kill(other, signal.SIGCONT)
+        assert ends(other)
 
 
 @pytest.mark.usefixtures("own_launchers")
-def test_a_vehicle_outlives_a_launcher_that_is_killed_and_the_next_has_another() -> None:
-    unknown = pytest.raises(ChildProcessError, match="has ended; how, only its launcher knew")
-    with unknown, launched(ENDS) as process:
+def test_a_vehicle_ends_with_its_launcher_and_the_next_has_another() -> None:
+    with start_simulator(SILENT) as process:
         assert isinstance(process, LaunchedProcess)
         assert process.stdout.readline().startswith("ready: ")
         launcher = parent_of(process.pid)
         os.kill(launcher, signal.SIGKILL)
-        assert ends(launcher)
-        assert process.poll() is None
+        assert process.wait(20.0) == -signal.SIGTERM
+        assert process.stdout.read().endswith("stopped\n")  # in order, all the same
         with vehicle() as other:
             assert parent_of(other.pid) != launcher
         assert other.process.returncode == 0
-        process.terminate()
-        assert process.stdout.read() == "stopped\n"
+        process.kill()  # it is gone: nothing to do
+    assert process.poll() == -signal.SIGTERM
+
+
+def test_several_threads_have_their_vehicles_at_once() -> None:
+    with ThreadPoolExecutor(4) as threads:
+        started = list(threads.map(lambda _: start_simulator(SILENT), range(8)))
+    assert len({process.pid for process in started}) == 8
+    for process in started:
+        with process:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("ready: ")
+            process.terminate()
+            assert process.wait(20.0) == 0
+
+
+def test_what_is_too_much_for_the_launcher_is_started_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HALF_A_MEGABYTE_1", "x" * 100_000)
+    for number in range(2, 6):
+        monkeypatch.setenv(f"HALF_A_MEGABYTE_{number}", "x" * 100_000)
+    with vehicle() as one:
+        assert isinstance(one.process, subprocess.Popen)
+    assert one.process.returncode == 0
+
+
+def test_a_request_that_nobody_understands_hurts_no_other() -> None:
+    with vehicle() as one:
+        launcher = launching._launcher()
+        launcher._requests.send(b"what?")
+        with vehicle() as other:
+            assert parent_of(one.pid) == parent_of(other.pid)
+        assert one.process.poll() is None
+
+
+def test_a_time_that_is_over_is_not_waited_for() -> None:
+    with vehicle() as one, pytest.raises(subprocess.TimeoutExpired):
+        one.process.wait(-1.0)
 
 
 @pytest.mark.usefixtures("own_launchers")
@@ -150,7 +200,7 @@ def test_a_launcher_that_ends_at_once_says_how(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(OSError, match="the launcher of mavlink-sim ended with code 7"):
-        launched(ENDS)
+        start_simulator(SILENT)
 
 
 def test_where_there_are_no_descriptors_of_processes_vehicles_are_started_anew(

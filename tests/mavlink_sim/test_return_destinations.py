@@ -112,6 +112,23 @@ def test_rtl_lands_at_the_nearer_rally_point(make: Any) -> None:
     assert any("m above destination)" in text for text in cockpit.texts())
 
 
+def test_a_pilot_who_returns_a_vehicle_that_started_elsewhere_lands_it_at_the_rally_point(
+    make_cockpit: Any,
+) -> None:
+    cockpit = make_cockpit(
+        ready_after_s=0.0,
+        start_ned_m=(10.0, 20.0),
+        parameters={"RTL_RETURN_ALT": 5.0, "RTL_DESCEND_ALT": 5.0},
+    )
+    listen(cockpit)
+    upload(cockpit, [rally(24, 20)], 2)  # from SIH's home
+    cockpit.take_off(4.0)
+    cockpit.vehicle.airframe.position = (12.0, 3.0, -4.0)
+    cockpit.fly(0.01)
+    cockpit.vehicle.faults.begin("pilot_takeover RTL")  # by who is no part of the vehicle
+    lands_at(cockpit, 14, 0)
+
+
 def test_rtl_goes_on_along_the_mission_to_its_landing(make: Any) -> None:
     cockpit = make(RTL_TYPE=2)
     plan = [takeoff(4.0), waypoint(6, 0, 4, 60.0), waypoint(6, 8, 4), item(189), land(0, 12)]

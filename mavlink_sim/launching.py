@@ -1,0 +1,244 @@
+"""`mavlink-sim` in a process of its own: forked by this program's launcher; started, where that cannot be."""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from typing import TextIO
+
+from mavlink_sim.launcher import ENDED, FAREWELL_S, STARTED, Request
+
+# What it takes to end its vehicles, and some more.
+LAUNCHER_ENDS_S = FAREWELL_S + 2.0
+
+
+class LaunchedProcess:
+    """A process that the launcher has forked, with what tests use of `subprocess.Popen`.
+
+    Attributes:
+        stdin, stdout: the other ends of its standard input and output; standard error goes where output goes.
+        returncode: its exit code, or less than nothing the signal that ended it; None until that is known.
+            Where its launcher ended before it: -SIGTERM, the signal that then ends it.
+    """
+
+    def __init__(
+        self, pid: int, descriptor: int, answers: socket.socket, stdin: TextIO, stdout: TextIO
+    ) -> None:
+        self.pid = pid
+        self.stdin, self.stdout = stdin, stdout
+        self.returncode: int | None = None
+        self._descriptor = descriptor
+        self._answers = answers
+
+    def poll(self) -> int | None:
+        """The exit code; None while it runs."""
+        return self._code_within(0.0)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """The exit code, once it has ended.
+
+        Raises:
+            subprocess.TimeoutExpired: it runs on after `timeout` seconds.
+        """
+        code = self._code_within(timeout)
+        if code is None:
+            assert timeout is not None
+            raise subprocess.TimeoutExpired("mavlink-sim", timeout)
+        return code
+
+    def _code_within(self, timeout_s: float | None) -> int | None:
+        if self.returncode is None and _readable(self._answers.fileno(), timeout_s):
+            # It stays there to be read: another thread may be waiting for it too.
+            answer = self._answers.recv(ENDED.size, socket.MSG_PEEK)
+            if answer:
+                self.returncode = ENDED.unpack(answer)[0]
+            elif _readable(self._descriptor, timeout_s):
+                self.returncode = -signal.SIGTERM
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Nothing if it has ended."""
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._descriptor, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+    def __enter__(self) -> LaunchedProcess:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the pipes, and wait for its end."""
+        with ExitStack() as stack:
+            stack.callback(self._answers.close)
+            stack.callback(os.close, self._descriptor)
+            stack.callback(self.wait)
+            stack.callback(self._close_input)
+            stack.callback(self.stdout.close)
+
+    def _close_input(self) -> None:
+        with suppress(BrokenPipeError):  # what was still to be written has nobody to go to
+            self.stdin.close()
+
+
+def _readable(descriptor: int, timeout_s: float | None) -> bool:
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return bool(poll.poll(None if timeout_s is None else max(timeout_s, 0.0) * 1e3))
+
+
+class _LauncherOfOurs:
+    """A launcher that this program has started, with Python set up as the variables say now."""
+
+    def __init__(self) -> None:
+        self._owner = os.getpid()
+        self._python = _python()
+        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # It must not hear of a Ctrl-C before it can ignore that.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            for end in (self._requests, theirs):
+                end.settimeout(None)  # whatever the program's sockets have by default
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "mavlink_sim.launcher", str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            theirs.close()
+
+    @property
+    def lives(self) -> bool:
+        return self._owner == os.getpid() and self._process.poll() is None
+
+    @property
+    def serves(self) -> bool:
+        """Whether a vehicle of it is what one would be that was started now."""
+        return self._python == _python() and self.lives
+
+    def start(self, arguments: Sequence[str]) -> LaunchedProcess:
+        """A new process with these arguments of `mavlink-sim`, in this one's folder and environment.
+
+        Raises:
+            OSError: it could not be.
+        """
+        request = Request(list(arguments), os.getcwd(), dict(os.environ))
+        with ExitStack() as ours, ExitStack() as theirs:
+            their_input, our_input = os.pipe()
+            theirs.callback(os.close, their_input)
+            stdin = ours.enter_context(open(our_input, "w"))
+            our_output, their_output = os.pipe()
+            theirs.callback(os.close, their_output)
+            stdout = ours.enter_context(open(our_output))
+            answers, their_answers = socket.socketpair()
+            ours.enter_context(answers).settimeout(None)
+            theirs.enter_context(their_answers).settimeout(None)
+            try:
+                request.send(self._requests, [their_input, their_output, their_answers.fileno()])
+            except (BrokenPipeError, ConnectionResetError):
+                raise self._ended() from None
+            theirs.close()
+            answer, descriptors, _, _ = socket.recv_fds(answers, STARTED.size, 1, socket.MSG_CMSG_CLOEXEC)
+            if not answer:
+                raise self._ended()
+            pid: int = STARTED.unpack(answer)[0]
+            if pid < 0:
+                raise OSError(-pid, f"a process for mavlink-sim cannot be forked: {os.strerror(-pid)}")
+            if not descriptors:
+                os.kill(pid, signal.SIGKILL)
+                raise OSError(errno.EMFILE, "no descriptor is left for a process of mavlink-sim")
+            ours.pop_all()
+        return LaunchedProcess(pid, descriptors[0], answers, stdin, stdout)
+
+    def _ended(self) -> OSError:
+        """What to say of no answer."""
+        try:
+            return OSError(f"the launcher of mavlink-sim ended with code {self._process.wait(1.0)}")
+        except subprocess.TimeoutExpired:
+            return OSError("the launcher of mavlink-sim could not fork; standard error tells why")
+
+    def close(self) -> None:
+        """Let it end, and what it has forked. Nothing happens in a fork of the program."""
+        if self._owner != os.getpid():
+            return
+        with suppress(OSError):  # not connected: it has ended
+            self._requests.shutdown(socket.SHUT_RDWR)
+        self._requests.close()
+        try:
+            self._process.wait(LAUNCHER_ENDS_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _python() -> dict[str, str]:
+    """What a launcher has read of the variables when it started."""
+    return {name: value for name, value in os.environ.items() if name.startswith("PYTHON")}
+
+
+_launchers: list[_LauncherOfOurs] = []
+_choosing = threading.Lock()
+
+
+def _close_launchers() -> None:
+    for launcher in _launchers:
+        launcher.close()
+
+
+def _launcher() -> _LauncherOfOurs:
+    with _choosing:
+        if not _launchers:
+            atexit.register(_close_launchers)
+        for launcher in [*_launchers]:
+            if launcher.serves:
+                return launcher
+            if not launcher.lives:  # one that lives on may have vehicles that fly
+                launcher.close()
+                _launchers.remove(launcher)
+        _launchers.append(_LauncherOfOurs())
+        return _launchers[-1]
+
+
+def can_launch() -> bool:
+    """Whether there can be a launcher: on Linux, where nothing keeps pidfd_open from programs."""
+    try:
+        os.close(os.pidfd_open(os.getpid()))
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def start_simulator(arguments: Sequence[str]) -> LaunchedProcess | subprocess.Popen[str]:
+    """Start `mavlink-sim` with these arguments; its standard input and output are text pipes.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    if can_launch():
+        try:
+            return _launcher().start(arguments)
+        except OSError as error:
+            if error.errno != errno.EMSGSIZE:  # some hundred kilobytes of variables fit into no packet
+                raise
+    return subprocess.Popen(
+        [sys.executable, "-m", "mavlink_sim", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )

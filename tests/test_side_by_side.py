@@ -1,0 +1,80 @@
+"""`make test` runs everything, tells all of it, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# Instead of pytest: says which part it was given, and ends, or waits, as the part's variable says.
+STAND_IN = """
+import os, sys, time
+part = "beside" if "not clocked" in sys.argv else "clocked" if "clocked" in sys.argv else "alone"
+watched = "watched" if os.environ["COMPANION_TEST_STANDSTILLS"] else "unwatched"
+print(part, "at niceness", os.nice(0), watched, flush=True)
+what = os.environ.get(part, "0")
+if what == "waits":
+    print(os.getpid(), flush=True)
+    time.sleep(100)
+sys.exit(int(what))
+"""
+RUN = """
+import sys
+from tests import side_by_side
+side_by_side.PYTEST = [sys.executable, sys.argv[1]]
+sys.exit(side_by_side.main(3))
+"""
+
+
+def started(tmp_path: Path, **parts: str) -> subprocess.Popen[str]:
+    stand_in = tmp_path / "stand_in.py"
+    stand_in.write_text(STAND_IN)
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN, str(stand_in)],
+        cwd=ROOT,
+        env={**os.environ, **parts},
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "code"),
+    [
+        ({}, 0),
+        ({"alone": "1"}, 1),
+        ({"clocked": "2"}, 2),
+        ({"beside": "3"}, 3),
+        ({"clocked": "2", "beside": "3"}, 2),
+    ],
+)
+def test_everything_runs_whatever_fails_and_what_computes_is_told_last(
+    tmp_path: Path, parts: dict[str, str], code: int
+) -> None:
+    with started(tmp_path, **parts) as running:
+        said, _ = running.communicate(timeout=60)
+    assert running.returncode == code
+    assert [line.split()[0] for line in said.splitlines()] == ["alone", "clocked", "beside"]
+    assert "beside at niceness 19 watched" in said
+    assert f"clocked at niceness {os.nice(0)} watched" in said
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_who_ends_it_ends_all_of_it(tmp_path: Path, number: int, code: int) -> None:
+    with started(tmp_path, clocked="waits", beside="waits") as running:
+        assert running.stdout is not None
+        assert running.stdout.readline().startswith("alone")
+        assert running.stdout.readline().startswith("clocked")
+        waiting = int(running.stdout.readline())
+        os.killpg(running.pid, number) if number == signal.SIGINT else running.send_signal(number)
+        assert running.wait(60) == code
+    with pytest.raises(ProcessLookupError):
+        os.kill(waiting, 0)
+    with pytest.raises(ProcessLookupError):
+        os.killpg(running.pid, 0)
