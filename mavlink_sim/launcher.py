@@ -4,7 +4,7 @@ To start Python and to import the simulator is most of what it takes until a veh
 starts hundreds pays it once: `mavlink_sim.launching` starts `python -m mavlink_sim.launcher`, which imports,
 and forks a process for each vehicle that is wanted. That does what `python -m mavlink_sim` does, in the
 folder, with the variables, standard input and output of who wants it; what Python or a library reads of them
-at its start is the launcher's. It takes Linux.
+at its start is the launcher's, as are umask, limits and niceness. It takes Linux.
 
 The launcher ends with the program that started it, however that ends, and a vehicle with its launcher.
 
@@ -16,6 +16,7 @@ input and output, and the end of a socket for the answers. Those are the process
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import os
 import selectors
@@ -30,13 +31,14 @@ from dataclasses import asdict, dataclass
 
 from vision.loading import uncollected
 
-LARGEST_REQUEST = 1 << 20
+LARGEST_REQUEST = 1 << 17  # less than any socket's buffer
 STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
 ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
-# How long vehicles have to end in order once nobody is there who wants them.
-FAREWELL_S = 3.0
+# How long vehicles have to end in order once nobody is there who wants them: a camera may take 5 s.
+FAREWELL_S = 7.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _GONE = (BrokenPipeError, ConnectionResetError)
+_ENDS_WITHOUT_US = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,10 @@ class Request:
         Raises:
             OSError: the launcher is gone, or this is more than fits into a packet (EMSGSIZE).
         """
-        socket.send_fds(connection, [json.dumps(asdict(self)).encode()], descriptors)
+        packet = json.dumps(asdict(self)).encode()
+        if len(packet) > LARGEST_REQUEST:
+            raise OSError(errno.EMSGSIZE, f"a request of {len(packet)} bytes is too long")
+        socket.send_fds(connection, [packet], descriptors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +76,7 @@ class _Child:
     answers: socket.socket
 
     def tell_start(self) -> None:
-        with suppress(*_GONE):  # who asked does not want to know any more
+        with suppress(OSError):  # who asked does not want to know any more, or sees the end of the answers
             socket.send_fds(self.answers, [STARTED.pack(self.pid)], [self.descriptor])
 
     def take_end(self) -> None:
@@ -90,19 +95,25 @@ class _Child:
         self.answers.close()
 
 
-def main(descriptor: int) -> None:
-    """Be the launcher with the requests of the socket `descriptor`; and in every fork be the simulator."""
-    # A Ctrl-C reaches every process of a terminal; this one ends with the program that started it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def main(requests: int, program: int) -> None:
+    """Be the launcher; and in every fork be the simulator.
+
+    Args:
+        requests: the descriptor of the socket on which they come.
+        program: a pidfd of the program that may ask.
+    """
+    # What ends a whole terminal or group reaches this one too, which ends its vehicles when the program ends.
+    for number in _ENDS_WITHOUT_US:
+        signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where that was ignored, no exit code could be had
     with uncollected():
         from mavlink_sim import cli
 
         cli.load()
-    with socket.socket(fileno=descriptor) as requests, selectors.DefaultSelector() as selector:
-        arguments = _Launcher(requests, selector).run()
+    with socket.socket(fileno=requests) as connection, selectors.DefaultSelector() as selector:
+        arguments = _Launcher(connection, program, selector).run()
     if arguments is not None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.argv = ["mavlink-sim", *arguments]
         cli.main()
 
@@ -110,13 +121,13 @@ def main(descriptor: int) -> None:
 class _Launcher:
     """Forks as often as asked."""
 
-    def __init__(self, requests: socket.socket, selector: selectors.BaseSelector) -> None:
+    def __init__(self, requests: socket.socket, program: int, selector: selectors.BaseSelector) -> None:
         self._requests = requests
         self._selector = selector
         self._children: list[_Child] = []
         self._pid = os.getpid()
         # A fork of the program may hold the other end of the socket when the program is long gone.
-        self._program = os.pidfd_open(os.getppid())
+        self._program = program
         selector.register(requests, selectors.EVENT_READ)
         selector.register(self._program, selectors.EVENT_READ)
 
@@ -130,9 +141,7 @@ class _Launcher:
                     elif key.fileobj == self._program:
                         return None
                     else:
-                        packet, descriptors, _, _ = socket.recv_fds(
-                            self._requests, LARGEST_REQUEST, 3, socket.MSG_CMSG_CLOEXEC
-                        )
+                        packet, descriptors, _, _ = socket.recv_fds(self._requests, LARGEST_REQUEST, 3)
                         if not packet:
                             return None
                         arguments = self._serve(packet, descriptors)
@@ -149,13 +158,13 @@ class _Launcher:
         """
         try:
             request = Request(**json.loads(packet))
-            *standard, answers = descriptors
+            standard_input, standard_output, answers = descriptors
             pid = self._fork(answers)
         except (OSError, TypeError, ValueError):
             traceback.print_exc()
             pid = None
         if pid == 0:
-            self._become(request, standard)
+            self._become(request, standard_input, standard_output)
             return request.arguments
         for descriptor in descriptors:
             os.close(descriptor)
@@ -181,20 +190,23 @@ class _Launcher:
             os.waitpid(pid, 0)
             connection.close()
             raise
-        child.tell_start()
         self._children.append(child)
         self._selector.register(child.descriptor, selectors.EVENT_READ, child)
+        child.tell_start()
         return pid
 
-    def _become(self, request: Request, standard: list[int]) -> None:
+    def _become(self, request: Request, standard_input: int, standard_output: int) -> None:
         """Be the process that is wanted: nothing that is the launcher's stays open."""
         for child in self._children:
             child.close()
         os.close(self._program)
-        for number, descriptor in enumerate(standard):
+        for number, descriptor in enumerate((standard_input, standard_output)):
             os.dup2(descriptor, number)
             os.close(descriptor)
         os.dup2(1, 2)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != self._pid:  # the launcher ended before the kernel was asked to tell
             os._exit(-signal.SIGTERM)
@@ -219,9 +231,10 @@ class _Launcher:
         while self._children and (left_s := until_s - time.monotonic()) > 0.0:
             for key, _ in self._selector.select(left_s):
                 self._take_end(key.data)
-        for child in self._children:
+        for child in [*self._children]:
             child.send(signal.SIGKILL)
+            self._take_end(child)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from typing import TextIO
@@ -56,12 +57,13 @@ class LaunchedProcess:
         return code
 
     def _code_within(self, timeout_s: float | None) -> int | None:
-        if self.returncode is None and _readable(self._answers.fileno(), timeout_s):
+        until_s = None if timeout_s is None else time.monotonic() + timeout_s
+        if self.returncode is None and _readable(self._answers.fileno(), until_s):
             # It stays there to be read: another thread may be waiting for it too.
             answer = self._answers.recv(ENDED.size, socket.MSG_PEEK)
             if answer:
                 self.returncode = ENDED.unpack(answer)[0]
-            elif _readable(self._descriptor, timeout_s):
+            elif _readable(self._descriptor, until_s):
                 self.returncode = -signal.SIGTERM
         return self.returncode
 
@@ -81,7 +83,9 @@ class LaunchedProcess:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the pipes, and wait for its end."""
+        """Close the pipes, and wait for its end; after an exception nobody else may have ended it."""
+        if exception[0] is not None:
+            self.kill()
         with ExitStack() as stack:
             stack.callback(self._answers.close)
             stack.callback(os.close, self._descriptor)
@@ -94,10 +98,11 @@ class LaunchedProcess:
             self.stdin.close()
 
 
-def _readable(descriptor: int, timeout_s: float | None) -> bool:
+def _readable(descriptor: int, until_s: float | None) -> bool:
+    """Whether it can be read, now or until a moment (monotonic; None: at some time)."""
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
-    return bool(poll.poll(None if timeout_s is None else max(timeout_s, 0.0) * 1e3))
+    return bool(poll.poll(None if until_s is None else max(until_s - time.monotonic(), 0.0) * 1e3))
 
 
 class _LauncherOfOurs:
@@ -107,20 +112,23 @@ class _LauncherOfOurs:
         self._owner = os.getpid()
         self._python = _python()
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        program = os.pidfd_open(os.getpid())
         # It must not hear of a Ctrl-C before it can ignore that.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             for end in (self._requests, theirs):
                 end.settimeout(None)  # whatever the program's sockets have by default
+            passed = [theirs.fileno(), program]
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "mavlink_sim.launcher", str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-m", "mavlink_sim.launcher", *map(str, passed)],
+                pass_fds=passed,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
             )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             theirs.close()
+            os.close(program)
 
     @property
     def lives(self) -> bool:
@@ -153,7 +161,7 @@ class _LauncherOfOurs:
             except (BrokenPipeError, ConnectionResetError):
                 raise self._ended() from None
             theirs.close()
-            answer, descriptors, _, _ = socket.recv_fds(answers, STARTED.size, 1, socket.MSG_CMSG_CLOEXEC)
+            answer, descriptors, _, _ = socket.recv_fds(answers, STARTED.size, 1)
             if not answer:
                 raise self._ended()
             pid: int = STARTED.unpack(answer)[0]
@@ -162,6 +170,7 @@ class _LauncherOfOurs:
             if not descriptors:
                 os.kill(pid, signal.SIGKILL)
                 raise OSError(errno.EMFILE, "no descriptor is left for a process of mavlink-sim")
+            os.set_inheritable(descriptors[0], False)
             ours.pop_all()
         return LaunchedProcess(pid, descriptors[0], answers, stdin, stdout)
 
@@ -233,7 +242,7 @@ def start_simulator(arguments: Sequence[str]) -> LaunchedProcess | subprocess.Po
         try:
             return _launcher().start(arguments)
         except OSError as error:
-            if error.errno != errno.EMSGSIZE:  # some hundred kilobytes of variables fit into no packet
+            if error.errno != errno.EMSGSIZE:  # a hundred kilobytes of variables fit into no packet
                 raise
     return subprocess.Popen(
         [sys.executable, "-m", "mavlink_sim", *arguments],

@@ -27,6 +27,8 @@ ALONE = "tests/alone"
 COMPUTING_TIMEOUT_S = 480
 LOOKS_EVERY_S = 0.5
 INTERRUPTED = 130
+# A worker that is in the middle of a test may take 15 s.
+ENDS_WITHIN_S = 30.0
 
 
 def main(workers: int) -> int:
@@ -40,6 +42,7 @@ def main(workers: int) -> int:
     beside = ["nice", "-n", "19", *parts, "-m", "not clocked", "-p", "no:cacheprovider"]
     beside += ["--timeout", str(COMPUTING_TIMEOUT_S)]
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
     with tempfile.TemporaryDirectory(prefix="tests-") as folder:
         # one watch for all: what runs at the lowest priority would take the others for a standstill
         watch = Watch(Path(folder) / "standstills")
@@ -54,8 +57,9 @@ def main(workers: int) -> int:
                 try:
                     codes = [_run([*PYTEST, ALONE]), _run([*parts, "-m", "clocked"])]
                     codes.append(_follow(computing, heard))
-                finally:
-                    computing.terminate()
+                except BaseException as error:
+                    _end(computing, error)
+                    raise
         except KeyboardInterrupt:
             return INTERRUPTED
         finally:
@@ -67,12 +71,20 @@ def _run(command: list[str]) -> int:
     with subprocess.Popen(command) as process:
         try:
             return process.wait()
-        except KeyboardInterrupt:  # it has heard of that too, and sums up
-            process.wait()
+        except BaseException as error:
+            _end(process, error)
             raise
-        except BaseException:
-            process.terminate()
-            raise
+
+
+def _end(process: subprocess.Popen[bytes], error: BaseException) -> None:
+    """Interrupt it, as a Ctrl-C has: its workers and what its tests have started end with it."""
+    if process.poll() is None and not isinstance(error, KeyboardInterrupt):
+        process.send_signal(signal.SIGINT)
+    try:
+        process.wait(ENDS_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _follow(process: subprocess.Popen[bytes], heard: BinaryIO) -> int:
