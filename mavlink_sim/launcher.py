@@ -38,7 +38,7 @@ ENDED = struct.Struct("!i")  # the exit code, as `subprocess` has it
 FAREWELL_S = 7.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _GONE = (BrokenPipeError, ConnectionResetError)
-_ENDS_WITHOUT_US = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ENDS_OF_A_GROUP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def main(requests: int, program: int) -> None:
         program: a pidfd of the program that may ask.
     """
     # What ends a whole terminal or group reaches this one too, which ends its vehicles when the program ends.
-    for number in _ENDS_WITHOUT_US:
+    for number in _ENDS_OF_A_GROUP:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where that was ignored, no exit code could be had
@@ -209,7 +209,7 @@ class _Launcher:
             signal.signal(number, signal.SIG_DFL)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != self._pid:  # the launcher ended before the kernel was asked to tell
-            os._exit(-signal.SIGTERM)
+            os._exit(1)
         os.chdir(request.folder)
         if not sys.flags.safe_path:
             sys.path[0] = request.folder

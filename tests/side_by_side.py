@@ -41,6 +41,7 @@ def main(workers: int) -> int:
     # the failures that `--lf` knows are those of the clock: two at once cannot write them down
     beside = ["nice", "-n", "19", *parts, "-m", "not clocked", "-p", "no:cacheprovider"]
     beside += ["--timeout", str(COMPUTING_TIMEOUT_S)]
+    codes: dict[str, int] = {}
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
     with tempfile.TemporaryDirectory(prefix="tests-") as folder:
@@ -55,8 +56,10 @@ def main(workers: int) -> int:
                 subprocess.Popen(beside, stdout=said, stderr=said) as computing,
             ):
                 try:
-                    codes = [_run([*PYTEST, ALONE]), _run([*parts, "-m", "clocked"])]
-                    codes.append(_follow(computing, heard))
+                    codes["the demonstration"] = _run([*PYTEST, ALONE])
+                    codes["what runs by the clock"] = _run([*parts, "-m", "clocked"])
+                    print("\nbeside these ran what computes:\n", flush=True)
+                    codes["what computes"] = _follow(computing, heard)
                 except BaseException as error:
                     _end(computing, error)
                     raise
@@ -64,7 +67,9 @@ def main(workers: int) -> int:
             return INTERRUPTED
         finally:
             watch.close()
-    return next((code for code in codes if code != 0), 0)
+    failed = {part: code for part, code in codes.items() if code != 0}
+    print("\nnot all have passed: see " + ", ".join(failed) if failed else "\nall have passed", flush=True)
+    return next(iter(failed.values()), 0)
 
 
 def _run(command: list[str]) -> int:
