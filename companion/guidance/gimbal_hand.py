@@ -51,6 +51,7 @@ class GimbalHand:
         on_event: called with (level, text) for what a person should know.
         carries_camera: a camera sits on it (`camera.gimbal`), so it is looked for until it is heard.
         carries_steering: the camera that steers does. camera_pitch_rad: how far above its axis that looks.
+        clock_ns: the time of `update`, `sight` and `status` (CLOCK_MONOTONIC nanoseconds).
     """
 
     def __init__(
@@ -61,10 +62,12 @@ class GimbalHand:
         carries_camera: bool = False,
         carries_steering: bool = False,
         camera_pitch_rad: float = 0.0,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._driver, self._on_event = driver, on_event
         self._carries_camera, self._carries_steering = carries_camera, carries_steering
         self._camera_pitch_rad = camera_pitch_rad
+        self._clock_ns = clock_ns
         self._control = GimbalControl(driver.own_address)
         self._asking: asyncio.Task[None] | None = None
         self._asked_ns = 0
@@ -116,7 +119,7 @@ class GimbalHand:
 
     async def find(self) -> None:
         """Return when it is known where the gimbal looks and who has it, or when it was not told in time."""
-        if _told(self._driver.state.gimbal, time.monotonic_ns()):
+        if _told(self._driver.state.gimbal, self._clock_ns()):
             return
         heard: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._heard.append(heard)
@@ -141,7 +144,7 @@ class GimbalHand:
         await self.find()
         if self._closed:
             return Outcome(False, _ENDING)
-        now_ns, state = time.monotonic_ns(), self._driver.state
+        now_ns, state = self._clock_ns(), self._driver.state
         missing = missing_gimbal(state, now_ns, self.sight(now_ns, state), (aim.pitch_rad,))
         if missing:
             return Outcome(False, f"gimbal needs {' and '.join(missing)}")
@@ -184,7 +187,7 @@ class GimbalHand:
         if self._asking is not None and self._asking.cancelled():
             # What the manager has shown since it was asked tells instead.
             self._control.answered(self._asked_ns, "the gimbal's manager did not answer")
-        request = self._control.update(time.monotonic_ns(), self._driver.state.gimbal, None, None)
+        request = self._control.update(self._clock_ns(), self._driver.state.gimbal, None, None)
         if request is not None:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CLOSE_TIMEOUT_S):
@@ -212,7 +215,7 @@ class GimbalHand:
             # Unanswered, nothing more would ever be asked.
             logger.exception("the gimbal's manager could not be asked")
             refused = f"{type(error).__name__}: {error}"
-        self._control.answered(time.monotonic_ns(), refused)
+        self._control.answered(self._clock_ns(), refused)
         self._tell_problem()  # at once: by the next turn, what flew may have ended for it
         if request.ask is GimbalAsk.GIVE_BACK:
             if refused is not None and not self._not_given_back:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from dataclasses import replace
 
 import pytest
@@ -53,8 +52,12 @@ class Desk:
     def __init__(self, fault: Exception | None = None) -> None:
         self.driver = RecordingDriver(fault)
         self.events: list[str] = []
-        self.hand = GimbalHand(self.driver, lambda level, text: self.events.append(text))
         self.vehicle = KinematicVehicle()
+        self.hand = GimbalHand(
+            self.driver,
+            lambda level, text: self.events.append(text),
+            clock_ns=lambda: self.vehicle.now_ns,
+        )
         self.began_ns = self.vehicle.now_ns
 
     @property
@@ -123,14 +126,15 @@ async def test_what_is_refused_is_said_though_the_behaviour_ends_by_it_first() -
 async def test_who_took_it_is_named_before_the_next_turn_too() -> None:
     desk = Desk()
     await desk.turn(DOWN)
-    now_ns = time.monotonic_ns()  # the clock by which it was taken
+    now_ns = desk.vehicle.now_ns
     taken = GimbalState(1, status_ns=now_ns, primary_control=(245, 190))
     assert desk.hand.sight(now_ns, replace(desk.state, gimbal=taken)).elsewhere == "245/190"
     assert desk.hand.sight(now_ns, desk.state).elsewhere == ""
 
 
 async def test_a_gimbal_is_found_when_it_is_known_where_it_looks_and_who_has_it() -> None:
-    desk, now_ns = Desk(), time.monotonic_ns()
+    desk = Desk()
+    now_ns = desk.vehicle.now_ns
     looking = GimbalState(1, attitude_ns=now_ns, attitude=(1.0, 0.0, 0.0, 0.0))
     desk.driver.state = replace(desk.state, gimbal=looking)
     finding = asyncio.create_task(desk.hand.find())
