@@ -1,4 +1,7 @@
-"""The worker's way out: a thread that sends, so that the loop never waits for a service that reads slowly.
+"""The worker's way out, so that the loop never waits for a service that reads slowly.
+
+A result leaves at once, from the thread that found it: to wake another for it takes longer than to send it.
+What the socket does not take at once, and everything else, a thread of its own sends.
 
 Of results and heartbeats only the newest waits; an older one is replaced and counted, but what it told of
 tracks that began, got lost or ended goes with the newer. Everything else waits in a queue, bounded too.
@@ -33,13 +36,15 @@ _WAITING_EVENTS = 1000
 
 
 class Outbox:
-    """Sends messages over `connection` in a thread of its own. Its methods never block, but `close`.
+    """Sends messages over `connection`. Its methods never block, but `close`.
 
     Args:
-        on_lost: called once, in that thread, when the other end is gone.
+        connection: loses its time-out.
+        on_lost: called once, in a thread of its own, when the other end is gone.
     """
 
     def __init__(self, connection: socket.socket, on_lost: Callable[[], None]) -> None:
+        connection.settimeout(None)  # with one, Python waits for the socket whatever MSG_DONTWAIT says
         self._connection = connection
         self._on_lost = on_lost
         self._changed = threading.Condition()
@@ -48,6 +53,8 @@ class Outbox:
         self._preview: Preview | None = None
         self._replaced = 0
         self._last: Message | None = None
+        self._busy = False
+        self._rest = b""
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
@@ -58,7 +65,10 @@ class Outbox:
             self._changed.notify()
 
     def put_newest(self, message: Report | Heartbeat) -> None:
-        """Send this unless a newer one comes before it can be sent. A heartbeat never replaces a result."""
+        """Send this now, or as soon as it can be, unless a newer one comes before.
+
+        A heartbeat never replaces a result.
+        """
         with self._changed:
             if isinstance(self._newest, Report):
                 if isinstance(message, Heartbeat):
@@ -66,7 +76,8 @@ class Outbox:
                 self._replaced += 1
                 message = _with_events_of(self._newest, message)
             self._newest = message
-            self._changed.notify()
+            if not self._send_newest():
+                self._changed.notify()
 
     def put_preview(self, preview: Preview) -> None:
         """Send this when nothing else waits, unless a newer one comes before."""
@@ -81,30 +92,52 @@ class Outbox:
             self._changed.notify()
         self._thread.join(timeout_s)
 
-    def _next(self) -> Message:
+    def _send_newest(self) -> bool:
+        """From the thread that calls, if nothing else is under way; False leaves something to the other."""
+        if self._busy or self._rest or self._queue or self._last:
+            return False
+        message = self._take_newest()
+        data = packed(message)
+        try:
+            sent = self._connection.send(data, socket.MSG_DONTWAIT)
+        except OSError:  # full, or the other end is gone: the thread waits for it, or finds out
+            self._newest = message
+            return False
+        self._rest = data[sent:]
+        return not self._rest
+
+    def _take_newest(self) -> Report | Heartbeat:
+        newest, self._newest = self._newest, None
+        assert newest is not None
+        return replace(newest, replaced=self._replaced) if isinstance(newest, Report) else newest
+
+    def _next(self) -> tuple[bytes, bool]:
+        """What the thread sends now, and whether it is the last."""
         with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._newest or self._preview or self._last)
+            self._busy = False
+            self._changed.wait_for(
+                lambda: self._rest or self._queue or self._newest or self._preview or self._last
+            )
+            self._busy = True
+            if self._rest:
+                rest, self._rest = self._rest, b""
+                return rest, False
             if self._queue:
-                return self._queue.popleft()
-            newest, self._newest = self._newest, None
-            if isinstance(newest, Report):
-                return replace(newest, replaced=self._replaced)
-            if newest is not None:
-                return newest
+                return packed(self._queue.popleft()), False
+            if self._newest is not None:
+                return packed(self._take_newest()), False
             if self._last is not None:
-                return self._last
+                return packed(self._last), True
             preview, self._preview = self._preview, None
             assert preview is not None
-            return preview
+            return packed(preview), False
 
     def _run(self) -> None:
         try:
-            message = self._next()
-            while True:
-                self._connection.sendall(packed(message))
-                if isinstance(message, Ended | StartFailed):
-                    return
-                message = self._next()
+            finished = False
+            while not finished:
+                data, finished = self._next()
+                self._connection.sendall(data)
         except OSError:
             self._on_lost()
 

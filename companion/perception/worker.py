@@ -72,7 +72,7 @@ class Orders:
     """What the service wants, taken from its socket by a thread.
 
     Attributes:
-        stop: end now.
+        stopping: end now.
         hud: for the recorded video's next frames.
         attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
         gimbal: the attitudes of the camera's gimbal; empty for a camera that sits on none.
@@ -80,7 +80,7 @@ class Orders:
     """
 
     def __init__(self, connection: socket.socket) -> None:
-        self.stop = threading.Event()
+        self.stopping = False
         self.hud = Hud((), None)
         self.watched = False
         self.attitudes, self.gimbal = AttitudeHistory(), AttitudeHistory()
@@ -88,6 +88,10 @@ class Orders:
         self._connection = connection
         self._finished = threading.Event()
         threading.Thread(target=self._take, name="inbox", daemon=True).start()
+
+    def stop(self) -> None:
+        """End now. Takes no lock: a second signal may come while the first is handled in the same thread."""
+        self.stopping = True
 
     def finished(self) -> None:
         """The work has ended in time."""
@@ -105,9 +109,9 @@ class Orders:
             elif isinstance(message, Watched):
                 self.watched = message.watched
             elif isinstance(message, Stop):
-                self.stop.set()
+                self.stop()
         # The service is gone. Whoever is stuck in a driver by then will not come back from there.
-        self.stop.set()
+        self.stop()
         if not self._finished.wait(GRACE_S):
             os._exit(1)
 
@@ -142,8 +146,8 @@ def main(arguments: list[str]) -> int:
     if not isinstance(begin, Begin):
         return 1
     orders = Orders(connection)
-    signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop.set())
-    outbox = Outbox(socket.socket(fileno=reports), on_lost=orders.stop.set)
+    signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop())
+    outbox = Outbox(socket.socket(fileno=reports), on_lost=orders.stop)
     logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[OutboxHandler(outbox)])
     last = _work(begin, orders, outbox)
     outbox.close(last, FAREWELL_S)
@@ -366,7 +370,7 @@ def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Out
         outbox.put_newest(Report(result, pipeline.frames, replaced=0))
         said_s = time.monotonic()
 
-    while not orders.stop.is_set():
+    while not orders.stopping:
         if perception.recording is not None:
             perception.recording.lines = orders.hud.lines
             perception.recording.highlight = orders.hud.highlight

@@ -96,10 +96,8 @@ def test_events_of_a_result_that_is_replaced_come_with_the_newer_one() -> None:
     with ours, theirs:
         outbox = Outbox(theirs, on_lost=lambda: None)
         # Larger than the socket takes, so that everything after it waits.
-        filler = Detections.empty(tuple("x" * 1000 for _ in range(2000)))
+        filler = Detections.empty(tuple(f"{number:01000}" for number in range(2000)))
         outbox.put_newest(Report(PerceptionResult(0, 0, 0, 64, 48, filler, {}, 0), 1, 0))
-        while outbox._newest is not None:
-            time.sleep(0.001)
         outbox.put_newest(Report(result(1, event(NEW, 1), event(UPDATE, 2)), 2, 0))
         outbox.put_newest(Report(result(2, event(UPDATE, 1), event(LOST, 2)), 3, 0))
         outbox.put_newest(Report(result(3, event(UPDATE, 1), event(END, 2)), 4, 0))

@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,6 +34,7 @@ from companion.perception.messages import (
 from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.process import PerceptionProcess
 from companion.perception.pulse import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Pulse
+from companion.perception.worker import Orders
 from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
@@ -80,6 +82,40 @@ def test_a_service_that_does_not_read_never_holds_up_the_loop_and_gets_the_newes
     assert sequences == sorted(set(sequences))
 
 
+def test_a_result_has_left_when_it_was_put(ends: tuple[socket.socket, socket.socket]) -> None:
+    service, worker = ends
+    outbox = Outbox(worker, on_lost=lambda: None)
+    service.setblocking(False)
+    for sequence in range(100):
+        outbox.put_newest(report(sequence))
+        message = receive(service)  # nothing there would be a BlockingIOError
+        assert isinstance(message, Report)
+        assert (message.result.sequence, message.replaced) == (sequence, 0)
+    outbox.close(Ended(True, "done", 100), 30.0)
+
+
+def test_what_the_socket_takes_in_part_comes_whole_and_before_what_follows(
+    ends: tuple[socket.socket, socket.socket],
+) -> None:
+    service, worker = ends
+    outbox = Outbox(worker, on_lost=lambda: None)
+    names = tuple(f"{number:01000}" for number in range(2000))
+    large = Report(PerceptionResult(1, 0, 0, 64, 48, Detections.empty(names), {}, 0), 1, 0)
+    outbox.put_newest(large)
+    outbox.put(LogLine(logging.INFO, "vision", "behind it"))
+    outbox.put_newest(report(2))
+    closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", 2), 30.0))
+    closing.start()
+    first, line, second, last = everything(service)
+    closing.join()
+    assert isinstance(first, Report)
+    assert first.result.detections.class_names == names
+    assert line == LogLine(logging.INFO, "vision", "behind it")
+    assert isinstance(second, Report)
+    assert second.result.sequence == 2
+    assert last == Ended(True, "done", 2)
+
+
 def test_a_heartbeat_never_takes_the_place_of_a_result(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     outbox = Outbox(worker, on_lost=lambda: None)
@@ -123,6 +159,31 @@ def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.soc
     outbox.put_newest(report(0))
     assert gone.wait(30)
     outbox.close(Ended(True, "done", 0), 30.0)
+
+
+def test_a_signal_in_the_middle_of_being_told_to_stop_does_no_harm(
+    ends: tuple[socket.socket, socket.socket],
+) -> None:
+    service, worker = ends
+    orders = Orders(worker)
+
+    def signalled(*_: object) -> Any:
+        """At every line: a second signal may find the first one's handler at work."""
+        orders.stop()
+        return signalled
+
+    tracing = sys.gettrace()
+    sys.settrace(signalled)
+    try:
+        orders.stop()
+    finally:
+        sys.settrace(tracing)
+    assert orders.stopping
+    orders.finished()
+    service.close()
+    for thread in threading.enumerate():
+        if thread.name == "inbox":
+            thread.join(30)
 
 
 def test_messages_of_any_size_come_through_in_pieces(ends: tuple[socket.socket, socket.socket]) -> None:
