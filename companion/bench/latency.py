@@ -7,6 +7,7 @@ import os
 import tempfile
 import time
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from companion.bench.percentiles import percentiles
@@ -25,12 +26,39 @@ from mavlink_sim.testing import free_port
 from vision.pipeline import PerceptionResult
 
 
+@dataclass(slots=True)
+class _Figures:
+    """Milliseconds, one of each for every setpoint that followed a frame."""
+
+    latency_ms: list[float] = field(default_factory=list)
+    beyond_ms: list[float] = field(default_factory=list)
+    stages_ms: dict[str, list[float]] = field(default_factory=dict)
+
+    def take(self, result: PerceptionResult, steered_ns: int, sent_ns: int) -> None:
+        elapsed_ms = (sent_ns - result.captured_ns) / 1e6
+        stages_ms = dict(result.timing_ms)
+        del stages_ms["total"]
+        stages_ms["deliver"] = (steered_ns - result.inferred_ns) / 1e6
+        stages_ms["steer"] = (sent_ns - steered_ns) / 1e6
+        self.latency_ms.append(elapsed_ms)
+        self.beyond_ms.append(elapsed_ms - stages_ms.get("capture", 0.0) - stages_ms["inference"])
+        for stage, time_ms in stages_ms.items():
+            self.stages_ms.setdefault(stage, []).append(time_ms)
+
+    def clear(self) -> None:
+        self.latency_ms.clear()
+        self.beyond_ms.clear()
+        self.stages_ms.clear()
+
+
 def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
     """Fly `seek` and `approach` and time every setpoint that is the first after a new detection message.
 
     `capture_to_setpoint` starts at the pose's stamp in the simulator, before the picture is drawn.
     `beyond_network` is what the companion adds to the network: from when the frame is there, less the
-    network's own time.
+    network's own time. Its parts are told by their medians: those of `PerceptionResult.timing_ms`, then
+    `deliver`, from when the result was known until the pilot has it, and `steer`, from there until the
+    setpoint has left.
 
     Raises:
         RehearsalError: the vehicle did not get into the air.
@@ -40,32 +68,31 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
 
 
 async def _measure(folder: Path, seconds: float, driver: str) -> dict[str, object]:
-    latency_ms: list[float] = []
-    beyond_ms: list[float] = []
+    figures = _Figures()
     camera = f"companion-bench-{os.getpid()}"
     port = free_port()
     async with simulator(port, camera, folder / "truth.jsonl", 1, folder / "simulator.log"):
         settings = rehearsal_settings(port, camera, driver=driver)
         service = Service(settings)
-        _measure_sent(service, latency_ms, beyond_ms)
-        await with_service(service, lambda: _fly(service, seconds, latency_ms, beyond_ms))
-    if not latency_ms:
+        _measure_sent(service, figures)
+        await with_service(service, lambda: _fly(service, seconds, figures))
+    if not figures.latency_ms:
         raise RehearsalError("no setpoint followed a detection message")
     return {
         "driver": driver,
-        "setpoints": len(latency_ms),
-        **{f"capture_to_setpoint_{name}": value for name, value in percentiles(latency_ms).items()},
-        **{f"beyond_network_{name}": value for name, value in percentiles(beyond_ms).items()},
+        "setpoints": len(figures.latency_ms),
+        **{f"capture_to_setpoint_{name}": value for name, value in percentiles(figures.latency_ms).items()},
+        **{f"beyond_network_{name}": value for name, value in percentiles(figures.beyond_ms).items()},
+        **{f"{stage}_p50_ms": percentiles(times)["p50_ms"] for stage, times in figures.stages_ms.items()},
     }
 
 
-async def _fly(service: Service, seconds: float, latency_ms: list[float], beyond_ms: list[float]) -> None:
+async def _fly(service: Service, seconds: float, figures: _Figures) -> None:
     await until_ready_to_arm(service)
     reply = await service.command(f"takeoff {ALTITUDE_M:g}")
     if not reply["success"]:
         raise RehearsalError(f"cannot measure in flight: {reply['reason']}")
-    latency_ms.clear()
-    beyond_ms.clear()
+    figures.clear()
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             for command in ("seek car", "approach car distance=5", "orbit radius=5 speed=1"):
@@ -73,31 +100,28 @@ async def _fly(service: Service, seconds: float, latency_ms: list[float], beyond
             await asyncio.sleep(seconds)
 
 
-def _measure_sent(service: Service, latency_ms: list[float], beyond_ms: list[float]) -> None:
+def _measure_sent(service: Service, figures: _Figures) -> None:
     """Time what goes on the wire, without changing it.
 
     `Pilot.update` makes a setpoint of the newest detections; what counts is when that very setpoint leaves.
     """
     update, send = service.pilot.update, service.driver.send_setpoint
     seen = -1
-    awaited: tuple[Setpoint | None, PerceptionResult] | None = None
+    awaited: tuple[Setpoint | None, PerceptionResult, int] | None = None
 
     def noted(situation: Situation) -> None:
         nonlocal seen, awaited
         update(situation)
         newest = service.steering.newest
         if newest is not None and newest.sequence != seen:
-            seen, awaited = newest.sequence, (service.pilot.sent, newest)
+            seen, awaited = newest.sequence, (service.pilot.sent, newest, situation.now_ns)
 
     def timed(setpoint: Setpoint) -> None:
         nonlocal awaited
         send(setpoint)
         if awaited is not None and setpoint is awaited[0]:
-            newest, awaited = awaited[1], None
-            elapsed_ms = (time.monotonic_ns() - newest.captured_ns) / 1e6
-            latency_ms.append(elapsed_ms)
-            timing_ms = newest.timing_ms
-            beyond_ms.append(elapsed_ms - timing_ms.get("capture", 0.0) - timing_ms["inference"])
+            (_, newest, steered_ns), awaited = awaited, None
+            figures.take(newest, steered_ns, time.monotonic_ns())
 
     service.pilot.update = noted  # type: ignore[method-assign]
     service.streamer.send = timed
