@@ -14,7 +14,7 @@ settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)
 settings.load_profile("steady")
 
-pytest_plugins = ["tests.run_again"]
+pytest_plugins = ["tests.late_workers", "tests.run_again"]
 
 # Tests run side by side: a thread pool of torch or OpenCV in each of them would only wait for the others'.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,7 +1,8 @@
 """`make test`: what runs by the clock, and beside it, on what it leaves of the processors, what computes.
 
 Flights in real time mostly wait, and must not be made to. So what only computes runs at the lowest priority,
-in their pauses. The demonstration comes first: no other flight is beside it, only what computes.
+in their pauses. The demonstration comes first: no other flight is beside it, only what computes. When that is
+done, more fly at once (`tests/late_workers.py`).
 
 Everything is run, whatever fails. The report on what computed comes last.
 """
@@ -18,6 +19,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
+from tests import late_workers
 from tests.run_again import NOTES
 from tests.standstill import Watch
 
@@ -37,9 +39,10 @@ def main(workers: int) -> int:
     Args:
         workers: how many tests run at once, of each kind.
     """
-    parts = [*PYTEST, "--ignore", ALONE, "-n", str(workers), "--dist", "worksteal"]
+    parts = [*PYTEST, "--ignore", ALONE, "--dist", "worksteal"]
+    clocked = [*parts, "-n", str(workers + max(1, workers // 2)), "-m", "clocked"]
     # the failures that `--lf` knows are those of the clock: two at once cannot write them down
-    beside = ["nice", "-n", "19", *parts, "-m", "not clocked", "-p", "no:cacheprovider"]
+    beside = ["nice", "-n", "19", *parts, "-n", str(workers), "-m", "not clocked", "-p", "no:cacheprovider"]
     beside += ["--timeout", str(COMPUTING_TIMEOUT_S)]
     codes: dict[str, int] = {}
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -49,15 +52,18 @@ def main(workers: int) -> int:
         watch = Watch(Path(folder) / "standstills")
         os.environ[NOTES] = str(watch.notes)
         report = Path(folder) / "computing"
+        os.environ[late_workers.WAITING] = f"{workers} {folder}/computes"
         try:
             with (
+                late_workers.held(Path(folder) / "computes") as lock,
                 report.open("wb") as said,
                 report.open("rb") as heard,
-                subprocess.Popen(beside, stdout=said, stderr=said) as computing,
+                subprocess.Popen(beside, stdout=said, stderr=said, pass_fds=[lock.fileno()]) as computing,
             ):
+                lock.close()  # held by what computes alone
                 try:
                     codes["the demonstration"] = _run([*PYTEST, ALONE])
-                    codes["what runs by the clock"] = _run([*parts, "-m", "clocked"])
+                    codes["what runs by the clock"] = _run(clocked)
                     print("\nbeside these ran what computes:\n", flush=True)
                     codes["what computes"] = _follow(computing, heard)
                 except BaseException as error:

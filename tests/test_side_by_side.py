@@ -7,9 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from tests import late_workers
 
 ROOT = Path(__file__).parent.parent
 # Instead of pytest: says which part it was given, and ends, or waits, as the part's variable says.
@@ -100,3 +103,46 @@ def test_who_ends_it_ends_all_of_it(tmp_path: Path, number: int, code: int) -> N
     with pytest.raises(ProcessLookupError):
         os.kill(waiting, 0)
     assert is_gone(running.pid)
+
+
+FLIGHTS = """
+import os
+import pytest
+
+@pytest.mark.parametrize("number", range(8))
+def test_flight(number):
+    with open("flown", "a") as flown:
+        print(os.environ["PYTEST_XDIST_WORKER"], file=flown)
+"""
+
+
+def test_a_late_worker_begins_when_what_it_waits_for_has_ended(tmp_path: Path) -> None:
+    (tmp_path / "test_flights.py").write_text(FLIGHTS)
+    flown = tmp_path / "flown"
+    held = late_workers.held(tmp_path / "computes")
+    command = [sys.executable, "-m", "pytest", "-p", "tests.late_workers", "-n", "2", "--dist", "worksteal"]
+    environment = {"PYTHONPATH": str(ROOT), late_workers.WAITING: f"1 {tmp_path}/computes"}
+    with (
+        subprocess.Popen(["sleep", "100"], pass_fds=[held.fileno()]) as computing,
+        subprocess.Popen(command, cwd=tmp_path, env={**os.environ, **environment}) as running,
+    ):
+        held.close()
+        try:
+            # The late one keeps what it waits with and one more; the other takes the rest from it.
+            until(lambda: flown.exists() and flown.read_text().count("\n") == 6)
+            assert set(flown.read_text().split()) == {"gw0"}
+            computing.kill()
+            assert running.wait(60) == 0
+        finally:
+            computing.kill()
+            running.kill()
+    assert flown.read_text().count("\n") == 8
+    assert set(flown.read_text().split()[6:]) == {"gw1"}
+
+
+def until(true: Callable[[], bool], within_s: float = 60.0) -> None:
+    """Raises AssertionError if it does not become true in time."""
+    until_s = time.monotonic() + within_s
+    while not true():
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
