@@ -31,6 +31,7 @@ FLEET_READY = re.compile(r"^ready: \d+ vehicles")
 
 # Between the choice of a port and its use another program may ask for any; Linux gives those from 32768 on.
 _NOT_GIVEN_AWAY = range(16384, 32768)
+_LINES_NOTED = 30
 _chance = random.SystemRandom()  # tests that run side by side may all have the same seed
 
 
@@ -241,6 +242,8 @@ def running_simulator(
 ) -> Iterator[RunningSimulator]:
     """Start a vehicle, wait until it is up, end it afterwards; on Linux at the latest when this program ends.
 
+    What is raised while it runs carries what it said last, as a note (PEP 678).
+
     Args:
         onboard_port, gcs_port: where it sends to; None for ports that are free now.
         onboard_bind, gcs_bind: what it binds; give a former run's port to start it anew in the same place.
@@ -283,6 +286,9 @@ def running_simulator(
         try:
             simulator.wait_until_ready(timeout_s)
             yield simulator
+        except Exception as error:
+            error.add_note("\n".join(["the vehicle said last:", *simulator.transcript[-_LINES_NOTED:]]))
+            raise
         finally:
             simulator.stop()
             assert process.stdin is not None

@@ -40,7 +40,7 @@ def main(workers: int) -> int:
         workers: how many tests run at once, of each kind.
     """
     parts = [*PYTEST, "--ignore", ALONE, "--dist", "worksteal"]
-    clocked = [*parts, "-n", str(workers + max(1, workers // 2)), "-m", "clocked"]
+    clocked = [*parts, "-n", str(2 * workers), "-m", "clocked"]
     # the failures that `--lf` knows are those of the clock: two at once cannot write them down
     beside = ["nice", "-n", "19", *parts, "-n", str(workers), "-m", "not clocked", "-p", "no:cacheprovider"]
     beside += ["--timeout", str(COMPUTING_TIMEOUT_S)]

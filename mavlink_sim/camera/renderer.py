@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.camera.ground_view import Buffers, View, add_haze, draw_ground, draw_sky
-from mavlink_sim.camera.image_effects import ImageEffects, apply_effects
+from mavlink_sim.camera.image_effects import ImageEffects, Sensor
 from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
 from mavlink_sim.camera.object_view import FACE_BITS, PlacedObject, Sighting, within_view
 from mavlink_sim.camera.shadow_view import Shadows
@@ -98,7 +98,8 @@ class Renderer:
         rng: np.random.Generator | None = None,
         shutter: Shutter | None = None,
     ) -> None:
-        self.world, self.camera, self.mount, self.effects = world, camera, mount, effects
+        self.world, self.camera, self.mount = world, camera, mount
+        self._sensor = None if effects is None else Sensor(effects)
         self._lens = Lens(camera, shutter) if any(camera.distortion) or shutter is not None else None
         self._drawn = camera if self._lens is None else self._lens.drawn
         self._buffers = buffers or Buffers(self._drawn.width, self._drawn.height)
@@ -170,8 +171,8 @@ class Renderer:
                 _visible_through_lens(placed, sighting, number, labels, found, inside, view)
                 for placed, sighting, number in sightings
             ]
-        if self.effects is not None:
-            image = apply_effects(image, self.effects, self._rng)
+        if self._sensor is not None:
+            image = self._sensor.expose(image, self._rng)
         with np.errstate(divide="ignore"):
             depth_m = np.divide(np.float32(1.0), inverse_depth, out=inverse_depth)
         np.copyto(depth_m, np.nan, where=np.isinf(depth_m))

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
 
 START_S = 60.0
+LINES_NOTED = 40
 
 
 class ServiceProcess:
@@ -73,10 +74,23 @@ class ServiceProcess:
 
     def take_off(self, altitude_m: float) -> None:
         """As soon as the vehicle has told all that a take-off needs to know; it does in its first seconds."""
+        reply = self.command_when_it_can(f"takeoff {altitude_m:g}")
+        assert reply["success"], reply
+
+    def command_when_it_can(self, text: str, timeout_s: float = 60.0) -> dict[str, Any]:
+        """As `command`, again while it is refused for a need that a busy computer meets a moment late."""
         deadline_s = time.monotonic() + 20.0
-        while not (reply := self.command(f"takeoff {altitude_m:g}"))["success"]:
-            assert "needs" in reply["reason"], reply
-            assert time.monotonic() < deadline_s, reply
+        while True:
+            reply = self.command(text, timeout_s)
+            if reply["success"] or " needs " not in reply["reason"] or time.monotonic() > deadline_s:
+                return reply
+
+    def said_last(self) -> list[str]:
+        """The newest lines, also those that nobody waited for."""
+        with suppress(queue.Empty):
+            while (line := self._queue.get_nowait()) is not None:
+                self.lines.append(line)
+        return self.lines[-LINES_NOTED:]
 
     def signal(self, number: signal.Signals) -> None:
         os.kill(self.pid, number)
@@ -103,7 +117,10 @@ def running_service(
     endpoint: str | None = None,
     stdin: int = subprocess.DEVNULL,
 ) -> Iterator[ServiceProcess]:
-    """Start `companion run`, wait until it takes commands, end it afterwards."""
+    """Start `companion run`, wait until it takes commands, end it afterwards.
+
+    What is raised meanwhile carries what it said last, as a note.
+    """
     command = [sys.executable, "-m", "companion.cli", "run"]
     command += ["--vehicle-url", f"udpin://127.0.0.1:{onboard_port}", "--detector-threads", "1", *flags]
     if endpoint is None:
@@ -114,6 +131,9 @@ def running_service(
     try:
         service.wait_for_line("ready: commands on", START_S)
         yield service
+    except Exception as error:
+        error.add_note("\n".join(["the service said last:", *service.said_last()]))
+        raise
     finally:
         service.stop()
         assert process.stderr is not None

@@ -89,7 +89,7 @@ def test_a_wall_is_not_flown_into_and_when_depth_stops_coming_it_brakes(tmp_path
             return float(row["velocity_ned_mps"][0])
 
         with ThreadPoolExecutor(2) as people:
-            there = people.submit(service.command, "goto north=40 east=0 speed=3", 90.0)
+            there = people.submit(service.command_when_it_can, "goto north=40 east=0 speed=3", 90.0)
             truth.wait_for(lambda row: north_mps(row) > 1.5)
             stands = truth.wait_for(lambda row: north_m(row) > 8.0 and abs(north_mps(row)) < 0.3)
             truth.wait_for(lambda row: row["stamp_ns"] > stands["stamp_ns"] + 3e9)
@@ -99,7 +99,7 @@ def test_a_wall_is_not_flown_into_and_when_depth_stops_coming_it_brakes(tmp_path
             assert not there.done()  # it waits for its way to be free
 
             # Away from the wall it may fly; then the pictures stop.
-            back = people.submit(service.command, "goto north=-150 east=0 speed=3", 90.0)
+            back = people.submit(service.command_when_it_can, "goto north=-150 east=0 speed=3", 90.0)
             truth.wait_for(lambda row: north_mps(row) < -1.5)
             assert not there.result(10.0)["success"]
             os.kill(camera_pid(simulator.pid), signal.SIGSTOP)
