@@ -86,8 +86,8 @@ class Sensor:
             image = np.asarray(cv2.addWeighted(image, 1.0 - effects.grey, grey, effects.grey, 0.0), np.uint8)
         gains = effects.exposure * np.array(effects.white_balance)
         if effects.contrast != 1.0 or effects.gamma != 1.0 or bool(np.any(gains != 1.0)):
-            level = (np.arange(256, dtype=np.float64)[:, None] / 255.0 * gains).clip(0.0, 1.0) ** effects.gamma
-            level = (level - 0.5) * effects.contrast + 0.5
+            level = (np.arange(256, dtype=np.float64)[:, None] / 255.0 * gains).clip(0.0, 1.0)
+            level = (level**effects.gamma - 0.5) * effects.contrast + 0.5
             table = np.clip(np.rint(level * 255.0), 0, 255).astype(np.uint8)
             image = np.asarray(cv2.LUT(image, table[None]), np.uint8)
         return self._with_noise(image, rng) if effects.noise_sigma > 0.0 else image

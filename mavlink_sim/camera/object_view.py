@@ -1,7 +1,8 @@
-"""One object as a camera sees it: which face covers each pixel, how far it is, how bright.
+"""One object as a camera sees it: which face covers each pixel, how far it is, and what colours they have.
 
-Faces are painted as numbers, far to near, into a small image; colour and depth then come from tables by that
-number. The reciprocal of a plane's depth is linear in the pixel, so depth is exact at every pixel.
+Faces are painted as numbers, far to near, into a small image; depth then comes from a table by that number.
+The reciprocal of a plane's depth is linear in the pixel, so depth is exact at every pixel. What is seen in
+the end is coloured by `painting`, all objects at once.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from mavlink_sim.world.painting_order import clip_polygon
 from mavlink_sim.world.palettes import palette_of
 from mavlink_sim.world.plates import printed_side, reflectance
 from mavlink_sim.world.shapes import Shape
-from mavlink_sim.world.textures import Plane, fractal_noise
+from mavlink_sim.world.textures import Plane
 from mavlink_sim.world.world import Light, Sky, WorldObject
 from vision.rotation import matrix_from_euler
 
@@ -41,7 +41,7 @@ class Sighting:
         pixels: (N,) int64, flat indices into the image.
         faces: (N,) the face covering each.
         inverse_depth: (N,) float32.
-        colours: (N, 3) float32 BGR.
+        face_colours: (F, 3) float32 BGR, not yet textured.
         inside_share: 0..1, share of its outline that lies inside the image.
     """
 
@@ -52,16 +52,8 @@ class Sighting:
     pixels: NDArray[np.int64]
     faces: NDArray[np.int64]
     inverse_depth: Plane
-    colours: Plane
+    face_colours: Plane
     inside_share: float
-
-
-@lru_cache(maxsize=1)
-def _mottle() -> Plane:
-    """(65536,) brightness factors around 1: dirt and cloth, a 256 × 256 tile laid flat."""
-    rng = np.random.default_rng(12)
-    tile = 1.0 + 0.03 * fractal_noise(rng, 256, 8, 5, 0.8)
-    return tile.astype(np.float32).ravel()
 
 
 class PlacedObject:
@@ -183,30 +175,22 @@ class PlacedObject:
         inverse += slopes[:, 1].take(faces) * y
         inverse += slopes[:, 2].take(faces)
         np.clip(inverse, 1.0 / farthest, 1.0 / max(nearest, NEAR_M), out=inverse)
-        colours = self._view_colours(view, facing).take(faces, axis=0)
-        colours *= self._texture(view, x, y, inverse)[:, None]
-        if self.item.printed is not None:
-            front = np.flatnonzero((self.shape.normals @ printed_side(self.item.printed)).take(faces) > 0.9)
-            seen_on = reflectance(self.item.printed, eye, rays, x[front], y[front])
-            colours[front] *= seen_on[:, None]
         pixels = rows * view.width + columns
         at_rim = left == 0 or top == 0 or right == view.width or bottom == view.height
         share = _inside_share(points, view) if at_rim else 1.0
+        colours = self._view_colours(view, facing)
         return Sighting(left, top, right, bottom, pixels, faces, inverse, colours, share)
 
-    def _texture(self, view: View, x: Plane, y: Plane, inverse: Plane) -> Plane:
-        """Brightness of each pixel: darker near the ground, a little mottled, fixed to the object."""
-        rows = view.ned_from_pixel.astype(np.float32)
-        depth = 1.0 / inverse
-        above = -(view.eye[2] + depth * (rows[2, 0] * x + rows[2, 1] * y + rows[2, 2]))
-        north = view.eye[0] - self.origin[0] + depth * (rows[0, 0] * x + rows[0, 1] * y + rows[0, 2])
-        east = view.eye[1] - self.origin[1] + depth * (rows[1, 0] * x + rows[1, 1] * y + rows[1, 2])
-        texels = 90.0 / self.item.scale
-        across = ((north + 0.37 * above) * texels).astype(np.int32) & 255
-        along = ((east + 0.71 * above) * texels).astype(np.int32) & 255
-        brightness = _mottle().take((along << 8) + across)
-        brightness *= 0.76 + 0.24 * np.clip(above * (1.6 / self.item.scale), 0.0, 1.0)
-        return np.asarray(brightness, np.float32)
+    def printed_brightness(self, view: View, faces: NDArray[np.int64], x: Plane, y: Plane) -> Plane:
+        """(N,) factors of pixels that see these faces of a plate: its print where it has one, else 1."""
+        brightness = np.ones(len(faces), np.float32)
+        printed = self.item.printed
+        if printed is not None:
+            front = np.flatnonzero((self.shape.normals @ printed_side(printed)).take(faces) > 0.9)
+            eye = (view.eye - self.origin) @ self.ned_from_object / self.item.scale
+            rays = self.ned_from_object.T @ view.ned_from_pixel / self.item.scale
+            brightness[front] = reflectance(printed, eye, rays, x[front], y[front])
+        return brightness
 
     def _view_colours(self, view: View, facing: NDArray[np.bool_]) -> Plane:
         """(F, 3) faces' colours with what glossy ones mirror of the sky and the sun."""
@@ -258,10 +242,13 @@ def _clipped(
     pieces: list[Matrix] = []
     first = [0]
     kept = facing.copy()
+    nearest = np.minimum.reduceat(corners[:, 2], shape.first[:-1])
     for face in range(len(shape.normals)):
         piece = np.zeros((0, 3))
         if facing[face]:
-            piece = clip_polygon(corners[shape.first[face] : shape.first[face + 1]], forward, NEAR_M)
+            piece = corners[shape.first[face] : shape.first[face + 1]]
+            if nearest[face] < NEAR_M:
+                piece = clip_polygon(piece, forward, NEAR_M)
         kept[face] = len(piece) >= 3
         if kept[face]:
             pieces.append(piece)

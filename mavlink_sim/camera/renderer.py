@@ -18,6 +18,7 @@ from mavlink_sim.camera.ground_view import Buffers, View, add_haze, draw_ground,
 from mavlink_sim.camera.image_effects import ImageEffects, Sensor
 from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
 from mavlink_sim.camera.object_view import FACE_BITS, PlacedObject, Sighting, within_view
+from mavlink_sim.camera.painting import Painted, paint_objects
 from mavlink_sim.camera.shadow_view import Shadows
 from mavlink_sim.world.textures import Image, Plane
 from mavlink_sim.world.world import World, WorldObject, range_to
@@ -153,23 +154,24 @@ class Renderer:
         inverse_depth = np.empty((view.height, view.width), np.float32)
         image = draw_ground(world, view, buffers, inverse_depth)
         self._shadows.cast(view, world.light.shadow, image)
-        labels = np.zeros((view.height, view.width), np.int32)
         seen = within_view(self._placed, self._middles, self._radii, view)
-        sightings = self._draw_objects(seen, view, image, inverse_depth, labels)
+        painted = paint_objects(seen, view, image, inverse_depth)
         add_haze(world.sky, inverse_depth, buffers, image)
         draw_sky(world.sky, world.light, view, inverse_depth, image)
-        _soften_edges(image, labels, sightings)
+        _soften_edges(image, painted)
+        labels = painted.labels
+        numbered = [(*item, number) for number, item in enumerate(painted.objects, start=1)]
         objects: list[VisibleObject | None]
         if self._lens is None:
             objects = [
-                _visible(placed, sighting, number, labels, view) for placed, sighting, number in sightings
+                _visible(placed, sighting, number, labels, view) for placed, sighting, number in numbered
             ]
         else:
             image, inverse_depth, exposed, inside = self._lens.expose(image, inverse_depth, labels, motion)
             found = _found(exposed)
             objects = [
                 _visible_through_lens(placed, sighting, number, labels, found, inside, view)
-                for placed, sighting, number in sightings
+                for placed, sighting, number in numbered
             ]
         if self._sensor is not None:
             image = self._sensor.expose(image, self._rng)
@@ -199,41 +201,12 @@ class Renderer:
             height=self._drawn.height,
         )
 
-    @staticmethod
-    def _draw_objects(
-        seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane, labels: NDArray[np.int32]
-    ) -> list[tuple[PlacedObject, Sighting, int]]:
-        sightings: list[tuple[PlacedObject, Sighting, int]] = []
-        flat_depth, flat_labels, flat_image = (
-            inverse_depth.reshape(-1),
-            labels.reshape(-1),
-            image.reshape(-1, 3),
-        )
-        for placed in seen:
-            sighting = placed.draw(view)
-            if sighting is None:
-                continue
-            number = len(sightings) + 1
-            nearer = sighting.inverse_depth > flat_depth.take(sighting.pixels)
-            pixels = sighting.pixels[nearer]
-            flat_depth[pixels] = sighting.inverse_depth[nearer]
-            flat_labels[pixels] = sighting.faces[nearer] + (number << FACE_BITS)
-            flat_image[pixels] = np.clip(sighting.colours[nearer], 0, 255).astype(np.uint8)
-            sightings.append((placed, sighting, number))
-        return sightings
 
-
-def _soften_edges(
-    image: Image, labels: NDArray[np.int32], sightings: list[tuple[PlacedObject, Sighting, int]]
-) -> None:
+def _soften_edges(image: Image, painted: Painted) -> None:
     """Blend pixels along the edges of faces with their neighbours, so that edges are not jagged."""
-    if not sightings:
+    if not painted.objects:
         return
-    left = max(min(sighting.left for _, sighting, _ in sightings) - 2, 0)
-    top = max(min(sighting.top for _, sighting, _ in sightings) - 2, 0)
-    right = max(sighting.right for _, sighting, _ in sightings) + 2
-    bottom = max(sighting.bottom for _, sighting, _ in sightings) + 2
-    part, label = image[top:bottom, left:right], labels[top:bottom, left:right]
+    part, label = image[painted.part], painted.labels[painted.part]
     across = label[:, 1:] != label[:, :-1]
     along = label[1:] != label[:-1]
     edge = np.zeros(label.shape, np.bool_)
@@ -268,7 +241,7 @@ def _visible(
 
 def _found(exposed: NDArray[np.int32]) -> _Found:
     """The pixels of an exposed picture in which there is any object."""
-    where = np.flatnonzero(exposed)
+    where = np.flatnonzero(exposed != 0)
     rows, columns = np.divmod(where, exposed.shape[1])
     return _Found(exposed.reshape(-1)[where] >> FACE_BITS, columns, rows)
 

@@ -15,7 +15,7 @@ import pytest
 from pymavlink import mavutil
 
 from mavlink_sim.cli import main
-from mavlink_sim.testing import RunningSimulator, free_port, free_udp_ports, running_simulator
+from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
 from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SharedFrameReader, segment_path
@@ -127,15 +127,16 @@ def test_a_signal_ends_it_in_good_order(number: signal.Signals) -> None:
         assert simulator.process.wait(20.0) == 0
 
 
-def fail_after(simulator: RunningSimulator, said: str) -> None:
-    simulator.wait_for_event(said, 20.0)
-    raise ValueError("of a test")
+def fail_beside_a_vehicle_that_says(fault: str) -> None:
+    with running_simulator() as simulator:
+        simulator.fault(fault)
+        simulator.wait_for_event(fault.split()[0], 20.0)
+        raise ValueError("of a test")
 
 
 def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
-    with pytest.raises(ValueError, match="of a test") as failure, running_simulator() as simulator:
-        simulator.fault("wind speed=3 direction=90")
-        fail_after(simulator, "wind")
+    with pytest.raises(ValueError, match="of a test") as failure:
+        fail_beside_a_vehicle_that_says("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
     first, *lines = note.splitlines()
     assert first == "the vehicle said last:"
