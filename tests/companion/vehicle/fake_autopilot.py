@@ -103,6 +103,14 @@ class FakeAutopilot:
         await wait_until(lambda: len(self.heard_named(name)) >= count, timeout_s, lambda: f"{count} {name}")
         return self.heard_named(name)
 
+    async def hears_command(self, command: int, timeout_s: float = 10.0) -> None:
+        """Returns once a COMMAND_LONG of that number came."""
+
+        def heard() -> list[int]:
+            return [message.command for message in self.heard_named("COMMAND_LONG")]
+
+        await wait_until(lambda: command in heard(), timeout_s, lambda: f"command {command}, not {heard()}")
+
 
 async def wait_until(
     met: Callable[[], bool], timeout_s: float, wanted: Callable[[], object] = lambda: "it"
