@@ -286,7 +286,7 @@ def running_simulator(
         try:
             simulator.wait_until_ready(timeout_s)
             yield simulator
-        except Exception as error:
+        except BaseException as error:  # a test's time-out is no Exception
             error.add_note("\n".join(["the vehicle said last:", *simulator.transcript[-_LINES_NOTED:]]))
             raise
         finally:

@@ -37,7 +37,7 @@ def main(workers: int) -> int:
     """The first exit code that is not 0; 0 if all have passed.
 
     Args:
-        workers: how many tests run at once, of each kind.
+        workers: how many tests run at once, of each kind; of those that fly twice as many at the end.
     """
     parts = [*PYTEST, "--ignore", ALONE, "--dist", "worksteal"]
     clocked = [*parts, "-n", str(2 * workers), "-m", "clocked"]
@@ -52,7 +52,6 @@ def main(workers: int) -> int:
         watch = Watch(Path(folder) / "standstills")
         os.environ[NOTES] = str(watch.notes)
         report = Path(folder) / "computing"
-        os.environ[late_workers.WAITING] = f"{workers} {folder}/computes"
         try:
             with (
                 late_workers.held(Path(folder) / "computes") as lock,
@@ -60,7 +59,8 @@ def main(workers: int) -> int:
                 report.open("rb") as heard,
                 subprocess.Popen(beside, stdout=said, stderr=said, pass_fds=[lock.fileno()]) as computing,
             ):
-                lock.close()  # held by what computes alone
+                lock.close()  # held by what computes alone, which must not wait for itself
+                os.environ[late_workers.WAITING] = f"{workers} {folder}/computes"
                 try:
                     codes["the demonstration"] = _run([*PYTEST, ALONE])
                     codes["what runs by the clock"] = _run(clocked)

@@ -20,7 +20,8 @@ STAND_IN = """
 import os, signal, subprocess, sys
 part = "beside" if "not clocked" in sys.argv else "clocked" if "clocked" in sys.argv else "alone"
 watched = "watched" if os.environ["COMPANION_TEST_STANDSTILLS"] else "unwatched"
-print(part, "at niceness", os.nice(0), watched, flush=True)
+late = "with" if "COMPANION_TEST_LATE_WORKERS" in os.environ else "without"
+print(part, "at niceness", os.nice(0), watched, late, "late workers", flush=True)
 what = os.environ.get(part, "0")
 if what == "waits":
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -87,8 +88,8 @@ def test_everything_runs_whatever_fails_and_what_computes_is_told_last(
     names = {"alone": "the demonstration", "clocked": "by the clock", "beside": "what computes"}
     verdict = said.splitlines()[-1]
     assert all((name in verdict) == (part in parts) for part, name in names.items())
-    assert "beside at niceness 19 watched" in said
-    assert f"clocked at niceness {os.nice(0)} watched" in said
+    assert "beside at niceness 19 watched without late workers" in said
+    assert f"clocked at niceness {os.nice(0)} watched with late workers" in said
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

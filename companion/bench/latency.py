@@ -56,9 +56,9 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
 
     `capture_to_setpoint` starts at the pose's stamp in the simulator, before the picture is drawn.
     `beyond_network` is what the companion adds to the network: from when the frame is there, less the
-    network's own time. Its parts are told by their medians: those of `PerceptionResult.timing_ms`, then
-    `deliver`, from when the result was known until the pilot has it, and `steer`, from there until the
-    setpoint has left.
+    network's own time. Every stage is told by its median: those of `PerceptionResult.timing_ms`, among them
+    `capture` and `inference`, which are not the companion's; then `deliver`, from when the result was known
+    until the pilot has it, and `steer`, from there until the setpoint has left.
 
     Raises:
         RehearsalError: the vehicle did not get into the air.

@@ -111,8 +111,8 @@ class Outbox:
         assert newest is not None
         return replace(newest, replaced=self._replaced) if isinstance(newest, Report) else newest
 
-    def _next(self) -> tuple[bytes, bool]:
-        """What the thread sends now, and whether it is the last."""
+    def _next(self) -> Message | bytes:
+        """What the thread sends now: a message, or the rest of one."""
         with self._changed:
             self._busy = False
             self._changed.wait_for(
@@ -121,23 +121,23 @@ class Outbox:
             self._busy = True
             if self._rest:
                 rest, self._rest = self._rest, b""
-                return rest, False
+                return rest
             if self._queue:
-                return packed(self._queue.popleft()), False
+                return self._queue.popleft()
             if self._newest is not None:
-                return packed(self._take_newest()), False
+                return self._take_newest()
             if self._last is not None:
-                return packed(self._last), True
+                return self._last
             preview, self._preview = self._preview, None
             assert preview is not None
-            return packed(preview), False
+            return preview
 
     def _run(self) -> None:
         try:
-            finished = False
-            while not finished:
-                data, finished = self._next()
-                self._connection.sendall(data)
+            message: Message | bytes = b""
+            while not isinstance(message, Ended | StartFailed):
+                message = self._next()
+                self._connection.sendall(message if isinstance(message, bytes) else packed(message))
         except OSError:
             self._on_lost()
 

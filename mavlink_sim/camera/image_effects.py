@@ -52,16 +52,6 @@ def _noise_bank() -> NDArray[np.int16]:
     return np.asarray(np.rint(64.0 * (0.8 * common + 0.6 * own)), np.int16)
 
 
-@lru_cache(maxsize=4)
-def _halves(sigma: float, rows: int, columns: int) -> tuple[Image, Image]:
-    """So many times the bank in each direction, at this deviation: what it adds, and what it takes away.
-
-    Eight bits a half, which saturate as a picture does: a third of the time that signed noise takes.
-    """
-    scaled = np.tile(_scaled(_noise_bank(), sigma), (rows, columns, 1))
-    return tuple(np.clip(half, 0, 255).astype(np.uint8) for half in (scaled, -scaled))  # type: ignore[return-value]
-
-
 def _scaled(noise: NDArray[np.int16], sigma: float) -> NDArray[np.int16]:
     return np.asarray(cv2.addWeighted(noise, sigma / 64.0, noise, 0.0, 0.0), np.int16)
 
@@ -71,7 +61,8 @@ class Sensor:
 
     def __init__(self, effects: ImageEffects) -> None:
         self._effects = effects
-        self._noisy = 0
+        self._has_exposed = False
+        self._halves: tuple[Image, Image] | None = None
 
     def expose(self, image: Image, rng: np.random.Generator) -> Image:
         """A new picture (H, W, 3) uint8 with the effects; `rng` chooses the noise."""
@@ -93,18 +84,30 @@ class Sensor:
         return self._with_noise(image, rng) if effects.noise_sigma > 0.0 else image
 
     def _with_noise(self, image: Image, rng: np.random.Generator) -> Image:
-        sigma, (height, width) = self._effects.noise_sigma, image.shape[:2]
+        height, width = image.shape[:2]
         bank = _noise_bank()
-        rows, columns = -(-height // bank.shape[0]), -(-width // bank.shape[1])
-        top = int(rng.integers(rows * bank.shape[0] - height + 1))
-        left = int(rng.integers(columns * bank.shape[1] - width + 1))
+        repeats = (-(-height // bank.shape[0]), -(-width // bank.shape[1]), 1)
+        top = int(rng.integers(repeats[0] * bank.shape[0] - height + 1))
+        left = int(rng.integers(repeats[1] * bank.shape[1] - width + 1))
         piece = (slice(top, top + height), slice(left, left + width))
-        self._noisy += 1
-        if self._noisy == 1:  # many a training scene's camera takes one picture: the halves would not pay
-            bank = np.tile(bank, (rows, columns, 1)) if rows > 1 or columns > 1 else bank
-            return np.asarray(cv2.add(image, _scaled(bank[piece], sigma), dtype=cv2.CV_8U), np.uint8)
-        more, less = _halves(sigma, rows, columns)
+        if not self._has_exposed:  # many a training scene's camera takes one picture: halves would not pay
+            self._has_exposed = True
+            bank = np.tile(bank, repeats) if repeats != (1, 1, 1) else bank
+            noise = _scaled(bank[piece], self._effects.noise_sigma)
+            return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), np.uint8)
+        if self._halves is None or self._halves[0].shape[0] < height or self._halves[0].shape[1] < width:
+            self._halves = _halves(np.tile(_scaled(bank, self._effects.noise_sigma), repeats))
+        more, less = self._halves
         return np.asarray(cv2.subtract(cv2.add(image, more[piece]), less[piece]), np.uint8)
+
+
+def _halves(noise: NDArray[np.int16]) -> tuple[Image, Image]:
+    """What it adds and what it takes away, in eight bits, which saturate as a picture does.
+
+    A picture takes them up in a third of the time that signed noise takes.
+    """
+    more, less = (np.clip(half, 0, 255).astype(np.uint8) for half in (noise, -noise))
+    return more, less
 
 
 def _smear(length_px: float, direction_rad: float) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.ground_view import Matrix, View
 from mavlink_sim.world.painting_order import clip_polygon
 from mavlink_sim.world.palettes import palette_of
-from mavlink_sim.world.plates import printed_side, reflectance
+from mavlink_sim.world.plates import Print, printed_side, reflectance
 from mavlink_sim.world.shapes import Shape
 from mavlink_sim.world.textures import Plane
 from mavlink_sim.world.world import Light, Sky, WorldObject
@@ -29,7 +29,7 @@ FAR_PX = 30000.0
 """Corners farther outside the image than this are pulled in: drawing needs bounded integers."""
 SUBPIXEL_BITS = 4
 FACE_BITS = 10
-"""A label is (object number + 1) << FACE_BITS | face number."""
+"""A label is the object's number << FACE_BITS | face; the first object's number is 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,15 +181,15 @@ class PlacedObject:
         colours = self._view_colours(view, facing)
         return Sighting(left, top, right, bottom, pixels, faces, inverse, colours, share)
 
-    def printed_brightness(self, view: View, faces: NDArray[np.int64], x: Plane, y: Plane) -> Plane:
-        """(N,) factors of pixels that see these faces of a plate: its print where it has one, else 1."""
+    def printed_brightness(
+        self, printed: Print, view: View, faces: NDArray[np.int64], x: Plane, y: Plane
+    ) -> Plane:
+        """(N,) factors of pixels that see these faces of a plate: its print on one of them, 1 elsewhere."""
         brightness = np.ones(len(faces), np.float32)
-        printed = self.item.printed
-        if printed is not None:
-            front = np.flatnonzero((self.shape.normals @ printed_side(printed)).take(faces) > 0.9)
-            eye = (view.eye - self.origin) @ self.ned_from_object / self.item.scale
-            rays = self.ned_from_object.T @ view.ned_from_pixel / self.item.scale
-            brightness[front] = reflectance(printed, eye, rays, x[front], y[front])
+        front = np.flatnonzero((self.shape.normals @ printed_side(printed)).take(faces) > 0.9)
+        eye = (view.eye - self.origin) @ self.ned_from_object / self.item.scale
+        rays = self.ned_from_object.T @ view.ned_from_pixel / self.item.scale
+        brightness[front] = reflectance(printed, eye, rays, x[front], y[front])
         return brightness
 
     def _view_colours(self, view: View, facing: NDArray[np.bool_]) -> Plane:

@@ -131,7 +131,7 @@ def running_service(
     try:
         service.wait_for_line("ready: commands on", START_S)
         yield service
-    except Exception as error:
+    except BaseException as error:  # a test's time-out is no Exception
         error.add_note("\n".join(["the service said last:", *service.said_last()]))
         raise
     finally:

@@ -131,17 +131,17 @@ def fail_beside_a_vehicle_that_says(fault: str) -> None:
     with running_simulator() as simulator:
         simulator.fault(fault)
         simulator.wait_for_event(fault.split()[0], 20.0)
-        raise ValueError("of a test")
+        pytest.fail("as a time-out does")
 
 
 def test_what_fails_while_it_runs_carries_what_it_said_last() -> None:
-    with pytest.raises(ValueError, match="of a test") as failure:
+    with pytest.raises(pytest.fail.Exception, match="as a time-out does") as failure:
         fail_beside_a_vehicle_that_says("wind speed=3 direction=90")
     (note,) = failure.value.__notes__
     first, *lines = note.splitlines()
     assert first == "the vehicle said last:"
     assert any("ready: system 1" in line for line in lines)
-    assert "wind" in lines[-1]
+    assert any("wind" in line for line in lines)
 
 
 def test_the_ready_file_tells_pid_and_ports(tmp_path: Path) -> None:

@@ -178,8 +178,8 @@ def test_a_signal_in_the_middle_of_being_told_to_stop_does_no_harm(
         orders.stop()
     finally:
         sys.settrace(tracing)
+        orders.finished()
     assert orders.stopping
-    orders.finished()
     service.close()
     for thread in threading.enumerate():
         if thread.name == "inbox":

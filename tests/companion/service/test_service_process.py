@@ -190,3 +190,17 @@ def test_frames_that_ffmpeg_writes_to_standard_input(exported_model: Path, tmp_p
         writer.kill()
         writer.wait()
         writer.stdout.close()
+
+
+def test_what_fails_beside_a_service_carries_what_it_said_last(seeing: list[str], tmp_path: Path) -> None:
+    with (
+        running_simulator() as simulator,
+        pytest.raises(TimeoutError, match="never said") as failure,
+        running_service(
+            simulator.onboard_port, [*seeing, "--detector-enabled", "false"], cwd=tmp_path
+        ) as service,
+    ):
+        service.wait_for_line("it was never said", 0.1)
+    (note,) = failure.value.__notes__
+    assert note.startswith("the service said last:\n")
+    assert "ready: commands on" in note
