@@ -1,36 +1,74 @@
-"""Workers of pytest-xdist that begin when something else has ended: here, what computes beside what flies.
+"""Workers of pytest-xdist that begin later: when what computes beside has ended, or an early one is idle.
 
-That holds a lock on a file for as long as it lives (flock(2)), so nobody has to tell its end, and a wait for
-it needs no polling. Meanwhile the other workers take from the late ones what is waiting there, all but the
-last two of each. One that takes the place of a worker that crashed is not late.
+Whatever they wait for holds a lock on a file while it goes on (flock(2)): nobody has to tell its end, and
+nobody has to ask again and again. Meanwhile the early workers take from the late ones what waits there,
+all but the last two of each. A worker that takes the place of one that crashed is neither.
 """
 
 from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
 import pytest
 
-# "N PATH": of 2 N workers the second half begin when nobody has the file locked any more.
-WAITING = "COMPANION_TEST_LATE_WORKERS"
+# "N FOLDER": of 2 N workers the first half is early. In the folder lie the files.
+LATE_WORKERS = "COMPANION_TEST_LATE_WORKERS"
+COMPUTES = "computes"
+GOES_ON = pytest.StashKey[IO[bytes]]()
 
 
 def held(path: Path) -> IO[bytes]:
-    """The file, locked for whoever inherits it too."""
+    """The file, locked until it is closed here and by whoever inherited it."""
     file = path.open("wb")
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    folder, early, _ = _workers()
+    worker = _worker(config)
+    if folder is not None and worker in early:
+        config.stash[GOES_ON] = held(folder / worker)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """An early worker finds nothing more to do."""
+    if GOES_ON in session.config.stash:
+        session.config.stash[GOES_ON].close()
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)  # the wait is no part of a test's time
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    worker = getattr(item.config, "workerinput", {}).get("workerid", "")
-    early, _, path = os.environ.get(WAITING, "").partition(" ")
-    if worker and path and int(early) <= int(worker.removeprefix("gw")) < 2 * int(early):
-        with Path(path).open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH)
+    folder, early, late = _workers()
+    if folder is not None and _worker(item.config) in late:
+        _until_one_has_ended(folder / name for name in (COMPUTES, *early))
     return (yield)
+
+
+def _workers() -> tuple[Path | None, list[str], list[str]]:
+    """The folder of locks, if there are late workers, and the names of the early and the late ones."""
+    number, _, folder = os.environ.get(LATE_WORKERS, "0 ").partition(" ")
+    names = [f"gw{index}" for index in range(2 * int(number))]
+    return Path(folder) if names else None, names[: int(number)], names[int(number) :]
+
+
+def _worker(config: pytest.Config) -> str:
+    return str(getattr(config, "workerinput", {}).get("workerid", ""))
+
+
+def _until_one_has_ended(paths: Iterable[Path]) -> None:
+    over = threading.Event()
+
+    def wait(path: Path) -> None:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH)
+            over.set()
+
+    for path in paths:
+        threading.Thread(target=wait, args=(path,), name=f"waits for {path.name}", daemon=True).start()
+    over.wait()

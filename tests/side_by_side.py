@@ -54,13 +54,13 @@ def main(workers: int) -> int:
         report = Path(folder) / "computing"
         try:
             with (
-                late_workers.held(Path(folder) / "computes") as lock,
+                late_workers.held(Path(folder) / late_workers.COMPUTES) as lock,
                 report.open("wb") as said,
                 report.open("rb") as heard,
                 subprocess.Popen(beside, stdout=said, stderr=said, pass_fds=[lock.fileno()]) as computing,
             ):
                 lock.close()  # held by what computes alone, which must not wait for itself
-                os.environ[late_workers.WAITING] = f"{workers} {folder}/computes"
+                os.environ[late_workers.LATE_WORKERS] = f"{workers} {folder}"
                 try:
                     codes["the demonstration"] = _run([*PYTEST, ALONE])
                     codes["what runs by the clock"] = _run(clocked)

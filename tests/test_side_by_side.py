@@ -107,22 +107,27 @@ def test_who_ends_it_ends_all_of_it(tmp_path: Path, number: int, code: int) -> N
 
 
 FLIGHTS = """
-import os
+import os, time
 import pytest
 
 @pytest.mark.parametrize("number", range(8))
 def test_flight(number):
     with open("flown", "a") as flown:
         print(os.environ["PYTEST_XDIST_WORKER"], file=flown)
+    with open("flown") as flown:
+        sixth = len(flown.readlines()) == 6
+    while sixth and not os.path.exists("landing"):
+        time.sleep(0.01)
 """
 
 
-def test_a_late_worker_begins_when_what_it_waits_for_has_ended(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ends_first", ["what computes", "the early worker's tests"])
+def test_a_late_worker_begins_when_one_that_it_waits_for_has_ended(tmp_path: Path, ends_first: str) -> None:
     (tmp_path / "test_flights.py").write_text(FLIGHTS)
-    flown = tmp_path / "flown"
-    held = late_workers.held(tmp_path / "computes")
+    flown, landing = tmp_path / "flown", tmp_path / "landing"
+    held = late_workers.held(tmp_path / late_workers.COMPUTES)
     command = [sys.executable, "-m", "pytest", "-p", "tests.late_workers", "-n", "2", "--dist", "worksteal"]
-    environment = {"PYTHONPATH": str(ROOT), late_workers.WAITING: f"1 {tmp_path}/computes"}
+    environment = {"PYTHONPATH": str(ROOT), late_workers.LATE_WORKERS: f"1 {tmp_path}"}
     with (
         subprocess.Popen(["sleep", "100"], pass_fds=[held.fileno()]) as computing,
         subprocess.Popen(command, cwd=tmp_path, env={**os.environ, **environment}) as running,
@@ -132,13 +137,15 @@ def test_a_late_worker_begins_when_what_it_waits_for_has_ended(tmp_path: Path) -
             # The late one keeps what it waits with and one more; the other takes the rest from it.
             until(lambda: flown.exists() and flown.read_text().count("\n") == 6)
             assert set(flown.read_text().split()) == {"gw0"}
-            computing.kill()
+            if ends_first == "what computes":
+                computing.kill()
+                until(lambda: flown.read_text().count("\n") == 8)
+            landing.touch()
             assert running.wait(60) == 0
         finally:
             computing.kill()
             running.kill()
-    assert flown.read_text().count("\n") == 8
-    assert set(flown.read_text().split()[6:]) == {"gw1"}
+    assert flown.read_text().split() == ["gw0"] * 6 + ["gw1"] * 2
 
 
 def until(true: Callable[[], bool], within_s: float = 60.0) -> None:
