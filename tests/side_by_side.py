@@ -52,6 +52,7 @@ def main(workers: int) -> int:
         watch = Watch(Path(folder) / "standstills")
         os.environ[NOTES] = str(watch.notes)
         report = Path(folder) / "computing"
+        os.environ.pop(late_workers.LATE_WORKERS, None)  # of a run that this one is a test of
         try:
             with (
                 late_workers.held(Path(folder) / late_workers.COMPUTES) as lock,
