@@ -6,8 +6,8 @@ TORCH_INDEX ?=
 # Gigabytes of CUDA come only when asked for: ALLOW_CUDA=1.
 ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-# How many tests run at once that fly, and as many that compute; then twice as many that fly. Empty: one for each
-# processor.
+# How many tests run at once that fly, and as many that compute; then half as many more that fly. Empty: one for
+# each processor.
 WORKERS ?=
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed

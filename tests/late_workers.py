@@ -16,7 +16,7 @@ from typing import IO
 
 import pytest
 
-# "N FOLDER": of 2 N workers the first half is early. In the folder lie the files.
+# "EARLY LATE FOLDER": how many there are of each, the early ones first; in the folder lie the files.
 LATE_WORKERS = "COMPANION_TEST_LATE_WORKERS"
 COMPUTES = "computes"
 GOES_ON = pytest.StashKey[IO[bytes]]()
@@ -50,11 +50,18 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     return (yield)
 
 
+def told(early: int, late: int, folder: Path) -> str:
+    """What the variable `LATE_WORKERS` is to say."""
+    return f"{early} {late} {folder}"
+
+
 def _workers() -> tuple[Path | None, list[str], list[str]]:
-    """The folder of locks, if there are late workers, and the names of the early and the late ones."""
-    number, _, folder = os.environ.get(LATE_WORKERS, "0 ").partition(" ")
-    names = [f"gw{index}" for index in range(2 * int(number))]
-    return Path(folder) if names else None, names[: int(number)], names[int(number) :]
+    """The folder of locks, None if nobody is late, and the names of the early and of the late ones."""
+    if LATE_WORKERS not in os.environ:
+        return None, [], []
+    early, late, folder = os.environ[LATE_WORKERS].split(" ", 2)
+    names = [f"gw{index}" for index in range(int(early) + int(late))]
+    return Path(folder), names[: int(early)], names[int(early) :]
 
 
 def _worker(config: pytest.Config) -> str:

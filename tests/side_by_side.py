@@ -37,10 +37,11 @@ def main(workers: int) -> int:
     """The first exit code that is not 0; 0 if all have passed.
 
     Args:
-        workers: how many tests run at once, of each kind; of those that fly twice as many at the end.
+        workers: how many tests run at once, of each kind; of those that fly half as many more at the end.
     """
     parts = [*PYTEST, "--ignore", ALONE, "--dist", "worksteal"]
-    clocked = [*parts, "-n", str(2 * workers), "-m", "clocked"]
+    late = max(1, workers // 2)
+    clocked = [*parts, "-n", str(workers + late), "-m", "clocked"]
     # the failures that `--lf` knows are those of the clock: two at once cannot write them down
     beside = ["nice", "-n", "19", *parts, "-n", str(workers), "-m", "not clocked", "-p", "no:cacheprovider"]
     beside += ["--timeout", str(COMPUTING_TIMEOUT_S)]
@@ -61,7 +62,7 @@ def main(workers: int) -> int:
                 subprocess.Popen(beside, stdout=said, stderr=said, pass_fds=[lock.fileno()]) as computing,
             ):
                 lock.close()  # held by what computes alone, which must not wait for itself
-                os.environ[late_workers.LATE_WORKERS] = f"{workers} {folder}"
+                os.environ[late_workers.LATE_WORKERS] = late_workers.told(workers, late, Path(folder))
                 try:
                     codes["the demonstration"] = _run([*PYTEST, ALONE])
                     codes["what runs by the clock"] = _run(clocked)

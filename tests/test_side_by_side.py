@@ -127,7 +127,7 @@ def test_a_late_worker_begins_when_one_that_it_waits_for_has_ended(tmp_path: Pat
     flown, landing = tmp_path / "flown", tmp_path / "landing"
     held = late_workers.held(tmp_path / late_workers.COMPUTES)
     command = [sys.executable, "-m", "pytest", "-p", "tests.late_workers", "-n", "2", "--dist", "worksteal"]
-    environment = {"PYTHONPATH": str(ROOT), late_workers.LATE_WORKERS: f"1 {tmp_path}"}
+    environment = {"PYTHONPATH": str(ROOT), late_workers.LATE_WORKERS: late_workers.told(1, 1, tmp_path)}
     with (
         subprocess.Popen(["sleep", "100"], pass_fds=[held.fileno()]) as computing,
         subprocess.Popen(command, cwd=tmp_path, env={**os.environ, **environment}) as running,

@@ -75,7 +75,8 @@ def test_a_vehicle_runs_in_the_folder_and_with_the_variables_of_who_wants_it(
     monkeypatch.setenv("WHO_WANTS_IT", "a test \udcff")
     with vehicle(ready_file="ready.json", camera=f"launcher-{os.getpid()}") as one:
         assert json.loads((tmp_path / "ready.json").read_text())["pid"] == one.pid
-        # its camera is a process that has them from it
+        one.wait_for_event("camera")
+        # that is a process that has them from it
         children = Path(f"/proc/{one.pid}/task/{one.pid}/children").read_text().split()
         assert children
         for child in children:

@@ -121,6 +121,8 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation():
             )
 
             refused = await followers[0].command("formation line leader=nobody")
+            while "nobody is heard" in refused["reason"]:  # a busy computer brings poses late
+                refused = await followers[0].command("formation line leader=nobody")
             assert "the pose of nobody (none came; heard are vehicle1" in refused["reason"]
             taken_off = await asyncio.gather(*(member.command("takeoff 5") for member in fleet))
             assert all(outcome["success"] for outcome in taken_off), taken_off
