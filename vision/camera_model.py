@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -85,9 +86,10 @@ class CameraModel:
             ).reshape(-1, 2)
         else:
             plane = (points - (self.cx, self.cy)) / (self.fx, self.fy)
-        rays = np.column_stack([plane, np.ones(len(plane))])
-        unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        return unit
+        rays = np.ones((len(plane), 3))
+        rays[:, :2] = plane
+        rays /= np.sqrt((rays * rays).sum(axis=1, keepdims=True))
+        return rays
 
     def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
         k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
@@ -147,10 +149,7 @@ class CameraMount:
     @property
     def _parent_from_optical(self) -> NDArray[np.float64]:
         """(3, 3) rotation from the optical frame to that of what the camera is screwed to."""
-        turned: NDArray[np.float64] = (
-            matrix_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad) @ BODY_FROM_OPTICAL
-        )
-        return turned
+        return _parent_from_optical(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
     def ned_from_optical(self, ned_from_body: NDArray[np.float64]) -> NDArray[np.float64]:
         """(3, 3) rotation from the optical frame to NED, for the body's (3, 3) attitude.
@@ -165,3 +164,11 @@ class CameraMount:
             heading_rad = math.atan2(float(ned_from_body[1, 0]), float(ned_from_body[0, 0]))
             ned_from_body = matrix_from_euler(0.0, 0.0, heading_rad)
         return ned_from_body @ self._parent_from_optical
+
+
+@lru_cache(maxsize=16)
+def _parent_from_optical(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
+    """Read-only: every camera that is mounted like this has it, several times a frame."""
+    turned: NDArray[np.float64] = matrix_from_euler(roll_rad, pitch_rad, yaw_rad) @ BODY_FROM_OPTICAL
+    turned.flags.writeable = False
+    return turned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,56 +11,57 @@ from numpy.typing import NDArray
 from vision.camera_model import CameraModel, CameraMount
 
 
-def direction_ned(
-    camera: CameraModel,
-    mount: CameraMount,
-    ned_from_body: NDArray[np.float64],
-    pixels: NDArray[Any],
-) -> NDArray[np.float64]:
-    """(N, 2) pixels → (N, 3) unit directions in NED, given the vehicle's attitude when they were captured."""
-    directions: NDArray[np.float64] = camera.rays(pixels) @ mount.ned_from_optical(ned_from_body).T
-    return directions
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightlines:
+    """Where pixels look, given the vehicle's attitude when they were captured. Offsets are from the vehicle.
 
-
-def point_at_depth(
-    camera: CameraModel,
-    mount: CameraMount,
-    ned_from_body: NDArray[np.float64],
-    pixels: NDArray[Any],
-    depth_m: NDArray[Any],
-) -> NDArray[np.float64]:
-    """(N, 3) NED offsets from the vehicle of points seen at `pixels` with a depth along the optical axis."""
-    rays = camera.rays(pixels)
-    points = rays / rays[:, 2:] * np.asarray(depth_m, np.float64).reshape(-1, 1)
-    offsets: NDArray[np.float64] = (
-        points @ mount.ned_from_optical(ned_from_body).T + ned_from_body @ mount.position_frd_m
-    )
-    return offsets
-
-
-def point_on_ground(
-    camera: CameraModel,
-    mount: CameraMount,
-    ned_from_body: NDArray[np.float64],
-    pixels: NDArray[Any],
-    height_m: float,
-    min_depression_rad: float = 0.02,
-) -> NDArray[np.float64]:
-    """(N, 3) NED offsets from the vehicle of where the pixels' rays meet level ground.
-
-    Args:
-        height_m: of the vehicle above that ground.
-        min_depression_rad: rays that point down by less than this give NaN: near the horizon a small error of
-            attitude is a large error of range.
+    Attributes:
+        directions: (N, 3) unit vectors, NED.
+        cosines: (N,) of the angle to the optical axis: how much of a metre along the line is depth.
+        camera_ned_m: (3,) offset of the optical centre.
     """
-    directions = direction_ned(camera, mount, ned_from_body, pixels)
-    camera_offset = ned_from_body @ mount.position_frd_m
-    drop = height_m - camera_offset[2]
-    points = np.full((len(directions), 3), np.nan)
-    down = directions[:, 2] > np.sin(min_depression_rad)
-    if drop > 0.0:
-        points[down] = camera_offset + directions[down] / directions[down, 2:] * drop
-    return points
+
+    directions: NDArray[np.float64]
+    cosines: NDArray[np.float64]
+    camera_ned_m: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        camera: CameraModel,
+        mount: CameraMount,
+        ned_from_body: NDArray[np.float64],
+        pixels: NDArray[Any],
+    ) -> Sightlines:
+        """Those of (N, 2) pixels; `ned_from_body` is the (3, 3) attitude."""
+        rays = camera.rays(pixels)
+        directions = rays @ mount.ned_from_optical(ned_from_body).T
+        return cls(directions, rays[:, 2], ned_from_body @ mount.position_frd_m)
+
+    def __getitem__(self, part: slice) -> Sightlines:
+        return Sightlines(self.directions[part], self.cosines[part], self.camera_ned_m)
+
+    def at_depth(self, depth_m: NDArray[Any]) -> NDArray[np.float64]:
+        """(N, 3) NED offsets of the points with these depths (N,) along the optical axis."""
+        along_m = np.asarray(depth_m, np.float64) / self.cosines
+        offsets: NDArray[np.float64] = self.camera_ned_m + self.directions * along_m[:, None]
+        return offsets
+
+    def on_ground(self, height_m: float, min_depression_rad: float = 0.02) -> NDArray[np.float64]:
+        """(N, 3) NED offsets of where the lines meet level ground; NaN where they do not.
+
+        Args:
+            height_m: of the vehicle above that ground.
+            min_depression_rad: lines that point down by less than this give NaN: near the horizon a small
+                error of attitude is a large error of range.
+        """
+        drop_m = height_m - float(self.camera_ned_m[2])
+        down = self.directions[:, 2]
+        if drop_m <= 0.0:
+            return np.full(self.directions.shape, np.nan)
+        met = np.where(down > np.sin(min_depression_rad), down, np.nan)
+        offsets: NDArray[np.float64] = self.camera_ned_m + self.directions * (drop_m / met)[:, None]
+        return offsets
 
 
 def foot_of_upright(
@@ -80,7 +82,8 @@ def foot_of_upright(
         top_and_foot: (2, 2) pixels.
         min_spread: the difference of the tangents below which the answer is NaN: it is too small to measure.
     """
-    directions = direction_ned(camera, mount, ned_from_body, top_and_foot)
+    lines = Sightlines.of(camera, mount, ned_from_body, top_and_foot)
+    directions = lines.directions
     level = np.hypot(directions[:, 0], directions[:, 1])
     # Nearly straight above something its height is not seen.
     if level.min() < 0.1:
@@ -89,7 +92,5 @@ def foot_of_upright(
     spread = tangents[0] - tangents[1]
     if not spread > min_spread:
         return np.full(3, np.nan)
-    foot: NDArray[np.float64] = ned_from_body @ mount.position_frd_m + directions[1] / level[1] * (
-        height_m / spread
-    )
+    foot: NDArray[np.float64] = lines.camera_ned_m + directions[1] / level[1] * (height_m / spread)
     return foot

@@ -22,7 +22,7 @@ from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import slerp, turned_about_down
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
-from vision.geolocation import direction_ned, foot_of_upright, point_at_depth, point_on_ground
+from vision.geolocation import Sightlines, foot_of_upright
 from vision.rotation import matrix_from_quaternion
 from vision.tracking.association import overlaps
 
@@ -181,7 +181,7 @@ def targets_from_detections(
 
 
 class _Sight(NamedTuple):
-    """What the geometry of one box says: (3,) in NED, offsets in metres; NaN where it says nothing.
+    """What the geometry of one box says: three numbers each, NED, offsets in metres; NaN: it says nothing.
 
     Attributes:
         direction: unit, to the box's centre.
@@ -189,35 +189,31 @@ class _Sight(NamedTuple):
         on_ground: to where the middle of its lower edge meets the ground.
     """
 
-    direction: NDArray[np.float64]
-    at_depth: NDArray[np.float64]
-    on_ground: NDArray[np.float64]
+    direction: list[float]
+    at_depth: list[float]
+    on_ground: list[float]
 
 
 def _sights(
     detections: Sequence[DetectionRecord], camera: CameraModel, mount: CameraMount, pose: Pose
 ) -> list[_Sight]:
     """Of all boxes at once: a frame's targets are worked out between its arrival and the next setpoint."""
-    boxes = np.array([detection["xyxy"] for detection in detections])
+    count = len(detections)
+    left, top, right, bottom = np.array([detection["xyxy"] for detection in detections]).T
     depths_m = np.array([detection["range_m"] for detection in detections], np.float64)  # None is NaN
-    middle = (boxes[:, 0] + boxes[:, 2]) / 2
-    centre = np.column_stack([middle, (boxes[:, 1] + boxes[:, 3]) / 2])
-    foot = np.column_stack([middle, boxes[:, 3]])
-    attitude = pose.ned_from_body
-    return [
-        _Sight(*rows)
-        for rows in zip(
-            direction_ned(camera, mount, attitude, centre),
-            point_at_depth(camera, mount, attitude, centre, depths_m),
-            point_on_ground(camera, mount, attitude, foot, pose.height_m, MIN_DEPRESSION_RAD),
-            strict=True,
-        )
-    ]
+    pixels = np.empty((2 * count, 2))
+    pixels[:count, 0] = pixels[count:, 0] = (left + right) / 2
+    pixels[:count, 1], pixels[count:, 1] = (top + bottom) / 2, bottom
+    lines = Sightlines.of(camera, mount, pose.ned_from_body, pixels)
+    centres, feet = lines[:count], lines[count:]
+    on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
+    of_each = (centres.directions, centres.at_depth(depths_m), on_ground)
+    return [_Sight(*rows) for rows in zip(*(values.tolist() for values in of_each), strict=True)]
 
 
 def _named_otherwise(detections: Sequence[DetectionRecord]) -> list[bool]:
     """Of each: a box of another class, (nearly) as sure, is about the same thing."""
-    if len(detections) < 2:
+    if len({detection["class_name"] for detection in detections}) < 2:
         return [False] * len(detections)
     boxes = np.array([detection["xyxy"] for detection in detections])
     scores = np.array([_score(detection) for detection in detections])
@@ -245,7 +241,7 @@ def _target(
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
     direction = sight.direction
-    source, offset = RangeSource.NONE, np.full(3, np.nan)
+    source, offset = RangeSource.NONE, [math.nan] * 3
     depth_m = detection["range_m"]
     if depth_m is not None and math.isfinite(depth_m) and depth_m > 0.0:
         source = RangeSource.DEPTH
@@ -256,19 +252,17 @@ def _target(
             source = RangeSource.GROUND_PLANE
     if source is RangeSource.NONE and height_m is not None and _measurable(camera, top, bottom):
         ends = np.array([[(left + right) / 2, top], [(left + right) / 2, bottom]])
-        offset = foot_of_upright(camera, mount, pose.ned_from_body, ends, height_m)
-        if np.isfinite(offset).all():
+        offset = foot_of_upright(camera, mount, pose.ned_from_body, ends, height_m).tolist()
+        if all(map(math.isfinite, offset)):
             source = RangeSource.KNOWN_HEIGHT
     known = source is not RangeSource.NONE
-    north, east, down = (
-        float(origin + away) for origin, away in zip(pose.position_ned_m, offset, strict=True)
-    )
+    north, east, down = (origin + away for origin, away in zip(pose.position_ned_m, offset, strict=True))
     return Target(
         class_name=detection["class_name"],
         confidence=detection["confidence"],
         captured_ns=captured_ns,
         bearing_rad=math.atan2(direction[1], direction[0]),
-        elevation_rad=math.asin(max(-1.0, min(1.0, -float(direction[2])))),
+        elevation_rad=math.asin(max(-1.0, min(1.0, -direction[2]))),
         range_m=math.hypot(offset[0], offset[1]) if known else math.nan,
         range_source=source,
         position_ned_m=(north, east, down) if known else None,

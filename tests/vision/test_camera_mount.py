@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vision.camera_model import CameraModel, CameraMount
-from vision.geolocation import direction_ned, point_at_depth, point_on_ground
+from vision.geolocation import Sightlines
 from vision.rotation import matrix_from_euler
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -23,7 +23,7 @@ headings = st.floats(-math.pi, math.pi)
 def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(roll, pitch, yaw, down, aside):
     mount = CameraMount(pitch_rad=-down, yaw_rad=aside, levelled=True)
     body = matrix_from_euler(roll, pitch, yaw)
-    north, east, below = direction_ned(CAMERA, mount, body, MIDDLE)[0]
+    north, east, below = Sightlines.of(CAMERA, mount, body, MIDDLE).directions[0]
     assert math.asin(below) == pytest.approx(down, abs=1e-6)
     heading = math.atan2(body[1, 0], body[0, 0])
     assert math.remainder(math.atan2(east, north) - heading - aside, math.tau) == pytest.approx(0.0, abs=1e-6)
@@ -43,10 +43,10 @@ def test_the_ground_point_and_the_point_at_its_depth_are_one(roll, pitch, yaw, l
     mount = CameraMount(0.2, -0.1, 0.05, pitch_rad=-0.9, levelled=levelled)
     body = matrix_from_euler(roll, pitch, yaw)
     pixels = np.array([[100.0, 80.0], [320.0, 240.0], [600.0, 470.0]])
-    ground = point_on_ground(CAMERA, mount, body, pixels, 10.0, 0.05)
+    ground = Sightlines.of(CAMERA, mount, body, pixels).on_ground(10.0, 0.05)
     met = np.isfinite(ground[:, 0])
     eye = body @ mount.position_frd_m
     depth = (ground[met] - eye) @ mount.ned_from_optical(body)[:, 2]
-    again = point_at_depth(CAMERA, mount, body, pixels[met], depth)
+    again = Sightlines.of(CAMERA, mount, body, pixels[met]).at_depth(depth)
     assert np.allclose(again, ground[met], atol=1e-6 * (1 + np.abs(ground[met])))
     assert np.allclose(ground[met][:, 2], 10.0)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import pickle
 from typing import Any
 
 import numpy as np
@@ -60,3 +63,21 @@ def test_tracks_are_as_many_as_boxes() -> None:
             track_score=np.zeros(3, np.float32),
             track_confirmed=np.zeros(2, np.bool_),
         )
+
+
+@pytest.mark.parametrize(
+    "detections",
+    [three(), tracked(), tracked()[:0], tracked()[::2], Detections.empty(("person", "car"))],
+    ids=["without tracks", "with tracks", "none left of some", "every other", "none"],
+)
+@pytest.mark.parametrize("copied", [lambda it: pickle.loads(pickle.dumps(it, 5)), copy.deepcopy])
+def test_they_are_the_same_after_a_journey(detections: Detections, copied: Any) -> None:
+    again = copied(detections)
+    for field in dataclasses.fields(Detections):
+        before, after = getattr(detections, field.name), getattr(again, field.name)
+        if isinstance(before, np.ndarray):
+            np.testing.assert_array_equal(after, before)
+            assert (after.dtype, after.shape) == (before.dtype, before.shape)
+            assert after.flags.writeable
+        else:
+            assert after == before
