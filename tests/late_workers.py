@@ -20,6 +20,7 @@ import pytest
 LATE_WORKERS = "COMPANION_TEST_LATE_WORKERS"
 COMPUTES = "computes"
 GOES_ON = pytest.StashKey[IO[bytes]]()
+BEGAN = pytest.StashKey[bool]()
 
 
 def held(path: Path) -> IO[bytes]:
@@ -45,7 +46,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 @pytest.hookimpl(wrapper=True, tryfirst=True)  # the wait is no part of a test's time
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     folder, early, late = _workers()
-    if folder is not None and _worker(item.config) in late:
+    if folder is not None and _worker(item.config) in late and BEGAN not in item.config.stash:
+        item.config.stash[BEGAN] = True
         _until_one_has_ended(folder / name for name in (COMPUTES, *early))
     return (yield)
 

@@ -107,11 +107,13 @@ def test_who_ends_it_ends_all_of_it(tmp_path: Path, number: int, code: int) -> N
 
 
 FLIGHTS = """
-import os, time
+import os, threading, time
 import pytest
 
 @pytest.mark.parametrize("number", range(8))
 def test_flight(number):
+    waits = [thread.name for thread in threading.enumerate() if thread.name.startswith("waits for")]
+    assert len(waits) == len(set(waits))
     with open("flown", "a") as flown:
         print(os.environ["PYTEST_XDIST_WORKER"], file=flown)
     with open("flown") as flown:
