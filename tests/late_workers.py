@@ -24,9 +24,12 @@ BEGAN = pytest.StashKey[bool]()
 
 
 def held(path: Path) -> IO[bytes]:
-    """The file, locked until it is closed here and by whoever inherited it."""
+    """The file, locked until it is closed here and by whoever inherited it.
+
+    Raises BlockingIOError if somebody holds it: two runs were given one folder.
+    """
     file = path.open("wb")
-    fcntl.flock(file, fcntl.LOCK_EX)
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return file
 
 
@@ -74,8 +77,10 @@ def _until_one_has_ended(paths: Iterable[Path]) -> None:
     over = threading.Event()
 
     def wait(path: Path) -> None:
-        with path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH)
+        try:
+            with path.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_SH)
+        finally:
             over.set()
 
     for path in paths:

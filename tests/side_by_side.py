@@ -2,7 +2,7 @@
 
 Flights in real time mostly wait, and must not be made to. So what only computes runs at the lowest priority,
 in their pauses. The demonstration comes first: no other flight is beside it, only what computes. When that is
-done, more fly at once (`tests/late_workers.py`).
+done, or nothing more waits for one that flies, more fly at once (`tests/late_workers.py`).
 
 Everything is run, whatever fails. The report on what computed comes last.
 """

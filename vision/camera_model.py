@@ -140,6 +140,8 @@ class CameraMount:
     def body_from_optical(self) -> NDArray[np.float64]:
         """(3, 3) rotation from the optical frame to the body frame (FRD), for a levelled one a level body.
 
+        Read-only: all that are mounted alike share it.
+
         Raises ValueError for a camera on a gimbal: it has no fixed one.
         """
         if self.on_gimbal:

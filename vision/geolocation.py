@@ -13,7 +13,9 @@ from vision.camera_model import CameraModel, CameraMount
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightlines:
-    """Where pixels look, given the vehicle's attitude when they were captured. Offsets are from the vehicle.
+    """Where pixels look, given the vehicle's attitude when they were captured.
+
+    All float64; offsets are metres from the vehicle.
 
     Attributes:
         directions: (N, 3) unit vectors, NED.

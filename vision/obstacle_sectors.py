@@ -118,7 +118,8 @@ def _sector(north: NDArray[np.float32], east: NDArray[np.float32]) -> NDArray[np
     # Good to a hundredth of a degree, and many times as fast as arctan2.
     turned = cv2.phase(north, east).ravel() * np.float32(1.0 / SECTOR_RAD)
     sector: NDArray[np.int64] = np.rint(turned).astype(np.int64)
-    sector[sector == SECTORS] = 0  # a quarter of the time that a remainder takes
+    # A quarter of the time that a remainder takes. What is no number became negative, and is in no band.
+    sector[(sector < 0) | (sector >= SECTORS)] = 0
     return sector
 
 
