@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.perception.assembly import CameraTelemetry, _held_at, _view_at
 from companion.perception.messages import Attitude, GimbalAttitude
-from companion.perception.worker import Orders, _held_at, _view_at
 from companion.service import Service
 from companion.settings.reading import ConfigurationError, load_settings
 from companion.vehicle.gimbal import GimbalState, YawFrame
@@ -22,7 +22,6 @@ from vision.attitude import quaternion_from_euler
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult
-from vision.tracking import AttitudeHistory
 
 PITCH_RAD, HEADING_RAD = -0.9, 1.2
 
@@ -141,17 +140,16 @@ def test_a_silent_gimbal_and_one_that_tells_exclude_each_other() -> None:
 
 
 def test_the_tracker_is_told_where_a_camera_on_a_gimbal_looked() -> None:
-    orders = Orders.__new__(Orders)  # without its thread
-    orders.attitudes, orders.gimbal, orders.height_m = AttitudeHistory(), AttitudeHistory(), 8.0
+    telemetry = CameraTelemetry()
     frame = Frame(np.zeros((480, 640, 3), np.uint8), 1_010_000_000, 1)
     settings = load_settings(os.devnull, {"camera.gimbal": "true"}, {})
     for stamp in (1_000_000_000, 1_020_000_000):
-        orders.attitudes.add(stamp, Attitude(stamp, quaternion_from_euler(0.3, -0.3, 1.0)).wxyz)
-    assert _view_at(settings, orders)(frame) is None
-    assert _held_at(settings, orders)(frame.captured_ns) is None
+        telemetry.attitudes.add(stamp, Attitude(stamp, quaternion_from_euler(0.3, -0.3, 1.0)).wxyz)
+    assert _view_at(settings, telemetry)(frame) is None
+    assert _held_at(settings, telemetry)(frame.captured_ns) is None
     for stamp, pitch in ((1_000_000_000, -0.6), (1_020_000_000, -0.8)):
-        orders.gimbal.add(stamp, GimbalAttitude(stamp, quaternion_from_euler(0.0, pitch, 1.0)).wxyz)
-    view = _view_at(settings, orders)(frame)
+        telemetry.gimbal.add(stamp, GimbalAttitude(stamp, quaternion_from_euler(0.0, pitch, 1.0)).wxyz)
+    view = _view_at(settings, telemetry)(frame)
     assert view is not None
     ahead = view.ned_from_optical @ np.array([0.0, 0.0, 1.0])
     assert math.asin(ahead[2]) == pytest.approx(0.7)
