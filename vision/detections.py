@@ -51,7 +51,7 @@ class Detections:
         track_id: (N,) int64, 1 or more, `NO_TRACK` for none. Together with the next two; all None if nobody
             looked for tracks.
         track_score: (N,) float32, the track's median confidence, NaN without a track.
-        track_confirmed: (N,) bool, whether the track counts as true.
+        track_confirmed: (N,) bool, whether the track counts as true and its class is not in doubt.
     """
 
     xyxy: NDArray[np.float32]

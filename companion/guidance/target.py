@@ -37,7 +37,7 @@ class Target:
         track_id: of the object, the same from frame to frame; None without a track.
         track_score: median confidence over the track; None without a track.
         trusted: it may be chosen to be flown to: its track counts as true, or nobody looks for tracks; and it
-            is not as likely of another class.
+            is not as likely of another class, neither in this frame nor over its track.
     """
 
     class_name: str

@@ -7,13 +7,15 @@ weak ones, which are mostly objects half hidden. A weak one that fits no track i
 Beyond the paper: time is in seconds and not in frames; the camera's rotation is removed where it is known;
 what is left over is tried again with larger boxes, as small objects seen a few times a second hardly overlap
 (F. Yang et al., "Hard to Track Objects with Irregular Motions and Similar Appearances", arXiv 2211.14317);
-and a track counts as true only past a second threshold, on the median of its confidences.
+a track counts as true only past a second threshold, on the median of its confidences; and it remembers what
+else its object was called: a detector that changes its mind is not sure of either class.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,6 +27,7 @@ from vision.tracking.association import grown, match, overlaps
 from vision.tracking.camera_motion import CameraView, turned
 from vision.tracking.kalman import BoxStates
 from vision.tracking.tracks import (
+    SCORES_KEPT,
     XYXY,
     ScoreHistory,
     Track,
@@ -41,6 +44,12 @@ Indices = NDArray[np.int64]
 # How far boxes are grown for the second try, in their own sizes. On rendered sequences anything from 0.3 to
 # 1.0 serves with the vehicle's attitude; without it, 0.6 has the fewest switches.
 REACH = 0.6
+# Boxes of two classes that overlap by so much are of one object; those of a rider and the bicycle do not.
+SAME_OBJECT_IOU = 0.7
+# A track's class is in doubt while the confidences of another class on its object sum up to this share of its
+# own. Older frames count for less: as much as the newest `SCORES_KEPT` together.
+RIVAL_SHARE = 0.5
+_KEPT = 1.0 - 1.0 / SCORES_KEPT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +73,16 @@ class _Life:
     confirmed: bool = False
     lost: bool = False
     scores: ScoreHistory = field(default_factory=ScoreHistory)
+    # Class id → confidences of this class on the object, summed up.
+    evidence: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def class_in_doubt(self) -> bool:
+        """Another class was given to the object about as surely, in this frame or before."""
+        if len(self.evidence) < 2:
+            return False
+        rival = max(value for key, value in self.evidence.items() if key != self.class_id)
+        return rival >= RIVAL_SHARE * self.evidence.get(self.class_id, 0.0)
 
     def see(self, confidence: float, captured_ns: int) -> None:
         self.last_ns = captured_ns
@@ -130,16 +149,26 @@ class Tracker:
         if len(chosen):
             seen = kalman.corrected(self._states[tracks], detections.xyxy[chosen])
             self._states.mean[tracks], self._states.covariance[tracks] = seen.mean, seen.covariance
-            for index, track in zip(chosen.tolist(), tracks.tolist(), strict=True):
-                lives[index] = life = self._lives[track]
-                life.see(float(confidence[index]), captured_ns)
-                self._tell_seen(life, boxes[index], captured_ns, events)
-        self._forget_unseen(captured_ns, events)
+        believed = self._states.xyxy
+        believed[tracks] = detections.xyxy[chosen]
+        self._weigh_classes(self._lives, believed, detections)
+        for index, track in zip(chosen.tolist(), tracks.tolist(), strict=True):
+            lives[index] = life = self._lives[track]
+            life.see(float(confidence[index]), captured_ns)
+            self._tell_seen(life, boxes[index], captured_ns, events)
         begun = np.flatnonzero((track_of < 0) & (confidence >= self.settings.high_confidence))
-        for index in begun.tolist():
+        on_object = overlaps(detections.xyxy[begun], believed)
+        known = [life.evidence for life in self._lives]
+        self._forget_unseen(captured_ns, events)
+        for row, index in enumerate(begun.tolist()):
             life = _Life(self._next_id, int(class_id[index]), captured_ns, captured_ns)
             self._next_id += 1
             life.see(float(confidence[index]), captured_ns)
+            if known and on_object[row].max() >= SAME_OBJECT_IOU:
+                # The same object under another name: what it was called before is known of this track too.
+                life.evidence = dict(known[int(on_object[row].argmax())])
+            else:
+                self._weigh_classes([life], detections.xyxy[[index]], detections)
             self._tell_seen(life, boxes[index], captured_ns, events)
             self._lives.append(life)
             lives[index] = life
@@ -206,11 +235,35 @@ class Tracker:
                 track_of[columns[column]] = rows[row]
                 free[rows[row]] = False
 
+    def _weigh_classes(
+        self, lives: Sequence[_Life], boxes: NDArray[np.floating], detections: Detections
+    ) -> None:
+        """Remember what the object of each track is called in this frame, and how surely.
+
+        Args:
+            boxes: (N, 4) of the tracks: as detected where one was, else as predicted.
+        """
+        on_object = overlaps(boxes, detections.xyxy) >= SAME_OBJECT_IOU
+        on_object &= detections.confidence >= self.settings.low_confidence
+        class_ids, confidences = detections.class_id.tolist(), detections.confidence.tolist()
+        surest: dict[int, dict[int, float]] = {}  # place of the track → class id → confidence
+        for place, index in np.argwhere(on_object).tolist():
+            called = surest.setdefault(place, {})
+            called[class_ids[index]] = max(confidences[index], called.get(class_ids[index], 0.0))
+        for place, called in surest.items():
+            evidence = lives[place].evidence
+            for key in evidence:
+                evidence[key] *= _KEPT
+            for key, value in called.items():
+                evidence[key] = evidence.get(key, 0.0) + value
+
     def _tell_seen(self, life: _Life, xyxy: list[float], captured_ns: int, events: list[TrackEvent]) -> None:
         kind = TrackEventKind.UPDATE
         if not life.confirmed:
             settings = self.settings
             if life.seen < settings.true_frames or life.scores.median < settings.true_score:
+                return
+            if life.class_in_doubt:
                 return
             life.confirmed = True
             kind = TrackEventKind.NEW
@@ -262,7 +315,9 @@ class Tracker:
         of_each = [lives.get(index) for index in range(len(detections))]
         track_id = np.array([NO_TRACK if life is None else life.track_id for life in of_each], np.int64)
         score = np.array([math.nan if life is None else life.scores.median for life in of_each], np.float32)
-        confirmed = np.array([life is not None and life.confirmed for life in of_each], np.bool_)
+        confirmed = np.array(
+            [life is not None and life.confirmed and not life.class_in_doubt for life in of_each], np.bool_
+        )
         labelled = replace(detections, track_id=track_id, track_score=score, track_confirmed=confirmed)
         kept = (track_id != NO_TRACK) | (detections.confidence >= self.settings.keep_confidence)
         return labelled if kept.all() else labelled[kept]

@@ -18,7 +18,7 @@ class TrackState(StrEnum):
     TENTATIVE = TRACK_TENTATIVE
     """too short, or its median confidence is too low: it may be a mistake of the detector"""
     CONFIRMED = TRACK_CONFIRMED
-    """it counts as true, once and for all"""
+    """it counts as true, once and for all; a detection is told as tentative while its class is in doubt"""
 
 
 class TrackEventKind(StrEnum):

@@ -361,3 +361,82 @@ def test_whatever_comes_the_promises_hold(
         assert confirmed <= live
         assert live == {t.track_id for t in film.tracker.tracks if t.state is TrackState.CONFIRMED}
         assert all(np.isfinite(track.xyxy).all() for track in film.tracker.tracks)
+
+
+# --- what else an object was called
+
+CAR, PERSON = 1, 0
+
+
+def called(*names: tuple[int, float], x: float = 100.0) -> Detections:
+    """One object that a frame gives these classes, each with its confidence."""
+    box = [[x - 20, 80.0, x + 20, 120.0]] * len(names)
+    return Detections(
+        np.array(box, np.float32).reshape(-1, 4),
+        np.array([confidence for _, confidence in names], np.float32),
+        np.array([class_id for class_id, _ in names], np.int64),
+        NAMES,
+    )
+
+
+def confirmed(frame: TrackedFrame, class_id: int) -> list[bool]:
+    assert frame.detections.track_confirmed is not None
+    return frame.detections.track_confirmed[frame.detections.class_id == class_id].tolist()
+
+
+def show(film: Film, frame: Detections, times: int) -> TrackedFrame:
+    for _ in range(times):
+        film.now_s += FRAME_S
+        shown = film.give(frame)
+    return shown
+
+
+def test_an_object_whose_class_changed_is_not_confirmed() -> None:
+    film = Film()
+    assert confirmed(show(film, called((PERSON, 0.8)), 6), PERSON) == [True]
+    assert confirmed(show(film, called((CAR, 0.8)), 6), CAR) == [False]
+    assert film.told[-1] != ("new", 2)
+
+
+def test_a_class_that_outweighs_the_former_one_is_confirmed() -> None:
+    film = Film()
+    show(film, called((PERSON, 0.5)), 3)
+    assert confirmed(show(film, called((CAR, 0.8)), 10), CAR) == [True]
+
+
+def test_a_rival_class_in_the_same_frames_prevents_confirmation() -> None:
+    film = Film()
+    frame = show(film, called((CAR, 0.8), (PERSON, 0.6)), 10)
+    assert (confirmed(frame, CAR), confirmed(frame, PERSON)) == ([False], [False])
+
+
+def test_a_rival_class_seen_seldom_or_weakly_changes_nothing() -> None:
+    film = Film()
+    for step in range(20):
+        names = [(CAR, 0.8), (PERSON, 0.7)] if step % 4 == 0 else [(CAR, 0.8), (PERSON, 0.12)]
+        frame = show(film, called(*names), 1)
+    assert confirmed(frame, CAR) == [True]
+
+
+def test_a_confirmed_track_is_in_doubt_while_its_class_changes() -> None:
+    film = Film()
+    show(film, called((CAR, 0.6)), 6)
+    frame = show(film, called((CAR, 0.6), (PERSON, 0.9)), 6)
+    assert confirmed(frame, CAR) == [False]
+    assert confirmed(show(film, called((CAR, 0.8)), 8), CAR) == [True]
+    assert film.told.count(("new", 1)) == 1, "events tell of it once"
+
+
+def test_an_object_beside_another_does_not_put_its_class_in_doubt() -> None:
+    film = Film()
+    for _ in range(6):
+        film.now_s += FRAME_S
+        rider, bicycle = called((PERSON, 0.8)), called((CAR, 0.8), x=112.0)
+        both = Detections(
+            np.concatenate([rider.xyxy, bicycle.xyxy]),
+            np.concatenate([rider.confidence, bicycle.confidence]),
+            np.concatenate([rider.class_id, bicycle.class_id]),
+            NAMES,
+        )
+        frame = film.give(both)
+    assert (confirmed(frame, CAR), confirmed(frame, PERSON)) == ([True], [True])
