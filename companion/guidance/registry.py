@@ -121,6 +121,7 @@ def _seek(command: commands.Seek, footprint: Footprint | None) -> SeekBehaviour:
         rate_radps=command.rate_radps,
         confidence=command.confidence,
         clockwise=command.direction == "clockwise",
+        whole_turn=True,
         sweep=sweep,
     )
 

@@ -1,4 +1,4 @@
-"""Turn on the spot until an object of a class is seen for sure, then face it; a gimbal may sweep too."""
+"""Turn on the spot to see what there is of a class, then face the surest object; a gimbal may sweep too."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.gimbal_sweep import GimbalSweep
 from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
-from companion.guidance.sighting import FACING_TIMEOUT_S, Gaze, Sightings
+from companion.guidance.sighting import FACING_TIMEOUT_S, SIGHT_FRESH_S, Candidates, Gaze, Sightings
 from companion.guidance.target import DOUBTED, Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
@@ -17,8 +17,8 @@ from vision.attitude import wrap_angle
 BLIND_TIMEOUT_S = 5.0
 # A turn may take this many times what it should, plus the looks on the way.
 SLOWEST_TURN = 3.0
-
-
+# The nose is so near to an object's direction that the camera sees the object.
+POINTED_RAD = math.radians(8.0)
 # A gimbal that swept in vain is let back to where it looked before, so long at most.
 BACK_TIMEOUT_S = 5.0
 
@@ -27,6 +27,9 @@ class SeekBehaviour(Behaviour):
     """Turns up to `laps` (counted from the real heading), and ends facing the object.
 
     Args:
+        whole_turn: see all around first (or as far as `laps` goes), then face the best of what was found, the
+            next best where it is not there any more; later finds are faced at once. False: the first find is
+            faced at once.
         sweep: how the gimbal moves meanwhile, slowing the turn as it must; found, the gimbal looks at the
             object. None: it is left alone.
     """
@@ -42,6 +45,7 @@ class SeekBehaviour(Behaviour):
         rate_radps: float = 0.5,
         confidence: float = 0.4,
         clockwise: bool = True,
+        whole_turn: bool = False,
         sweep: GimbalSweep | None = None,
     ) -> None:
         self._sweep = sweep
@@ -58,17 +62,22 @@ class SeekBehaviour(Behaviour):
         self._turn = 1.0 if clockwise else -1.0
         self._rate_radps = rate_radps
         self._sightings = Sightings((class_name,), confidence)
+        self._candidates = Candidates()
+        self._compare_at_rad = min(laps, 1.0) * math.tau if whole_turn else 0.0
+        self._compared = False
         self._place: Vector3 = (0.0, 0.0, 0.0)
         self._yaw_rad = 0.0
         self._turned_rad = 0.0
         self._give_up_ns: float = 0
         self._blind_since_ns: int | None = None
         self._gaze: Gaze | None = None
+        self._pointed = False
 
     def on_activate(self, situation: Situation) -> None:
         self._place, self._yaw_rad = position_and_yaw(situation.state)
         self._turned_rad = 0.0
         self._sightings.reset(situation.now_ns)
+        self._candidates, self._compared = Candidates(), False
         self._gaze = self._blind_since_ns = None
         self._vain, self._begun_ns = "", situation.now_ns
         gimbal = situation.state.gimbal
@@ -93,10 +102,11 @@ class SeekBehaviour(Behaviour):
         if not situation.perception_fresh:
             return self._wait_blind(situation, stay)
         self._blind_since_ns = None
+        seen = self._sightings.fresh(situation)
         if self._gaze is not None:
-            self._gaze.follow(self._sightings.fresh(situation))
-        elif (found := self._sightings.look(situation)) is not None:
-            self._gaze = Gaze(found, now_ns)
+            self._gaze.follow(seen)
+        else:
+            self._gaze = self._choose(seen, now_ns)
         if self._gaze is not None:
             if self._sweep is not None:
                 self._sweep.towards(
@@ -115,6 +125,19 @@ class SeekBehaviour(Behaviour):
         rate = 0.0 if waiting else self._turn * self._rate_radps
         return Setpoint.velocity(stay, now_ns, yaw_rate_radps=rate)
 
+    def _choose(self, seen: list[Target], now_ns: int) -> Gaze | None:
+        """Take what new frames show; what to face now."""
+        found = self._sightings.agreed(seen, now_ns)
+        if found:
+            self._sightings.look_until_ns = now_ns  # what the turn waited for has come
+        self._candidates.add(seen, found)
+        self._compared = self._compared or abs(self._turned_rad) >= self._compare_at_rad
+        best = self._candidates.best() if self._compared else None
+        if best is None:
+            return None
+        self._pointed = now_ns - best.captured_ns <= SIGHT_FRESH_S * 1e9
+        return Gaze(best, now_ns)
+
     @property
     def gimbal_aim(self) -> GimbalAim | None:
         return None if self._sweep is None else self._sweep.aim
@@ -123,7 +146,8 @@ class SeekBehaviour(Behaviour):
     def status(self) -> str:
         if self._gaze is not None:
             return f"facing the {self._class_name} at {in_degrees(self._gaze.target.bearing_rad)}°"
-        return f"looking for a {self._class_name}, {max(0.0, self._turned_rad) / math.tau:.1f} laps"
+        seen = f", {len(self._candidates)} found" if len(self._candidates) else ""
+        return f"looking for a {self._class_name}, {max(0.0, self._turned_rad) / math.tau:.1f} laps{seen}"
 
     def _hindered(self, sweep: GimbalSweep, situation: Situation) -> str | None:
         """Why the gimbal does not do what is asked, in words; None: it does."""
@@ -148,9 +172,16 @@ class SeekBehaviour(Behaviour):
 
     def _face(self, gaze: Gaze, situation: Situation, yaw_rad: float, stay: Vector3) -> Step:
         now_ns = situation.now_ns
+        if not self._pointed:
+            pitch_off_rad = 0.0
+            if self._sweep is not None:
+                pitch_off_rad = abs(_within_reach(gaze.target, situation) - _gimbal_pitch(situation))
+            self._pointed = max(gaze.off_rad(yaw_rad), pitch_off_rad) <= POINTED_RAD
+            gaze.expect_later(now_ns)
         if gaze.lost(now_ns):
-            # The turn goes on from here.
+            # The next best, or the turn goes on from here.
             self._gaze = None
+            self._candidates.drop(gaze.target)
             self._sightings.forget()
             return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
         if gaze.faced(yaw_rad, now_ns):

@@ -1,7 +1,7 @@
 """When what is seen counts as found, and turning the nose to it: what `seek`, `patrol` and searches share.
 
 One detection is a rumour. Several frames that agree on a direction, of an object that counts as true, make a
-find; it is confirmed when the vehicle faces it and still sees it.
+find; it is confirmed when the vehicle faces it and still sees it. Of several finds the surest is the best.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 
 from companion.guidance.behaviour import Situation
 from companion.guidance.target import Target
@@ -27,6 +28,8 @@ FACING_TIMEOUT_S = 12.0
 SIGHT_LOST_S = 2.0
 # Found means seen now, not a moment ago.
 SIGHT_FRESH_S = 0.7
+# Candidates less sure than the surest by no more than this are as good: the nearest of them is taken.
+AS_SURE = 0.1
 
 
 class Sightings:
@@ -65,15 +68,21 @@ class Sightings:
         self, situation: Situation, wanted: Callable[[Target], bool] = lambda target: True
     ) -> Target | None:
         """Take what new frames show. A target: found now. `wanted` may leave some out."""
-        seen = [target for target in self.fresh(situation) if wanted(target)]
+        found = self.agreed([t for t in self.fresh(situation) if wanted(t)], situation.now_ns)
+        return found[0] if found else None
+
+    def agreed(self, seen: Collection[Target], now_ns: int) -> list[Target]:
+        """Take targets that are `fresh`; those of them that are found now, the surest in this frame first."""
+        found: list[Target] = []
         if not seen:
-            return None
+            return found
+        seen = sorted(seen, key=lambda target: -target.confidence)
         if not self._seen or seen[0].captured_ns - self._seen[-1].captured_ns > LOOK_S * 1e9:
-            self.look_until_ns = situation.now_ns + LOOK_S * 1e9
+            self.look_until_ns = now_ns + LOOK_S * 1e9
         self._seen.extend(seen)
         oldest_ns = self._newest_ns - FRAMES_WINDOW_S * 1e9
         recent = [target for target in self._seen if target.captured_ns >= oldest_ns]
-        for target in sorted(seen, key=lambda target: -target.confidence):
+        for target in seen:
             agreeing = [
                 t
                 for t in recent
@@ -85,9 +94,78 @@ class Sightings:
             first = next((index for index, t in enumerate(agreeing) if t.trusted), len(agreeing))
             since = [t.trusted for t in agreeing[first:]]
             if target.trusted and 2 * sum(since) > len(since):
-                return target
-            self.doubted = True
-        return None
+                found.append(target)
+            else:
+                self.doubted = True
+        return found
+
+
+@dataclass(slots=True)
+class _Candidate:
+    """What is known of one object that was seen on a turn.
+
+    Attributes:
+        target: as it was last seen without doubt. range_m: the newest that is known.
+        frames, doubted: how many frames showed it, without doubt and with.
+        found: they agreed.
+    """
+
+    target: Target
+    range_m: float = math.nan
+    frames: int = 0
+    doubted: int = 0
+    found: bool = False
+
+    @property
+    def sureness(self) -> float:
+        """Its track's median confidence, less the more frames doubted it, and the fewer there are."""
+        return self.target.score * self.frames / (self.frames + self.doubted + FRAMES_NEEDED)
+
+
+class Candidates:
+    """What was found on a turn, to be compared when the turn is done."""
+
+    def __init__(self) -> None:
+        self._seen: list[_Candidate] = []
+
+    def __len__(self) -> int:
+        return sum(candidate.found for candidate in self._seen)
+
+    def add(self, seen: Collection[Target], found: Collection[Target]) -> None:
+        """Take a frame's targets (`Sightings.fresh`), and those of them that are found now (`agreed`)."""
+        for target in seen:
+            candidate = next((one for one in self._seen if _same(one.target, target)), None)
+            if candidate is None:
+                candidate = _Candidate(target)
+                self._seen.append(candidate)
+            if target.trusted:
+                candidate.target = target
+                candidate.frames += 1
+            else:
+                candidate.doubted += 1
+            if math.isfinite(target.range_m):
+                candidate.range_m = target.range_m
+            candidate.found = candidate.found or target in found
+
+    def best(self) -> Target | None:
+        """The surest, as it was last seen; of those about as sure, the nearest. None: nothing was found."""
+        found = [one for one in self._seen if one.found]
+        if not found:
+            return None
+        least = max(one.sureness for one in found) - AS_SURE
+        as_sure = [one for one in found if one.sureness >= least]
+        nearest = min(as_sure, key=lambda one: one.range_m if math.isfinite(one.range_m) else math.inf)
+        return nearest.target
+
+    def drop(self, target: Target) -> None:
+        """It was not there after all, whatever it was called."""
+        self._seen = [one for one in self._seen if apart_rad(one.target, target) > SAME_BEARING_RAD]
+
+
+def _same(known: Target, target: Target) -> bool:
+    if known.track_id is not None or target.track_id is not None:
+        return known.track_id == target.track_id
+    return apart_rad(known, target) <= SAME_BEARING_RAD
 
 
 class Gaze:
@@ -100,6 +178,7 @@ class Gaze:
     def __init__(self, found: Target, now_ns: int) -> None:
         self.target = found
         self._since_ns = now_ns
+        self._expected_ns = found.captured_ns
         self._facing_since_ns: int | None = None
 
     def follow(self, seen: Collection[Target]) -> None:
@@ -118,16 +197,23 @@ class Gaze:
                 key=lambda t: (t.track_id is None or t.track_id != found.track_id, apart_rad(t, found)),
             )
 
+    def expect_later(self, now_ns: int) -> None:
+        """The camera does not look there yet: that it is not seen says nothing."""
+        self._expected_ns = now_ns
+
     def lost(self, now_ns: int) -> bool:
         """It was not there after all, or it went away."""
-        unseen_s = (now_ns - self.target.captured_ns) / 1e9
+        unseen_s = (now_ns - max(self.target.captured_ns, self._expected_ns)) / 1e9
         return unseen_s > SIGHT_LOST_S or now_ns - self._since_ns > FACING_TIMEOUT_S * 1e9
+
+    def off_rad(self, yaw_rad: float) -> float:
+        """How far the nose is from it."""
+        return _across(wrap_angle(self.target.bearing_rad - yaw_rad), self.target.elevation_rad)
 
     def faced(self, yaw_rad: float, now_ns: int) -> bool:
         """Whether the nose has pointed at it for long enough, and it is still seen."""
         unseen_s = (now_ns - self.target.captured_ns) / 1e9
-        off_rad = _across(wrap_angle(self.target.bearing_rad - yaw_rad), self.target.elevation_rad)
-        if unseen_s > SIGHT_FRESH_S or off_rad > FACING_RAD:
+        if unseen_s > SIGHT_FRESH_S or self.off_rad(yaw_rad) > FACING_RAD:
             self._facing_since_ns = None
         elif self._facing_since_ns is None:
             self._facing_since_ns = now_ns

@@ -3,6 +3,8 @@ import math
 import pytest
 from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
 
+from companion.guidance.grammar import parse
+from companion.guidance.registry import behaviour_for
 from companion.guidance.seek import SeekBehaviour
 from vision.attitude import wrap_angle
 
@@ -84,3 +86,125 @@ def test_a_detector_that_falls_silent_stops_the_turn_and_then_ends_it():
     assert not outcome.success
     assert "detector" in outcome.reason
     assert abs(flight.vehicle.yaw_rate_radps) < 0.01
+
+
+# --- the best of a turn, as the command `seek` flies it
+
+
+def whole_turn(**options):
+    return SeekBehaviour("car", whole_turn=True, **options)
+
+
+def faces(vehicle, thing):
+    return abs(wrap_angle(math.atan2(thing.east, thing.north) - vehicle.yaw_rad)) < math.radians(5)
+
+
+def test_the_command_compares_what_a_whole_turn_shows():
+    first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
+    surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
+    vehicle = KinematicVehicle()
+    outcome = Flight(behaviour_for(parse("seek car")), vehicle, [first, surer]).run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, surer)
+    assert math.dist(vehicle.position, (0, 0, -5)) < 0.3
+
+
+def test_without_a_whole_turn_the_first_is_faced():
+    first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
+    surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
+    vehicle = KinematicVehicle()
+    Flight(SeekBehaviour("car"), vehicle, [first, surer]).run(60.0)
+    assert faces(vehicle, first)
+
+
+def test_of_objects_as_sure_the_nearest_is_faced():
+    far = SeenObject("car", 34.0, 12.0, track_id=1, track_score=0.85)
+    near = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.8)
+    vehicle = KinematicVehicle()
+    outcome = Flight(whole_turn(), vehicle, [far, near]).run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, near)
+
+
+def test_both_of_two_in_one_view_are_compared():
+    """The one that is surer in every frame has the poorer history."""
+    poor = SeenObject("car", 20.0, 0.0, confidence=0.9, track_id=1, track_score=0.45)
+    good = SeenObject("car", 20.0, 9.0, confidence=0.8, track_id=2, track_score=0.8)
+    vehicle = KinematicVehicle()
+    Flight(whole_turn(), vehicle, [poor, good]).run(60.0)
+    assert faces(vehicle, good)
+
+
+def test_an_object_doubted_in_many_frames_comes_after_one_that_never_was():
+    doubted = SeenObject("car", 12.0, 6.0, track_id=1, track_score=0.8)
+    clear = SeenObject("car", -25.0, 9.0, track_id=2, track_score=0.7)
+    vehicle = KinematicVehicle()
+
+    def each(seconds, vehicle):
+        doubted.trusted = int(seconds * 10) % 3 != 0
+
+    outcome = Flight(whole_turn(), vehicle, [doubted, clear]).run(60.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, clear)
+
+
+def test_the_next_best_is_faced_where_the_best_has_gone():
+    best = SeenObject("car", 10.0, 10.0, track_id=1, track_score=0.9)
+    other = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.6)
+    vehicle = KinematicVehicle()
+
+    def each(seconds, vehicle):
+        best.visible = seconds < 6.0
+
+    outcome = Flight(whole_turn(laps=1.0), vehicle, [best, other]).run(60.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, other)
+
+
+def test_what_is_doubted_when_it_is_faced_is_not_confirmed():
+    car = SeenObject("car", 10.0, 10.0, track_id=1, track_score=0.9)
+
+    def each(seconds, vehicle):
+        car.trusted = seconds < 8.0
+
+    outcome = Flight(whole_turn(laps=1.0), objects=[car]).run(90.0, each)
+    assert outcome is not None
+    assert not outcome.success
+
+
+def test_less_than_a_lap_is_compared_as_far_as_it_goes():
+    beyond = SeenObject("car", 0.0, -15.0, track_id=1, track_score=0.9)
+    within = SeenObject("car", 0.0, 15.0, track_id=2, track_score=0.6)
+    vehicle = KinematicVehicle()
+    outcome = Flight(whole_turn(laps=0.5), vehicle, [beyond, within]).run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, within)
+
+
+def test_a_second_lap_faces_its_first_find_at_once():
+    late = SeenObject("car", 0.0, 15.0, track_id=1, visible=False)
+    vehicle = KinematicVehicle()
+
+    def each(seconds, vehicle):
+        late.visible = seconds > 8.0
+
+    seconds = []
+    outcome = Flight(whole_turn(), vehicle, [late]).run(60.0, lambda t, v: (seconds.append(t), each(t, v)))
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert seconds[-1] < 20.0
+
+
+def test_without_a_tracker_the_best_of_a_turn_is_found_by_bearing():
+    far = SeenObject("car", 34.0, 12.0)
+    near = SeenObject("car", -15.0, 9.0)
+    vehicle = KinematicVehicle()
+    outcome = Flight(whole_turn(), vehicle, [far, near]).run(60.0)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, near)
