@@ -106,6 +106,7 @@ class Pipeline:
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
         find_markers: Callable[[Frame], tuple[Marker, ...]] | None = None,
         obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """
         Args:
@@ -118,6 +119,7 @@ class Pipeline:
                 after the detection, when what the vehicle told of that moment has come.
             find_markers: is given every frame that is looked at, beside the detector.
             obstacles_in: finds them in a frame with depth.
+            clock_ns: the clock of the frames' stamps, CLOCK_MONOTONIC nanoseconds.
         """
         self._source = source
         self._detector = detector
@@ -127,6 +129,7 @@ class Pipeline:
         self._view_at = view_at
         self._find_markers = find_markers
         self._obstacles_in = obstacles_in
+        self._clock_ns = clock_ns
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self._missing = 0
@@ -159,7 +162,7 @@ class Pipeline:
         frame = self._source.read(timeout_s)
         if frame is None:
             return False
-        picked_ns = time.monotonic_ns()
+        picked_ns = self._clock_ns()
         self._missing += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
         self.frames += 1
@@ -218,7 +221,7 @@ class Pipeline:
         return PerceptionResult(
             sequence=frame.sequence,
             captured_ns=frame.captured_ns,
-            inferred_ns=time.monotonic_ns(),
+            inferred_ns=self._clock_ns(),
             width=frame.width,
             height=frame.height,
             detections=detections,

@@ -13,7 +13,8 @@ import numpy as np
 
 from companion.bench.drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, Sight
+from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from companion.bench.synthetic_camera import SyntheticCamera
 from companion.guidance.approach import ApproachBehaviour
 from vision.camera_model import CameraModel, CameraMount
 
@@ -49,11 +50,11 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
         _standing(rng, "dog", yaw + float(rng.uniform(-0.4, 0.4)), (10.0, 20.0)),
     ]
     detector = DrawnDetector(things, CAMERA, MOUNT, seed=seed, with_depth=with_depth)
-    flight = LockstepFlight(
+    flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        sight=Sight(CAMERA, MOUNT, detector),
+        camera=lambda _: SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector),
     )
     flight.turn_to(
         math.atan2(goal.pose(0.0).east_m, goal.pose(0.0).north_m) + float(rng.uniform(-0.15, 0.15))

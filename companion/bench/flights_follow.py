@@ -22,7 +22,8 @@ import numpy as np
 
 from companion.bench.drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, Moment, Sight
+from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_settings
+from companion.bench.synthetic_camera import SyntheticCamera
 from companion.guidance.follow import FollowBehaviour
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
@@ -45,11 +46,11 @@ def run(seed: int) -> FlightResult:
     yaw = float(rng.uniform(-math.pi, math.pi))
     goal = _goal(rng, class_name, yaw)
     detector = DrawnDetector([goal, *_like_it(rng, goal)], CAMERA, MOUNT, seed=seed)
-    flight = LockstepFlight(
+    flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        sight=Sight(CAMERA, MOUNT, detector),
+        camera=lambda _: SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector),
     )
     flight.turn_to(yaw)
     on_target: list[bool] = []

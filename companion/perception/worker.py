@@ -17,12 +17,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import cv2
-
+from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
 from companion.perception.messages import (
     Attitude,
     Begin,
@@ -40,18 +39,12 @@ from companion.perception.messages import (
 from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.preview import PreviewEncoder
 from companion.settings import Settings
-from vision.camera_model import CameraMount
 from vision.detections import Detections
 from vision.frame import Frame
-from vision.loading import uncollected
-from vision.markers import Marker, MarkerDetector
-from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
-from vision.pipeline import FrameDetector, PerceptionResult, Pipeline
+from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import FrameSharing
-from vision.tracking import AttitudeHistory, CameraView, Tracker
-from vision.tracking.camera_motion import Array
 from vision.video_writer import VideoWriterError
 
 if TYPE_CHECKING:
@@ -74,8 +67,7 @@ class Orders:
     Attributes:
         stopping: end now.
         hud: for the recorded video's next frames.
-        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
-        gimbal: the attitudes of the camera's gimbal; empty for a camera that sits on none.
+        telemetry: what the vehicle has told.
         watched: whether anybody wants pictures.
     """
 
@@ -83,8 +75,7 @@ class Orders:
         self.stopping = False
         self.hud = Hud((), None)
         self.watched = False
-        self.attitudes, self.gimbal = AttitudeHistory(), AttitudeHistory()
-        self.height_m: float | None = None
+        self.telemetry = CameraTelemetry()
         self._connection = connection
         self._finished = threading.Event()
         threading.Thread(target=self._take, name="inbox", daemon=True).start()
@@ -102,10 +93,10 @@ class Orders:
             if isinstance(message, Hud):
                 self.hud = message
             elif isinstance(message, Attitude):
-                self.attitudes.add(message.stamp_ns, message.wxyz)
-                self.height_m = message.height_m
+                self.telemetry.attitudes.add(message.stamp_ns, message.wxyz)
+                self.telemetry.height_m = message.height_m
             elif isinstance(message, GimbalAttitude):
-                self.gimbal.add(message.stamp_ns, message.wxyz)
+                self.telemetry.gimbal.add(message.stamp_ns, message.wxyz)
             elif isinstance(message, Watched):
                 self.watched = message.watched
             elif isinstance(message, Stop):
@@ -185,15 +176,13 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
         gc.collect()
         gc.freeze()
         outbox.put(_ready(settings, perception))
-        pipeline = Pipeline(
+        pipeline = build_pipeline(
+            settings,
             perception.source,
-            _looking(settings, perception.detector),
-            selection=settings.detector.selection(),
+            perception.detector,
+            orders.telemetry,
             recorder=perception,
-            tracker=_tracker(begin),
-            view_at=_view_at(settings, orders),
-            find_markers=_find_markers(settings),
-            obstacles_in=_obstacles_in(settings, orders),
+            first_track_id=begin.first_track_id,
         )
         try:
             _run(pipeline, perception, orders, outbox)
@@ -230,7 +219,7 @@ def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Pe
     if settings.recording.video is not None:
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
         stack.callback(recording.close)
-    detector = _load(settings) if settings.detector.enabled else None
+    detector = load_detector(settings) if settings.detector.enabled else None
     on_frame = None
     if settings.source.share is not None:
         on_frame = stack.enter_context(FrameSharing(settings.source.share)).write
@@ -241,111 +230,6 @@ def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Pe
     preview = PreviewEncoder(settings.preview, outbox.put_preview)
     stack.callback(preview.close)
     return Perception(source, detector, recording, preview)
-
-
-def _looking(settings: Settings, detector: Detector | None) -> FrameDetector | None:
-    """The detector as the pipeline uses it."""
-    wanted = settings.detector
-    if detector is None or not wanted.tiles:
-        return detector
-    from vision.tiling import TiledDetector
-
-    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
-
-
-def _load(settings: Settings) -> Detector:
-    # Only here: a worker that only records needs none of it.
-    with uncollected():
-        from vision.detector import Detector
-
-    wanted = settings.detector
-    if wanted.threads is not None:
-        # Else its resizing takes every core, whatever the network was given.
-        cv2.setNumThreads(wanted.threads)
-    return Detector(
-        wanted.model,
-        classes=wanted.classes or None,
-        confidence=_least_confidence(settings),
-        iou=wanted.iou,
-        image_size=wanted.image_size,
-        precision=wanted.precision,
-        threads=wanted.threads,
-        runtime=wanted.runtime,
-    )
-
-
-def _least_confidence(settings: Settings) -> float:
-    """A tracker wants to see the weak ones too; it leaves out again what `detector.confidence` leaves out."""
-    wanted, tracker = settings.detector.confidence, settings.tracker
-    return min(wanted, tracker.low_confidence) if tracker.enabled else wanted
-
-
-def _tracker(begin: Begin) -> Tracker | None:
-    settings = begin.settings
-    if not settings.tracker.enabled or not settings.detector.enabled:
-        return None
-    following = settings.tracker.following(settings.detector.confidence)
-    return Tracker(following, first_track_id=begin.first_track_id)
-
-
-def _held_at(settings: Settings, orders: Orders) -> Callable[[int], tuple[CameraMount, Array] | None]:
-    """How the camera was mounted, and (3, 3) `ned_from_body`, at a capture stamp (CLOCK_MONOTONIC ns).
-
-    None without the attitude of that moment: the vehicle's or, for a camera on a gimbal, the gimbal's.
-    """
-    mount = settings.camera.mount()
-
-    def held_at(captured_ns: int) -> tuple[CameraMount, Array] | None:
-        ned_from_body = orders.attitudes.at(captured_ns)
-        if ned_from_body is None or not mount.on_gimbal:
-            return None if ned_from_body is None else (mount, ned_from_body)
-        ned_from_gimbal = orders.gimbal.at(captured_ns)
-        return None if ned_from_gimbal is None else (mount.held(ned_from_gimbal), ned_from_body)
-
-    return held_at
-
-
-def _view_at(settings: Settings, orders: Orders) -> Callable[[Frame], CameraView | None]:
-    """Where the camera looked when it took a frame; None without the attitude of that moment."""
-    if not settings.tracker.camera_motion:
-        return lambda _: None
-    held_at = _held_at(settings, orders)
-
-    def view_at(frame: Frame) -> CameraView | None:
-        held = held_at(frame.captured_ns)
-        if held is None:
-            return None
-        mount, ned_from_body = held
-        return CameraView(
-            settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
-        )
-
-    return view_at
-
-
-def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] | None:
-    """What looks for markers in a frame; None where the settings do not ask for it."""
-    kind = settings.markers.kind()
-    if kind is None:
-        return None
-    detector = MarkerDetector(kind)
-    return lambda frame: detector.detect(frame.image, settings.camera.model(frame.width, frame.height))
-
-
-def _obstacles_in(settings: Settings, orders: Orders) -> Callable[[Frame], ObstacleSectors | None]:
-    """How far obstacles are in a frame with depth; None without the attitude of that moment."""
-    held_at = _held_at(settings, orders)
-
-    def obstacles_in(frame: Frame) -> ObstacleSectors | None:
-        if settings.guidance.obstacles == "off" or frame.depth_m is None:
-            return None
-        held = held_at(frame.captured_ns)
-        if held is None:
-            return None
-        camera = settings.camera.model(frame.width, frame.height)
-        return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *held, orders.height_m)
-
-    return obstacles_in
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:

@@ -2,7 +2,8 @@ import itertools
 import math
 
 import pytest
-from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+from guidance_harness import Flight
+from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.behaviour import Situation
 from companion.guidance.hold import HoldBehaviour

@@ -74,14 +74,14 @@ def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing
     assert pitches(log)[-1] < -50.0, "found, the gimbal looks at it"
     assert thing.range_m(seen[-1].position_ned_m, 0.0) < PLACE_BOUND_M
     # Nobody holds it any more.
-    flight.move_gimbal_on()
+    flight.run(1.0)
     assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
 
 
 def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there():
     table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
     mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
-    flight = LockstepFlight(seed=5, height_m=HEIGHT_M, gimbal=True)
+    flight = LockstepFlight.airborne(seed=5, height_m=HEIGHT_M, gimbal=True)
     log = flight.fly(mission, 20.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason

@@ -122,7 +122,7 @@ def test_the_worker_takes_attitudes_beside_other_orders() -> None:
         while orders.hud.lines != ("flying",):
             assert time.monotonic() < deadline_s
             time.sleep(0.001)
-        attitude = orders.attitudes.at(50_000_000)
+        attitude = orders.telemetry.attitudes.at(50_000_000)
         orders.finished()
     assert attitude is not None
     np.testing.assert_allclose(attitude, matrix_from_euler(0, 0, 0.25), atol=1e-5)

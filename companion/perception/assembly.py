@@ -1,0 +1,173 @@
+"""From settings to the pipeline that looks at frames. The worker and flights in lockstep use it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import cv2
+
+from companion.settings import Settings
+from vision.camera_model import CameraMount
+from vision.frame import Frame
+from vision.loading import uncollected
+from vision.markers import Marker, MarkerDetector
+from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
+from vision.pipeline import FrameDetector, FrameRecorder, Pipeline
+from vision.sources import Source
+from vision.tracking import AttitudeHistory, CameraView, Tracker
+from vision.tracking.camera_motion import Array
+
+if TYPE_CHECKING:
+    from vision.detector import Detector
+
+
+class CameraTelemetry:
+    """What the vehicle has told that a camera's pictures are seen by.
+
+    Attributes:
+        attitudes: of the vehicle, the last few seconds. height_m: the newest above home; None: not known.
+        gimbal: the attitudes of the camera's gimbal; empty for a camera that sits on none.
+    """
+
+    def __init__(self) -> None:
+        self.attitudes, self.gimbal = AttitudeHistory(), AttitudeHistory()
+        self.height_m: float | None = None
+
+
+def build_pipeline(
+    settings: Settings,
+    source: Source,
+    detector: Detector | None,
+    telemetry: CameraTelemetry,
+    *,
+    recorder: FrameRecorder | None = None,
+    first_track_id: int = 1,
+    clock_ns: Callable[[], int] = time.monotonic_ns,
+) -> Pipeline:
+    """The pipeline as the settings want it.
+
+    Args:
+        source: open. detector: as `load_detector` gives it; None where the settings want none.
+        clock_ns: the clock of the frames' stamps.
+    """
+    return Pipeline(
+        source,
+        tiled(settings, detector),
+        selection=settings.detector.selection(),
+        recorder=recorder,
+        tracker=_tracker(settings, first_track_id),
+        view_at=_view_at(settings, telemetry),
+        find_markers=_find_markers(settings),
+        obstacles_in=_obstacles_in(settings, telemetry),
+        clock_ns=clock_ns,
+    )
+
+
+def tiled(settings: Settings, detector: Detector | None) -> FrameDetector | None:
+    """The detector as the pipeline uses it."""
+    wanted = settings.detector
+    if detector is None or not wanted.tiles:
+        return detector
+    from vision.tiling import TiledDetector
+
+    return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
+
+
+def load_detector(settings: Settings) -> Detector:
+    # Only here: a worker that only records needs none of it.
+    with uncollected():
+        from vision.detector import Detector
+
+    wanted = settings.detector
+    if wanted.threads is not None:
+        # Else its resizing takes every core, whatever the network was given.
+        cv2.setNumThreads(wanted.threads)
+    return Detector(
+        wanted.model,
+        classes=wanted.classes or None,
+        confidence=_least_confidence(settings),
+        iou=wanted.iou,
+        image_size=wanted.image_size,
+        precision=wanted.precision,
+        threads=wanted.threads,
+        runtime=wanted.runtime,
+    )
+
+
+def _least_confidence(settings: Settings) -> float:
+    """A tracker wants to see the weak ones too; it leaves out again what `detector.confidence` leaves out."""
+    wanted, tracker = settings.detector.confidence, settings.tracker
+    return min(wanted, tracker.low_confidence) if tracker.enabled else wanted
+
+
+def _tracker(settings: Settings, first_track_id: int) -> Tracker | None:
+    if not settings.tracker.enabled or not settings.detector.enabled:
+        return None
+    following = settings.tracker.following(settings.detector.confidence)
+    return Tracker(following, first_track_id=first_track_id)
+
+
+def _held_at(
+    settings: Settings, telemetry: CameraTelemetry
+) -> Callable[[int], tuple[CameraMount, Array] | None]:
+    """How the camera was mounted, and (3, 3) `ned_from_body`, at a capture stamp (CLOCK_MONOTONIC ns).
+
+    None without the attitude of that moment: the vehicle's or, for a camera on a gimbal, the gimbal's.
+    """
+    mount = settings.camera.mount()
+
+    def held_at(captured_ns: int) -> tuple[CameraMount, Array] | None:
+        ned_from_body = telemetry.attitudes.at(captured_ns)
+        if ned_from_body is None or not mount.on_gimbal:
+            return None if ned_from_body is None else (mount, ned_from_body)
+        ned_from_gimbal = telemetry.gimbal.at(captured_ns)
+        return None if ned_from_gimbal is None else (mount.held(ned_from_gimbal), ned_from_body)
+
+    return held_at
+
+
+def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame], CameraView | None]:
+    """Where the camera looked when it took a frame; None without the attitude of that moment."""
+    if not settings.tracker.camera_motion:
+        return lambda _: None
+    held_at = _held_at(settings, telemetry)
+
+    def view_at(frame: Frame) -> CameraView | None:
+        held = held_at(frame.captured_ns)
+        if held is None:
+            return None
+        mount, ned_from_body = held
+        return CameraView(
+            settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
+        )
+
+    return view_at
+
+
+def _find_markers(settings: Settings) -> Callable[[Frame], tuple[Marker, ...]] | None:
+    """What looks for markers in a frame; None where the settings do not ask for it."""
+    kind = settings.markers.kind()
+    if kind is None:
+        return None
+    detector = MarkerDetector(kind)
+    return lambda frame: detector.detect(frame.image, settings.camera.model(frame.width, frame.height))
+
+
+def _obstacles_in(
+    settings: Settings, telemetry: CameraTelemetry
+) -> Callable[[Frame], ObstacleSectors | None]:
+    """How far obstacles are in a frame with depth; None without the attitude of that moment."""
+    held_at = _held_at(settings, telemetry)
+
+    def obstacles_in(frame: Frame) -> ObstacleSectors | None:
+        if settings.guidance.obstacles == "off" or frame.depth_m is None:
+            return None
+        held = held_at(frame.captured_ns)
+        if held is None:
+            return None
+        camera = settings.camera.model(frame.width, frame.height)
+        return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *held, telemetry.height_m)
+
+    return obstacles_in
