@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from companion.bench.drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.approach import ApproachBehaviour
 from vision.camera_model import CameraModel, CameraMount
 
@@ -49,7 +49,7 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
         _standing(rng, class_name, yaw + math.copysign(0.7, rng.uniform(-1, 1)), (18.0, 34.0)),
         _standing(rng, "dog", yaw + float(rng.uniform(-0.4, 0.4)), (10.0, 20.0)),
     ]
-    detector = DrawnDetector(things, CAMERA, MOUNT, seed=seed, with_depth=with_depth)
+    detector = SyntheticDetector(things, CAMERA, MOUNT, seed=seed, with_depth=with_depth)
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
@@ -84,11 +84,11 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
 
 def _standing(
     rng: np.random.Generator, class_name: str, bearing_rad: float, range_m: tuple[float, float]
-) -> Thing:
+) -> SceneObject:
     distance = float(rng.uniform(*range_m))
-    pose = Pose(
+    pose = ScenePose(
         distance * math.cos(bearing_rad),
         distance * math.sin(bearing_rad),
         float(rng.uniform(-math.pi, math.pi)),
     )
-    return Thing(class_name, SIZES_M[class_name], lambda _: pose)
+    return SceneObject(class_name, SIZES_M[class_name], lambda _: pose)

@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bench.drawn_detector import DrawnDetector, Faults, Pose, Thing
 from companion.bench.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_settings
 from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.orbit import OrbitBehaviour
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
@@ -37,9 +37,9 @@ def run(seed: int) -> FlightResult:
     """One flight of somewhat more than one lap."""
     rng = np.random.default_rng((seed, 83))
     yaw_rad = float(rng.uniform(-math.pi, math.pi))
-    pose = Pose(RADIUS_M * math.cos(yaw_rad), RADIUS_M * math.sin(yaw_rad))
-    drawn = DrawnDetector(
-        [Thing("person", (0.5, 0.6, 1.7), lambda _: pose)], CAMERA, MOUNT, seed=seed, faults=EXACT
+    pose = ScenePose(RADIUS_M * math.cos(yaw_rad), RADIUS_M * math.sin(yaw_rad))
+    drawn = SyntheticDetector(
+        [SceneObject("person", (0.5, 0.6, 1.7), lambda _: pose)], CAMERA, MOUNT, seed=seed, faults=EXACT
     )
     true_attitude: dict[int, NDArray[np.float64]] = {}
 

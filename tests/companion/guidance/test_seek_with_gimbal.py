@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from gimbal_flight import CAMERA, FOOTPRINT, HEIGHT_M, PERSON_M, gimbal_flight, person
 
-from companion.bench.drawn_detector import Thing
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
+from companion.bench.synthetic_detector import SceneObject
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
 from companion.guidance.sequence import SequenceBehaviour
@@ -25,7 +25,7 @@ DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
 
 
 def fly(
-    command: str, thing: Thing, *, seed: int = 5, limit_s: float = 90.0, **options: object
+    command: str, thing: SceneObject, *, seed: int = 5, limit_s: float = 90.0, **options: object
 ) -> tuple[LockstepFlight, FlightLog, list[Target]]:
     """The flight, its log, and every target that was seen, once."""
     flight = gimbal_flight(thing, seed=seed, **options)
