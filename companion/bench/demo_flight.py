@@ -21,17 +21,18 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.demo import (
+from companion.guidance.sequence import SequenceBehaviour
+from companion.rehearsal import (
     FIND,
     MISSION,
     RANGE_TOLERANCE_M,
     REACH,
+    SIMULATOR_PARAMETERS,
     STAND,
     STOP_DISTANCE_M,
     TARGET_CLASS,
+    rehearsal_settings,
 )
-from companion.guidance.sequence import SequenceBehaviour
-from companion.rehearsal import SIMULATOR_PARAMETERS, rehearsal_settings
 from companion.settings import Settings
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo

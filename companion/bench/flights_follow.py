@@ -21,7 +21,8 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_settings
+from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment, camera_settings
+from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.follow import FollowBehaviour
@@ -39,18 +40,26 @@ LEAST_TIME_ON_TARGET = 0.95
 _STEP_S = 0.05
 
 
-def run(seed: int) -> FlightResult:
-    """One flight."""
+def run(seed: int, *, rendered: bool = False) -> FlightResult:
+    """One flight. `rendered`: the camera is drawn, and looked at by the real detector and tracker."""
     rng = np.random.default_rng((seed, 91))
     class_name = ("person", "car")[seed % 2]
     yaw = float(rng.uniform(-math.pi, math.pi))
     goal = _goal(rng, class_name, yaw)
-    detector = SyntheticDetector([goal, *_like_it(rng, goal)], CAMERA, MOUNT, seed=seed)
+    objects = [goal, *_like_it(rng, goal)]
+    settings = camera_settings(CAMERA, MOUNT, {"detector.image_size": "320", "detector.threads": "1"})
+    camera: Camera
+    if rendered:
+        scene, (goal, *_) = rendered_scene(objects, CAMERA, MOUNT, seed)
+        camera = RenderedCamera(settings, scene, by_flight=True, depth=False)
+    else:
+        detector = SyntheticDetector(objects, CAMERA, MOUNT, seed=seed)
+        camera = SyntheticCamera(settings, detect=detector)
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        camera=lambda _: SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector),
+        camera=lambda _: camera,
     )
     flight.turn_to(yaw)
     on_target: list[bool] = []

@@ -4,8 +4,8 @@ A pad of two AprilTags, a small one in its middle and a large one beside it, lie
 the vehicle begins, 6 to 9 m high. The wind is up to 3 m/s with its gusts (the built-in airframe has the drag
 of PX4's SIH, 1 N for each m/s on 1 kg: it leans by 17° against 3 m/s). Corners are off by 0.3 pixels (one
 sigma), frames come 80 ms late, one in twelve is missed, and so is half a second now and then; the camera sits
-a third of a degree (one sigma) from where the settings have it. Every `RENDERED_EVERY`-th flight sees drawn
-pictures, searched by OpenCV, instead.
+a third of a degree (one sigma) from where the settings have it. Rendered flights see drawn pictures, searched
+by OpenCV, instead.
 The limits are the default ones, but for `max_acceleration_mps2` 5.
 
 A flight succeeds when the behaviour says that it landed, and the true place is at most 0.3 m beside the pad's
@@ -47,7 +47,6 @@ FAR_M, HEIGHTS_M, STRONGEST_WIND_MPS = 3.0, (6.0, 9.0), 3.0
 ALLOWED_M = 0.3
 LIMIT_S = 240.0
 MAX_ACCELERATION_MPS2 = 5.0
-RENDERED_EVERY = 20
 MARKER_SETTINGS = {
     "detector.enabled": "false",
     "markers.dictionary": DICTIONARY,
@@ -56,9 +55,9 @@ MARKER_SETTINGS = {
 }
 
 
-def run(seed: int) -> FlightResult:
-    """One landing, flown by us."""
-    return land(seed)
+def run(seed: int, *, rendered: bool = False) -> FlightResult:
+    """One landing, flown by us. `rendered`: pictures are drawn, and searched by OpenCV."""
+    return land(seed, rendered=rendered)
 
 
 def land(
@@ -66,7 +65,7 @@ def land(
     *,
     by_autopilot: bool = False,
     pad_speed_mps: float = 0.0,
-    rendered: bool | None = None,
+    rendered: bool = False,
     max_acceleration_mps2: float = MAX_ACCELERATION_MPS2,
 ) -> FlightResult:
     """One landing.
@@ -74,7 +73,7 @@ def land(
     Args:
         by_autopilot: PX4's precision landing flies it, told by LANDING_TARGET.
         pad_speed_mps: of a pad that moves in a line.
-        rendered: whether pictures are drawn; None: of every `RENDERED_EVERY`-th seed.
+        rendered: pictures are drawn and searched; else corners are put where geometry has them.
         max_acceleration_mps2: of the envelope.
     """
     rng = np.random.default_rng((seed, 149))
@@ -85,18 +84,17 @@ def land(
         (pad_speed_mps * math.cos(course), pad_speed_mps * math.sin(course)),
     )
     wind_mps = float(rng.uniform(0.0, STRONGEST_WIND_MPS))
-    drawn = seed % RENDERED_EVERY == 0 if rendered is None else rendered
     truly = CameraMount(
         MOUNT.forward_m,
         MOUNT.right_m,
         MOUNT.down_m,
         *(np.array([MOUNT.roll_rad, MOUNT.pitch_rad, MOUNT.yaw_rad]) + rng.normal(0.0, MOUNT_SIGMA_RAD, 3)),
     )
-    pictures = DrawnCamera(pad, truly) if drawn else ProjectedCamera(pad, truly, rng)
+    pictures = DrawnCamera(pad, truly) if rendered else ProjectedCamera(pad, truly, rng)
     camera = SyntheticCamera(
         camera_settings(CAMERA, MOUNT, MARKER_SETTINGS),
         find_markers=pictures.look,
-        rate_hz=10.0 if drawn else 20.0,
+        rate_hz=10.0 if rendered else 20.0,
     )
     flight = LockstepFlight.airborne(
         seed=seed,
