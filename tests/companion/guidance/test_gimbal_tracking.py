@@ -57,6 +57,7 @@ def fly(
     pointed = flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(begin_deg))), 20.0)
     assert pointed.outcome is not None
     assert pointed.outcome.success, pointed.outcome.reason
+    flight.turn_to(flight.state.yaw_rad or 0.0)  # stands, where the hold's last velocity would go on
     flight.move_gimbal_on()
     return flight, flight.fly(behaviour, limit_s, each=lambda moment: each(flight, moment))
 
