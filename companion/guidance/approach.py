@@ -34,10 +34,11 @@ STANDING_MPS = 0.3
 # around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
 ANCHOR_M = (1.5, 3.0)
 # That place follows the filtered place of the object with this time constant: the filter lets an object
-# wander, and so follows the noise of single ranges (0.3 m, one sigma, on the ground plane). What is farther
-# off than STILL_M has moved, and is not reached yet.
+# wander, and so follows the noise of single ranges. An object whose filtered place is farther off than
+# STILL_M, or than this share of its range, has moved, and is not reached yet.
 PLACE_TIME_CONSTANT_S = 1.5
 STILL_M = 0.6
+STILL_SHARE = 0.1
 # Detectors miss single frames; this long without the object and the vehicle brakes.
 LOST_AFTER_S = 1.0
 # What appears where a lost object was, in this direction and at half to twice its range, is taken for it.
@@ -138,18 +139,18 @@ class ApproachBehaviour(Behaviour):
         bearing = math.atan2(east - position[1], north - position[0])
         if self._range_m > MIN_YAW_RANGE_M or self._bearing_rad is None:
             self._bearing_rad = bearing
+        error_m = self._range_m - self._distance_m
+        top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
         goal = self._goal(track.position_ned_m, position, bearing, dt_s)
         if goal is not None:
             self._range_m = math.dist(self._place[:2], position[:2])
-            still = math.dist(self._place[:2], track.position_ned_m[:2]) < STILL_M
-            if self._arrival.update(
-                math.dist(goal, position) if still else math.inf, speed_of(state), now_ns
-            ):
+            moved_m = math.dist(self._place[:2], track.position_ned_m[:2])
+            still = moved_m < max(STILL_M, STILL_SHARE * self._range_m)
+            off_m = math.dist(goal, position) if still else math.inf
+            if self._arrival.update(off_m, speed_of(state), now_ns):
                 return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m", goal)
-            velocity = self._controller.velocity(goal, state, dt_s, self._speed_mps)
+            velocity = self._controller.velocity(goal, state, dt_s, top)
             return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
-        error_m = self._range_m - self._distance_m
-        top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
         speed = stopping_speed(error_m, top, STOPPING_MPS2)
         # Towards what the camera does not look at yet, only as fast as the nose comes round.
         speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2

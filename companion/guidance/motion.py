@@ -32,7 +32,7 @@ ARRIVED_M = 0.3
 ARRIVED_MPS = 0.3
 # ... at the end of one of these: (distance m, speed m/s, duration s). In strong gusts no vehicle stands as
 # still as the first one asks for.
-SETTLED = ((ARRIVED_M, ARRIVED_MPS, 0.5), (0.8, 0.8, 4.0))
+SETTLED = ((ARRIVED_M, ARRIVED_MPS, 1.0), (0.8, 0.8, 4.0))
 
 
 def position_and_yaw(state: VehicleState) -> tuple[Vector3, float]:

@@ -1,7 +1,7 @@
-"""How near behaviours come to their goals, in lockstep with the built-in vehicle in wind and gusts of 0.6 m/s.
+"""How near behaviours come to their goals, in lockstep with the built-in vehicle in wind and gusts.
 
-The built-in vehicle moves as a real PX4 was measured to (velocity step, stop and overshoot); the others answer
-more slowly. Distances are those that the vehicle itself knows: its estimate is off by some more.
+The built-in vehicle moves as a real PX4 was measured to (velocity step, stop and overshoot); the others
+answer more slowly. Distances are those that the vehicle itself knows: its estimate is off by some more.
 """
 
 from __future__ import annotations

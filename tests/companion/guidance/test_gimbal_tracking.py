@@ -138,7 +138,7 @@ def test_a_camera_that_is_mounted_askew_is_brought_to_the_object():
 @pytest.mark.parametrize("word", ["approach", "follow"])
 def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word):
     """The picture ends 45° down, above its wheels: it has no range until the gimbal looks at it."""
-    thing = Thing("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
+    thing = Thing("car", (4.0, 1.8, 1.5), person(0.0, 9.4).pose)
     # an approach ends by itself, long before; who follows has been there for half a minute
     flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-13.0, limit_s=50.0)
     first = next(seen for moment in log.moments for seen in moment.situation.targets)

@@ -46,7 +46,7 @@ def test_hold_keeps_the_goal_before_where_it_is_near(goal, held):
     assert outcome is not None
     place = goal if held else (3.0, -2.0, -6.0)
     assert outcome.goal_ned_m == place
-    assert math.dist(vehicle.position, place) < 0.02
+    assert math.dist(vehicle.position, place) < 0.05
 
 
 def test_hold_brakes_first_and_does_not_fly_back_to_where_it_began():
