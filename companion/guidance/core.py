@@ -213,6 +213,8 @@ class Guidance:
             markers=inputs.markers,
             neighbourhood=inputs.neighbourhood,
             min_separation_m=self.options.limits.min_separation_m,
+            max_acceleration_mps2=self.options.limits.max_acceleration_mps2,
+            goal_ned_m=self._goal_ned_m,
             gimbal=gimbal,
             ranging=inputs.ranging,
         )
@@ -305,6 +307,8 @@ class Guidance:
             if not self._activated:
                 self._activated, self._stepped_ns = True, None
                 behaviour.on_activate(situation)
+                if self.busy:
+                    self._goal_ned_m = None
             dt_s = 0.0 if self._stepped_ns is None else (situation.now_ns - self._stepped_ns) / 1e9
             step: Step = behaviour.update(dt_s, situation)
             for note in behaviour.take_notes():
@@ -362,6 +366,7 @@ class Guidance:
     def _conclude(self, outcome: Outcome, situation: Situation, sent_count: int) -> None:
         """It ended by itself: hold where setpoints are flown, else leave it to the autopilot."""
         self._end(outcome)
+        self._goal_ned_m = outcome.goal_ned_m
         if self.phase is Phase.REQUESTING:
             self._drop_request()
         if not self._streaming:
@@ -370,7 +375,7 @@ class Guidance:
         hold = HoldBehaviour()
         self._begin(hold, None, busy=False)
         if self.phase is Phase.OFFBOARD:
-            self._run(hold, situation, sent_count)
+            self._run(hold, replace(situation, goal_ned_m=self._goal_ned_m), sent_count)
 
     def _watch_battery(self, behaviour: Behaviour, situation: Situation) -> None:
         """Too little charge ends what is flown; the vehicle brakes until what the operator chose begins."""
@@ -501,6 +506,7 @@ class Guidance:
     def _lose(self, why: str) -> None:
         """Command was taken from us: not one setpoint more."""
         self._silence()
+        self._goal_ned_m = None
         behaviour, outcome = self._behaviour, Outcome(False, why)
         self._end(outcome, told=True)
         self._release()
