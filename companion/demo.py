@@ -18,6 +18,12 @@ from typing import Any
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
 from companion.rehearsal import (
+    FIND,
+    MISSION,
+    RANGE_TOLERANCE_M,
+    STAND,
+    STOP_DISTANCE_M,
+    TARGET_CLASS,
     rehearsal_settings,
     simulator,
     until_ready_to_arm,
@@ -27,18 +33,10 @@ from companion.service import Event, Service
 from mavlink_sim.testing import free_port
 from vision.video_encoders import has_pyav
 
-# Where the mission's approach stops.
-STOP_DISTANCE_M = 5.0
-# Arrival counts when the simulator agrees with it to within this.
-RANGE_TOLERANCE_M = 1.0
 VIDEO_NAME = "flight.webm"
 # What two cores draw, look at and film at once. A slow encoder films every third frame: of an odd number of
 # frames to a picture none is between two.
 _CAMERA_RATE_HZ, _SLOW_FILM_RATE_HZ = 18.0, 6.0
-
-# What is flown: a mission file that comes with this package. Its steps `find` and `stand` are looked at.
-MISSION = "demo"
-FIND, STAND = "find", "stand"
 
 Say = Callable[[str], None]
 
@@ -175,7 +173,7 @@ def _range_at(truth_path: Path, stamp_ns: int) -> float | None:
     if not rows:
         return None
     row = min(rows, key=lambda row: abs(row["stamp_ns"] - stamp_ns))
-    ranges = [item["range_m"] for item in row["objects"] if item["class_name"] == "car"]
+    ranges = [item["range_m"] for item in row["objects"] if item["class_name"] == TARGET_CLASS]
     return min(ranges) if ranges else None
 
 

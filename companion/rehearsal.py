@@ -23,6 +23,15 @@ from mavlink_sim.testing import free_port
 # High enough to see far, low enough that a car at 5 m is in the picture.
 ALTITUDE_M = 4.0
 
+# What the demonstration flies: a mission file that comes with this package, and the steps that are judged.
+MISSION = "demo"
+FIND, REACH, STAND = "find", "reach", "stand"
+TARGET_CLASS = "car"
+# Where the mission's approach stops, and how well the simulator must agree with that after the hold.
+STOP_DISTANCE_M, RANGE_TOLERANCE_M = 5.0, 0.5
+# The open field of the built-in world needs no 30 m on the way home (PX4's default).
+SIMULATOR_PARAMETERS = {"RTL_RETURN_ALT": 5.0}
+
 _SIMULATOR_START_S = 20.0
 _SIMULATOR_END_S = 5.0
 _ARMABLE_S = 20.0
@@ -54,8 +63,8 @@ async def simulator(
     ]
     arguments += ["--camera", camera, "--camera-rate", f"{camera_rate_hz:g}"]
     arguments += ["--truth", str(truth_path), "--seed", str(seed)]
-    # The open field of the built-in world needs no 30 m on the way home (PX4's default).
-    arguments += ["--param", "RTL_RETURN_ALT=5"]
+    for name, value in SIMULATOR_PARAMETERS.items():
+        arguments += ["--param", f"{name}={value:g}"]
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",

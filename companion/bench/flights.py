@@ -1,12 +1,15 @@
 """How well a behaviour flies: the same flight over many seeds, in lockstep, and a table of what came out.
 
 A flight is a module `companion/bench/flights_NAME.py` with a function `run(seed: int) -> FlightResult`; it is
-found by that name (`_` is written `-`). The same seed gives the same flight, every time.
+found by that name (`_` is written `-`). The same seed gives the same flight, every time. One whose `run`
+takes `rendered` as well is flown in two ways: with synthetic detections, or with the rendered camera and the
+real perception.
 """
 
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import pkgutil
 from collections.abc import Callable, Iterator, Sequence
@@ -35,7 +38,7 @@ class FlightResult:
     reason: str = ""
 
 
-Flight = Callable[[int], FlightResult]
+Flight = Callable[..., FlightResult]
 
 _PREFIX = "flights_"
 _FIGURES = ("mean", "min", "p5", "p50", "p95", "max")
@@ -63,27 +66,33 @@ def flight_named(name: str) -> Flight:
     return flight
 
 
-def fly(name: str, seeds: Sequence[int], processes: int = 1) -> Iterator[FlightResult]:
+def fly(
+    name: str, seeds: Sequence[int], processes: int = 1, *, rendered: bool = False
+) -> Iterator[FlightResult]:
     """Fly it once with each seed, the results in the seeds' order.
 
     Args:
         processes: at once; 1 flies in this one.
+        rendered: with the rendered camera and the real perception.
 
     Raises:
-        UnknownFlightError: before the first flight.
+        UnknownFlightError: before the first flight, also of one that has no rendered camera.
     """
-    flight = flight_named(name)
+    if rendered and "rendered" not in inspect.signature(flight_named(name)).parameters:
+        raise UnknownFlightError(f"{name} has no flights with a rendered camera")
+    flight_named(name)
     if processes <= 1 or len(seeds) <= 1:
-        yield from map(flight, seeds)
+        yield from (_fly_one(name, seed, rendered) for seed in seeds)
         return
     with ProcessPoolExecutor(min(processes, len(seeds)), get_context("spawn")) as pool:
-        yield from pool.map(_fly_one, [name] * len(seeds), seeds)
+        yield from pool.map(_fly_one, [name] * len(seeds), seeds, [rendered] * len(seeds))
 
 
-def _fly_one(name: str, seed: int) -> FlightResult:
+def _fly_one(name: str, seed: int, rendered: bool) -> FlightResult:
     # A network's thread pool in every process would have them wait for each other.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    return flight_named(name)(seed)
+    flight = flight_named(name)
+    return flight(seed, rendered=True) if rendered else flight(seed)
 
 
 def summary(name: str, results: Sequence[FlightResult]) -> dict[str, Any]:

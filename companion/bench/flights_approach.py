@@ -11,9 +11,11 @@ import math
 
 import numpy as np
 
-from companion.bench.drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, Sight
+from companion.bench.lockstep_flight import Camera, LockstepFlight, camera_settings
+from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.approach import ApproachBehaviour
 from vision.camera_model import CameraModel, CameraMount
 
@@ -31,13 +33,17 @@ LIMIT_S = 120.0
 WITHOUT_DEPTH_M, WITH_DEPTH_M = 1.5, 0.5
 
 
-def run(seed: int) -> FlightResult:
+def run(seed: int, *, rendered: bool = False) -> FlightResult:
     """One flight without depth."""
-    return fly(seed, with_depth=False, tolerance_m=WITHOUT_DEPTH_M)
+    return fly(seed, with_depth=False, tolerance_m=WITHOUT_DEPTH_M, rendered=rendered)
 
 
-def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
-    """One flight; its success allows an error of the final range of `tolerance_m`."""
+def fly(seed: int, *, with_depth: bool, tolerance_m: float, rendered: bool = False) -> FlightResult:
+    """One flight; its success allows an error of the final range of `tolerance_m`.
+
+    Args:
+        rendered: the camera is drawn and looked at by the real detector, tracker and ranging.
+    """
     rng = np.random.default_rng((seed, 81))
     class_name = ("car", "person", "truck")[seed % 3]
     yaw = float(rng.uniform(-math.pi, math.pi))
@@ -48,12 +54,19 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
         _standing(rng, class_name, yaw + math.copysign(0.7, rng.uniform(-1, 1)), (18.0, 34.0)),
         _standing(rng, "dog", yaw + float(rng.uniform(-0.4, 0.4)), (10.0, 20.0)),
     ]
-    detector = DrawnDetector(things, CAMERA, MOUNT, seed=seed, with_depth=with_depth)
-    flight = LockstepFlight(
+    settings = camera_settings(CAMERA, MOUNT, {"detector.image_size": "320", "detector.threads": "1"})
+    camera: Camera
+    if rendered:
+        scene, (goal, *_) = rendered_scene(things, CAMERA, MOUNT, seed, depth=with_depth)
+        camera = RenderedCamera(settings, scene, by_flight=True, depth=with_depth)
+    else:
+        detector = SyntheticDetector(things, CAMERA, MOUNT, seed=seed, with_depth=with_depth)
+        camera = SyntheticCamera(settings, detect=detector)
+    flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        sight=Sight(CAMERA, MOUNT, detector),
+        camera=lambda _: camera,
     )
     flight.turn_to(
         math.atan2(goal.pose(0.0).east_m, goal.pose(0.0).north_m) + float(rng.uniform(-0.15, 0.15))
@@ -83,11 +96,11 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float) -> FlightResult:
 
 def _standing(
     rng: np.random.Generator, class_name: str, bearing_rad: float, range_m: tuple[float, float]
-) -> Thing:
+) -> SceneObject:
     distance = float(rng.uniform(*range_m))
-    pose = Pose(
+    pose = ScenePose(
         distance * math.cos(bearing_rad),
         distance * math.sin(bearing_rad),
         float(rng.uniform(-math.pi, math.pi)),
     )
-    return Thing(class_name, SIZES_M[class_name], lambda _: pose)
+    return SceneObject(class_name, SIZES_M[class_name], lambda _: pose)

@@ -6,6 +6,6 @@ from companion.bench.flights import FlightResult
 from companion.bench.flights_approach import WITH_DEPTH_M, fly
 
 
-def run(seed: int) -> FlightResult:
+def run(seed: int, *, rendered: bool = False) -> FlightResult:
     """One flight with depth."""
-    return fly(seed, with_depth=True, tolerance_m=WITH_DEPTH_M)
+    return fly(seed, with_depth=True, tolerance_m=WITH_DEPTH_M, rendered=rendered)

@@ -14,9 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bench.drawn_detector import DrawnDetector, Faults, Pose, Thing
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, Moment, Sight
+from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_settings
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.orbit import OrbitBehaviour
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
@@ -36,9 +37,9 @@ def run(seed: int) -> FlightResult:
     """One flight of somewhat more than one lap."""
     rng = np.random.default_rng((seed, 83))
     yaw_rad = float(rng.uniform(-math.pi, math.pi))
-    pose = Pose(RADIUS_M * math.cos(yaw_rad), RADIUS_M * math.sin(yaw_rad))
-    drawn = DrawnDetector(
-        [Thing("person", (0.5, 0.6, 1.7), lambda _: pose)], CAMERA, MOUNT, seed=seed, faults=EXACT
+    pose = ScenePose(RADIUS_M * math.cos(yaw_rad), RADIUS_M * math.sin(yaw_rad))
+    drawn = SyntheticDetector(
+        [SceneObject("person", (0.5, 0.6, 1.7), lambda _: pose)], CAMERA, MOUNT, seed=seed, faults=EXACT
     )
     true_attitude: dict[int, NDArray[np.float64]] = {}
 
@@ -46,11 +47,13 @@ def run(seed: int) -> FlightResult:
         true_attitude[flight.now_ns] = matrix_from_quaternion(attitude)
         return drawn(position, attitude, seconds)
 
-    flight = LockstepFlight(
+    settings = camera_settings(CAMERA, MOUNT)
+    camera = SyntheticCamera(settings, detect=detect, rate_hz=20.0, tracker=None)
+    flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 5.0)),
-        sight=Sight(CAMERA, MOUNT, detect, rate_hz=20.0, tracker=None),
+        camera=lambda _: camera,
     )
     flight.turn_to(yaw_rad)
     errors_deg: dict[str, list[float]] = {"at_capture": [], "newest": [], "heading_alone": []}
@@ -74,7 +77,7 @@ def run(seed: int) -> FlightResult:
                 "at_capture": target.bearing_rad,
                 "newest": _bearing_rad(matrix_from_quaternion(newest) @ ray),
                 "heading_alone": _bearing_rad(
-                    _levelled(flight.history.at(target.captured_ns).ned_from_body) @ ray
+                    _levelled(flight.inputs.history.at(target.captured_ns).ned_from_body) @ ray
                 ),
             }
             for way, bearing_rad in told.items():

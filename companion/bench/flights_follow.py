@@ -2,7 +2,7 @@
 
 A person or a car goes its winding way for a minute, with up to 1 m/s² sideways. Twice it is hidden, for 1 to
 2 s. Another of its class stands 3.5 m beside its way, a second one comes towards it and passes as near. The
-wind is up to 3 m/s with its gusts; the detector's faults are those of `drawn_detector`, its results
+wind is up to 3 m/s with its gusts; the detector's faults are those of `synthetic_detector`, its results
 80 ms late. Range comes from the ground plane. A gimbal holds the camera level and 27° down: the built-in
 airframe has PX4's SIH's drag and leans by 17° to fly 3 m/s, by 28° to gain speed.
 
@@ -20,9 +20,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.bench.drawn_detector import DrawnDetector, Pose, Thing
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight, Moment, Sight
+from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment, camera_settings
+from companion.bench.rendered_camera import RenderedCamera, rendered_scene
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.follow import FollowBehaviour
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
@@ -38,18 +40,26 @@ LEAST_TIME_ON_TARGET = 0.95
 _STEP_S = 0.05
 
 
-def run(seed: int) -> FlightResult:
-    """One flight."""
+def run(seed: int, *, rendered: bool = False) -> FlightResult:
+    """One flight. `rendered`: the camera is drawn, and looked at by the real detector and tracker."""
     rng = np.random.default_rng((seed, 91))
     class_name = ("person", "car")[seed % 2]
     yaw = float(rng.uniform(-math.pi, math.pi))
     goal = _goal(rng, class_name, yaw)
-    detector = DrawnDetector([goal, *_like_it(rng, goal)], CAMERA, MOUNT, seed=seed)
-    flight = LockstepFlight(
+    objects = [goal, *_like_it(rng, goal)]
+    settings = camera_settings(CAMERA, MOUNT, {"detector.image_size": "320", "detector.threads": "1"})
+    camera: Camera
+    if rendered:
+        scene, (goal, *_) = rendered_scene(objects, CAMERA, MOUNT, seed)
+        camera = RenderedCamera(settings, scene, by_flight=True, depth=False)
+    else:
+        detector = SyntheticDetector(objects, CAMERA, MOUNT, seed=seed)
+        camera = SyntheticCamera(settings, detect=detector)
+    flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        sight=Sight(CAMERA, MOUNT, detector),
+        camera=lambda _: camera,
     )
     flight.turn_to(yaw)
     on_target: list[bool] = []
@@ -88,7 +98,7 @@ def run(seed: int) -> FlightResult:
     )
 
 
-def _off_middle(goal: Thing, moment: Moment) -> float:
+def _off_middle(goal: SceneObject, moment: Moment) -> float:
     """Angle of the object's middle beside the picture's middle column, by the truth; π behind the camera."""
     pose, truth = goal.pose(moment.seconds), moment.truth
     ned_from_body = matrix_from_quaternion(truth.quaternion)
@@ -98,7 +108,7 @@ def _off_middle(goal: Thing, moment: Moment) -> float:
     return math.atan2(float(right), float(forward))
 
 
-def _goal(rng: np.random.Generator, class_name: str, yaw: float) -> Thing:
+def _goal(rng: np.random.Generator, class_name: str, yaw: float) -> SceneObject:
     """It stands still for two seconds, so that it can be chosen, and then goes on its winding way."""
     start_m = float(rng.uniform(8.0, 12.0))
     sway_rad_s, period_s = float(rng.uniform(0.0, 0.33)), float(rng.uniform(8.0, 20.0))
@@ -110,9 +120,9 @@ def _goal(rng: np.random.Generator, class_name: str, yaw: float) -> Thing:
     north = start_m * math.cos(yaw) + np.cumsum(speeds * np.cos(headings)) * _STEP_S
     east = start_m * math.sin(yaw) + np.cumsum(speeds * np.sin(headings)) * _STEP_S
 
-    def pose(seconds: float) -> Pose:
+    def pose(seconds: float) -> ScenePose:
         at = min(max(seconds, 0.0), float(times[-1]))
-        return Pose(
+        return ScenePose(
             float(np.interp(at, times, north)),
             float(np.interp(at, times, east)),
             float(np.interp(at, times, headings)),
@@ -124,32 +134,32 @@ def _goal(rng: np.random.Generator, class_name: str, yaw: float) -> Thing:
     def hidden(seconds: float) -> bool:
         return any(begin <= seconds < end for begin, end in spells)
 
-    return Thing(class_name, SIZES_M[class_name], pose, hidden)
+    return SceneObject(class_name, SIZES_M[class_name], pose, hidden)
 
 
-def _like_it(rng: np.random.Generator, goal: Thing) -> list[Thing]:
+def _like_it(rng: np.random.Generator, goal: SceneObject) -> list[SceneObject]:
     """Two more of its class: one stands beside its way, one comes towards it and passes by."""
     beside = math.copysign(3.5, float(rng.uniform(-1.0, 1.0)))
     standing = _beside(goal.pose(float(rng.uniform(24.0, 32.0))), beside)
     meeting_s = float(rng.uniform(10.0, 55.0))
     met = _beside(goal.pose(meeting_s), -beside)
 
-    def towards(seconds: float) -> Pose:
+    def towards(seconds: float) -> ScenePose:
         gone = 1.5 * (seconds - meeting_s)
         back = met.yaw_rad + math.pi
-        return Pose(met.north_m + gone * math.cos(back), met.east_m + gone * math.sin(back), back)
+        return ScenePose(met.north_m + gone * math.cos(back), met.east_m + gone * math.sin(back), back)
 
-    return [_still(goal, standing), Thing(goal.class_name, goal.size_m, towards)]
+    return [_still(goal, standing), SceneObject(goal.class_name, goal.size_m, towards)]
 
 
-def _beside(pose: Pose, right_m: float) -> Pose:
-    return Pose(
+def _beside(pose: ScenePose, right_m: float) -> ScenePose:
+    return ScenePose(
         pose.north_m - right_m * math.sin(pose.yaw_rad),
         pose.east_m + right_m * math.cos(pose.yaw_rad),
         pose.yaw_rad,
     )
 
 
-def _still(like: Thing, pose: Pose) -> Thing:
-    where: Callable[[float], Pose] = lambda _: pose  # noqa: E731  (a thing's pose is a function of time)
-    return Thing(like.class_name, like.size_m, where)
+def _still(like: SceneObject, pose: ScenePose) -> SceneObject:
+    where: Callable[[float], ScenePose] = lambda _: pose  # noqa: E731  (a thing's pose is a function of time)
+    return SceneObject(like.class_name, like.size_m, where)

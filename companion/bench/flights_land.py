@@ -4,8 +4,8 @@ A pad of two AprilTags, a small one in its middle and a large one beside it, lie
 the vehicle begins, 6 to 9 m high. The wind is up to 3 m/s with its gusts (the built-in airframe has the drag
 of PX4's SIH, 1 N for each m/s on 1 kg: it leans by 17° against 3 m/s). Corners are off by 0.3 pixels (one
 sigma), frames come 80 ms late, one in twelve is missed, and so is half a second now and then; the camera sits
-a third of a degree (one sigma) from where the settings have it. Every `RENDERED_EVERY`-th flight sees drawn
-pictures, searched by OpenCV, instead.
+a third of a degree (one sigma) from where the settings have it. Rendered flights see drawn pictures, searched
+by OpenCV, instead.
 The limits are the default ones, but for `max_acceleration_mps2` 5.
 
 A flight succeeds when the behaviour says that it landed, and the true place is at most 0.3 m beside the pad's
@@ -20,15 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.bench.flights import FlightResult
-from companion.bench.marker_flight import RATES_HZ, LandingFlight, beside_m
+from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.guidance.behaviour import Outcome
 from companion.guidance.envelope import Limits
 from companion.guidance.land_on_marker import LandOnMarkerBehaviour
 from mavlink_sim.camera.renderer import Renderer
-from mavlink_sim.lockstep import LockstepVehicle, Truth
+from mavlink_sim.lockstep import Truth
 from mavlink_sim.world.plates import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
-from vision.markers import Marker, MarkerDetector, MarkerKind, PadMarker, marker_from_corners, square
+from vision.markers import Marker, MarkerDetector, MarkerKind, marker_from_corners, square
 from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(75.0))
@@ -45,13 +47,17 @@ FAR_M, HEIGHTS_M, STRONGEST_WIND_MPS = 3.0, (6.0, 9.0), 3.0
 ALLOWED_M = 0.3
 LIMIT_S = 240.0
 MAX_ACCELERATION_MPS2 = 5.0
-RENDERED_EVERY = 20
-ON_PADS = {LARGE: PadMarker(LARGE, MIDDLE, *OFFSETS_M[LARGE])}
+MARKER_SETTINGS = {
+    "detector.enabled": "false",
+    "markers.dictionary": DICTIONARY,
+    "markers.size_m": f"{SIZES_M[MIDDLE]}",
+    "markers.others": f"{LARGE}:{SIZES_M[LARGE]}@{MIDDLE}:{OFFSETS_M[LARGE][0]}:{OFFSETS_M[LARGE][1]}",
+}
 
 
-def run(seed: int) -> FlightResult:
-    """One landing, flown by us."""
-    return land(seed)
+def run(seed: int, *, rendered: bool = False) -> FlightResult:
+    """One landing, flown by us. `rendered`: pictures are drawn, and searched by OpenCV."""
+    return land(seed, rendered=rendered)
 
 
 def land(
@@ -59,7 +65,7 @@ def land(
     *,
     by_autopilot: bool = False,
     pad_speed_mps: float = 0.0,
-    rendered: bool | None = None,
+    rendered: bool = False,
     max_acceleration_mps2: float = MAX_ACCELERATION_MPS2,
 ) -> FlightResult:
     """One landing.
@@ -67,7 +73,7 @@ def land(
     Args:
         by_autopilot: PX4's precision landing flies it, told by LANDING_TARGET.
         pad_speed_mps: of a pad that moves in a line.
-        rendered: whether pictures are drawn; None: of every `RENDERED_EVERY`-th seed.
+        rendered: pictures are drawn and searched; else corners are put where geometry has them.
         max_acceleration_mps2: of the envelope.
     """
     rng = np.random.default_rng((seed, 149))
@@ -78,37 +84,38 @@ def land(
         (pad_speed_mps * math.cos(course), pad_speed_mps * math.sin(course)),
     )
     wind_mps = float(rng.uniform(0.0, STRONGEST_WIND_MPS))
-    vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, wind_mps=wind_mps)
-    drawn = seed % RENDERED_EVERY == 0 if rendered is None else rendered
     truly = CameraMount(
         MOUNT.forward_m,
         MOUNT.right_m,
         MOUNT.down_m,
         *(np.array([MOUNT.roll_rad, MOUNT.pitch_rad, MOUNT.yaw_rad]) + rng.normal(0.0, MOUNT_SIGMA_RAD, 3)),
     )
-    camera = DrawnCamera(pad, truly) if drawn else ProjectedCamera(pad, truly, rng)
-    flight = LandingFlight(
-        vehicle,
-        MOUNT,
-        camera.look,
-        ON_PADS,
-        rate_hz=10.0 if drawn else 20.0,
+    pictures = DrawnCamera(pad, truly) if rendered else ProjectedCamera(pad, truly, rng)
+    camera = SyntheticCamera(
+        camera_settings(CAMERA, MOUNT, MARKER_SETTINGS),
+        find_markers=pictures.look,
+        rate_hz=10.0 if rendered else 20.0,
+    )
+    flight = LockstepFlight.airborne(
+        seed=seed,
+        height_m=float(rng.uniform(*HEIGHTS_M)),
+        wind_mps=wind_mps,
+        camera=lambda _: camera,
         limits=Limits(max_acceleration_mps2=max_acceleration_mps2),
     )
-    vehicle.take_off(float(rng.uniform(*HEIGHTS_M)), limit_s=90.0)
-    flight.settle(1.0)
-    begun_s = vehicle.now_s
     behaviour = LandOnMarkerBehaviour(MIDDLE, by_autopilot=by_autopilot, moving=pad_speed_mps > 0.0)
     touched: list[float] = []
 
-    def note_touch(truth: Truth) -> None:
+    def note_touch() -> None:
+        truth = flight.vehicle.truth
         if truth.on_ground and not touched:
-            touched.append(beside_m(truth, pad.place(vehicle.now_s - begun_s)))
+            touched.append(math.dist(truth.position_ned_m[:2], pad.place(flight.seconds)))
 
-    outcome = flight.fly(behaviour, LIMIT_S, note_touch)
-    took_s = vehicle.now_s - begun_s
+    log = flight.fly(behaviour, LIMIT_S, on_tick=note_touch)
+    outcome = log.outcome or Outcome(False, f"not landed after {LIMIT_S:g} s: {behaviour.status}")
+    took_s = flight.seconds
     error_m = touched[0] if touched else math.nan
-    descents = sum(words.startswith("descending") for words in flight.states)
+    descents = sum(words.startswith("descending") for words in flight.state_words)
     near = error_m <= ALLOWED_M
     return FlightResult(
         seed,

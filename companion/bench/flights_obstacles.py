@@ -9,13 +9,12 @@ the wall (nobody gets round it) has stopped it.
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
 from companion.bench.flights import FlightResult
-from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.behaviour import Situation
+from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from companion.bench.synthetic_camera import SyntheticCamera
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.obstacles import ObstacleRules
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
@@ -32,47 +31,25 @@ HEIGHT_M, FLIGHT_S = 2.5, 25.0
 RATE_HZ, LATENCY_S = 10.0, 0.08
 
 
-class DepthInLockstep:
-    """Adds what a rendered depth camera sees to the situation, late."""
+class DepthCamera:
+    """What a rendered depth camera makes of a world, as `SyntheticCamera.find_obstacles`."""
 
-    def __init__(self, flight: LockstepFlight, world: World, seed: int) -> None:
-        self._flight, self._rng = flight, np.random.default_rng((seed, 62))
+    def __init__(self, world: World, seed: int) -> None:
+        self._rng = np.random.default_rng((seed, 62))
         self._renderer = Renderer(world, CAMERA, MOUNT)
-        self._late: deque[tuple[int, ObstacleSectors]] = deque()
-        self._next_ns = 0
-        self._newest: ObstacleSectors | None = None
-        self.dark = False
 
-    def __call__(self, situation: Situation) -> Situation:
-        now_ns = situation.now_ns
-        if now_ns >= self._next_ns and not self.dark:
-            self._next_ns = now_ns + round(1e9 / RATE_HZ)
-            self._late.append((now_ns + round(LATENCY_S * 1e9), self._look(now_ns)))
-        while self._late and self._late[0][0] <= now_ns:
-            self._newest = self._late.popleft()[1]
-        return Situation(
-            now_ns,
-            situation.state,
-            situation.targets,
-            situation.perception_age_s,
-            situation.perception_fresh,
-            self._newest,
-            situation.sent,
-        )
-
-    def _look(self, now_ns: int) -> ObstacleSectors:
-        truth = self._flight.vehicle.truth
-        true_attitude = matrix_from_quaternion(truth.quaternion)
-        rendered = self._renderer.render(truth.position_ned_m, true_attitude)
+    def __call__(self, flight: LockstepFlight) -> ObstacleSectors:
+        truth, now_ns = flight.vehicle.truth, flight.now_ns
+        rendered = self._renderer.render(truth.position_ned_m, matrix_from_quaternion(truth.quaternion))
         depth = measured_depth(rendered.depth_m, CAMERA.fx, DepthSensor(), self._rng)
-        pose = self._flight.history.at(now_ns)  # the estimate, as a worker knows it
+        pose = flight.inputs.history.at(now_ns)  # the estimate, as a worker knows it
         return obstacle_sectors(depth, now_ns, CAMERA, MOUNT, pose.ned_from_body, pose.height_m)
 
 
 def run(seed: int) -> FlightResult:
     """One flight."""
     rng = np.random.default_rng((seed, 61))
-    flight = LockstepFlight(seed=seed, height_m=HEIGHT_M, wind_mps=float(rng.uniform(0.0, 3.0)))
+    wind_mps = float(rng.uniform(0.0, 3.0))
     heading, away_m = float(rng.uniform(-math.pi, math.pi)), float(rng.uniform(12.0, 18.0))
     place = (away_m * math.cos(heading), away_m * math.sin(heading), 0.0)
     wall = seed % 2 == 0
@@ -81,13 +58,26 @@ def run(seed: int) -> FlightResult:
         thing = WorldObject(0, "wall", place, slant, size_m=(40.0, 0.4, 5.0))
     else:
         thing = WorldObject(0, "box", place, heading, size_m=(2.0, 2.0, 6.0))
+    camera = SyntheticCamera(
+        camera_settings(CAMERA, MOUNT),
+        find_obstacles=DepthCamera(World((thing,)), seed),
+        size=(CAMERA.width, CAMERA.height),
+        rate_hz=RATE_HZ,
+        latency_s=LATENCY_S,
+    )
+    flight = LockstepFlight.airborne(
+        seed=seed,
+        height_m=HEIGHT_M,
+        wind_mps=wind_mps,
+        camera=lambda _: camera,
+        rules=ObstacleRules("required", MARGIN_M),
+    )
     flight.turn_to(heading)
     goto = GotoBehaviour(
         from_home_m=((away_m + 10.0) * math.cos(heading), (away_m + 10.0) * math.sin(heading)),
         speed_mps=float(rng.uniform(2.0, 4.0)),
     )
-    depth = DepthInLockstep(flight, World((thing,)), seed)
-    log = flight.fly(goto, FLIGHT_S, situated=depth, rules=ObstacleRules("required", MARGIN_M))
+    log = flight.fly(goto, FLIGHT_S)
     ranges = [range_to(thing, moment.truth.position_ned_m) for moment in log.moments]
     nearest_m, crashed = min(ranges), "crash" in log.violations
     backwards_m = ranges[-1] - nearest_m

@@ -1,8 +1,7 @@
 """A fleet in one process: each vehicle with its guidance, its own clock and local origin, and a bad network.
 
-Everything but the driver and the sockets is what flies for real: behaviours, envelope, neighbours, and the
-messages as they go over the bus. The vehicles are the built-in one in lockstep, or points that follow a
-velocity late, of which many can be flown.
+Everything but driver and sockets is what flies for real, the messages as they go over the bus too. The
+vehicles are the built-in one in lockstep, or points that follow a velocity late, of which many can be flown.
 """
 
 from __future__ import annotations
@@ -12,50 +11,44 @@ import json
 import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from companion.guidance.behaviour import Behaviour, Outcome, Situation
-from companion.guidance.envelope import Envelope, Limits
+from companion.bench.lockstep_flight import TICK_S, LockstepFlight, plain_settings
+from companion.bench.simulated_driver import LockstepDriver, SimulatedDriver
+from companion.guidance.behaviour import Behaviour, Outcome
+from companion.guidance.envelope import Limits
 from companion.guidance.formation import FormationBehaviour
 from companion.guidance.hold import HoldBehaviour
-from companion.guidance.neighbours import Anchor, Neighbours
-from companion.guidance.pose import pose_from_message, pose_message, pose_of
-from companion.guidance.refusal import refusal
+from companion.guidance.interface import Answer, EventKind, Request, SetMode
+from companion.guidance.neighbours import Anchor
+from companion.guidance.pose import pose_from_message, pose_message
+from companion.service.factory import guidance_options
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+from companion.vehicle.telemetry_fold import FOLDED_MESSAGES
 from mavlink_sim import LockstepVehicle
+from mavlink_sim.lockstep import COMPANION
 from mavlink_sim.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
-from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 from vision.attitude import quaternion_from_euler, wrap_angle
 
-GUIDANCE_HZ = 20.0
-POSES_EVERY = 2  # guidance turns: 10 Hz
+POSES_HZ = 10.0
 # Of what PX4 sends a companion by itself, what its state is made of.
 _FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in FOLDED_MESSAGES}
 # Where the fleet's common frame has its origin; any place away from the poles would do.
 _ORIGIN = Anchor(47.3977, 8.5456, 488.0, (0.0, 0.0, 0.0))
 
 
-class Airframe(Protocol):
-    """Something that flies setpoints, in a local frame of its own."""
-
-    def state(self) -> VehicleState:
-        """What its telemetry has told, stamped by its own clock."""
-
-    def now_ns(self) -> int:
-        """Its own clock."""
+class Airframe(LockstepDriver, Protocol):
+    """A vehicle of a fleet, in a local frame of its own."""
 
     def place(self) -> Vector3:
         """Where it really is, in the fleet's common frame (NED)."""
 
-    def fly(self, setpoint: Setpoint | None, dt_s: float) -> None:
-        """Let time pass with this setpoint."""
 
-
-class LockstepAirframe:
+class LockstepAirframe(SimulatedDriver):
     """The built-in vehicle, hovering.
 
     Args:
@@ -72,7 +65,7 @@ class LockstepAirframe:
         clock_ns: int,
         wind_mps: tuple[float, float],
     ) -> None:
-        self.vehicle = LockstepVehicle(
+        vehicle = LockstepVehicle(
             {"onboard": _FOLDED_RATES_HZ},
             system_id=system_id,
             seed=seed,
@@ -81,60 +74,13 @@ class LockstepAirframe:
             start_ned_m=start,
             ready_after_s=0.0,
         )
-        self._start, self._clock_ns = start, clock_ns
-        self._state = VehicleState()
-        self.vehicle.take_off(height_m)
-        self._fold()
-
-    def engage(self) -> None:
-        """Into OFFBOARD, standing."""
-        self._send(Setpoint.brake(0))
-        self.vehicle.step(0.1)
-        self.vehicle.set_mode("OFFBOARD")
-        self._fold()
-
-    def now_ns(self) -> int:
-        return self._clock_ns + round(self.vehicle.now_s * 1e9)
-
-    def state(self) -> VehicleState:
-        return self._state
+        self._start = start
+        vehicle.take_off(height_m)
+        super().__init__(vehicle, clock_ns)
 
     def place(self) -> Vector3:
         north, east, down = self.vehicle.truth.position_ned_m
         return (self._start[0] + north, self._start[1] + east, down)
-
-    def fly(self, setpoint: Setpoint | None, dt_s: float) -> None:
-        if setpoint is not None:
-            self._send(setpoint)
-        self.vehicle.step(dt_s)
-        self._fold()
-
-    def _send(self, setpoint: Setpoint) -> None:
-        place = setpoint.position_ned_m or (0.0, 0.0, 0.0)
-        velocity = setpoint.velocity_ned_mps or (0.0, 0.0, 0.0)
-        self.vehicle.send(
-            dialect.MAVLink_set_position_target_local_ned_message(
-                0,
-                self.vehicle.vehicle.system_id,
-                1,
-                dialect.MAV_FRAME_LOCAL_NED,
-                setpoint.type_mask,
-                *place,
-                *velocity,
-                0.0,
-                0.0,
-                0.0,
-                setpoint.yaw_rad or 0.0,
-                setpoint.yaw_rate_radps or 0.0,
-            )
-        )
-
-    def _fold(self) -> None:
-        now_ns = self.now_ns()
-        newest = {message.get_type(): message for message in self.vehicle.receive()}
-        for name, message in newest.items():
-            if name in FOLDED_MESSAGES:
-                self._state = fold(self._state, name, message.to_dict(), now_ns)
 
 
 class PointAirframe:
@@ -144,23 +90,40 @@ class PointAirframe:
 
     def __init__(self, seed: int, start: tuple[float, float], height_m: float, clock_ns: int) -> None:
         self._chance = random.Random(seed)
-        self._start, self._clock_ns = start, clock_ns
+        self._start, self.now_ns = start, clock_ns
         self._place = [start[0], start[1], -height_m]
         self._velocity = [0.0, 0.0, 0.0]
         self._gust = [0.0, 0.0, 0.0]
         self._yaw_rad = self._yaw_rate_radps = 0.0
-
-    def engage(self) -> None:
-        """It always does what it is told."""
-
-    def now_ns(self) -> int:
-        return self._clock_ns
+        self._setpoint: Setpoint | None = None
+        self._mode = FlightMode.HOLD
+        self._answers: list[Answer] = []
+        self.state = self._estimate()
 
     def place(self) -> Vector3:
         return (self._place[0], self._place[1], self._place[2])
 
-    def state(self) -> VehicleState:
-        now_ns = self._clock_ns
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        self._setpoint = setpoint
+
+    def send_landing_target(self, target: LandingTarget) -> None:
+        raise NotImplementedError("a point lands on nothing")
+
+    def start(self, request: Request) -> None:
+        """It does at once what it is asked."""
+        if isinstance(request.action, SetMode):
+            self._mode = request.action.mode
+        self._answers.append(Answer(request.identifier))
+
+    def cancel(self, identifier: int) -> None:
+        """Every request was answered at once."""
+
+    def take_answers(self) -> tuple[Answer, ...]:
+        answers, self._answers = tuple(self._answers), []
+        return answers
+
+    def _estimate(self) -> VehicleState:
+        now_ns = self.now_ns
         north, east, down = (value + self._chance.gauss(0.0, 0.03) for value in self._place)
         latitude, longitude, altitude_m = _ORIGIN.globally((north, east, down))
         v_north, v_east, v_down = (value + self._chance.gauss(0.0, 0.05) for value in self._velocity)
@@ -170,8 +133,10 @@ class PointAirframe:
             position_ns=now_ns,
             global_ns=now_ns,
             landed_ns=now_ns,
+            battery_ns=now_ns,
+            battery_fraction=0.9,
             armed=True,
-            mode=FlightMode.OFFBOARD,
+            mode=self._mode,
             landed=LandedState.IN_AIR,
             position_ned_m=(north - self._start[0], east - self._start[1], down),
             velocity_ned_mps=(v_north, v_east, v_down),
@@ -184,7 +149,8 @@ class PointAirframe:
             home_position_ned_m=(0.0, 0.0, 0.0),
         )
 
-    def fly(self, setpoint: Setpoint | None, dt_s: float) -> None:
+    def step(self, dt_s: float) -> None:
+        setpoint = self._setpoint if self._mode is FlightMode.OFFBOARD else None
         wanted: Vector3 = (0.0, 0.0, 0.0)
         rate = 0.0
         if setpoint is not None:
@@ -209,7 +175,8 @@ class PointAirframe:
             self._place[axis] += self._velocity[axis] * dt_s
         self._yaw_rate_radps += (rate - self._yaw_rate_radps) * share
         self._yaw_rad = wrap_angle(self._yaw_rad + self._yaw_rate_radps * dt_s)
-        self._clock_ns += round(dt_s * 1e9)
+        self.now_ns += round(dt_s * 1e9)
+        self.state = self._estimate()
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,24 +197,29 @@ class Member:
     """One vehicle of the fleet, and what its companion knows.
 
     Attributes:
+        flight: its guidance and all around it.
         muted: its poses do not go out. deaf: none come in.
-        outcome: how its last behaviour ended, while nothing but a hold flies.
         limited: the words of every limit that has acted.
     """
 
     name: str
-    airframe: Any
-    neighbours: Neighbours
-    envelope: Envelope
-    behaviour: Behaviour
+    airframe: LockstepAirframe | PointAirframe
+    flight: LockstepFlight
     muted: bool = False
     deaf: bool = False
-    outcome: Outcome | None = None
     limited: set[str] = field(default_factory=set)
-    commanded: bool = False
-    activated: bool = False
-    sent: Setpoint | None = None
+    commanded: int | None = None
     inbox: list[tuple[float, int, Any]] = field(default_factory=list)
+
+    @property
+    def behaviour(self) -> Behaviour | None:
+        """What is flown now."""
+        return self.flight.guidance.behaviour
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """How its last commanded behaviour ended; None: it has not, or none was commanded."""
+        return None if self.commanded is None else self.flight.outcome(self.commanded)
 
 
 class Fleet:
@@ -267,37 +239,45 @@ class Fleet:
         self._network = network or Network()
         self._limits = limits or Limits()
         self._as_text = as_text
-        self._turn = 0
+        self._ticks = 0
         self._numbers = itertools.count()
         self.members: dict[str, Member] = {}
-        self.now_s = 0.0
         self.least_m = math.inf
         self.sent_bytes: list[int] = []
 
+    @property
+    def now_s(self) -> float:
+        return self._ticks * TICK_S
+
     def add(self, name: str, airframe: LockstepAirframe | PointAirframe) -> Member:
         """A vehicle that hovers where it is, under its companion's hold."""
-        airframe.engage()
-        member = Member(name, airframe, Neighbours(name, name), Envelope(self._limits), HoldBehaviour())
+        settings = plain_settings({"vehicle.name": name})
+        options = replace(guidance_options(settings, COMPANION), limits=self._limits)
+        member = Member(name, airframe, LockstepFlight(airframe, settings, options=options))
+        member.flight.command(HoldBehaviour())
         self.members[name] = member
         return member
 
     def command(self, name: str, behaviour: Behaviour) -> str | None:
         """Let a vehicle fly it; the words of the refusal, if it is refused."""
         member = self.members[name]
-        situation = self._situation(member)
-        refused = refusal(behaviour, situation, None)
-        if refused is None:
-            self._begin(member, behaviour)
-            member.outcome, member.commanded = None, True
-        return refused
+        told = len(member.flight.events)
+        commanded = member.flight.command(behaviour)
+        member.flight.step()
+        for event in member.flight.events[told:]:
+            if event.kind is EventKind.REFUSED and event.outcome is not None:
+                return event.outcome.reason
+        member.commanded = commanded
+        return None
 
     def remove(self, name: str) -> None:
         """A vehicle is there no more, and says nothing more."""
         del self.members[name]
 
     def run(self, seconds: float, each: Callable[[], object] = lambda: None) -> None:
-        """Let time pass; `each` is called at every turn."""
-        for _ in range(round(seconds * GUIDANCE_HZ)):
+        """Let time pass; `each` is called at every step."""
+        until_s = self.now_s + seconds
+        while self.now_s < until_s - TICK_S / 2:
             self.step()
             each()
 
@@ -311,20 +291,19 @@ class Fleet:
         return True
 
     def step(self) -> None:
-        """One turn of everybody's guidance."""
-        dt_s = 1.0 / GUIDANCE_HZ
-        self._turn += 1
+        """As long as a period of guidance."""
         members = list(self.members.values())
-        for index, member in enumerate(members):
-            # Nobody publishes at the same moment as the others.
-            if (self._turn + index) % POSES_EVERY == 0:
-                self._publish(member)
-        for member in members:
-            self._deliver(member)
-            self._fly(member, dt_s)
-        for member in members:
-            member.airframe.fly(member.sent, dt_s)
-        self.now_s += dt_s
+        period = round(1.0 / (POSES_HZ * TICK_S))
+        for _ in range(period // 2):
+            self._ticks += 1
+            for index, member in enumerate(members):
+                # Nobody publishes at the same moment as the others.
+                if (self._ticks + index) % period == 0:
+                    self._publish(member)
+            for member in members:
+                self._deliver(member)
+                member.flight.tick()
+                member.limited.update(member.flight.guidance.limited_by)
         for one, other in itertools.combinations(members, 2):
             self.least_m = min(self.least_m, math.dist(one.airframe.place(), other.airframe.place()))
 
@@ -344,46 +323,9 @@ class Fleet:
                     errors[name] = math.dist(wanted, member.airframe.place())
         return errors
 
-    def _situation(self, member: Member) -> Situation:
-        state, now_ns = member.airframe.state(), member.airframe.now_ns()
-        return Situation(
-            now_ns,
-            state,
-            sent=member.sent,
-            neighbourhood=member.neighbours.around(state, now_ns),
-            min_separation_m=self._limits.min_separation_m,
-        )
-
-    def _begin(self, member: Member, behaviour: Behaviour) -> None:
-        if member.activated:
-            member.behaviour.on_deactivate()
-        member.behaviour, member.activated = behaviour, False
-
-    def _fly(self, member: Member, dt_s: float) -> None:
-        situation = self._situation(member)
-        if not member.activated:
-            member.behaviour.on_activate(situation)
-            member.activated = True
-        step = member.behaviour.update(dt_s, situation)
-        if isinstance(step, Outcome):
-            # As the pilot does: what follows a behaviour that flew by setpoints is a hold.
-            if member.commanded:
-                member.outcome, member.commanded = step, False
-            self._begin(member, HoldBehaviour())
-            member.behaviour.on_activate(situation)
-            member.activated = True
-            step = member.behaviour.update(dt_s, situation)
-        if not isinstance(step, Setpoint):
-            raise TypeError(f"{member.name}: {member.behaviour.name} does not fly by setpoints: {step}")
-        limited = member.envelope.apply(step, situation.state, situation.now_ns, dt_s, situation.neighbours)
-        member.sent = limited.sent
-        member.limited.update(limited.reasons)
-
     def _publish(self, member: Member) -> None:
-        state, now_ns = member.airframe.state(), member.airframe.now_ns()
-        behaviour = member.behaviour
-        note = behaviour.note if isinstance(behaviour, FormationBehaviour) else None
-        pose = pose_of(state, now_ns, vehicle=member.name, source=member.name, formation=note)
+        flight = member.flight
+        pose = flight.inputs.poses.pose(flight.state, member.behaviour, flight.now_ns)
         if pose is None or member.muted:
             return
         message: Any = pose
@@ -403,6 +345,6 @@ class Fleet:
             if member.deaf:
                 continue
             pose = pose_from_message(json.loads(message)) if self._as_text else message
-            # It came between two turns; the receiver stamps it as it comes.
-            receipt_ns = member.airframe.now_ns() - round((self.now_s - came_s) * 1e9)
-            member.neighbours.hear(pose, receipt_ns)
+            # It came between two ticks; the receiver stamps it as it comes.
+            receipt_ns = member.flight.now_ns - round((self.now_s - came_s) * 1e9)
+            member.flight.inputs.poses.take(pose, receipt_ns)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from companion.bench.percentiles import percentiles
-from companion.guidance.behaviour import Situation
+from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.rehearsal import (
     ALTITUDE_M,
     RehearsalError,
@@ -58,7 +58,7 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
     `beyond_network` is what the companion adds to the network: from when the frame is there, less the
     network's own time. Every stage is told by its median: those of `PerceptionResult.timing_ms`, among them
     `capture` and `inference`, which are not the companion's; then `deliver`, from when the result was known
-    until the pilot has it, and `steer`, from there until the setpoint has left.
+    until guidance has it, and `steer`, from there until the setpoint has left.
 
     Raises:
         RehearsalError: the vehicle did not get into the air.
@@ -103,18 +103,19 @@ async def _fly(service: Service, seconds: float, figures: _Figures) -> None:
 def _measure_sent(service: Service, figures: _Figures) -> None:
     """Time what goes on the wire, without changing it.
 
-    `Pilot.update` makes a setpoint of the newest detections; what counts is when that very setpoint leaves.
+    `Guidance.step` makes a setpoint of the newest detections; what counts is when that very setpoint leaves.
     """
-    update, send = service.pilot.update, service.driver.send_setpoint
+    step, send = service.guidance.step, service.driver.send_setpoint
     seen = -1
     awaited: tuple[Setpoint | None, PerceptionResult, int] | None = None
 
-    def noted(situation: Situation) -> None:
+    def noted(now_ns: int, inputs: GuidanceInput) -> GuidanceOutput:
         nonlocal seen, awaited
-        update(situation)
-        newest = service.steering.newest
+        output = step(now_ns, inputs)
+        newest = service.inputs.steering.newest
         if newest is not None and newest.sequence != seen:
-            seen, awaited = newest.sequence, (service.pilot.sent, newest, situation.now_ns)
+            seen, awaited = newest.sequence, (output.setpoint, newest, now_ns)
+        return output
 
     def timed(setpoint: Setpoint) -> None:
         nonlocal awaited
@@ -123,5 +124,5 @@ def _measure_sent(service: Service, figures: _Figures) -> None:
             (_, newest, steered_ns), awaited = awaited, None
             figures.take(newest, steered_ns, time.monotonic_ns())
 
-    service.pilot.update = noted  # type: ignore[method-assign]
+    service.guidance.step = noted  # type: ignore[method-assign]
     service.streamer.send = timed

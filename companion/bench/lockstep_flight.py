@@ -1,88 +1,69 @@
-"""A behaviour flown with the built-in vehicle in lockstep: no sockets, no clock, the same every time.
+"""Flights in lockstep: the service's own parts without asyncio, sockets or a clock, the same every time.
 
-What a flight in the service has is here too, with the service's own parts: telemetry as messages, folded into
-the state; targets from boxes through the history of poses; the envelope; setpoints at 50 Hz. In place of the
-network stands a detector made of the truth (`drawn_detector`), whose results come late and pass a
-tracker.
+What flies is `Guidance.step` with inputs from the service's `InputAssembler` and its setpoints through the
+service's `Streamer`. Only the driver is another one, and the perception worker's process: a camera here is
+either a detector made of the truth (`synthetic_camera`) or the rendered camera with the real pipeline
+(`rendered_camera`); simulated time stands still while it computes.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
-from companion.guidance.envelope import Envelope, Limited, Limits
-from companion.guidance.gimbal_control import GimbalAsk, GimbalControl, GimbalRequest
-from companion.guidance.gimbal_sight import GimbalSight
-from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
-from companion.guidance.target import Target
-from companion.guidance.targets import HistoryError, StateHistory, mount_at, targets_from_detections
-from companion.settings.perception import DetectorSection
-from companion.vehicle.gimbal import GimbalAim
-from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
+from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, LockstepDriver, SimulatedDriver
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.core import Guidance, GuidanceOptions, Phase
+from companion.guidance.envelope import Limits
+from companion.guidance.interface import CommandInput, GuidanceEvent, StreamStatus
+from companion.guidance.motion import position_and_yaw
+from companion.guidance.obstacles import ObstacleRules
+from companion.perception.views import View
+from companion.service.factory import guidance_options
+from companion.service.inputs import InputAssembler
+from companion.settings import Settings
+from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+from companion.vehicle.streamer import Streamer
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle, Truth
-from mavlink_sim.wire.messages import dialect
-from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
-from vision.detections import Detections
-from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings
+from vision.pipeline import PerceptionResult
 
-# What the drivers ask of an autopilot (`manners.Manners.rates_hz`), and home.
-RATES_HZ = {
-    "HEARTBEAT": 1.0,
-    "ATTITUDE_QUATERNION": 50.0,
-    "LOCAL_POSITION_NED": 30.0,
-    "GLOBAL_POSITION_INT": 5.0,
-    "SYS_STATUS": 2.0,
-    "EXTENDED_SYS_STATE": 5.0,
-    "CURRENT_MODE": 10.0,
-    "HOME_POSITION": 0.5,
-}
-# The same where there is a gimbal (`gimbal_commands`).
-GIMBAL_RATES_HZ = {"GIMBAL_DEVICE_ATTITUDE_STATUS": 50.0, "GIMBAL_MANAGER_STATUS": 5.0}
 TICK_S = 0.01
 WARM_UP_S = 1.5
-GUIDANCE_TICKS = 5  # 20 Hz, the default of guidance.rate_hz
-SETPOINT_RATE_HZ = 50.0
-PERCEPTION_MAX_AGE_S = 0.5
-START_NS = 1_000_000_000_000
 # An envelope of setpoints is not one of gusts: by so much the truth may be beyond a limit.
 SPEED_TOLERANCE_MPS = 1.0
 PLACE_TOLERANCE_M = 0.5
-_HEIGHTS_M = DetectorSection().heights()
-_GIMBAL_MANAGER_INFORMATION_ID = 280
-_GIMBAL_COMMANDS = (PITCHYAW, CONFIGURE)
 
 
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """A detector in lockstep.
+class Camera(Protocol):
+    """A camera with its perception, in lockstep.
 
     Attributes:
-        camera, mount: as the service has them.
-        detect: true position (NED), true attitude (FRD to NED) and seconds of the flight → detections.
-        rate_hz: frames a second. latency_s: from capture until the result can steer.
-        tracker: how identities are given; None: no tracking.
+        view: what its results are placed by.
+        rate_hz: frames a second. latency_s: from capture until what it shows can steer.
     """
 
-    camera: CameraModel
-    mount: CameraMount
-    detect: Callable[[Vector3, Quaternion, float], Detections]
-    rate_hz: float = 15.0
-    latency_s: float = 0.08
-    tracker: TrackerSettings | None = field(default_factory=TrackerSettings)
+    view: View
+    rate_hz: float
+    latency_s: float
+
+    def on_state(self, state: VehicleState) -> None:
+        """A new snapshot of the vehicle, as the perception worker is told it."""
+
+    def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
+        """Take a frame now. What is returned is called when its result is due; None: the frame is lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One turn of guidance. `seconds` since the behaviour began."""
+    """One step of guidance that was flown by setpoints. `seconds` since the command was given."""
 
     seconds: float
     truth: Truth
@@ -97,7 +78,7 @@ class FlightLog:
     """How it went.
 
     Attributes:
-        outcome: how the behaviour ended; None: it flew on until the time was over.
+        outcome: how the command ended; None: it flew on until the time was over.
         violations: every kind of limit that was left, in words, told once with its worst.
     """
 
@@ -105,248 +86,284 @@ class FlightLog:
     moments: list[Moment] = field(default_factory=list)
     violations: dict[str, float] = field(default_factory=dict)
 
-    def violated(self, what: str, by: float) -> None:
-        """Remember the worst of each kind."""
-        self.violations[what] = max(by, self.violations.get(what, 0.0))
-
 
 class LockstepFlight:
-    """One vehicle, in the air and in OFFBOARD, that a behaviour can fly.
+    """One vehicle with its guidance.
 
     Args:
-        height_m: above home, where the behaviour begins.
-        sight: what it sees with; None: nothing.
-        wind_mps, seed: of the vehicle; the direction of the wind follows from the seed.
-        options: further ones of `LockstepVehicle`; with `gimbal` it is moved as the service does.
+        driver: the vehicle.
+        settings: as the service reads them.
+        cameras: the first is the first view's, and so on; none: nothing is seen.
+        options: replace what the settings say.
 
-    Raises:
-        NotReachedError, CommandRefusedError: the vehicle did not take off.
+    Attributes:
+        events: everything guidance told.
+        state_words: what the active behaviours were doing, as it changed (their status up to a comma).
     """
 
     def __init__(
         self,
+        driver: LockstepDriver,
+        settings: Settings,
+        cameras: Sequence[Camera] = (),
+        options: GuidanceOptions | None = None,
+    ) -> None:
+        self.driver, self.settings, self.cameras = driver, settings, tuple(cameras)
+        self.notes: list[tuple[str, str]] = []
+        views = [camera.view for camera in cameras] or [View(settings.of_view(None))]
+        self.inputs = InputAssembler(settings, views, lambda level, text: self.notes.append((level, text)))
+        self.guidance = Guidance(options or guidance_options(settings, COMPANION))
+        self.streamer = Streamer(
+            driver.send_setpoint,
+            rate_hz=settings.guidance.setpoint_rate_hz,
+            brake_s=settings.guidance.brake_s,
+            clock_ns=lambda: driver.now_ns,
+        )
+        self.events: list[GuidanceEvent] = []
+        self.state_words: list[str] = []
+        self.begun_ns = driver.now_ns
+        self._identifiers = itertools.count(1)
+        self._new: list[CommandInput] = []
+        self._results: dict[int, Outcome] = {}
+        self._next_frame_ns = [driver.now_ns] * len(self.cameras)
+        self._late: deque[tuple[int, View, Callable[[], PerceptionResult | None]]] = deque()
+        self._step_due_ns = self._stream_due_ns = driver.now_ns
+        self._seen_state: VehicleState | None = None
+        self._take_state()
+
+    @classmethod
+    def airborne(
+        cls,
         *,
         seed: int,
         height_m: float = 5.0,
         wind_mps: float = 0.0,
-        sight: Sight | None = None,
+        camera: Callable[[LockstepVehicle], Camera] | None = None,
+        settings: Settings | None = None,
         limits: Limits | None = None,
+        rules: ObstacleRules | None = None,
         **options: Any,
-    ) -> None:
-        gimbal = bool(options.get("gimbal", False))
-        rates_hz = RATES_HZ | GIMBAL_RATES_HZ if gimbal else RATES_HZ
-        self.vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
-        self.gimbal = GimbalControl(COMPANION) if gimbal else None
-        self.limits = limits or Limits()
-        self.state = VehicleState()
-        self.history = StateHistory()
-        self._attitudes = AttitudeHistory()
-        self._sight = sight
-        tracked = sight is not None and sight.tracker is not None
-        self._tracker = Tracker(sight.tracker) if sight is not None and tracked else None
-        self._late: deque[tuple[int, int, Detections]] = deque()
-        self._targets: tuple[Target, ...] = ()
-        self._seen_ns: int | None = None
-        if gimbal:
-            self.vehicle.command(dialect.MAV_CMD_REQUEST_MESSAGE, _GIMBAL_MANAGER_INFORMATION_ID)
-        self.vehicle.take_off(height_m)
-        still = Setpoint.brake(self.now_ns)
-        self._stream = self.vehicle.repeat(setpoint_message(still), SETPOINT_RATE_HZ)
-        self.vehicle.step(0.5)
-        self._take()
-        self.vehicle.set_mode("OFFBOARD")
-        self._take()
-        self.begun_s = self.vehicle.now_s
-        self._next_frame_s = self.vehicle.now_s
+    ) -> LockstepFlight:
+        """The built-in vehicle in the air, in HOLD.
+
+        Args:
+            height_m: above home, where the flight begins.
+            wind_mps, seed: of the vehicle; the direction of the wind follows from the seed.
+            camera: makes the camera of a vehicle. limits, rules: replace what the settings say.
+            options: further ones of `LockstepVehicle`.
+
+        Raises:
+            NotReachedError, CommandRefusedError: the vehicle did not take off.
+        """
+        rates_hz = RATES_HZ | GIMBAL_RATES_HZ if options.get("gimbal") else RATES_HZ
+        vehicle = LockstepVehicle({"onboard": rates_hz}, seed=seed, wind_mps=wind_mps, **options)
+        vehicle.take_off(height_m, limit_s=90.0)
+        seen = None if camera is None else camera(vehicle)
+        chosen = settings or (plain_settings() if seen is None else seen.view.settings)
+        guided = guidance_options(chosen, COMPANION)
+        guided = replace(guided, limits=limits or guided.limits, obstacles=rules or guided.obstacles)
+        return cls(SimulatedDriver(vehicle), chosen, [] if seen is None else [seen], guided)
+
+    @property
+    def vehicle(self) -> LockstepVehicle:
+        """The built-in vehicle. Raises TypeError where another one is flown."""
+        if not isinstance(self.driver, SimulatedDriver):
+            raise TypeError(f"{type(self.driver).__name__} is not the built-in vehicle")
+        return self.driver.vehicle
+
+    @property
+    def state(self) -> VehicleState:
+        """What the vehicle has told."""
+        return self.driver.state
 
     @property
     def now_ns(self) -> int:
-        """The flight's clock, as CLOCK_MONOTONIC would be."""
-        return START_NS + round(self.vehicle.now_s * 1e9)
+        """The flight's clock."""
+        return self.driver.now_ns
 
     @property
     def seconds(self) -> float:
-        """Since OFFBOARD."""
-        return self.vehicle.now_s - self.begun_s
+        """Since the newest command of `fly`."""
+        return (self.driver.now_ns - self.begun_ns) / 1e9
 
-    def turn_to(self, yaw_rad: float, limit_s: float = 15.0) -> None:
-        """Turn on the spot before the behaviour begins."""
-        self._stream.message = setpoint_message(
-            Setpoint.velocity((0.0, 0.0, 0.0), self.now_ns, yaw_rad=yaw_rad)
-        )
-        self.vehicle.run_until(
-            lambda truth: abs(math.remainder(truth.yaw_rad - yaw_rad, math.tau)) < 0.05, limit_s
-        )
-        self._take()
-        self.begun_s = self._next_frame_s = self.vehicle.now_s
+    # --- commands ----------------------------------------------------------------------------------------
+
+    def command(self, command: str | Behaviour) -> int:
+        """Give a command, for the next step. Returns its identifier; see `outcome`.
+
+        Raises:
+            GrammarError, MissionError: the text is none.
+        """
+        identifier = next(self._identifiers)
+        if isinstance(command, str):
+            read = self.inputs.read_command(identifier, command, self.state, self.guidance.check_requirements)
+        else:
+            read = CommandInput(identifier, command.name, command)
+        self._new.append(read)
+        self._step_due_ns = self.now_ns
+        return identifier
+
+    def outcome(self, identifier: int) -> Outcome | None:
+        """How a command ended; None: it has not."""
+        return self._results.get(identifier)
 
     def fly(
         self,
-        behaviour: Behaviour,
+        command: str | Behaviour,
         limit_s: float,
-        each: Callable[[Moment], None] | None = None,
-        situated: Callable[[Situation], Situation] = lambda situation: situation,
-        rules: ObstacleRules = NO_RULES,
+        each: Callable[[Moment], None] = lambda moment: None,
+        on_tick: Callable[[], None] = lambda: None,
+        warm_up_s: float = WARM_UP_S,
     ) -> FlightLog:
         """Fly it until it ends or the time is over.
 
         Args:
-            each: called with every turn of guidance.
-            situated: adds what the service would to what the behaviour sees.
-            rules: for the obstacles that `situated` tells of.
-
-        Raises:
-            TypeError: the behaviour asks for a mode of the autopilot's own.
+            each: called with every step of guidance that is flown by setpoints.
+            on_tick: called with every tick.
+            warm_up_s: perception is at work before the command comes.
         """
-        log, envelope, memory = FlightLog(), Envelope(self.limits), ObstacleMemory()
-        self._watch(WARM_UP_S)
-        self.begun_s = self.vehicle.now_s
-        sent, activated, stepped_ns, ticks = None, False, self.now_ns, 0
+        log = FlightLog()
+        self.run(warm_up_s)
+        self.begun_ns = self.now_ns
+        identifier = self.command(command)
         while self.seconds < limit_s:
-            if ticks % GUIDANCE_TICKS == 0:
-                now_ns = self.now_ns
-                situation = situated(replace(self._situation(now_ns), sent=sent))
-                dt_s = (now_ns - stepped_ns) / 1e9
-                stepped_ns = now_ns
-                if not activated:
-                    behaviour.on_activate(situation)
-                    activated = True
-                step = behaviour.update(dt_s, situation)
-                self._move_gimbal(now_ns, behaviour, isinstance(step, Outcome))
-                if isinstance(step, Outcome):
-                    log.outcome = step
-                    break
-                if isinstance(step, ModeRequest):
-                    raise TypeError(
-                        f"{behaviour.name} asks for {step.mode.value}: only setpoints are flown here"
-                    )
-                envelope.near = rules.rows(memory.filled(situation))
-                if (blind := rules.blind(situation)) is not None:
-                    envelope.reset()
-                    sent, reasons = Limited(Setpoint.brake(now_ns), (blind,))
-                else:
-                    sent, reasons = envelope.apply(step, situation.state, now_ns, dt_s)
-                self._stream.message = setpoint_message(sent)
-                moment = Moment(self.seconds, self.vehicle.truth, situation, step, sent, reasons)
+            stepped = self.tick()
+            on_tick()
+            log.outcome = self.outcome(identifier)
+            if log.outcome is not None:
+                break
+            moment = self._moment() if stepped else None
+            if moment is not None:
                 log.moments.append(moment)
                 self._judge(moment, log)
-                if each is not None:
-                    each(moment)
-            self._pass_tick()
-            ticks += 1
+                each(moment)
         return log
 
-    def move_gimbal_on(self, seconds: float = 1.0) -> None:
-        """Nothing flies any more: what was taken is given back."""
+    def turn_to(self, yaw_rad: float, limit_s: float = 15.0) -> None:
+        """Turn on the spot before the flight that counts."""
+        self.fly(_Turn(yaw_rad), limit_s, warm_up_s=0.0)
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
         for _ in range(round(seconds / TICK_S)):
-            self._ask_gimbal(self.now_ns, None, None)
-            self._pass_tick()
+            self.tick()
 
-    def _watch(self, seconds: float) -> None:
-        """Perception is at work before a command comes: stand still and let it see."""
-        for _ in range(round(seconds / TICK_S)):
-            self._pass_tick()
+    def run_until(self, condition: Callable[[], object], limit_s: float) -> bool:
+        """Let time pass until something is so; whether it came to be."""
+        until_ns = self.now_ns + limit_s * 1e9
+        while not condition():
+            if self.now_ns >= until_ns:
+                return False
+            self.tick()
+        return True
 
-    def _pass_tick(self) -> None:
-        now_s = self.vehicle.now_s
-        if self._sight is not None and now_s >= self._next_frame_s:
-            self._look(self._sight)
-            self._next_frame_s += 1.0 / self._sight.rate_hz
-        self.vehicle.step(TICK_S)
-        self._take()
-        self._show()
+    # --- time --------------------------------------------------------------------------------------------
 
-    def _situation(self, now_ns: int) -> Situation:
-        age_s = None if self._seen_ns is None else (now_ns - self._seen_ns) / 1e9
-        fresh = age_s is not None and age_s <= PERCEPTION_MAX_AGE_S
-        carried = self._sight is not None and self._sight.mount.on_gimbal
-        problem = "" if self.gimbal is None else self.gimbal.problem
-        return Situation(
+    def tick(self) -> bool:
+        """`TICK_S` of everything; whether guidance was stepped."""
+        now_ns = self.now_ns
+        for index, camera in enumerate(self.cameras):
+            if now_ns >= self._next_frame_ns[index]:
+                self._next_frame_ns[index] += round(1e9 / camera.rate_hz)
+                due_ns = now_ns + round(camera.latency_s * 1e9)
+                self._late.append((due_ns, camera.view, camera.capture(self)))
+        seen = self._deliver(now_ns)
+        stepped = seen or now_ns >= self._step_due_ns
+        if stepped:
+            self._step_due_ns = now_ns + round(1e9 / self.settings.guidance.rate_hz)
+            self.step()
+        if seen:
+            self.streamer.hasten(now_ns)
+        if now_ns >= self._stream_due_ns:
+            self._stream_due_ns += round(1e9 / self.settings.guidance.setpoint_rate_hz)
+            self.streamer.tick(now_ns)
+        self.driver.step(TICK_S)
+        self._take_state()
+        return stepped
+
+    def step(self) -> None:
+        """One step of guidance, now."""
+        now_ns = self.now_ns
+        commands, self._new = tuple(self._new), []
+        output = self.guidance.step(
             now_ns,
-            self.state,
-            self._targets if fresh else (),
-            age_s,
-            fresh,
-            gimbal=GimbalSight(
-                carried,
-                problem=problem,
-                camera_pitch_rad=0.0 if self._sight is None else self._sight.mount.pitch_rad,
+            self.inputs.assemble(
+                now_ns,
+                self.state,
+                StreamStatus(self.streamer.state, self.streamer.sent_count),
+                answers=self.driver.take_answers(),
+                commands=commands,
             ),
         )
+        if output.setpoint is None:
+            self.streamer.stop()
+        else:
+            self.streamer.submit(output.setpoint)
+        for identifier in output.cancelled:
+            self.driver.cancel(identifier)
+        for request in output.requests:
+            self.driver.start(request)
+        if output.landing_target is not None:
+            self.driver.send_landing_target(output.landing_target)
+        self.events += output.events
+        self._results |= {result.identifier: result.outcome for result in output.results}
+        if self.guidance.behaviour is not None:
+            words = self.guidance.behaviour.status.split(",")[0]
+            if not self.state_words or self.state_words[-1] != words:
+                self.state_words.append(words)
 
-    def _move_gimbal(self, now_ns: int, behaviour: Behaviour, ended: bool) -> None:
-        """As `GimbalHand` does, without waiting."""
-        flown = None if ended else behaviour.flown
-        self._ask_gimbal(now_ns, None if flown is None else flown.gimbal_aim, flown)
+    def _deliver(self, now_ns: int) -> bool:
+        """The results that are due; whether the steering camera has seen something."""
+        seen = False
+        while self._late and self._late[0][0] <= now_ns:
+            _, view, finish = self._late.popleft()
+            result = finish()
+            if result is None:
+                continue
+            view.take(result)
+            markers = self.inputs.on_result(view, result, now_ns)
+            seen = seen or view is self.inputs.steering or markers is not None
+        return seen
 
-    def _ask_gimbal(self, now_ns: int, aim: GimbalAim | None, owner: object | None) -> None:
-        if self.gimbal is None:
-            return
-        request = self.gimbal.update(now_ns, self.state.gimbal, aim, owner)
-        if request is not None:
-            self.vehicle.send(gimbal_message(request))
+    def _take_state(self) -> None:
+        state = self.driver.state
+        if state is not self._seen_state:
+            self._seen_state = state
+            self.inputs.on_state(state)
+            for camera in self.cameras:
+                camera.on_state(state)
 
-    def _take(self) -> None:
-        """Messages into the state, as the driver does."""
-        now_ns = self.now_ns
-        for message in self.vehicle.receive():
-            name = message.get_type()
-            if name == "COMMAND_ACK" and message.command in _GIMBAL_COMMANDS and self.gimbal is not None:
-                self.gimbal.answered(now_ns, None if message.result == 0 else f"result {message.result}")
-            if name in FOLDED_MESSAGES:
-                self.state = fold(self.state, name, message.to_dict(), now_ns)
-        self.history.add(self.state)
-        if self.state.attitude is not None:
-            self._attitudes.add(self.state.attitude_ns, self.state.attitude)
-
-    def _look(self, sight: Sight) -> None:
-        truth = self.vehicle.truth
-        detections = sight.detect(truth.position_ned_m, truth.quaternion, self.seconds)
-        now_ns = self.now_ns
-        self._late.append((now_ns + round(sight.latency_s * 1e9), now_ns, detections))
-
-    def _show(self) -> None:
-        """What has arrived: through the tracker, into the level frame."""
-        sight = self._sight
-        while sight is not None and self._late and self._late[0][0] <= self.now_ns:
-            _, captured_ns, detections = self._late.popleft()
-            if self._tracker is not None:
-                view = self._view(sight, captured_ns)
-                detections = self._tracker.update(detections, captured_ns, view).detections
-            self._seen_ns = captured_ns
-            try:
-                self._targets = targets_from_detections(
-                    detections.records(), captured_ns, sight.camera, sight.mount, self.history, _HEIGHTS_M
-                )
-            except HistoryError:
-                self._targets = ()  # as in the service: seen, not steered by
-
-    def _view(self, sight: Sight, captured_ns: int) -> CameraView | None:
-        ned_from_body = self._attitudes.at(captured_ns)
-        if ned_from_body is None:
+    def _moment(self) -> Moment | None:
+        guidance = self.guidance
+        flown = guidance.phase is Phase.OFFBOARD and guidance.sent is not None and guidance.busy
+        if not flown or guidance.asked is None or guidance.sent is None or guidance.situation is None:
             return None
-        try:
-            mount = mount_at(sight.mount, self.history, captured_ns)
-        except HistoryError:
-            return None
-        return CameraView(sight.camera, mount.ned_from_optical(ned_from_body))
+        return Moment(
+            self.seconds,
+            self.vehicle.truth,
+            guidance.situation,
+            guidance.asked,
+            guidance.sent,
+            guidance.limited_by,
+        )
 
     def _judge(self, moment: Moment, log: FlightLog) -> None:
         """Against the limits: what was sent, exactly; what was flown, by the truth, within the tolerances."""
-        limits, truth = self.limits, moment.truth
+        limits, truth = self.guidance.options.limits, moment.truth
         north, east, down = truth.velocity_ned_mps
         home = moment.situation.state.home_position_ned_m or (0.0, 0.0, 0.0)
         height_m = truth.height_m
         away = (truth.position_ned_m[0] - home[0], truth.position_ned_m[1] - home[1])
+        landing = self.guidance.behaviour is not None and self.guidance.behaviour.flown.landing
         flown = {
             "speed": math.hypot(north, east) - limits.max_horizontal_speed_mps - SPEED_TOLERANCE_MPS,
             "climb": -down - limits.max_climb_mps - SPEED_TOLERANCE_MPS,
             "descent": down - limits.max_descend_mps - SPEED_TOLERANCE_MPS,
             "height": height_m - limits.max_altitude_m - PLACE_TOLERANCE_M,
-            "lowness": limits.min_altitude_m - PLACE_TOLERANCE_M - height_m,
+            "lowness": 0.0 if landing else limits.min_altitude_m - PLACE_TOLERANCE_M - height_m,
             "distance": math.hypot(*away) - limits.max_distance_m - PLACE_TOLERANCE_M,
             "fence": 0.0 if limits.fence.holds(away) else 1.0,
-            "crash": 1.0 if truth.crashed or truth.on_ground else 0.0,
+            "crash": 1.0 if truth.crashed or (truth.on_ground and not landing) else 0.0,
         }
         if moment.sent.velocity_ned_mps is not None:
             north, east, down = moment.sent.velocity_ned_mps
@@ -355,31 +372,51 @@ class LockstepFlight:
             flown["descent sent"] = down - limits.max_descend_mps * (1 + 1e-9)
         for what, by in flown.items():
             if by > 0.0:
-                log.violated(what, by)
+                log.violations[what] = max(by, log.violations.get(what, 0.0))
 
 
-def setpoint_message(setpoint: Setpoint) -> object:
-    """SET_POSITION_TARGET_LOCAL_NED as the drivers send it."""
-    zero = (0.0, 0.0, 0.0)  # the type mask says what counts
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        0,
-        1,
-        1,
-        dialect.MAV_FRAME_LOCAL_NED,
-        setpoint.type_mask,
-        *(setpoint.position_ned_m or zero),
-        *(setpoint.velocity_ned_mps or zero),
-        *zero,
-        setpoint.yaw_rad or 0.0,
-        setpoint.yaw_rate_radps or 0.0,
-    )
+def plain_settings(changes: Mapping[str, str] | None = None) -> Settings:
+    """The default settings with changes, whatever is configured on this machine."""
+    return load_settings(os.devnull, dict(changes or {}), {})
 
 
-def gimbal_message(request: GimbalRequest) -> object:
-    """What is asked of a gimbal's manager, as the drivers send it."""
-    if request.aim is not None:
-        pitch, yaw = math.degrees(request.aim.pitch_rad), math.degrees(request.aim.yaw_rad)
-        values = (pitch, yaw, math.nan, math.nan, FOLLOWING_NOSE, 0.0, 0.0)
-        return dialect.MAVLink_command_long_message(1, 1, PITCHYAW, 0, *values)
-    who = (RELEASE, RELEASE) if request.ask is GimbalAsk.GIVE_BACK else COMPANION
-    return dialect.MAVLink_command_long_message(1, 1, CONFIGURE, 0, *who, UNCHANGED, UNCHANGED, 0.0, 0.0, 0.0)
+def camera_settings(
+    camera: CameraModel, mount: CameraMount, changes: Mapping[str, str] | None = None
+) -> Settings:
+    """The same for a calibrated camera that is mounted so."""
+    values = {
+        "camera.fx_px": camera.fx,
+        "camera.fy_px": camera.fy,
+        "camera.cx_px": camera.cx,
+        "camera.cy_px": camera.cy,
+        "camera.calibrated_width": camera.width,
+        "camera.calibrated_height": camera.height,
+        "camera.mount_forward_m": mount.forward_m,
+        "camera.mount_right_m": mount.right_m,
+        "camera.mount_down_m": mount.down_m,
+        "camera.mount_roll_deg": math.degrees(mount.roll_rad),
+        "camera.mount_pitch_deg": math.degrees(mount.pitch_rad),
+        "camera.mount_yaw_deg": math.degrees(mount.yaw_rad),
+        "camera.mount_levelled": str(mount.levelled).lower(),
+        "camera.gimbal": str(mount.on_gimbal).lower(),
+    }
+    return plain_settings({key: str(value) for key, value in values.items()} | dict(changes or {}))
+
+
+class _Turn(Behaviour):
+    """Turns on the spot; ends when the nose is there."""
+
+    name = "turn"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
+
+    def __init__(self, yaw_rad: float) -> None:
+        self._yaw_rad = yaw_rad
+        self._place: Vector3 | None = None
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        position, yaw_rad = position_and_yaw(situation.state)
+        if self._place is None:
+            self._place = position
+        if abs(math.remainder(yaw_rad - self._yaw_rad, math.tau)) < 0.05:
+            return Outcome(True, "turned")
+        return Setpoint.position(self._place, situation.now_ns, yaw_rad=self._yaw_rad)

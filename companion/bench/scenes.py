@@ -202,7 +202,7 @@ def scene_frames(
         )
 
 
-class DrawnDetector:
+class SyntheticDetector:
     """Detections made of the truth, with a detector's faults, so that only the tracker is on trial.
 
     Boxes are off by 4 % of their size; what is half hidden is seen with less confidence and missed more

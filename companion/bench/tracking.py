@@ -15,9 +15,9 @@ from companion.bench.scenes import (
     CAMERA,
     MOTIONS,
     MOUNT,
-    DrawnDetector,
     Motion,
     SceneFrame,
+    SyntheticDetector,
     scene_frames,
     without_image,
 )
@@ -53,7 +53,7 @@ def measure_tracking(
     Raises:
         CheckpointError: the model cannot be read.
     """
-    detect = _looking(model) if model is not None else DrawnDetector(seed).detect
+    detect = _looking(model) if model is not None else SyntheticDetector(seed).detect
     settings = TrackerSettings()
     timing_ms: list[float] = []
     figures: dict[str, object] = {"detector": model or "drawn", "rate_hz": rate_hz, "dropped_share": drop}

@@ -142,6 +142,9 @@ def bench_flights(
     runs: Annotated[int, typer.Option(min=1, help="flights, one for each seed")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="the first one")] = 0,
     processes: Annotated[int, typer.Option(min=1, help="flights at once")] = 1,
+    rendered: Annotated[
+        bool, typer.Option("--rendered", help="the rendered camera with the real detector and tracker")
+    ] = False,
     as_json: _JSON = False,
 ) -> None:
     """How well a behaviour flies over many seeds, in lockstep with the built-in vehicle."""
@@ -150,7 +153,8 @@ def bench_flights(
     from companion.bench.flights import UnknownFlightError, flights_table, fly, summary
 
     with plain_errors(UnknownFlightError):
-        figures = summary(behaviour, list(fly(behaviour, range(seed, seed + runs), processes)))
+        results = list(fly(behaviour, range(seed, seed + runs), processes, rendered=rendered))
+        figures = summary(behaviour, results)
     if as_json:
         typer.echo(json.dumps(figures))
         return

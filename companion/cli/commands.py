@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import gc
+import json
 import logging
 import signal
 import sys
@@ -109,8 +110,19 @@ def demo(
     duration: Annotated[float, typer.Option(min=20, help="give up after so many seconds")] = 90.0,
     output: Annotated[Path, typer.Option(help="where the video and summary.json go")] = Path("demo-output"),
     seed: Annotated[int, typer.Option(min=0, help="of the world: where the car stands, the wind")] = 1,
+    seeds: Annotated[
+        str | None, typer.Option(help="fly many in lockstep instead, without a video: 1..50, or 3,7,9..12")
+    ] = None,
+    processes: Annotated[int, typer.Option(min=1, help="flights at once, with --seeds")] = 1,
+    synthetic: Annotated[
+        bool, typer.Option("--synthetic", help="with --seeds: detections made of the truth, no network")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="with --seeds: one JSON object")] = False,
 ) -> None:
     """Fly the built-in vehicle to a car it has to find: the whole way, from frames to landing."""
+    if seeds is not None:
+        _fly_seeds(seeds, processes, synthetic=synthetic, as_json=as_json)
+        return
     from companion.bus.session import BusError
     from companion.demo import run_demo
     from companion.perception.keeper import PerceptionStartError
@@ -131,6 +143,27 @@ def demo(
         f"found, reached (stopped {summary.final_range_m} m from the car, by the simulator's truth), landed; "
         f"{summary.detections_published} detection messages. Video: {output / summary.video}"
     )
+
+
+def _fly_seeds(text: str, processes: int, *, synthetic: bool, as_json: bool) -> None:
+    from rich.console import Console
+
+    from companion.bench.demo_flight import demos_summary, demos_table, fly_demos, seeds_of
+
+    logging.basicConfig(level=logging.ERROR, format="companion: %(message)s", stream=sys.stderr)
+    with plain_errors(ValueError):
+        seeds = seeds_of(text)
+    flights = []
+    for flight in fly_demos(seeds, processes=processes, synthetic=synthetic):
+        flights.append(flight)
+        words = "success" if flight.success else f"failed: {flight.failure}"
+        typer.echo(f"seed {flight.seed}: {words}", err=True)
+    if as_json:
+        typer.echo(json.dumps(demos_summary(flights)))
+    else:
+        Console(width=None if sys.stdout.isatty() else 160).print(demos_table(flights))
+    if not all(flight.success for flight in flights):
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _say_with_time() -> Callable[[str], None]:

@@ -8,13 +8,16 @@ from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situat
 from companion.guidance.choosing import Choice
 from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import (
+    STOPPING_MPS2,
+    Arrival,
+    PositionController,
     correction,
     ground_speed,
     position_and_yaw,
     pressed,
-    stay_at,
+    speed_of,
+    stopping_point,
     stopping_speed,
-    towards,
 )
 from companion.guidance.target import DOUBTED, Target
 from companion.guidance.track import ObjectTrack
@@ -23,21 +26,19 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
-# Well under the envelope's acceleration, so that a vehicle that answers late still stops in time.
-DECELERATION_MPS2 = 0.7
 # Away from an object that is too near: slowly, the camera does not look backwards.
 MAX_RETREAT_MPS = 1.0
-# There: so near (m), so slow (m/s), for so long (s). A real PX4 holds a position to 0.26 m (one sigma) in
-# calm air and moves at up to 0.5 m/s doing so; in gusts it never stands as still: what lasts may be coarser,
-# but it ends at a moment at which it is near.
+# Slower than this a vehicle that has lost its object stands.
 STANDING_MPS = 0.3
-NEAR_M = 0.2
-ARRIVALS = ((0.3, 0.5, 1.0), (0.8, 1.0, 5.0))
 # The last of the way is flown to a fixed place before the object, so that wind does not carry the vehicle
 # around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
 ANCHOR_M = (1.5, 3.0)
-# Answer to what is missing to that place, 1/s; stiffer than the autopilot's own, see `pressed`.
-ANCHOR_GAIN = 1.3
+# That place follows the filtered place of the object with this time constant: the filter lets an object
+# wander, and so follows the noise of single ranges. An object whose filtered place is farther off than
+# STILL_M, or than this share of its range, has moved, and is not reached yet.
+PLACE_TIME_CONSTANT_S = 1.5
+STILL_M = 0.6
+STILL_SHARE = 0.1
 # Detectors miss single frames; this long without the object and the vehicle brakes.
 LOST_AFTER_S = 1.0
 # What appears where a lost object was, in this direction and at half to twice its range, is taken for it.
@@ -94,7 +95,8 @@ class ApproachBehaviour(Behaviour):
         self._bearing_rad: float | None = None
         self._wait_place: Vector3 | None = None
         self._anchor_rad: float | None = None
-        self._arrived_since_ns: list[int | None] = [None] * len(ARRIVALS)
+        self._place: Vector3 = (0.0, 0.0, 0.0)
+        self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
 
     def on_activate(self, situation: Situation) -> None:
@@ -106,7 +108,7 @@ class ApproachBehaviour(Behaviour):
         self._choice = Choice()
         self._doubted = False
         self.lost_at = None
-        self._arrived_since_ns = [None] * len(ARRIVALS)
+        self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
         if self._tracking is not None:
             self._tracking.begin(situation)
@@ -130,24 +132,29 @@ class ApproachBehaviour(Behaviour):
             took_s = (now_ns - self._started_ns) / 1e9
             return Outcome(False, f"did not reach the {self._class_name} in {took_s:.0f} s: {away}")
         if track is None or unseen_s > LOST_AFTER_S or not situation.perception_fresh:
-            return self._wait(situation, position, unseen_s)
-        self._wait_place = None
+            return self._wait(dt_s, situation, position, unseen_s)
+        if self._wait_place is not None:
+            self._wait_place, self._controller = None, PositionController()
 
         bearing = math.atan2(east - position[1], north - position[0])
         if self._range_m > MIN_YAW_RANGE_M or self._bearing_rad is None:
             self._bearing_rad = bearing
         error_m = self._range_m - self._distance_m
-        if self._arrived(error_m, ground_speed(state), now_ns):
-            return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m")
-        anchor = self._anchor(track.position_ned_m, position, bearing)
-        if anchor is not None:
-            wanted = towards(anchor, position, ANCHOR_GAIN)
-        else:
-            top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
-            speed = stopping_speed(error_m, top, DECELERATION_MPS2)
-            # Towards what the camera does not look at yet, only as fast as the nose comes round.
-            speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
-            wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
+        top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
+        goal = self._goal(track.position_ned_m, position, bearing, dt_s)
+        if goal is not None:
+            self._range_m = math.dist(self._place[:2], position[:2])
+            moved_m = math.dist(self._place[:2], track.position_ned_m[:2])
+            still = moved_m < max(STILL_M, STILL_SHARE * self._range_m)
+            off_m = math.dist(goal, position) if still else math.inf
+            if self._arrival.update(off_m, speed_of(state), now_ns):
+                return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m", goal)
+            velocity = self._controller.velocity(goal, state, dt_s, top)
+            return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
+        speed = stopping_speed(error_m, top, STOPPING_MPS2)
+        # Towards what the camera does not look at yet, only as fast as the nose comes round.
+        speed *= max(0.0, math.cos(wrap_angle(bearing - yaw_rad))) ** 2
+        wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
         north_mps, east_mps = pressed(wanted, state, self._speed_mps)
         velocity = (north_mps, east_mps, correction(self._down_m - position[2]))
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
@@ -209,34 +216,35 @@ class ApproachBehaviour(Behaviour):
         way_m = abs(target.range_m - self._distance_m)
         self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * way_m / self._speed_mps) * 1e9
 
-    def _anchor(self, place: Vector3, position: Vector3, bearing: float) -> Vector3 | None:
+    def _goal(self, place: Vector3, position: Vector3, bearing: float, dt_s: float) -> Vector3 | None:
         """The place to stop at, once it is near: on the side of the object from which the vehicle came."""
         chosen = self._anchor_rad is not None
         away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
-        anchor = (
+        if chosen:
+            share = min(1.0, dt_s / PLACE_TIME_CONSTANT_S)
+            was, down = self._place, place[2]
+            place = (was[0] + share * (place[0] - was[0]), was[1] + share * (place[1] - was[1]), down)
+        goal = (
             place[0] + self._distance_m * math.cos(away_rad),
             place[1] + self._distance_m * math.sin(away_rad),
             self._down_m,
         )
-        near = math.dist(anchor[:2], position[:2]) < ANCHOR_M[1 if chosen else 0]
-        self._anchor_rad = away_rad if near else None
-        return anchor if near else None
+        self._place = place
+        near = math.dist(goal[:2], position[:2]) < ANCHOR_M[1 if chosen else 0]
+        if not near:
+            self._leave_goal()
+            return None
+        self._anchor_rad = away_rad
+        return goal
 
-    def _arrived(self, error_m: float, speed_mps: float, now_ns: int) -> bool:
-        for index, (tolerance_m, slow_mps, lasting_s) in enumerate(ARRIVALS):
-            since_ns = self._arrived_since_ns[index]
-            if abs(error_m) > tolerance_m or speed_mps > slow_mps:
-                self._arrived_since_ns[index] = None
-            elif since_ns is None:
-                self._arrived_since_ns[index] = now_ns
-            elif now_ns - since_ns >= lasting_s * 1e9 and abs(error_m) <= NEAR_M:
-                return True
-        return False
-
-    def _wait(self, situation: Situation, position: Vector3, unseen_s: float) -> Step:
-        """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""
-        self._arrived_since_ns = [None] * len(ARRIVALS)
+    def _leave_goal(self) -> None:
         self._anchor_rad = None
+        self._arrival, self._controller = Arrival(), PositionController()
+
+    def _wait(self, dt_s: float, situation: Situation, position: Vector3, unseen_s: float) -> Step:
+        """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""
+        if self._wait_place is None:
+            self._leave_goal()
         if unseen_s > self._lost_timeout_s:
             if not situation.perception_fresh:
                 why = situation.why_blind("nothing comes from the detector")
@@ -249,11 +257,12 @@ class ApproachBehaviour(Behaviour):
                 self.lost_at = self._track.position_ned_m
             return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
         if self._wait_place is None and ground_speed(situation.state) < STANDING_MPS:
-            self._wait_place = (position[0], position[1], self._down_m)
+            north, east, _ = stopping_point(situation.state)
+            self._wait_place = (north, east, self._down_m)
         if self._wait_place is None:
             velocity = (0.0, 0.0, correction(self._down_m - position[2]))
         else:
-            velocity = stay_at(self._wait_place, position)
+            velocity = self._controller.velocity(self._wait_place, situation.state, dt_s)
         if self._bearing_rad is None:
             return Setpoint.velocity(velocity, situation.now_ns, yaw_rate_radps=0.0)
         return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=self._bearing_rad)

@@ -50,6 +50,8 @@ class Situation:
         markers: what is seen of markers, or why none can be.
         gimbal: how the gimbal stands to what flies; where it looks is in `state`.
         ranging: what there is to tell how far away something is.
+        max_acceleration_mps2: the envelope's.
+        goal_ned_m: `Outcome.goal_ned_m` of the behaviour that ended just before; None: it had none.
     """
 
     now_ns: int
@@ -64,6 +66,8 @@ class Situation:
     min_separation_m: float = 3.0
     gimbal: GimbalSight = NO_GIMBAL
     ranging: RangeMeans = ALL_MEANS
+    max_acceleration_mps2: float = 2.0
+    goal_ned_m: Vector3 | None = None
 
     def why_blind(self, usually: str) -> str:
         """Why nothing that is seen can be steered by, in words; `usually` where it is not the gimbal."""
@@ -78,10 +82,16 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A behaviour has ended."""
+    """A behaviour has ended.
+
+    Attributes:
+        success: it did what was asked. reason: how it ended, for people.
+        goal_ned_m: where the vehicle is to stand now, local NED metres; None: where it comes to rest.
+    """
 
     success: bool
     reason: str
+    goal_ned_m: Vector3 | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Whose the gimbal is, and what to ask of its manager next. Pure: no link, no clock; `gimbal_hand` asks.
+"""Whose the gimbal is, and what to ask of its manager next. No link, no clock: `gimbal_controller` asks.
 
 Control is taken when somebody wants the gimbal moved and given back when nobody does any more. It is never
 fought for: who has it at the beginning keeps it (the autopilot itself, which keeps it after a landing, is

@@ -1,12 +1,12 @@
 """Point the gimbal as a step of a mission: the vehicle holds until it looks there.
 
-An operator's `gimbal` does not pass here: it changes nothing about what flies (`gimbal_hand`).
+An operator's `gimbal` does not pass here: it changes nothing about what flies (`gimbal_controller`).
 """
 
 from __future__ import annotations
 
 from companion.guidance.behaviour import Outcome, Requirement, Situation, Step
-from companion.guidance.gimbal_hand import POINT_TIMEOUT_S, POINTED_RAD, direction_text
+from companion.guidance.gimbal_controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
 from companion.guidance.hold import HoldBehaviour
 from companion.vehicle.gimbal import GimbalAim
 

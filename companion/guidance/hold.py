@@ -1,19 +1,27 @@
-"""Stay where you are: the position and the heading of the moment it was asked for."""
+"""Stay in place: at the goal of what was flown before, else where the vehicle comes to rest."""
 
 from __future__ import annotations
 
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.motion import PositionController, speed_of, stopping_point
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
 # Above this a vehicle brakes first: held at once, it would fly back to where the command reached it.
 STANDING_MPS = 0.5
+# The goal of the behaviour before is held where the vehicle is so near. An arrival is said within 0.3 m; a
+# gust, or the second in which a mode changes, moves a vehicle by less than this. Farther away something else
+# holds it back (a limit, an obstacle, a neighbour), and nobody asked to fly there now.
+GOAL_NEAR_M = 1.0
 
 
 class HoldBehaviour(Behaviour):
-    """Holds until `duration_s` is over; 0: until another command comes."""
+    """Holds until `duration_s` is over; 0: until another command comes.
+
+    The heading is that of the moment it begins.
+    """
 
     name = "hold"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
@@ -23,21 +31,26 @@ class HoldBehaviour(Behaviour):
         self._place: Vector3 | None = None
         self._yaw_rad: float | None = None
         self._since_ns = 0
+        self._controller = PositionController()
 
     def on_activate(self, situation: Situation) -> None:
         self._since_ns = situation.now_ns
-        self._place = None
+        self._controller = PositionController()
         self._yaw_rad = situation.state.yaw_rad
+        goal, position = situation.goal_ned_m, situation.state.position_ned_m
+        near = goal is not None and position is not None and math.dist(goal, position) <= GOAL_NEAR_M
+        self._place = goal if near else None
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         now_ns, state = situation.now_ns, situation.state
         if self._duration_s and now_ns - self._since_ns >= self._duration_s * 1e9:
-            return Outcome(True, f"held for {self._duration_s:g} s")
-        if self._place is None and math.hypot(*(state.velocity_ned_mps or (0.0, 0.0, 0.0))) < STANDING_MPS:
-            self._place = state.position_ned_m
-        if self._place is None:
-            return Setpoint.velocity((0.0, 0.0, 0.0), now_ns, yaw_rad=self._yaw_rad)
-        return Setpoint.position(self._place, now_ns, yaw_rad=self._yaw_rad)
+            return Outcome(True, f"held for {self._duration_s:g} s", self._place)
+        if self._place is None and speed_of(state) < STANDING_MPS:
+            self._place = stopping_point(state)
+        velocity = (
+            (0.0, 0.0, 0.0) if self._place is None else self._controller.velocity(self._place, state, dt_s)
+        )
+        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
 
     @property
     def status(self) -> str:

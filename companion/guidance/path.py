@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
-from companion.guidance.motion import MAX_CORRECTION_MPS, POSITION_GAIN
+from companion.guidance.motion import MAX_CORRECTION_MPS, POSITION_GAIN, STOPPING_MPS2, stopping_speed
 from companion.vehicle.state import Vector3
 
 # Under the envelope's 2 m/s², so that something is left against wind.
@@ -160,13 +160,19 @@ class Path:
 class PathFollower:
     """A vehicle on its way along a path: call `velocity` at every turn.
 
+    Args:
+        laps: of a closed path, after which the vehicle stops; 0: it never does.
+
     Attributes:
         along_m: how far it has come, over all rounds; it never goes back.
         off_m: how far beside the path it was at the last turn.
+        end_m: where along the path it stops; infinite: nowhere.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, laps: float = 1.0) -> None:
         self.path = path
+        rounds = laps if path.closed else 1.0
+        self.end_m = rounds * path.length_m if rounds else math.inf
         self.along_m = 0.0
         self.off_m = 0.0
         self._joined = not path.closed
@@ -187,8 +193,7 @@ class PathFollower:
                 return (north, east, down)
             self._joined = True
         reach_m = self.along_m + min(SEARCH_AHEAD_M + 2.0 * speed_mps * DELAY_S, self.path.length_m / 2)
-        if not self.path.closed:
-            reach_m = min(reach_m, self.path.length_m)
+        reach_m = min(reach_m, self.end_m)
         self.along_m = self.path.nearest(position, self.along_m, self._before_turning_back(reach_m))
         here = self.path.point(self.along_m)
         ahead = self.path.point(self.along_m + DELAY_S * here.speed_mps)
@@ -198,8 +203,7 @@ class PathFollower:
         back_mps = min(POSITION_GAIN * self.off_m, max(MAX_CORRECTION_MPS, here.speed_mps))
         slowest = min(SLOWEST_MPS, self.path.speed_mps)
         along_mps = math.sqrt(max(0.0, max(here.speed_mps, slowest) ** 2 - back_mps**2))
-        if not self.path.closed:
-            along_mps = min(along_mps, POSITION_GAIN * (self.path.length_m - self.along_m))
+        along_mps = min(along_mps, stopping_speed(self.left_m, along_mps, STOPPING_MPS2))
         scale = back_mps / self.off_m if self.off_m > 1e-6 else 0.0
         north, east, down = (d * along_mps + o * scale for d, o in zip(ahead.direction, offset, strict=True))
         return (north, east, down)
@@ -220,8 +224,13 @@ class PathFollower:
 
     @property
     def left_m(self) -> float:
-        """Of an open path: how much is left of it."""
-        return max(0.0, self.path.length_m - self.along_m)
+        """How much of the way is left until it stops."""
+        return max(0.0, self.end_m - self.along_m)
+
+    @property
+    def end_ned_m(self) -> Vector3 | None:
+        """Where it stops, local NED; None: nowhere."""
+        return self.path.point(self.end_m).position_ned_m if math.isfinite(self.end_m) else None
 
 
 def _dot(one: Vector3, other: Vector3) -> float:

@@ -6,13 +6,23 @@ import math
 from abc import abstractmethod
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.motion import ground_speed, in_degrees, position_and_yaw, pressed
+from companion.guidance.motion import (
+    Arrival,
+    PositionController,
+    ground_speed,
+    in_degrees,
+    position_and_yaw,
+    pressed,
+    speed_of,
+)
 from companion.guidance.path import Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import Vector3
+from vision.attitude import wrap_angle
 
-# There: so near, so slow, for so long. In gusts a vehicle never stands still: what lasts may be coarser.
-ARRIVALS = ((0.5, 0.5, 0.5), (1.0, 1.0, 3.0))
+# So near to its end, along the way and beside it, the end is flown to as a point, see `PositionController`.
+END_M = 1.5
+# With a heading that was asked for, it is there when the nose is, too.
+HEADING_RAD = math.radians(5.0)
 # No metre of the way gained in so long, and it is not going to be: a limit, or the wind.
 STUCK_S = 12.0
 GAIN_M = 0.5
@@ -47,7 +57,7 @@ class PathFlight(Behaviour):
         self._yaw_rad: float | None = None
         self._best_m = -math.inf
         self._best_ns = 0
-        self._arrived_since_ns: list[int | None] = [None] * len(ARRIVALS)
+        self._arrival, self._controller = Arrival(), PositionController()
 
     @abstractmethod
     def _path(self, situation: Situation) -> Path:
@@ -60,58 +70,43 @@ class PathFlight(Behaviour):
     def on_activate(self, situation: Situation) -> None:
         _, self._yaw_rad = position_and_yaw(situation.state)
         self._follower, self._problem = None, ""
-        self._arrived_since_ns = [None] * len(ARRIVALS)
+        self._arrival, self._controller = Arrival(), PositionController()
         self._best_m, self._best_ns = -math.inf, situation.now_ns
         try:
-            self._follower = PathFollower(self._path(situation))
+            self._follower = PathFollower(self._path(situation), self._laps)
         except ValueError as error:
             self._problem = str(error)
 
     def resume(self, situation: Situation) -> None:
         """Something else was flown in between: the way goes on where it was left."""
         self._best_m, self._best_ns = -math.inf, situation.now_ns
-        self._arrived_since_ns = [None] * len(ARRIVALS)
+        self._arrival, self._controller = Arrival(), PositionController()
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         follower = self._follower
         if follower is None:
             return Outcome(False, f"{self.name}: {self._problem}")
         state, now_ns = situation.state, situation.now_ns
-        position, _ = position_and_yaw(state)
-        speed_mps = ground_speed(state)
-        wanted = follower.velocity(position, speed_mps)
-        if follower.path.closed:
-            if self._laps and follower.along_m >= self._laps * follower.path.length_m:
-                return Outcome(True, self._flown())
-        elif self._arrived(follower, position, math.hypot(*(state.velocity_ned_mps or ())), now_ns):
-            return Outcome(True, self._flown())
+        position, yaw_rad = position_and_yaw(state)
+        velocity = follower.velocity(position, ground_speed(state))
+        end = follower.end_ned_m
+        away_m = math.inf if end is None or follower.left_m > END_M else math.dist(end, position)
+        turned = self._heading_rad is None or abs(wrap_angle(self._heading_rad - yaw_rad)) <= HEADING_RAD
+        if self._arrival.update(away_m, speed_of(state), now_ns) and turned:
+            return Outcome(True, self._flown(), end)
         if stuck := self._stuck(follower, now_ns):
             return Outcome(False, stuck)
         bearing = follower.bearing()
         if self._heading_rad is not None:
             self._yaw_rad = self._heading_rad
-        elif (
-            self._nose_along
-            and bearing is not None
-            and (follower.path.closed or follower.left_m > KEEP_NOSE_M)
-        ):
+        elif self._nose_along and bearing is not None and follower.left_m > KEEP_NOSE_M:
             self._yaw_rad = bearing
-        north_mps, east_mps = pressed((wanted[0], wanted[1]), state, SPEED_MARGIN * self._speed_mps)
-        return Setpoint.velocity((north_mps, east_mps, wanted[2]), now_ns, yaw_rad=self._yaw_rad)
-
-    def _arrived(self, follower: PathFollower, position: Vector3, speed_mps: float, now_ns: int) -> bool:
-        away_m = math.dist(follower.path.point(follower.path.length_m).position_ned_m, position)
-        if follower.left_m > ARRIVALS[-1][0]:
-            away_m = math.inf
-        for index, (tolerance_m, slow_mps, lasting_s) in enumerate(ARRIVALS):
-            since_ns = self._arrived_since_ns[index]
-            if away_m > tolerance_m or speed_mps > slow_mps:
-                self._arrived_since_ns[index] = None
-            elif since_ns is None:
-                self._arrived_since_ns[index] = now_ns
-            elif now_ns - since_ns >= lasting_s * 1e9:
-                return True
-        return False
+        if end is not None and away_m < END_M:
+            velocity = self._controller.velocity(end, state, dt_s, self._speed_mps)
+        else:
+            over_ground = pressed((velocity[0], velocity[1]), state, SPEED_MARGIN * self._speed_mps)
+            velocity = (*over_ground, velocity[2])
+        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
 
     def _stuck(self, follower: PathFollower, now_ns: int) -> str | None:
         """No way was gained for long: how far it came, and what may hold it."""
@@ -120,7 +115,7 @@ class PathFlight(Behaviour):
             self._best_m, self._best_ns = gained_m, now_ns
         if now_ns - self._best_ns < STUCK_S * 1e9:
             return None
-        left = "" if follower.path.closed else f", {follower.left_m:.0f} m before its end"
+        left = f", {follower.left_m:.0f} m before its end" if math.isfinite(follower.left_m) else ""
         return (
             f"{self.name} came no further for {STUCK_S:g} s, {follower.off_m:.1f} m beside the path{left}: "
             f"a limit of [guidance] or the wind holds the vehicle"

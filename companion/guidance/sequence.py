@@ -10,10 +10,11 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.vehicle.landing_target import LandingTarget
+from companion.vehicle.state import Vector3
 
 logger = logging.getLogger(__name__)
 
@@ -104,6 +105,7 @@ class SequenceBehaviour(Behaviour):
         self._request_failure = ""
         self._failure = ""
         self._ended = False
+        self._goal_ned_m: Vector3 | None = None
         self._notes: list[str] = []
         known = {name for step in plan.steps for name in step.make().class_names}
         self.class_names = tuple(sorted(known))
@@ -158,6 +160,7 @@ class SequenceBehaviour(Behaviour):
 
     def on_activate(self, situation: Situation) -> None:
         self._started_ns = situation.now_ns
+        self._goal_ned_m = situation.goal_ned_m
         self.records.clear()
         self._visits.clear()
         self._request_failure = self._failure = ""
@@ -195,6 +198,7 @@ class SequenceBehaviour(Behaviour):
         """One turn of the step that is flown."""
         flown, planned = self._flown, self._plan.steps[self._at]
         assert flown is not None
+        situation = replace(situation, goal_ned_m=self._goal_ned_m)
         if self._request_failure:
             why, self._request_failure = self._request_failure, ""
             return Outcome(False, why)
@@ -226,6 +230,7 @@ class SequenceBehaviour(Behaviour):
     def _after(self, outcome: Outcome, situation: Situation) -> Outcome | None:
         """What follows a step that has ended; the outcome of all, if nothing does."""
         planned, where = self._plan.steps[self._at], self.where
+        self._goal_ned_m = outcome.goal_ned_m
         self._take_last_notes()
         self._leave()
         if self._failure:
@@ -243,7 +248,7 @@ class SequenceBehaviour(Behaviour):
         if isinstance(follows, int):
             return self._begin(follows, situation)
         if follows == END:
-            return Outcome(True, f"flown, {len(self.records)} steps")
+            return Outcome(True, f"flown, {len(self.records)} steps", self._goal_ned_m)
         if follows == ABORT:
             return Outcome(False, told)
         self._failure = told
@@ -272,6 +277,7 @@ class SequenceBehaviour(Behaviour):
     def _give_up(self, situation: Situation) -> Outcome | None:
         """The time of the whole mission is over: the step that is flown fails for good."""
         told = f"{self.where}: the mission's {self._plan.timeout_s:g} s are over"
+        self._goal_ned_m = None
         self._take_last_notes()
         self._leave()
         self._notes.append(f"mission {self._plan.name}: {told}")

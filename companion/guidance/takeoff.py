@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState, Vector3
+from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 
 # PX4 counts a take-off as done inside its altitude acceptance radius (NAV_MC_ALT_RAD, 0.8 m) and holds there:
 # measured 1.8-2.2 m of 2.5 m. What is left beyond this tolerance is climbed by setpoint.
-ALTITUDE_TOLERANCE_M = 0.4
+ALTITUDE_TOLERANCE_M = ARRIVED_M
 # Time for the autopilot's hold to come to rest before the height is judged.
 SETTLE_S = 1.0
+# So long within the tolerance, and it is there.
+THERE_S = 0.5
 # Arming, spooling up and a climb at half a metre a second.
 BASE_TIMEOUT_S = 25.0
 SLOWEST_CLIMB_MPS = 0.5
+CLIMB_MPS = 1.0
 
 
 class TakeoffBehaviour(Behaviour):
@@ -25,15 +29,18 @@ class TakeoffBehaviour(Behaviour):
     def __init__(self, altitude_m: float = 2.5) -> None:
         self._altitude_m = altitude_m
         self._until_ns: float = 0
-        self._held_since_ns: int | None = None
+        self._still_since_ns: int | None = None
+        self._there_since_ns: int | None = None
         self._top: Vector3 | None = None
         self._yaw_rad: float | None = None
+        self._controller = PositionController()
         self._altitude_now_m = 0.0
 
     def on_activate(self, situation: Situation) -> None:
         limit_s = BASE_TIMEOUT_S + self._altitude_m / SLOWEST_CLIMB_MPS
         self._until_ns = situation.now_ns + limit_s * 1e9
-        self._held_since_ns, self._top = None, None
+        self._still_since_ns = self._there_since_ns = self._top = None
+        self._controller = PositionController()
 
     def update(self, dt_s: float, situation: Situation) -> Step:
         now_ns, state = situation.now_ns, situation.state
@@ -41,24 +48,35 @@ class TakeoffBehaviour(Behaviour):
         self._altitude_now_m = altitude_m or 0.0
         missing_m = self._altitude_m - self._altitude_now_m
         airborne = state.armed and state.landed is LandedState.IN_AIR and altitude_m is not None
-        holding = state.mode in (FlightMode.HOLD, FlightMode.OFFBOARD)
-        if airborne and holding and abs(missing_m) <= ALTITUDE_TOLERANCE_M:
-            return Outcome(True, f"in the air at {self._altitude_now_m:.1f} m")
+        # ArduPilot takes off in GUIDED, which is OFFBOARD here.
+        holding = airborne and state.mode in (FlightMode.HOLD, FlightMode.OFFBOARD)
+        still = holding and abs((state.velocity_ned_mps or (0.0, 0.0, 0.0))[2]) <= ARRIVED_MPS
+        there = still and abs(missing_m) <= ALTITUDE_TOLERANCE_M
+        self._still_since_ns = (self._still_since_ns or now_ns) if still else None
+        self._there_since_ns = (self._there_since_ns or now_ns) if there else None
+        if self._there_since_ns is not None and now_ns - self._there_since_ns >= THERE_S * 1e9:
+            return Outcome(
+                True,
+                f"took off, {self._altitude_now_m:.1f} m above home",
+                self._top or self._above(state, missing_m),
+            )
         if now_ns > self._until_ns:
             return Outcome(
                 False, f"take-off timed out: {self._altitude_now_m:.1f} m of {self._altitude_m:g} m reached"
             )
-        if self._top is not None:
-            return Setpoint.position(self._top, now_ns, yaw_rad=self._yaw_rad)
-        if not (airborne and state.mode is FlightMode.HOLD):
-            self._held_since_ns = None
-        elif self._held_since_ns is None:
-            self._held_since_ns = now_ns
-        elif now_ns - self._held_since_ns >= SETTLE_S * 1e9 and state.position_fresh(now_ns):
-            north, east, down = state.position_ned_m or (0.0, 0.0, 0.0)
-            self._top, self._yaw_rad = (north, east, down - missing_m), state.yaw_rad
-            return Setpoint.position(self._top, now_ns, yaw_rad=self._yaw_rad)
-        return ModeRequest(FlightMode.TAKEOFF, self._altitude_m, arm=True)
+        if self._top is None:
+            still_s = 0.0 if self._still_since_ns is None else (now_ns - self._still_since_ns) / 1e9
+            if there or still_s < SETTLE_S or not state.position_fresh(now_ns):
+                return ModeRequest(FlightMode.TAKEOFF, self._altitude_m, arm=True)
+            self._top, self._yaw_rad = self._above(state, missing_m), state.yaw_rad
+        velocity = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)
+        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
+
+    @staticmethod
+    def _above(state: VehicleState, missing_m: float) -> Vector3:
+        """The place at the wanted height, over where the vehicle is; local NED."""
+        north, east, down = state.position_ned_m or (0.0, 0.0, 0.0)
+        return (north, east, down - missing_m)
 
     @property
     def status(self) -> str:

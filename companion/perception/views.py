@@ -5,6 +5,7 @@ The first view is the one of the sections `source`, `camera` and `detector`; it 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import statistics
@@ -20,6 +21,7 @@ from companion.perception.keeper import PerceptionKeeper, PerceptionState
 from companion.perception.messages import Preview
 from companion.perception.pulse import START_S
 from companion.settings import DetectorSection, Section, Settings
+from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -29,7 +31,7 @@ _SEEING_S = 1.0
 
 
 class View:
-    """One perception worker, and what it saw last.
+    """One camera with its model, and what was seen last in it.
 
     Attributes:
         name: None for the first.
@@ -37,37 +39,24 @@ class View:
         newest: the newest result; None before the first.
         targets: where the newest result's objects are, after `place`.
         unplaced: why they have no place; empty if they have.
+        class_names: what the detector knows; None while there is none to ask.
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        name: str | None,
-        *,
-        on_result: Callable[[View, PerceptionResult], None],
-        on_preview: Callable[[View, Preview], None],
-        on_event: Callable[[str, str], None],
+        self, settings: Settings, name: str | None = None, class_names: tuple[str, ...] | None = None
     ) -> None:
         self.name = name
         self.settings = settings
         self.newest: PerceptionResult | None = None
         self.targets: tuple[Target, ...] = ()
         self.unplaced = ""
+        self._class_names = class_names
         self._depth_came = False
         self._between_s: deque[float] = deque(maxlen=9)
-        self._on_result = on_result
-        self._on_event = on_event
-        self.keeper = PerceptionKeeper(
-            settings,
-            on_result=self._take,
-            on_event=self._tell,
-            on_preview=lambda preview: on_preview(self, preview),
-        )
 
     @property
     def class_names(self) -> tuple[str, ...] | None:
-        """What the detector knows; None while there is none to ask."""
-        return self.keeper.class_names or None
+        return self._class_names
 
     def age_s(self, now_ns: int) -> float | None:
         """Of the newest result, from its capture; None before the first."""
@@ -75,7 +64,7 @@ class View:
 
     def seeing(self, now_ns: int) -> bool:
         """Results come as they should, or none are to be expected."""
-        if not self.settings.detector.enabled or self.keeper.state is PerceptionState.FINISHED:
+        if not self.settings.detector.enabled:
             return True
         age_s = self.age_s(now_ns)
         allowed_s = max(_SEEING_S, self.settings.guidance.perception_max_age_s)
@@ -112,12 +101,59 @@ class View:
             # Without the attitude of that moment a box has no direction: seen and published, not steered by.
             self.targets, self.unplaced = (), str(error)
 
-    def _take(self, result: PerceptionResult) -> None:
+    def take(self, result: PerceptionResult) -> None:
+        """A new result; where its objects are is `place`'s."""
         if self.newest is not None:
             self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
         self.newest = result
         if result.obstacles is not None or bool(np.isfinite(result.detections.range_m).any()):
             self._depth_came = True
+
+
+class WorkerView(View):
+    """A view whose results come from a perception worker, a process of its own, which `keeper` supervises."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        name: str | None,
+        *,
+        on_result: Callable[[WorkerView, PerceptionResult], None],
+        on_preview: Callable[[WorkerView, Preview], None],
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        super().__init__(settings, name)
+        self._on_result = on_result
+        self._on_event = on_event
+        self._gimbal_ns = 0
+        self.keeper = PerceptionKeeper(
+            settings,
+            on_result=self._on_report,
+            on_event=self._tell,
+            on_preview=lambda preview: on_preview(self, preview),
+        )
+
+    @property
+    def class_names(self) -> tuple[str, ...] | None:
+        return self.keeper.class_names or None
+
+    def seeing(self, now_ns: int) -> bool:
+        return self.keeper.state is PerceptionState.FINISHED or super().seeing(now_ns)
+
+    def send_state(self, state: VehicleState, history: StateHistory) -> None:
+        """The worker's tracker needs to know where its camera looked."""
+        if state.attitude is not None:
+            self.keeper.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
+        gimbal = state.gimbal
+        if gimbal is None or not self.settings.camera.gimbal or gimbal.attitude is None:
+            return
+        if gimbal.attitude_ns != self._gimbal_ns:
+            self._gimbal_ns = gimbal.attitude_ns
+            with contextlib.suppress(HistoryError):
+                self.keeper.send_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
+
+    def _on_report(self, result: PerceptionResult) -> None:
+        self.take(result)
         try:
             self._on_result(self, result)
         except Exception as error:
@@ -132,10 +168,10 @@ class View:
 def open_views(
     settings: Settings,
     *,
-    on_result: Callable[[View, PerceptionResult], None],
-    on_preview: Callable[[View, Preview], None],
+    on_result: Callable[[WorkerView, PerceptionResult], None],
+    on_preview: Callable[[WorkerView, Preview], None],
     on_event: Callable[[str, str], None],
-) -> tuple[View, ...]:
+) -> tuple[WorkerView, ...]:
     """Every view there is, the first one first. None is started yet."""
     own_settings = {name: settings.of_view(name) for name in (None, *settings.views)}
     threads = threads_each([own.detector for own in own_settings.values()])
@@ -150,7 +186,7 @@ def open_views(
             patient_s = own.source.open_timeout_s + START_S
             changes["source"] = own.source.model_copy(update={"open_timeout_s": patient_s})
         own = own.model_copy(update=changes)
-        views.append(View(own, name, on_result=on_result, on_preview=on_preview, on_event=on_event))
+        views.append(WorkerView(own, name, on_result=on_result, on_preview=on_preview, on_event=on_event))
     return tuple(views)
 
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from companion.bus.session import Bus
-from companion.guidance.pilot import Pilot
-from companion.guidance.pose_sharing import PoseSharing
-from companion.perception.views import View
+from companion.guidance.core import Guidance
+from companion.perception.views import WorkerView
+from companion.service.inputs import InputAssembler
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 
@@ -19,19 +19,18 @@ def status_message(
     uptime_s: float,
     healthy: bool,
     state: VehicleState,
-    pilot: Pilot,
+    guidance: Guidance,
     streamer: Streamer,
-    views: Sequence[View],
-    steering: View,
-    poses: PoseSharing,
-    gimbal: dict[str, Any] | None,
+    views: Sequence[WorkerView],
+    inputs: InputAssembler,
     bus: Bus,
 ) -> dict[str, Any]:
     """What is published on `status` (`docs/messages.md`).
 
     Args:
-        now_ns: CLOCK_MONOTONIC. uptime_s: since the service began. gimbal: as `GimbalHand.status`.
+        now_ns: CLOCK_MONOTONIC. uptime_s: since the service began.
     """
+    steering = inputs.steering
     return {
         "stamp_ns": now_ns,
         "uptime_s": round(uptime_s, 1),
@@ -43,8 +42,8 @@ def status_message(
             "failsafe": state.failsafe,
         },
         "pilot": {
-            "in_command": pilot.in_command,
-            "behaviour": pilot.status,
+            "in_command": guidance.in_command,
+            "behaviour": guidance.status,
             "stream": streamer.state.value,
             "setpoints_sent": streamer.sent_count,
         },
@@ -55,11 +54,23 @@ def status_message(
             "count": len(steering.targets),
             "problem": steering.unplaced,
         },
-        "gimbal": gimbal,
-        "neighbours": poses.status(now_ns),
+        "gimbal": guidance.gimbal.status(now_ns, state),
+        "neighbours": inputs.poses.status(now_ns),
         "bus": {
             "connected": bus.connected,
             "published": dict(bus.published),
             "unsent": bus.unsent,
         },
     }
+
+
+def hud_lines(state: VehicleState, status: str) -> tuple[str, ...]:
+    """What stands in the recorded video. `status`: guidance's, in words."""
+    altitude = "-" if state.altitude_m is None else f"{state.altitude_m:.1f} m"
+    speed = state.velocity_ned_mps
+    horizontal = "-" if speed is None else f"{(speed[0] ** 2 + speed[1] ** 2) ** 0.5:.1f} m/s"
+    return (
+        f"{state.mode.value}  {'armed' if state.armed else 'disarmed'}",
+        status,
+        f"height {altitude}  speed {horizontal}",
+    )

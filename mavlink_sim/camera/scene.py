@@ -11,16 +11,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import Literal
+from typing import Literal, Protocol
 
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.lens import Shutter
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
+from mavlink_sim.world.obstacles import Way
 from mavlink_sim.world.world import Vector, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 
 Repeat = Literal["loop", "back_and_forth", "once"]
+
+
+class Motion(Way, Protocol):
+    """How an object of a scene moves; `Path` is one."""
+
+    @property
+    def period_s(self) -> float:
+        """After this time it has been everywhere it goes."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +151,7 @@ class Scene:
     """A world at time 0, the paths of what moves (by the object's identifier), and the camera."""
 
     world: World
-    paths: Mapping[int, Path] = field(default_factory=dict)
+    paths: Mapping[int, Motion] = field(default_factory=dict)
     camera: CameraSettings = field(default_factory=CameraSettings)
     name: str = "scene"
 
@@ -162,7 +171,7 @@ class Scene:
         return replace(self.world, objects=self.objects_at(time_s)) if self.paths else self.world
 
 
-def _moved(item: WorldObject, path: Path | None, time_s: float) -> WorldObject:
+def _moved(item: WorldObject, path: Motion | None, time_s: float) -> WorldObject:
     if path is None:
         return item
     position, yaw = path.pose_at(time_s)

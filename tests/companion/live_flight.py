@@ -4,40 +4,53 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from typing import Any
 
 from pymavlink import mavutil
 
-from companion.guidance.behaviour import Outcome, Situation
-from companion.guidance.envelope import Envelope
-from companion.guidance.grammar import parse
-from companion.guidance.pilot import Pilot
-from companion.guidance.pilot_event import PilotEvent
-from companion.guidance.registry import behaviour_for
-from companion.vehicle.drivers import open_driver
+from companion.bench.lockstep_flight import plain_settings
+from companion.guidance.behaviour import Outcome
+from companion.guidance.core import Guidance
+from companion.perception.views import View
+from companion.service.factory import driver_of, guidance_options
+from companion.service.guidance_loop import GuidanceLoop
+from companion.service.inputs import InputAssembler
 from companion.vehicle.streamer import Streamer
 
 STATION = (245, 190)
 
 
 class LiveFlight:
-    """The parts that fly, as the service runs them; `guide` says what the pilot knows."""
+    """The parts that fly, as the service runs them.
 
-    def __init__(self, kind: str, port: int) -> None:
-        self.driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
+    Attributes:
+        events: (level, text) of everything that guidance told.
+    """
+
+    def __init__(self, kind: str, port: int, changes: Mapping[str, str] | None = None) -> None:
+        link = {"vehicle.driver": kind, "vehicle.url": f"udpin://127.0.0.1:{port}"}
+        settings = plain_settings({"detector.enabled": "false", **link, **(changes or {})})
+        self.driver = driver_of(settings)
         self.streamer = Streamer(self.driver.send_setpoint)
-        self.events: list[PilotEvent] = []
-        self.pilot = Pilot(self.driver, self.streamer, Envelope(), on_event=self.events.append)
+        self.events: list[tuple[str, str]] = []
+        self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
+        self.inputs = InputAssembler(settings, [View(settings.of_view(None))], self._event)
+        self.loop = GuidanceLoop(
+            self.guidance,
+            self.inputs,
+            self.driver,
+            self.streamer,
+            rate_hz=50.0,
+            on_event=self._event,
+            on_step=self.on_step,
+        )
 
-    def turn(self, now_ns: int) -> None:
-        """One turn of the guidance loop."""
-        self.pilot.update(Situation(now_ns, self.driver.state))
+    def on_step(self, now_ns: int) -> None:
+        """After every step of guidance."""
 
-    async def close(self) -> None:
-        """After the loops have ended."""
-        await self.driver.close()
+    def _event(self, level: str, text: str) -> None:
+        self.events.append((level, text))
 
     async def until(self, condition: Callable[[], object], timeout_s: float = 30.0) -> None:
         async with asyncio.timeout(timeout_s):
@@ -45,25 +58,25 @@ class LiveFlight:
                 await asyncio.sleep(0.01)
 
     async def fly(self, text: str, timeout_s: float = 60.0) -> Outcome:
-        return await asyncio.wait_for(self.pilot.command(behaviour_for(parse(text))), timeout_s)
-
-    async def _guide(self) -> None:
-        while True:
-            self.turn(time.monotonic_ns())
-            await asyncio.sleep(0.02)
+        """Give a command and wait for its answer."""
+        reply = await asyncio.wait_for(self.loop.execute(text), timeout_s)
+        return Outcome(reply["success"], reply["reason"])
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         await self.driver.connect(20.0)
-        tasks = [asyncio.create_task(self._guide()), asyncio.create_task(self.streamer.run())]
+        unsubscribe = self.driver.subscribe(self.inputs.on_state)
+        tasks = [asyncio.create_task(self.loop.run()), asyncio.create_task(self.streamer.run())]
         try:
             yield
         finally:
-            self.pilot.close()
+            self.loop.begin_to_end()
+            await self.loop.until_released()
+            unsubscribe()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            await self.close()
+            await self.driver.close()
 
 
 @contextlib.contextmanager

@@ -47,8 +47,8 @@ REACH = 0.6
 # Boxes of two classes that overlap by so much are of one object; those of a rider and the bicycle do not.
 SAME_OBJECT_IOU = 0.7
 # A track's class is in doubt while the confidences of another class on its object sum up to this share of its
-# own. Of rendered tracks that counted as true, 0.25, 0.5, 0.75 and 1.0 leave 142, 160, 169 and 172 of 174 of the
-# right class, 77, 85, 90 and 94 of 114 of a wrong one. Sums fade as if only `SCORES_KEPT` frames counted.
+# own. Of rendered tracks that counted as true, 0.25, 0.5, 0.75 and 1.0 leave 142, 160, 169 and 172 of 174 of
+# the right class, 77, 85, 90 and 94 of 114 of a wrong one. Sums fade as if only `SCORES_KEPT` frames counted.
 RIVAL_SHARE = 0.5
 _KEPT = 1.0 - 1.0 / SCORES_KEPT
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from companion.bench.drawn_detector import DrawnDetector, Faults, Pose, Thing
-from companion.bench.lockstep_flight import LockstepFlight, Sight
+from companion.bench.lockstep_flight import LockstepFlight, camera_settings
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.search_pattern import Footprint
+from mavlink_sim import LockstepVehicle
 from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
 
@@ -17,27 +20,30 @@ HEIGHT_M = 10.0
 PERSON_M = (0.5, 0.6, 1.7)
 
 
-def person(bearing_deg: float, distance_m: float = 4.0) -> Thing:
+def person(bearing_deg: float, distance_m: float = 4.0) -> SceneObject:
     """Somebody who stands."""
     bearing = math.radians(bearing_deg)
-    pose = Pose(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
-    return Thing("person", PERSON_M, lambda _: pose)
+    pose = ScenePose(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
+    return SceneObject("person", PERSON_M, lambda _: pose)
 
 
 def gimbal_flight(
-    thing: Thing, *, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: object
+    thing: SceneObject, *, seed: int = 5, mount: CameraMount = ON_GIMBAL, **options: Any
 ) -> LockstepFlight:
     """In the air, with a detector that sees the thing where the gimbal looks at it."""
-    flights: list[LockstepFlight] = []
+    vehicles: list[LockstepVehicle] = []
 
     def looks() -> Quaternion:
-        # The first frame comes after the take-off, when the flight is there.
-        return flights[0].vehicle.vehicle.gimbal.quaternion
+        gimbal = vehicles[0].vehicle.gimbal
+        assert gimbal is not None
+        return gimbal.quaternion
+
+    def camera(vehicle: LockstepVehicle) -> SyntheticCamera:
+        vehicles.append(vehicle)
+        return SyntheticCamera(camera_settings(CAMERA, mount), detect=detector)
 
     # A box that shakes is the detector's fault, and is measured elsewhere.
-    detector = DrawnDetector(
+    detector = SyntheticDetector(
         [thing], CAMERA, mount, seed=seed, faults=Faults(0.0, 0.05, 0.0, 0.0), gimbal=looks
     )
-    sight = Sight(CAMERA, mount, detector)
-    flights.append(LockstepFlight(seed=seed, height_m=HEIGHT_M, sight=sight, gimbal=True, **options))
-    return flights[0]
+    return LockstepFlight.airborne(seed=seed, height_m=HEIGHT_M, camera=camera, gimbal=True, **options)

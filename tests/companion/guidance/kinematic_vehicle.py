@@ -1,4 +1,4 @@
-"""A vehicle for lockstep tests: it follows velocity, position, yaw and yaw rate with a short lag."""
+"""A vehicle for tests in lockstep: it follows velocity, position, yaw and yaw rate with a short lag."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation
-from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.target import RangeSource, Target
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from vision.attitude import quaternion_from_euler, wrap_angle
 
 START_NS = 1_000_000_000_000
@@ -41,19 +39,23 @@ class KinematicVehicle:
             mode=self.mode,
             landed=self.landed,
             ready_to_arm=True,
-            position_ned_m=tuple(self.position),
-            velocity_ned_mps=tuple(self.velocity),
+            position_ned_m=self.place,
+            velocity_ned_mps=(self.velocity[0], self.velocity[1], self.velocity[2]),
             attitude=quaternion_from_euler(0.0, 0.0, self.yaw_rad),
             home_altitude_amsl_m=489.0,
             home_position_ned_m=(0.0, 0.0, 0.0),
         )
 
+    @property
+    def place(self) -> Vector3:
+        return (self.position[0], self.position[1], self.position[2])
+
     def fly(self, setpoint: Setpoint, dt_s: float) -> None:
-        wanted = setpoint.velocity_ned_mps
+        wanted: Sequence[float] = setpoint.velocity_ned_mps or (0.0, 0.0, 0.0)
         if setpoint.position_ned_m is not None:
             error = [a - b for a, b in zip(setpoint.position_ned_m, self.position, strict=True)]
             length = max(1e-9, math.hypot(*error))
-            wanted = tuple(0.95 * e * min(1.0, 5.0 / (0.95 * length)) for e in error)
+            wanted = [0.95 * e * min(1.0, 5.0 / (0.95 * length)) for e in error]
         rate = setpoint.yaw_rate_radps or 0.0
         if setpoint.yaw_rad is not None:
             rate = max(-1.5, min(1.5, 2.0 * wrap_angle(setpoint.yaw_rad - self.yaw_rad)))
@@ -121,62 +123,3 @@ def look(
             )
         )
     return tuple(targets)
-
-
-@dataclass
-class Flight:
-    """A behaviour flown in lockstep: guidance at 50 Hz, camera at 10 Hz whose results come 0.1 s late."""
-
-    behaviour: Behaviour
-    vehicle: KinematicVehicle = field(default_factory=KinematicVehicle)
-    objects: list[SeenObject] = field(default_factory=list)
-    perception_alive: bool = True
-    noise: Callable[[], float] = lambda: 0.0
-    limits: Limits = field(default_factory=Limits)
-    rate_hz: float = 50.0
-    camera_hz: float = 10.0
-    latency_s: float = 0.1
-    steps: list[object] = field(default_factory=list)
-    track: list[tuple[float, float, float]] = field(default_factory=list)
-
-    def run(
-        self, seconds: float, each: Callable[[float, KinematicVehicle], None] = lambda t, v: None
-    ) -> Outcome | None:
-        """Fly until it ends or the time is over (None). `each(seconds, vehicle)` runs every step."""
-        dt_s, envelope = 1.0 / self.rate_hz, Envelope(self.limits)
-        pending: list[tuple[int, tuple[Target, ...]]] = []
-        shown: tuple[Target, ...] = ()
-        newest_ns, next_frame_ns = 0, self.vehicle.now_ns
-        start_ns, sent, activated = self.vehicle.now_ns, None, False
-        while self.vehicle.now_ns - start_ns < seconds * 1e9:
-            now_ns = self.vehicle.now_ns
-            each((now_ns - start_ns) / 1e9, self.vehicle)
-            if now_ns >= next_frame_ns and self.perception_alive:
-                pending.append((now_ns, look(self.vehicle, self.objects, now_ns, noise=self.noise)))
-                next_frame_ns += round(1e9 / self.camera_hz)
-            while pending and now_ns - pending[0][0] >= self.latency_s * 1e9:
-                newest_ns, shown = pending.pop(0)
-            fresh = newest_ns > 0 and now_ns - newest_ns <= 0.5e9
-            situation = Situation(
-                now_ns,
-                self.vehicle.state,
-                shown if fresh else (),
-                (now_ns - newest_ns) / 1e9 if newest_ns else None,
-                fresh,
-                sent,
-            )
-            if not activated:
-                self.behaviour.on_activate(situation)
-                activated = True
-            step = self.behaviour.update(dt_s, situation)
-            self.steps.append(step)
-            assert self.behaviour.status
-            if isinstance(step, Outcome):
-                return step
-            if isinstance(step, ModeRequest):
-                self.vehicle.now_ns += round(dt_s * 1e9)
-                continue
-            sent, _ = envelope.apply(step, situation.state, now_ns, dt_s)
-            self.vehicle.fly(sent, dt_s)
-            self.track.append(tuple(self.vehicle.position))
-        return None

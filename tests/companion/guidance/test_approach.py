@@ -2,7 +2,8 @@ import math
 import random
 
 import pytest
-from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+from guidance_harness import Flight
+from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.target import RangeSource

@@ -1,4 +1,4 @@
-"""Pilot, pymavlink driver and a Copter in its own process: a whole flight, and whose vehicle it is."""
+"""Guidance, pymavlink driver and a Copter in its own process: a whole flight, and whose vehicle it is."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import time
 import pytest
 from live_flight import LiveFlight, ground_station
 
-from companion.guidance.grammar import parse
-from companion.guidance.registry import behaviour_for
+from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode
 from mavlink_sim.testing import running_simulator
 
@@ -22,25 +21,24 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot
     with running_simulator(**options) as simulator, ground_station(simulator.gcs_port) as station:
         service = LiveFlight("pymavlink", simulator.onboard_port)
         async with service.running():
-            driver, pilot = service.driver, service.pilot
+            driver, guidance = service.driver, service.guidance
             await service.until(lambda: driver.state.ready_to_arm and driver.state.home_position_ned_m)
 
             outcome = await service.fly("takeoff 3")
             assert outcome.success, outcome.reason
             assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
 
-            orbit = pilot.command(behaviour_for(parse("orbit radius=6 speed=2")))
-            await service.until(lambda: pilot.phase == "offboard")
+            assert await service.fly("orbit radius=6 speed=2") == Outcome(True, "in progress")
             await service.until(lambda: math.hypot(*driver.state.velocity_ned_mps[:2]) > 1.5)
             assert driver.state.mode is FlightMode.OFFBOARD
-            assert not orbit.done()
+            assert guidance.busy
 
             # The station has to have heard the vehicle to know where to send.
             station.mav.heartbeat_send(6, 8, 0, 0, 4)
             assert station.wait_heartbeat(timeout=10)
             station.set_mode(LOITER)
-            await service.until(orbit.done, 10.0)
-            assert orbit.result().reason == "the pilot took over: position mode"
+            await service.until(lambda: not guidance.in_command, 10.0)
+            assert service.events[-1] == ("warning", "command lost: the pilot took over: position mode")
 
             # GUIDED again, but not by us: nothing is sent, and nothing of ours is flown.
             sent = service.streamer.sent_count
@@ -49,7 +47,7 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot
             watched_until = time.monotonic() + 1.0
             await service.until(lambda: time.monotonic() > watched_until)
             assert service.streamer.sent_count == sent
-            assert not pilot.in_command
+            assert not guidance.in_command
 
             stopped = await service.fly("stop")
             assert stopped.success, stopped.reason

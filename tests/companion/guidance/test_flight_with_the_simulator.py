@@ -1,4 +1,4 @@
-"""The pilot with a real driver, a real socket and the built-in vehicle in its own process."""
+"""Guidance with a real driver, a real socket and the built-in vehicle in its own process."""
 
 import asyncio
 import math
@@ -8,9 +8,7 @@ import pytest
 from live_flight import LiveFlight, ground_station
 from pymavlink import mavutil
 
-from companion.guidance.grammar import parse
-from companion.guidance.pilot_event import PilotEventKind
-from companion.guidance.registry import behaviour_for
+from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode
 from mavlink_sim.testing import running_simulator
 
@@ -26,7 +24,7 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over(kind):
     with running_simulator(speed=SPEED) as simulator, ground_station(simulator.gcs_port) as station:
         service = LiveFlight(kind, simulator.onboard_port)
         async with service.running():
-            driver, pilot = service.driver, service.pilot
+            driver, guidance = service.driver, service.guidance
             await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
             assert not driver.state.armed
 
@@ -34,26 +32,24 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over(kind):
             assert outcome.success, outcome.reason
             assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
 
-            orbit = pilot.command(behaviour_for(parse("orbit radius=6 speed=2")))
-            await service.until(lambda: pilot.phase == "offboard")
+            assert await service.fly("orbit radius=6 speed=2") == Outcome(True, "in progress")
             assert driver.state.mode is FlightMode.OFFBOARD
             await service.until(lambda: math.hypot(*driver.state.velocity_ned_mps[:2]) > 1.5)
-            assert not orbit.done()
+            assert guidance.busy
 
             # The station has to have heard the vehicle to know where to send.
             assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)
             choose_mode(station, 4, 3)  # AUTO.LOITER
-            await service.until(orbit.done, 10.0)
+            await service.until(lambda: not guidance.in_command, 10.0)
             sent = service.streamer.sent_count
-            assert orbit.result().reason == "the pilot took over: hold mode"
-            assert service.events[-1].kind is PilotEventKind.LOST
+            assert service.events[-1] == ("warning", "command lost: the pilot took over: hold mode")
 
             # Well past the time in which PX4 would go back to OFFBOARD if setpoints came.
             watched_until = time.monotonic() + 2.0
             await service.until(lambda: time.monotonic() > watched_until)
             assert service.streamer.sent_count == sent
             assert driver.state.mode is FlightMode.HOLD
-            assert not pilot.in_command
+            assert not guidance.in_command
 
             # Only an operator's new command takes the vehicle again.
             landed = await service.fly("land")

@@ -1,7 +1,8 @@
 import math
 
 import pytest
-from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+from guidance_harness import Flight
+from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.bench.flights import UnknownFlightError, flight_named, flights, summary
 from companion.bench.flights_follow import run

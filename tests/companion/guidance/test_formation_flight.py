@@ -116,7 +116,7 @@ def test_without_their_leader_followers_brake_and_hold_and_go_on_when_it_is_back
     fleet.run(3.5)
     for name in "bc":
         member = fleet.members[name]
-        assert math.hypot(*member.airframe.state().velocity_ned_mps) < 0.5
+        assert math.hypot(*member.airframe.state.velocity_ned_mps) < 0.5
         assert "a, the leader, is not heard" in member.behaviour.status
     fleet.members["a"].muted = False
     assert fleet.run_until(lambda: settled(fleet, "bc", 1.2), 40.0)

@@ -1,29 +1,25 @@
-"""Several vehicles from one process: each its driver, pilot and zenoh session, and keys of its own."""
+"""Several vehicles from one process: each its driver, guidance and zenoh session, and keys of its own."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import json
 import math
 import os
 import socket
 import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+from live_flight import LiveFlight
 
 from companion.bus import topics
 from companion.bus.session import Bus
-from companion.guidance.behaviour import Situation
-from companion.guidance.envelope import Envelope
 from companion.guidance.formation import FormationBehaviour
-from companion.guidance.grammar import parse
-from companion.guidance.pilot import Pilot
-from companion.guidance.pose_sharing import PoseSharing
-from companion.guidance.registry import behaviour_for
+from companion.guidance.neighbours import Neighbourhood
 from companion.settings import ZenohSection
-from companion.vehicle.drivers import open_driver
-from companion.vehicle.streamer import Streamer
-from mavlink_sim.testing import free_port, running_simulator
+from mavlink_sim.testing import FleetMember, RunningSimulator, free_port, running_simulator
 
 VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
 
@@ -31,71 +27,58 @@ VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
 class Companion:
     """One vehicle's service, without a camera."""
 
-    def __init__(self, name, member, zenoh_port, known_ports):
+    def __init__(self, name: str, member: FleetMember, zenoh_port: int, known_ports: list[int]) -> None:
         self.name = name
-        self.events = []
-        self.poses = PoseSharing(name, lambda level, text: self.events.append(text))
-        self.driver = open_driver(
-            "pymavlink",
-            f"udpin://127.0.0.1:{member.onboard_port}",
-            system_id=member.system_id,
-            own_system_id=member.system_id,
-        )
-        self.streamer = Streamer(self.driver.send_setpoint)
-        self.pilot = Pilot(self.driver, self.streamer, Envelope(), on_event=self.events.append)
+        changes = {"vehicle.name": name, "vehicle.system_id": f"{member.system_id}"}
+        self.flight = LiveFlight("pymavlink", member.onboard_port, changes)
+        self.driver, self.guidance = self.flight.driver, self.flight.guidance
+        self.poses = self.flight.inputs.poses
         self.bus = Bus(
             ZenohSection(
                 connect=tuple(f"tcp/127.0.0.1:{port}" for port in known_ports),
                 listen=(f"tcp/127.0.0.1:{zenoh_port}",),
             ),
             name,
-            on_event=lambda level, text: self.events.append(text),
-            on_command=self.command,
+            on_event=lambda level, text: None,
+            on_command=self.flight.loop.execute,
             listeners=[(topics.POSE, self.poses.hear)],
         )
 
-    async def command(self, text):
-        outcome = await self.pilot.command(behaviour_for(parse(text)))
-        return {"success": outcome.success, "reason": outcome.reason}
+    async def command(self, text: str) -> dict[str, Any]:
+        return await self.flight.loop.execute(text)
 
-    def around(self):
+    def around(self) -> Neighbourhood:
         return self.poses.around(self.driver.state, time.monotonic_ns())
 
-    async def guide(self):
-        for turn in itertools.count():
-            now_ns = time.monotonic_ns()
-            self.pilot.update(Situation(now_ns, self.driver.state, neighbourhood=self.around()))
-            if turn % 2 == 0:
-                message = self.poses.message(self.driver.state, self.pilot.behaviour, now_ns)
-                if message is not None:
-                    self.bus.publish(topics.POSE, message)
-            await asyncio.sleep(0.05)
+    async def publish(self) -> None:
+        while True:
+            message = self.poses.message(self.driver.state, self.guidance.behaviour, time.monotonic_ns())
+            if message is not None:
+                self.bus.publish(topics.POSE, message)
+            await asyncio.sleep(0.1)
 
 
 @contextlib.asynccontextmanager
-async def companions(simulator, count):
-    ports, members = [], []
+async def companions(simulator: RunningSimulator, count: int) -> AsyncIterator[list[Companion]]:
+    ports: list[int] = []
+    members = []
     for index, vehicle in enumerate(simulator.vehicles[:count]):
         port = free_port(socket.SOCK_STREAM)
         members.append(Companion(f"vehicle{index + 1}", vehicle, port, ports.copy()))
         ports.append(port)
-    tasks = []
-    try:
+    async with contextlib.AsyncExitStack() as stack:
         for member in members:
             await member.bus.start()
-        await asyncio.gather(*(member.driver.connect(30.0) for member in members))
+            stack.push_async_callback(member.bus.close)
         for member in members:
-            tasks += [asyncio.create_task(member.guide()), asyncio.create_task(member.streamer.run())]
-        yield members
-    finally:
-        for member in members:
-            member.pilot.close()
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        for member in members:
-            await member.bus.close()
-            await member.driver.close()
+            await stack.enter_async_context(member.flight.running())
+        publishing = [asyncio.create_task(member.publish()) for member in members]
+        try:
+            yield members
+        finally:
+            for task in publishing:
+                task.cancel()
+            await asyncio.gather(*publishing, return_exceptions=True)
 
 
 async def until(condition, timeout_s=60.0):
@@ -123,17 +106,17 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation():
             refused = await followers[0].command("formation line leader=nobody")
             until_s = time.monotonic() + 30.0
             while "heard are vehicle1" not in refused["reason"] and time.monotonic() < until_s:
-                await asyncio.sleep(0.02)  # a pilot knows of its last turn what was heard
+                await asyncio.sleep(0.02)
                 refused = await followers[0].command("formation line leader=nobody")
             assert "the pose of nobody (none came; heard are vehicle1" in refused["reason"]
             taken_off = await asyncio.gather(*(member.command("takeoff 5") for member in fleet))
             assert all(outcome["success"] for outcome in taken_off), taken_off
 
-            for member in followers:
-                member.pilot.command(behaviour_for(parse("formation line leader=vehicle1 spacing=6")))
+            formed = [member.command("formation line leader=vehicle1 spacing=6") for member in followers]
+            assert all(reply["success"] for reply in await asyncio.gather(*formed))
 
             def error_m(member):
-                behaviour = member.pilot.behaviour
+                behaviour = member.guidance.behaviour
                 formed = isinstance(behaviour, FormationBehaviour) and behaviour.note is not None
                 return behaviour.note.error_m if formed and behaviour.slot_offset_ned_m else math.inf
 
@@ -157,5 +140,5 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation():
             assert min(least_m) > 3.0
             # A vehicle whose service ends is not heard any more, and its followers hold.
             await leader.bus.close()
-            await until(lambda: all("is not heard" in m.pilot.status for m in followers))
+            await until(lambda: all("is not heard" in m.guidance.status for m in followers))
             assert all(json.dumps(m.poses.status(time.monotonic_ns())) for m in fleet)

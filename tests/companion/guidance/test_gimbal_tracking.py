@@ -15,8 +15,8 @@ from gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.bench.drawn_detector import Pose, Thing
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
+from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.guidance.behaviour import Behaviour, Situation
 from companion.guidance.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.gimbal_sight import GimbalSight
@@ -28,6 +28,7 @@ from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.target import Target
 from companion.missions.mission_file import plan_from
 from companion.vehicle.gimbal import GimbalAim, GimbalState
+from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState
 from mavlink_sim.wire.messages import dialect
 from vision.camera_model import CameraMount
@@ -45,7 +46,7 @@ Each = Callable[[LockstepFlight, Moment], None]
 
 def fly(
     behaviour: Behaviour,
-    thing: Thing,
+    thing: SceneObject,
     each: Each = lambda flight, moment: None,
     *,
     begin_deg: float = -37.0,
@@ -57,7 +58,7 @@ def fly(
     pointed = flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(begin_deg))), 20.0)
     assert pointed.outcome is not None
     assert pointed.outcome.success, pointed.outcome.reason
-    flight.move_gimbal_on()
+    flight.run(1.0)
     return flight, flight.fly(behaviour, limit_s, each=lambda moment: each(flight, moment))
 
 
@@ -71,7 +72,7 @@ def reason(log: FlightLog, success: bool) -> str:
     return log.outcome.reason
 
 
-def off_rad(moment: Moment, thing: Thing, camera_rad: float = 0.0) -> float:
+def off_rad(moment: Moment, thing: SceneObject, camera_rad: float = 0.0) -> float:
     """Between where the camera looks and the object's true elevation."""
     pose, (north, east, down) = thing.pose(moment.seconds), moment.truth.position_ned_m
     range_m = math.hypot(pose.north_m - north, pose.east_m - east)
@@ -106,13 +107,13 @@ def test_an_approach_keeps_what_a_camera_at_rest_loses():
     assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(2.0, abs=0.6)
     assert max(off_rad(moment, thing) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
     # Nobody holds it any more, and it stays as it was pointed.
-    flight.move_gimbal_on()
+    flight.run(1.0)
     assert primary(flight) == NOBODY
     assert math.degrees(flight.state.gimbal.pitch_rad) < -70.0
 
 
 def test_somebody_who_walks_is_followed_from_nearly_above():
-    thing = Thing("person", PERSON_M, lambda seconds: Pose(8.0, seconds))
+    thing = SceneObject("person", PERSON_M, lambda seconds: ScenePose(8.0, seconds))
     _, still = fly(command("follow person distance=2 duration=20"), thing)
     assert "lost the person" in reason(still, False)
 
@@ -136,10 +137,10 @@ def test_a_camera_that_is_mounted_askew_is_brought_to_the_object():
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
 def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word):
-    """The picture ends 45° down, above its wheels: it has no range until the gimbal looks at it."""
-    thing = Thing("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
+    """The picture ends 46° down, above its wheels: it has no range until the gimbal looks at it."""
+    thing = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
     # an approach ends by itself, long before; who follows has been there for half a minute
-    flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-13.0, limit_s=50.0)
+    flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-14.0, limit_s=50.0)
     first = next(seen for moment in log.moments for seen in moment.situation.targets)
     assert first.position_ned_m is None
     assert math.degrees(flight.state.gimbal.pitch_rad) < -40.0
@@ -156,19 +157,19 @@ def test_who_takes_the_gimbal_meanwhile_wins(word):
     # What comes first: the manager's word of who has it, or its answer to the next aim.
     assert reason(log, False) in (
         f"{word} lost the gimbal: 245/190 has taken control of it",
-        f"{word} lost the gimbal: result 2",
+        f"{word} lost the gimbal: the vehicle refused to point the gimbal ({result_name(2)})",
     )
-    flight.move_gimbal_on(3.0)
+    flight.run(3.0)
     assert primary(flight) == STATION
 
 
 GONE_AFTER_S = 4.0
 
 
-def who_leaves() -> Thing:
+def who_leaves() -> SceneObject:
     """Somebody who is gone at once."""
-    near, gone = Pose(12.0, 0.0), Pose(-200.0, 0.0)
-    return Thing("person", PERSON_M, lambda seconds: near if seconds < GONE_AFTER_S else gone)
+    near, gone = ScenePose(12.0, 0.0), ScenePose(-200.0, 0.0)
+    return SceneObject("person", PERSON_M, lambda seconds: near if seconds < GONE_AFTER_S else gone)
 
 
 def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_given_back():
@@ -186,7 +187,7 @@ def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_give
     around = [pitch for status, pitch, _ in seen if "all around" in status]
     assert max(around) > -6.0, "up to level"
     assert min(around) == pytest.approx(lost_deg, abs=6.0)
-    flight.move_gimbal_on()
+    flight.run(1.0)
     assert primary(flight) == NOBODY
 
 
@@ -225,7 +226,7 @@ def test_the_steps_of_a_mission_hand_it_on():
     assert reason(log, True)
     assert [step.reason[:14] for step in mission.records] == ["reached person"] * 2
     assert off_rad(log.moments[-1], thing) < IN_THE_MIDDLE_RAD
-    flight.move_gimbal_on()
+    flight.run(1.0)
     assert primary(flight) == NOBODY
 
 

@@ -4,7 +4,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+from guidance_harness import Flight
+from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.seek import SeekBehaviour

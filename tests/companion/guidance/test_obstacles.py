@@ -1,15 +1,17 @@
 import math
 
 import pytest
+from guidance_harness import GuidanceHarness
 from hypothesis import given
 from hypothesis import strategies as st
 from kinematic_vehicle import KinematicVehicle
-from scripted_autopilot import Cockpit
 
 from companion.bench.flights_obstacles import ALLOWED_M, MARGIN_M, run
 from companion.guidance.behaviour import Situation
+from companion.guidance.core import GuidanceOptions
 from companion.guidance.envelope import Envelope
 from companion.guidance.goto import GotoBehaviour
+from companion.guidance.interface import EventKind
 from companion.guidance.land import LandBehaviour
 from companion.guidance.obstacles import (
     MAX_AGE_S,
@@ -18,7 +20,6 @@ from companion.guidance.obstacles import (
     obstacles_message,
     speed_towards,
 )
-from companion.guidance.pilot_event import PilotEventKind
 from companion.guidance.refusal import refusal
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
@@ -100,24 +101,24 @@ def test_required_depth_that_is_missing_is_a_refusal_that_names_it():
     assert refusal(goto, situation(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
 
 
-async def test_the_pilot_sends_a_brake_while_depth_is_missing():
-    cockpit = Cockpit(KinematicVehicle(mode=FlightMode.HOLD))
-    await cockpit.turn(0.1)
-    cockpit.pilot.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
-    await cockpit.until(lambda: cockpit.pilot.phase == "offboard", 5.0)
-    await cockpit.turn(1.0)
-    assert math.hypot(*cockpit.pilot.sent.velocity_ned_mps) > 1.0
-    cockpit.pilot._obstacles = ObstacleRules("required")
-    await cockpit.turn(0.1)
-    assert cockpit.pilot.sent.velocity_ned_mps == (0.0, 0.0, 0.0)
-    assert cockpit.pilot.limited_by == ("no depth to fly by: none came yet",)
-    cockpit.pilot._obstacles = ObstacleRules("auto")
-    await cockpit.turn(1.0)
-    assert math.hypot(*cockpit.pilot.sent.velocity_ned_mps) > 0.5
-    told = [(event.kind, event.message) for event in cockpit.events][-2:]
+def test_the_pilot_sends_a_brake_while_depth_is_missing():
+    harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
+    harness.run(0.1)
+    harness.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    harness.run(1.0)
+    assert math.hypot(*harness.guidance.sent.velocity_ned_mps) > 1.0
+    harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("required"))
+    harness.run(0.1)
+    assert harness.guidance.sent.velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert harness.guidance.limited_by == ("no depth to fly by: none came yet",)
+    harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("auto"))
+    harness.run(1.0)
+    assert math.hypot(*harness.guidance.sent.velocity_ned_mps) > 0.5
+    told = [(event.kind, event.message) for event in harness.events][-2:]
     assert told == [
-        (PilotEventKind.BLIND, "braking: no depth to fly by: none came yet"),
-        (PilotEventKind.NOTED, "depth is back"),
+        (EventKind.BLIND, "braking: no depth to fly by: none came yet"),
+        (EventKind.NOTED, "depth is back"),
     ]
 
 

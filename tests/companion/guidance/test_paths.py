@@ -7,9 +7,10 @@ import math
 from dataclasses import replace
 
 import pytest
+from guidance_harness import Flight
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kinematic_vehicle import Flight, KinematicVehicle
+from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError

@@ -1,8 +1,8 @@
 import math
 
 import pytest
-from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
-from scripted_autopilot import Cockpit
+from guidance_harness import Flight, GuidanceHarness
+from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.grammar import parse
 from companion.guidance.patrol import PatrolBehaviour
@@ -163,14 +163,14 @@ def test_the_grammar_of_a_patrol():
             parse(text, ("person", "car") if "zebra" in text else None)
 
 
-async def test_a_pilots_mode_ends_a_patrol_and_an_operators_command_takes_its_place():
-    cockpit = Cockpit(KinematicVehicle(mode=FlightMode.HOLD))
-    await cockpit.turn(0.1)
-    future = cockpit.pilot.command(PatrolBehaviour(ROUND, ["car"]))
-    await cockpit.until(lambda: cockpit.vehicle.position[0] > 3.0)
-    cockpit.autopilot.change_mode(FlightMode.POSITION)
-    await cockpit.until(future.done, 2.0)
+def test_a_pilots_mode_ends_a_patrol_and_an_operators_command_takes_its_place():
+    harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
+    harness.run(0.1)
+    future = harness.command(PatrolBehaviour(ROUND, ["car"]))
+    harness.until(lambda: harness.vehicle.position[0] > 3.0)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.until(future.done, 2.0)
     assert future.result().reason == "the pilot took over: position mode"
-    sent = len(cockpit.autopilot.setpoints)
-    await cockpit.turn(3.0)
-    assert len(cockpit.autopilot.setpoints) == sent
+    sent = len(harness.autopilot.setpoints)
+    harness.run(3.0)
+    assert len(harness.autopilot.setpoints) == sent

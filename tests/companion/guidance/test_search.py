@@ -2,9 +2,10 @@ import math
 from itertools import pairwise
 
 import pytest
+from guidance_harness import Flight
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kinematic_vehicle import Flight, KinematicVehicle, SeenObject
+from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from gimbal_flight import CAMERA, FOOTPRINT, HEIGHT_M, PERSON_M, gimbal_flight, person
 
-from companion.bench.drawn_detector import Thing
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
+from companion.bench.synthetic_detector import SceneObject
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
 from companion.guidance.sequence import SequenceBehaviour
@@ -25,7 +25,7 @@ DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
 
 
 def fly(
-    command: str, thing: Thing, *, seed: int = 5, limit_s: float = 90.0, **options: object
+    command: str, thing: SceneObject, *, seed: int = 5, limit_s: float = 90.0, **options: object
 ) -> tuple[LockstepFlight, FlightLog, list[Target]]:
     """The flight, its log, and every target that was seen, once."""
     flight = gimbal_flight(thing, seed=seed, **options)
@@ -74,14 +74,14 @@ def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing
     assert pitches(log)[-1] < -50.0, "found, the gimbal looks at it"
     assert thing.range_m(seen[-1].position_ned_m, 0.0) < PLACE_BOUND_M
     # Nobody holds it any more.
-    flight.move_gimbal_on()
+    flight.run(1.0)
     assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
 
 
 def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there():
     table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
     mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
-    flight = LockstepFlight(seed=5, height_m=HEIGHT_M, gimbal=True)
+    flight = LockstepFlight.airborne(seed=5, height_m=HEIGHT_M, gimbal=True)
     log = flight.fly(mission, 20.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason

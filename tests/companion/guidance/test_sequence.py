@@ -1,14 +1,15 @@
 """Missions flown in lockstep by the real pilot, streamer and envelope."""
 
 import pytest
+from guidance_harness import GuidanceHarness
 from kinematic_vehicle import KinematicVehicle
-from scripted_autopilot import Cockpit
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement
 from companion.guidance.hold import HoldBehaviour
-from companion.guidance.pilot_event import PilotEventKind
+from companion.guidance.interface import EventKind
 from companion.guidance.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.missions.mission_file import plan_from
+from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
 
@@ -23,84 +24,84 @@ def parked():
     )
 
 
-def mission(cockpit, *steps, **top):
+def mission(harness, *steps, **top):
     text = "".join(f"{key} = {value!r}\n" for key, value in top.items())
     for step in steps:
         text += "[[step]]\n" + "".join(f"{key} = {value!r}\n" for key, value in step.items())
-    return SequenceBehaviour(plan_from(text, "test.toml"), cockpit.pilot.refusal_of)
+    return SequenceBehaviour(plan_from(text, "test.toml"), harness.guidance.check_requirements)
 
 
-async def begun(cockpit, behaviour):
-    await cockpit.turn(0.1)
-    return cockpit.pilot.command(behaviour)
+def begun(harness, behaviour):
+    harness.run(0.1)
+    return harness.command(behaviour)
 
 
-def told(cockpit):
-    return [event.message for event in cockpit.events if event.kind is PilotEventKind.NOTED]
+def told(harness):
+    return [event.message for event in harness.events if event.kind is EventKind.NOTED]
 
 
-async def test_a_mission_from_the_ground_and_back_to_it():
-    cockpit = Cockpit(parked())
+def test_a_mission_from_the_ground_and_back_to_it():
+    harness = GuidanceHarness(parked())
     behaviour = mission(
-        cockpit,
+        harness,
         {"do": "takeoff 5"},
         {"do": "goto 6 0", "name": "out"},
         {"do": "hold 2", "name": "wait"},
         {"do": "land"},
     )
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome == Outcome(True, "flown, 4 steps")
     assert [record.title for record in behaviour.records] == ["takeoff altitude=5", "out", "wait", "land"]
     assert all(record.success for record in behaviour.records)
-    assert cockpit.vehicle.position[0] == pytest.approx(6.0, abs=1.0)
-    assert not cockpit.vehicle.armed
-    assert cockpit.pilot.phase == "idle"
-    assert "mission test: step 2 of 4: goto north=6 east=0" in told(cockpit)
-    assert "offboard" in cockpit.autopilot.requests
+    assert harness.vehicle.position[0] == pytest.approx(6.0, abs=1.0)
+    assert not harness.vehicle.armed
+    assert harness.guidance.phase == "idle"
+    assert "mission test: step 2 of 4: goto north=6 east=0" in told(harness)
+    assert "offboard" in harness.autopilot.requests
 
 
-async def test_between_two_steps_flown_by_setpoints_not_one_setpoint_is_missing():
-    cockpit = Cockpit(flying())
+def test_between_two_steps_flown_by_setpoints_not_one_setpoint_is_missing():
+    harness = GuidanceHarness(flying())
     behaviour = mission(
-        cockpit, {"do": "hold 1", "repeat": 2}, {"do": "goto 3 0"}, {"do": "orbit radius=3 laps=0.5"}
+        harness, {"do": "hold 1", "repeat": 2}, {"do": "goto 3 0"}, {"do": "orbit radius=3 laps=0.5"}
     )
-    future = await begun(cockpit, behaviour)
-    await cockpit.until(lambda: cockpit.pilot.phase == "offboard")
+    future = begun(harness, behaviour)
+    harness.until(lambda: harness.guidance.phase == "offboard")
     while not future.done():
-        before = len(cockpit.autopilot.setpoints)
-        await cockpit.turn()
-        assert len(cockpit.autopilot.setpoints) == before + 1
-        assert cockpit.autopilot.setpoints[-1].deadline_ns >= cockpit.vehicle.now_ns
-        assert cockpit.pilot.phase == "offboard"
+        before = len(harness.autopilot.setpoints)
+        harness.run()
+        assert len(harness.autopilot.setpoints) == before + 1
+        assert harness.autopilot.setpoints[-1].deadline_ns >= harness.vehicle.now_ns
+        assert harness.guidance.phase == "offboard"
     assert future.result().success, future.result().reason
     assert len(behaviour.records) == 4
-    assert cockpit.autopilot.requests == ["offboard"]
+    assert harness.autopilot.requests == ["offboard"]
 
 
-async def test_from_a_landing_the_next_step_may_take_off_again():
-    cockpit = Cockpit(parked())
+def test_from_a_landing_the_next_step_may_take_off_again():
+    harness = GuidanceHarness(parked())
     behaviour = mission(
-        cockpit, {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}
+        harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}
     )
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.success, outcome.reason
-    assert cockpit.autopilot.requests.count("arm") == 2
+    assert harness.autopilot.requests.count("arm") == 2
 
 
-async def test_a_step_that_fails_ends_the_mission_and_is_named_and_the_vehicle_holds():
-    cockpit = Cockpit(flying())
+def test_a_step_that_fails_ends_the_mission_and_is_named_and_the_vehicle_holds():
+    harness = GuidanceHarness(flying())
     behaviour = mission(
-        cockpit, {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
+        harness, {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
     )
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome == Outcome(False, "step 2 of 3 (long): timed out after 2 s: holding")
-    assert cockpit.pilot.phase == "offboard"
-    assert isinstance(cockpit.pilot.behaviour, HoldBehaviour)
-    assert "land" not in cockpit.autopilot.requests
+    assert harness.guidance.phase == "offboard"
+    assert isinstance(harness.guidance.behaviour, HoldBehaviour)
+    assert "land" not in harness.autopilot.requests
 
 
-async def test_on_failure_branches_are_taken():
-    cockpit = Cockpit(flying())
+def test_on_failure_branches_are_taken():
+    harness = GuidanceHarness(flying())
     steps = [
         {"do": "hold 60", "timeout_s": 1, "on_failure": "other"},
         {"do": "hold 1", "name": "skipped"},
@@ -108,8 +109,8 @@ async def test_on_failure_branches_are_taken():
         {"do": "hold 60", "timeout_s": 1, "name": "ignored", "on_failure": "continue"},
         {"do": "hold 0.5", "name": "last", "on_success": "end"},
     ]
-    behaviour = mission(cockpit, *steps)
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    behaviour = mission(harness, *steps)
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.success, outcome.reason
     titles = [record.title for record in behaviour.records]
     assert titles == ["hold duration=60", "other", "ignored", "last"]
@@ -117,162 +118,157 @@ async def test_on_failure_branches_are_taken():
 
 
 @pytest.mark.parametrize(("way", "mode"), [("rtl", FlightMode.RETURN), ("land", FlightMode.LAND)])
-async def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_same(way, mode):
-    cockpit = Cockpit(flying())
-    behaviour = mission(cockpit, {"do": "hold 60", "timeout_s": 1, "name": "wait", "on_failure": way})
-    future = await begun(cockpit, behaviour)
-    await cockpit.until(lambda: cockpit.vehicle.mode is mode)
-    assert "way down after step 1 of 1 (wait)" in cockpit.pilot.status
-    outcome = await cockpit.outcome(future)
+def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_same(way, mode):
+    harness = GuidanceHarness(flying())
+    behaviour = mission(harness, {"do": "hold 60", "timeout_s": 1, "name": "wait", "on_failure": way})
+    future = begun(harness, behaviour)
+    harness.until(lambda: harness.vehicle.mode is mode)
+    assert "way down after step 1 of 1 (wait)" in harness.guidance.status
+    outcome = harness.outcome(future)
     assert not outcome.success
     assert outcome.reason.startswith("step 1 of 1 (wait): timed out after 1 s")
     assert outcome.reason.endswith("landed and disarmed")
-    assert not cockpit.vehicle.armed
+    assert not harness.vehicle.armed
 
 
-async def test_a_step_that_is_refused_fails_with_what_it_needs():
-    cockpit = Cockpit(parked())
+def test_a_step_that_is_refused_fails_with_what_it_needs():
+    harness = GuidanceHarness(parked())
     behaviour = mission(
-        cockpit, {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}
+        harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}
     )
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.reason == (
         "step 3 of 4 (too late): refused: hold needs to be in the air (disarmed, on ground)"
     )
 
 
-async def test_what_the_first_step_needs_refuses_the_mission_and_leaves_what_flies_alone():
-    cockpit = Cockpit(flying())
-    current = await begun(cockpit, HoldBehaviour())
-    refused = cockpit.pilot.command(mission(cockpit, {"do": "takeoff 3"}, {"do": "land"}))
+def test_what_the_first_step_needs_refuses_the_mission_and_leaves_what_flies_alone():
+    harness = GuidanceHarness(flying())
+    current = begun(harness, HoldBehaviour())
+    refused = harness.command(mission(harness, {"do": "takeoff 3"}, {"do": "land"}))
     assert refused.result().reason == "mission needs to be on the ground (armed, in air)"
     assert not current.done()
     # A mission that knows what to do then is flown.
-    behaviour = mission(cockpit, {"do": "takeoff 3", "on_failure": "continue"}, {"do": "hold 1"})
-    outcome = await cockpit.outcome(cockpit.pilot.command(behaviour))
+    behaviour = mission(harness, {"do": "takeoff 3", "on_failure": "continue"}, {"do": "hold 1"})
+    outcome = harness.outcome(harness.command(behaviour))
     assert outcome.success
     assert current.result().reason == "replaced by mission"
 
 
-async def test_a_class_the_detector_does_not_know_refuses_the_whole_mission():
-    cockpit = Cockpit(flying(), class_names=("person", "car"))
-    await cockpit.turn(0.1)
-    outcome = cockpit.pilot.command(mission(cockpit, {"do": "hold 1"}, {"do": "seek zebra"})).result()
+def test_a_class_the_detector_does_not_know_refuses_the_whole_mission():
+    harness = GuidanceHarness(flying(), class_names=("person", "car"))
+    harness.run(0.1)
+    outcome = harness.command(mission(harness, {"do": "hold 1"}, {"do": "seek zebra"})).result()
     assert outcome == Outcome(False, "mission needs a detector that knows zebra")
 
 
-async def test_a_mode_the_autopilot_refuses_is_the_failure_of_its_step_alone():
-    cockpit = Cockpit(flying())
-    cockpit.autopilot.refuse[FlightMode.LAND] = "land refused: no place"
+def test_a_mode_the_autopilot_refuses_is_the_failure_of_its_step_alone():
+    harness = GuidanceHarness(flying())
+    harness.autopilot.refuse[FlightMode.LAND] = "land refused: no place"
     behaviour = mission(
-        cockpit,
+        harness,
         {"do": "hold 0.5"},
         {"do": "land", "name": "down", "on_failure": "stay"},
         {"do": "hold 1", "name": "stay", "on_failure": "down"},
     )
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.success, outcome.reason
     assert [(record.title, record.success) for record in behaviour.records][1:] == [
         ("down", False),
         ("stay", True),
     ]
     assert behaviour.records[1].reason == "land refused: no place"
-    assert cockpit.autopilot.requests.count("offboard") == 1
+    assert harness.autopilot.requests.count("offboard") == 1
 
 
-async def test_a_refused_offboard_is_a_failure_of_the_step_and_nothing_is_sent_any_more():
-    cockpit = Cockpit(flying())
-    cockpit.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
-    behaviour = mission(cockpit, {"do": "hold 1", "name": "stay", "on_failure": "land"})
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+def test_a_refused_offboard_is_a_failure_of_the_step_and_nothing_is_sent_any_more():
+    harness = GuidanceHarness(flying())
+    harness.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
+    behaviour = mission(harness, {"do": "hold 1", "name": "stay", "on_failure": "land"})
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.reason == "step 1 of 1 (stay): offboard refused; landed and disarmed"
 
 
-async def test_an_arming_that_is_refused_ends_the_mission_on_the_ground():
-    cockpit = Cockpit(parked())
+def test_an_arming_that_is_refused_ends_the_mission_on_the_ground():
+    harness = GuidanceHarness(parked())
 
-    async def no_arming():
-        from companion.vehicle.driver import CommandRefusedError
-
-        raise CommandRefusedError("arming refused: no GPS")
-
-    cockpit.autopilot.arm = no_arming
-    outcome = await cockpit.outcome(await begun(cockpit, mission(cockpit, {"do": "takeoff 3"})))
+    harness.autopilot.refuse_arming = "arming refused: no GPS"
+    outcome = harness.outcome(begun(harness, mission(harness, {"do": "takeoff 3"})))
     assert outcome == Outcome(False, "step 1 of 1 (takeoff altitude=3): arming refused: no GPS")
-    assert cockpit.pilot.phase == "idle"
-    assert not cockpit.autopilot.setpoints
+    assert harness.guidance.phase == "idle"
+    assert not harness.autopilot.setpoints
 
 
-async def test_a_command_without_end_is_done_after_its_time():
-    cockpit = Cockpit(flying())
-    behaviour = mission(cockpit, {"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+def test_a_command_without_end_is_done_after_its_time():
+    harness = GuidanceHarness(flying())
+    behaviour = mission(harness, {"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.success
     assert behaviour.records[0].reason == "flown for 4 s"
 
 
-async def test_a_limit_of_visits_ends_a_loop():
-    cockpit = Cockpit(flying())
+def test_a_limit_of_visits_ends_a_loop():
+    harness = GuidanceHarness(flying())
     behaviour = mission(
-        cockpit,
+        harness,
         {"do": "hold 0.2", "name": "a", "visits": 3},
         {"do": "hold 0.2", "name": "b", "on_success": "a"},
     )
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome == Outcome(False, "step 1 of 2 (a): begun 3 times already")
     assert [record.title for record in behaviour.records] == ["a", "b"] * 3
 
 
-async def test_steps_that_fail_at_once_do_not_go_round_for_ever():
-    cockpit = Cockpit(flying())
-    cockpit.perception_age_s = None
-    behaviour = mission(cockpit, {"do": "hold 0.2"}, {"do": "seek car", "name": "look", "on_failure": "look"})
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+def test_steps_that_fail_at_once_do_not_go_round_for_ever():
+    harness = GuidanceHarness(flying())
+    harness.perception_age_s = None
+    behaviour = mission(harness, {"do": "hold 0.2"}, {"do": "seek car", "name": "look", "on_failure": "look"})
+    outcome = harness.outcome(begun(harness, behaviour))
     assert not outcome.success
     assert "end as soon as they begin" in outcome.reason
     assert "perception" in outcome.reason
 
 
-async def test_the_time_of_the_whole_mission_ends_the_step_that_is_flown():
-    cockpit = Cockpit(flying())
-    behaviour = mission(cockpit, {"do": "hold 60", "name": "wait", "on_failure": "continue"}, timeout_s=3)
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+def test_the_time_of_the_whole_mission_ends_the_step_that_is_flown():
+    harness = GuidanceHarness(flying())
+    behaviour = mission(harness, {"do": "hold 60", "name": "wait", "on_failure": "continue"}, timeout_s=3)
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome == Outcome(False, "step 1 of 1 (wait): the mission's 3 s are over")
 
 
 @pytest.mark.parametrize("mode", [FlightMode.POSITION, FlightMode.HOLD, FlightMode.RETURN])
-async def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode):
-    cockpit = Cockpit(flying())
+def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode):
+    harness = GuidanceHarness(flying())
     behaviour = mission(
-        cockpit, *({"do": "hold 0.1", "on_failure": "continue"} for _ in range(30)), {"do": "land"}
+        harness, *({"do": "hold 0.1", "on_failure": "continue"} for _ in range(30)), {"do": "land"}
     )
-    future = await begun(cockpit, behaviour)
-    await cockpit.until(lambda: len(behaviour.records) >= 3)
-    cockpit.autopilot.change_mode(mode)
-    await cockpit.until(future.done, 2.0)
-    sent, flown = len(cockpit.autopilot.setpoints), len(behaviour.records)
+    future = begun(harness, behaviour)
+    harness.until(lambda: len(behaviour.records) >= 3)
+    harness.autopilot.change_mode(mode)
+    harness.until(future.done, 2.0)
+    sent, flown = len(harness.autopilot.setpoints), len(behaviour.records)
     ended = behaviour.told(future.result())
     assert ended.reason.startswith("step ")
     assert "the pilot took over" in ended.reason
     # OFFBOARD that comes back by itself is not ours to use.
-    cockpit.autopilot.change_mode(FlightMode.OFFBOARD)
-    await cockpit.turn(5.0)
-    assert len(cockpit.autopilot.setpoints) == sent
+    harness.autopilot.change_mode(FlightMode.OFFBOARD)
+    harness.run(5.0)
+    assert len(harness.autopilot.setpoints) == sent
     assert len(behaviour.records) == flown
-    assert not cockpit.pilot.in_command
+    assert not harness.guidance.in_command
 
 
-async def test_an_operators_command_ends_the_mission_at_once():
-    cockpit = Cockpit(flying())
-    behaviour = mission(cockpit, {"do": "hold 5", "on_failure": "land"}, {"do": "land"})
-    future = await begun(cockpit, behaviour)
-    await cockpit.until(lambda: cockpit.pilot.phase == "offboard")
-    await cockpit.turn(1.0)
-    cockpit.pilot.command(HoldBehaviour())
+def test_an_operators_command_ends_the_mission_at_once():
+    harness = GuidanceHarness(flying())
+    behaviour = mission(harness, {"do": "hold 5", "on_failure": "land"}, {"do": "land"})
+    future = begun(harness, behaviour)
+    harness.until(lambda: harness.guidance.phase == "offboard")
+    harness.run(1.0)
+    harness.command(HoldBehaviour())
     assert behaviour.told(future.result()).reason == "step 1 of 2 (hold duration=5): replaced by hold"
-    await cockpit.turn(10.0)
-    assert "land" not in cockpit.autopilot.requests
-    assert cockpit.pilot.phase == "offboard"
+    harness.run(10.0)
+    assert "land" not in harness.autopilot.requests
+    assert harness.guidance.phase == "offboard"
 
 
 class Broken(Behaviour):
@@ -291,8 +287,8 @@ class Broken(Behaviour):
         self.left = True
 
 
-async def test_what_goes_wrong_in_a_step_is_its_failure_and_the_plan_goes_on():
-    cockpit, broken = Cockpit(flying()), Broken()
+def test_what_goes_wrong_in_a_step_is_its_failure_and_the_plan_goes_on():
+    harness, broken = GuidanceHarness(flying()), Broken()
     plan = Plan(
         "test",
         (
@@ -301,27 +297,31 @@ async def test_what_goes_wrong_in_a_step_is_its_failure_and_the_plan_goes_on():
         ),
         way_down=lambda word: HoldBehaviour(0.1),
     )
-    behaviour = SequenceBehaviour(plan, cockpit.pilot.refusal_of)
-    outcome = await cockpit.outcome(await begun(cockpit, behaviour))
+    behaviour = SequenceBehaviour(plan, harness.guidance.check_requirements)
+    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome.success
     assert behaviour.records[0].reason == "broken failed: ZeroDivisionError: no such luck"
     assert broken.left
 
 
+TARGET = LandingTarget(7, 1, (1.0, 2.0, 0.0), (0.1, 0.2, 4.0), 0.2)
+
+
 class Telling(HoldBehaviour):
-    landing_target = "what the autopilot is to land on"
+    landing_target = TARGET
 
 
-async def test_what_a_step_tells_and_needs_is_told_and_needed_by_the_mission():
-    cockpit, telling = Cockpit(flying()), Telling(1.0)
+def test_what_a_step_tells_and_needs_is_told_and_needed_by_the_mission():
+    harness, telling = GuidanceHarness(flying()), Telling(1.0)
     plan = Plan(
         "test", (PlannedStep("tell", "hold", lambda: telling),), way_down=lambda word: HoldBehaviour()
     )
-    behaviour = SequenceBehaviour(plan, cockpit.pilot.refusal_of)
+    behaviour = SequenceBehaviour(plan, harness.guidance.check_requirements)
     assert behaviour.landing_target is None
-    future = await begun(cockpit, behaviour)
-    await cockpit.until(lambda: cockpit.pilot.phase == "offboard")
-    assert behaviour.landing_target == "what the autopilot is to land on"
+    future = begun(harness, behaviour)
+    harness.until(lambda: harness.guidance.phase == "offboard")
+    assert behaviour.landing_target == TARGET
+    assert [output.landing_target for output in harness.outputs if output.landing_target] == [TARGET], "once"
     assert behaviour.flown is telling
     assert behaviour.requirements == telling.requirements
-    await cockpit.outcome(future)
+    harness.outcome(future)

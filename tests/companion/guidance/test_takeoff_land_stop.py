@@ -33,21 +33,30 @@ def test_takeoff_asks_the_autopilot_until_it_holds_near_the_height():
     request = ModeRequest(FlightMode.TAKEOFF, 5.0, arm=True)
     assert behaviour.update(0.0, situation(0)) == request
     assert behaviour.update(0.02, situation(5, **climbing(4.8))) == request
-    holding = climbing(4.7, FlightMode.HOLD, LandedState.IN_AIR)
-    assert behaviour.update(0.02, situation(6, **holding)) == Outcome(True, "in the air at 4.7 m")
+    holding = climbing(4.8, FlightMode.HOLD, LandedState.IN_AIR)
+    rising = holding | {"velocity_ned_mps": (0.0, 0.0, -0.5)}
+    assert behaviour.update(0.02, situation(6, **rising)) == request
+    assert behaviour.update(0.02, situation(7, **holding)) == request
+    assert behaviour.update(0.02, situation(7.5, **holding)) == Outcome(
+        True, "took off, 4.8 m above home", (0.0, 0.0, -5.0)
+    )
 
 
-def test_takeoff_finishes_a_climb_that_was_ended_short_once_the_vehicle_has_settled():
+def test_takeoff_climbs_the_rest_of_a_climb_that_was_ended_short():
     behaviour = TakeoffBehaviour(2.5)
     behaviour.on_activate(situation(0))
-    short = climbing(1.8, FlightMode.HOLD, LandedState.IN_AIR)
+    short = climbing(2.1, FlightMode.HOLD, LandedState.IN_AIR)
     assert isinstance(behaviour.update(0.02, situation(5.0, **short)), ModeRequest)
     assert isinstance(behaviour.update(0.02, situation(5.9, **short)), ModeRequest)
     step = behaviour.update(0.02, situation(6.1, **short))
     assert isinstance(step, Setpoint)
-    assert step.position_ned_m == pytest.approx((0.0, 0.0, -2.5))
+    assert step.velocity_ned_mps is not None
+    assert step.velocity_ned_mps[2] < -0.3
     risen = climbing(2.3, FlightMode.OFFBOARD, LandedState.IN_AIR)
-    assert behaviour.update(0.02, situation(8.0, **risen)) == Outcome(True, "in the air at 2.3 m")
+    assert isinstance(behaviour.update(0.02, situation(8.0, **risen)), Setpoint)
+    assert behaviour.update(0.02, situation(8.5, **risen)) == Outcome(
+        True, "took off, 2.3 m above home", (0.0, 0.0, -2.5)
+    )
 
 
 def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached():

@@ -31,7 +31,7 @@ def test_a_running_service_tells_its_stages_and_what_became_of_every_frame(
         running_simulator() as simulator,
         running_service(simulator.onboard_port, flags, cwd=tmp_path) as service,
     ):
-        service.wait_for_line("the autopilot is heard")
+        service.wait_for_line("autopilot heartbeat received")
         numbers = fetch(port)
         while not numbers.get('companion_frames_left_out_total{reason="rate",view=""}'):
             numbers = fetch(port)

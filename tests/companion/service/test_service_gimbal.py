@@ -12,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.guidance.behaviour import Situation
+from companion.guidance.interface import StreamStatus
 from companion.perception.assembly import CameraTelemetry, _held_at, _view_at
 from companion.perception.messages import Attitude, GimbalAttitude
 from companion.service import Service
@@ -55,64 +57,86 @@ def seen(captured_ns: int) -> PerceptionResult:
 
 def take(service: Service, state: VehicleState) -> None:
     service.driver._heard.state = state  # type: ignore[attr-defined]
-    service._take_state(state)
+    service._on_state(state)
+
+
+def see(service: Service, captured_ns: int) -> None:
+    """The steering camera's newest frame."""
+    view, result = service.views[0], seen(captured_ns)
+    view.take(result)
+    service.inputs.on_result(view, result, captured_ns)
+
+
+def step(service: Service, now_ns: int) -> Situation:
+    """One step of guidance; what behaviours would see."""
+    inputs = service.inputs.assemble(now_ns, service.driver.state, StreamStatus())
+    service.guidance.step(now_ns, inputs)
+    assert service.guidance.situation is not None
+    return service.guidance.situation
 
 
 async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_where_it_looks() -> None:
     service, now_ns = service_of(camera__gimbal="true"), time.monotonic_ns()
     take(service, state_at(now_ns, None))
-    service.steering._take(seen(now_ns))
-    assert service.steering.targets == ()
+    see(service, now_ns)
+    assert service.views[0].targets == ()
     assert service.status()["targets"]["problem"] == "no attitude of the gimbal is known yet"
     assert service.status()["gimbal"]["problem"] == "no gimbal answers"
-    situation = service._situation(now_ns)
+    situation = step(service, now_ns)
     assert not situation.perception_fresh
     assert situation.gimbal.undirected == "the gimbal that carries it: no gimbal answers"
 
     take(service, state_at(now_ns + 1, looking_down(now_ns + 1)))
-    service.steering._take(seen(now_ns + 1))
-    (target,) = service.steering.targets
+    see(service, now_ns + 1)
+    (target,) = service.views[0].targets
     assert target.elevation_rad == pytest.approx(PITCH_RAD, abs=0.01)
     assert target.bearing_rad == pytest.approx(HEADING_RAD, abs=0.01)
-    situation = service._situation(now_ns + 1)
+    situation = step(service, now_ns + 1)
     assert situation.perception_fresh
     assert situation.targets == (target,)
     json.dumps(service.status(), allow_nan=False)
     # It grows old: what is seen then has no direction again, and the status says why.
     later_ns = now_ns + 2_000_000_000
     take(service, replace(state_at(later_ns, looking_down(now_ns + 1))))
-    service.steering._take(seen(later_ns))
-    assert service.steering.targets == ()
+    see(service, later_ns)
+    assert service.views[0].targets == ()
     assert "newer than the newest attitude of the gimbal" in service.status()["targets"]["problem"]
-    assert "old" in service._situation(later_ns).gimbal.undirected
+    assert "old" in step(service, later_ns).gimbal.undirected
 
 
 async def test_a_camera_on_the_body_asks_no_gimbal() -> None:
     service, now_ns = service_of(), time.monotonic_ns()
     take(service, state_at(now_ns, None))
-    service.steering._take(seen(now_ns))
-    assert len(service.steering.targets) == 1
+    see(service, now_ns)
+    assert len(service.views[0].targets) == 1
     assert service.status()["gimbal"] is None
-    assert service._situation(now_ns).gimbal.undirected == ""
+    assert step(service, now_ns).gimbal.undirected == ""
 
 
 def test_a_search_over_an_area_counts_on_what_the_camera_sees_from_where_the_gimbal_points_it() -> None:
     service, now_ns = service_of(camera__gimbal="true", camera__mount_pitch_deg="-10"), time.monotonic_ns()
     take(service, state_at(now_ns, looking_down(now_ns)))
-    assert service._camera_pitch() == pytest.approx(PITCH_RAD - math.radians(10.0))
-    assert service_of(camera__mount_pitch_deg="-10")._camera_pitch() == pytest.approx(-math.radians(10.0))
+    assert service.inputs.camera_pitch_rad(service.driver.state) == pytest.approx(
+        PITCH_RAD - math.radians(10.0)
+    )
+    fixed = service_of(camera__mount_pitch_deg="-10")
+    assert fixed.inputs.camera_pitch_rad(fixed.driver.state) == pytest.approx(-math.radians(10.0))
 
 
-async def test_an_operators_word_for_a_gimbal_that_is_not_there_is_refused_and_ends_nothing() -> None:
+async def test_a_gimbal_command_without_a_gimbal_is_refused() -> None:
     service = service_of()
     service.ready = True
+    steering = asyncio.create_task(service._loop.run())
     reply = await service.command("gimbal pitch=-30")
     assert (reply["success"], reply["reason"]) == (False, "gimbal needs a gimbal (none answers)")
-    assert service.pilot.behaviour is None
+    assert service.guidance.behaviour is None
+    steering.cancel()
+    await asyncio.gather(steering, return_exceptions=True)
 
 
-async def test_a_gimbal_that_carries_a_camera_is_looked_for_until_it_is_heard() -> None:
+async def test_a_gimbal_that_carries_a_camera_is_looked_for_and_its_loss_is_told() -> None:
     service, now_ns = service_of(camera__gimbal="true"), time.monotonic_ns()
+    take(service, state_at(now_ns, None))
     asked = asyncio.Event()
 
     async def find() -> bool:
@@ -120,18 +144,16 @@ async def test_a_gimbal_that_carries_a_camera_is_looked_for_until_it_is_heard() 
         return False
 
     service.driver.find_gimbal = find  # type: ignore[method-assign]
-    service.gimbal.update(now_ns, state_at(now_ns, None), None)
+    service._loop._step(now_ns)
     await asked.wait()
-    asked.clear()
-    await asyncio.sleep(0)
     later_ns = now_ns + 1_000_000_000
-    service.gimbal.update(later_ns, state_at(later_ns, looking_down(later_ns)), None)
+    take(service, state_at(later_ns, looking_down(later_ns)))
+    service._loop._step(later_ns)
     assert service.events[-1].text == "the camera's gimbal tells where it looks"
     lost_ns = later_ns + 10_000_000_000
-    service.gimbal.update(lost_ns, state_at(lost_ns, looking_down(later_ns)), None)
+    take(service, state_at(lost_ns, looking_down(later_ns)))
+    service._loop._step(lost_ns)
     assert service.events[-1].text == "where the camera looks is not known: its attitude is 10.0 s old"
-    await asked.wait()
-    await service.gimbal.close()
 
 
 def test_a_silent_gimbal_and_one_that_tells_exclude_each_other() -> None:
@@ -140,16 +162,16 @@ def test_a_silent_gimbal_and_one_that_tells_exclude_each_other() -> None:
 
 
 def test_the_tracker_is_told_where_a_camera_on_a_gimbal_looked() -> None:
-    telemetry = CameraTelemetry()
+    told = CameraTelemetry()
     frame = Frame(np.zeros((480, 640, 3), np.uint8), 1_010_000_000, 1)
     settings = load_settings(os.devnull, {"camera.gimbal": "true"}, {})
     for stamp in (1_000_000_000, 1_020_000_000):
-        telemetry.attitudes.add(stamp, Attitude(stamp, quaternion_from_euler(0.3, -0.3, 1.0)).wxyz)
-    assert _view_at(settings, telemetry)(frame) is None
-    assert _held_at(settings, telemetry)(frame.captured_ns) is None
+        told.attitudes.add(stamp, Attitude(stamp, quaternion_from_euler(0.3, -0.3, 1.0)).wxyz)
+    assert _view_at(settings, told)(frame) is None
+    assert _held_at(settings, told)(frame.captured_ns) is None
     for stamp, pitch in ((1_000_000_000, -0.6), (1_020_000_000, -0.8)):
-        telemetry.gimbal.add(stamp, GimbalAttitude(stamp, quaternion_from_euler(0.0, pitch, 1.0)).wxyz)
-    view = _view_at(settings, telemetry)(frame)
+        told.gimbal.add(stamp, GimbalAttitude(stamp, quaternion_from_euler(0.0, pitch, 1.0)).wxyz)
+    view = _view_at(settings, told)(frame)
     assert view is not None
     ahead = view.ned_from_optical @ np.array([0.0, 0.0, 1.0])
     assert math.asin(ahead[2]) == pytest.approx(0.7)
@@ -160,8 +182,8 @@ def test_a_camera_that_looks_up_tells_no_range_by_the_ground() -> None:
     for pitch_deg, ground in (("45", False), ("0", True)):
         service, now_ns = service_of(camera__mount_pitch_deg=pitch_deg), time.monotonic_ns()
         take(service, state_at(now_ns, None))
-        assert service._situation(now_ns).ranging.ground, "nothing was seen yet: nothing is known to miss"
-        service.steering._take(seen(now_ns))
-        ranging = service._situation(now_ns).ranging
+        assert step(service, now_ns).ranging.ground, "nothing was seen yet: nothing is known to miss"
+        see(service, now_ns)
+        ranging = step(service, now_ns).ranging
         assert (ranging.depth, ranging.ground) == (False, ground)
         assert "car" in ranging.classes

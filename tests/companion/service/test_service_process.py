@@ -45,7 +45,7 @@ def wait_for_truth(path: Path, condition: Any, timeout_s: float = 30.0) -> dict[
 def fly(service: ServiceProcess) -> None:
     """In the air and in OFFBOARD."""
     service.take_off(2.5)
-    assert service.command("hold") == {"command": "hold", "success": True, "reason": "under way"}
+    assert service.command("hold") == {"command": "hold", "success": True, "reason": "in progress"}
 
 
 @pytest.mark.parametrize("driver", ["mavsdk", "pymavlink"])
@@ -135,10 +135,10 @@ def test_a_vehicle_that_vanishes_is_told_and_found_again(filming: list[str], tmp
         with running_service(first.onboard_port, filming, cwd=tmp_path) as service:
             fly(service)
             first.kill()
-            service.wait_for_line("the autopilot is not heard any more")
+            service.wait_for_line("autopilot heartbeat lost")
             said = len(service.lines)
             with running_simulator(**ports) as second:
-                service.wait_for_line("the autopilot is heard", after=said)
+                service.wait_for_line("autopilot heartbeat received", after=said)
                 service.take_off(2.5)
                 second.wait_for_event("takeoff")
 

@@ -1,13 +1,16 @@
-"""The parts of a service as its settings want them."""
+"""The parts of a service as its settings want them. A flight in lockstep is made of the same ones."""
 
 from __future__ import annotations
 
 from companion.guidance.battery import BatteryMinimum
+from companion.guidance.core import GuidanceOptions
 from companion.guidance.envelope import Limits
+from companion.guidance.gimbal_controller import GimbalMounting
 from companion.guidance.obstacles import ObstacleRules
 from companion.settings import Settings
 from companion.vehicle.driver import Driver
 from companion.vehicle.drivers import open_driver
+from companion.vehicle.gimbal import Address
 from companion.vehicle.signing import read_key
 
 
@@ -21,6 +24,26 @@ def driver_of(settings: Settings) -> Driver:
         signing_key=None
         if settings.vehicle.signing_key_file is None
         else read_key(settings.vehicle.signing_key_file),
+    )
+
+
+def guidance_options(settings: Settings, own_address: Address) -> GuidanceOptions:
+    """What guidance keeps to. `own_address`: system and component id of our messages."""
+    guidance = settings.guidance
+    cameras = [settings.of_view(name).camera for name in (None, *settings.views)]
+    steering = settings.of_view(guidance.view).camera
+    return GuidanceOptions(
+        limits=limits_of(settings),
+        own_address=own_address,
+        lifetime_s=guidance.setpoint_lifetime_s,
+        battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
+        obstacles=ObstacleRules(guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps),
+        perception_max_age_s=guidance.perception_max_age_s,
+        gimbal=GimbalMounting(
+            carries_camera=any(camera.gimbal for camera in cameras),
+            carries_steering=steering.gimbal,
+            camera_pitch_rad=steering.mount().pitch_rad,
+        ),
     )
 
 
@@ -39,15 +62,3 @@ def limits_of(settings: Settings) -> Limits:
         fence=guidance.fence(),
         min_separation_m=guidance.min_separation_m,
     )
-
-
-def battery_minimum_of(settings: Settings) -> BatteryMinimum:
-    """How much charge a flight needs, and what follows one that ended for its lack."""
-    guidance = settings.guidance
-    return BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery)
-
-
-def obstacle_rules_of(settings: Settings) -> ObstacleRules:
-    """How far to stay from what the depth camera sees."""
-    guidance = settings.guidance
-    return ObstacleRules(guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps)

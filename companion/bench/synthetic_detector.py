@@ -30,7 +30,7 @@ CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class ScenePose:
     """Where something stands: north, east in metres, heading in radians."""
 
     north_m: float
@@ -39,7 +39,7 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class SceneObject:
     """An upright box on the ground.
 
     Attributes:
@@ -51,7 +51,7 @@ class Thing:
 
     class_name: str
     size_m: Vector3
-    pose: Callable[[float], Pose]
+    pose: Callable[[float], ScenePose]
     hidden: Callable[[float], bool] = lambda _: False
 
     def range_m(self, place: Sequence[float], seconds: float) -> float:
@@ -82,7 +82,7 @@ class _Outline:
     inside: float
 
 
-class DrawnDetector:
+class SyntheticDetector:
     """Callable as `lockstep_flight.Sight.detect`. The same seed and calls give the same detections.
 
     Args:
@@ -93,7 +93,7 @@ class DrawnDetector:
 
     def __init__(
         self,
-        things: Sequence[Thing],
+        things: Sequence[SceneObject],
         camera: CameraModel,
         mount: CameraMount,
         *,
@@ -166,7 +166,7 @@ class DrawnDetector:
     def _outline(
         self,
         index: int,
-        thing: Thing,
+        thing: SceneObject,
         eye: NDArray[np.float64],
         optical_from_ned: NDArray[np.float64],
         seconds: float,
@@ -189,7 +189,7 @@ class DrawnDetector:
 
     def _depth(
         self,
-        thing: Thing,
+        thing: SceneObject,
         box: NDArray[np.float64],
         eye: NDArray[np.float64],
         optical_from_ned: NDArray[np.float64],

@@ -1,0 +1,232 @@
+"""The demonstration in lockstep, over many seeds: the same mission, core, camera, network and tracker.
+
+`companion demo` flies it in real time, with processes and sockets; here simulated time waits for the camera
+and the network, so that a result does not depend on how busy the computer is. Every figure is the
+simulator's truth.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from typing import Any
+
+from rich.table import Table
+
+from companion.bench.lockstep_flight import Camera, LockstepFlight
+from companion.bench.rendered_camera import RenderedCamera
+from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
+from companion.guidance.sequence import SequenceBehaviour
+from companion.rehearsal import (
+    FIND,
+    MISSION,
+    RANGE_TOLERANCE_M,
+    REACH,
+    SIMULATOR_PARAMETERS,
+    STAND,
+    STOP_DISTANCE_M,
+    TARGET_CLASS,
+    rehearsal_settings,
+)
+from companion.settings import Settings
+from mavlink_sim.camera.scene import Scene
+from mavlink_sim.camera.scene_file import scene_or_demo
+from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.world.shapes import CLASS_NAMES, shape_of, variant_of
+from mavlink_sim.world.world import World, WorldObject, range_to
+
+LIMIT_S = 240.0
+# As the demonstration draws and looks at them, on two cores.
+CAMERA_RATE_HZ, LATENCY_S = 10.0, 0.12
+
+
+@dataclass(frozen=True, slots=True)
+class DemoFlight:
+    """One demonstration. Ranges are horizontal, from the vehicle to the car's nearest surface, metres.
+
+    Attributes:
+        confirmed: class of the object that `seek` ended at, by truth; None: it found none.
+        arrival_range_m: when the approach said that it had arrived. hold_range_m: after the hold.
+        time_s: simulated, from the command to its answer.
+        failure: why it failed; None: it did not.
+    """
+
+    seed: int
+    success: bool
+    confirmed: str | None
+    arrival_range_m: float | None
+    hold_range_m: float | None
+    time_s: float
+    failure: str | None
+
+
+def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
+    """One demonstration; the same seed gives the same flight.
+
+    Args:
+        synthetic: detections are made of the truth instead of drawn and looked for.
+    """
+    settings = rehearsal_settings(14540, "lockstep")
+    scene = scene_or_demo(None, seed)
+    vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, parameters=dict(SIMULATOR_PARAMETERS))
+    camera: Camera
+    if synthetic:
+        camera = _synthetic_camera(settings, scene, seed)
+    else:
+        camera = RenderedCamera(settings, scene, rate_hz=CAMERA_RATE_HZ, latency_s=LATENCY_S)
+    flight = LockstepFlight(SimulatedDriver(vehicle), settings, [camera])
+    flight.run_until(lambda: flight.state.ready_to_arm, 30.0)
+    flight.begun_ns = flight.now_ns
+    identifier = flight.command(f"mission {MISSION}")
+    flight.tick()
+    behaviour = flight.guidance.behaviour
+    confirmed: str | None = None
+    ranges_m: dict[str, float] = {}
+    while flight.seconds < LIMIT_S and flight.outcome(identifier) is None:
+        flight.tick()
+        records = behaviour.records if isinstance(behaviour, SequenceBehaviour) else []
+        if records and records[-1].title not in ranges_m and records[-1].success:
+            ranges_m[records[-1].title] = _range_to_target(scene.world, vehicle)
+            if records[-1].title == FIND:
+                confirmed = _faced(scene.world, flight)
+    outcome = flight.outcome(identifier)
+    arrival_m, hold_m = ranges_m.get(REACH), ranges_m.get(STAND)
+    failure = None
+    if outcome is None:
+        failure = f"not finished in {LIMIT_S:g} s: {flight.guidance.status}"
+    elif not outcome.success:
+        words = behaviour.told(outcome) if isinstance(behaviour, SequenceBehaviour) else outcome
+        failure = words.reason
+    elif hold_m is None or abs(hold_m - STOP_DISTANCE_M) > RANGE_TOLERANCE_M:
+        failure = f"stood {_metres(hold_m)} from the {TARGET_CLASS}, not {STOP_DISTANCE_M:g} m"
+    elif vehicle.truth.armed or not vehicle.truth.landed:
+        failure = "the vehicle is not on the ground and disarmed"
+    return DemoFlight(
+        seed,
+        failure is None,
+        confirmed,
+        None if arrival_m is None else round(arrival_m, 2),
+        None if hold_m is None else round(hold_m, 2),
+        round(flight.seconds, 1),
+        failure,
+    )
+
+
+def fly_demos(seeds: Sequence[int], *, processes: int = 1, synthetic: bool = False) -> Iterator[DemoFlight]:
+    """One for each seed, in the seeds' order, some at once."""
+    if processes <= 1 or len(seeds) <= 1:
+        yield from (fly_demo(seed, synthetic=synthetic) for seed in seeds)
+        return
+    with ProcessPoolExecutor(
+        min(processes, len(seeds)), get_context("spawn"), initializer=_one_thread
+    ) as pool:
+        yield from pool.map(_fly, [(seed, synthetic) for seed in seeds])
+
+
+def demos_summary(flights: Sequence[DemoFlight]) -> dict[str, Any]:
+    """Plain values, ready for JSON."""
+    errors_m = [abs(f.hold_range_m - STOP_DISTANCE_M) for f in flights if f.hold_range_m is not None]
+    return {
+        "flights": len(flights),
+        "successes": sum(flight.success for flight in flights),
+        "worst_range_error_m": round(max(errors_m), 2) if errors_m else None,
+        "seeds": [asdict(flight) for flight in flights],
+    }
+
+
+def demos_table(flights: Sequence[DemoFlight]) -> Table:
+    """The same for people."""
+    succeeded = sum(flight.success for flight in flights)
+    table = Table(title=f"demonstration: {succeeded} of {len(flights)} succeeded")
+    for heading in ("seed", "success", "confirmed", "range at arrival", "after the hold", "time"):
+        table.add_column(heading, justify="right")
+    table.add_column("why it failed", justify="left")
+    for flight in flights:
+        table.add_row(
+            f"{flight.seed}",
+            "yes" if flight.success else "no",
+            flight.confirmed or "-",
+            _metres(flight.arrival_range_m),
+            _metres(flight.hold_range_m),
+            f"{flight.time_s:.1f} s",
+            flight.failure or "",
+        )
+    return table
+
+
+def seeds_of(text: str) -> list[int]:
+    """`1..50` or `1,5,9..12` as numbers. Raises ValueError for what is none."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, dots, last = part.strip().partition("..")
+        try:
+            low = int(first)
+            high = int(last) if dots else low
+        except ValueError:
+            raise ValueError(f"seeds {text!r}: expected numbers and ranges such as 1..50 or 3,7") from None
+        if low < 0 or high < low:
+            raise ValueError(f"seeds {text!r}: {part.strip()} is no range of seeds from 0 up")
+        seeds.extend(range(low, high + 1))
+    return seeds
+
+
+def _one_thread() -> None:
+    # A network's thread pool in every process would have them wait for each other.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def _fly(task: tuple[int, bool]) -> DemoFlight:
+    return fly_demo(task[0], synthetic=task[1])
+
+
+def _range_to_target(world: World, vehicle: LockstepVehicle) -> float:
+    """To the nearest car, by truth."""
+    place = vehicle.truth.position_ned_m
+    return min(range_to(item, place) for item in world.objects if item.class_name == TARGET_CLASS)
+
+
+def _faced(world: World, flight: LockstepFlight) -> str | None:
+    """Class of the object that stands where guidance believes the one it faces to be."""
+    situation = flight.guidance.situation
+    assert situation is not None
+    yaw_rad = situation.state.yaw_rad or 0.0
+    seen = [t for t in situation.targets if t.class_name == TARGET_CLASS and t.position_ned_m is not None]
+    if not seen:
+        return None
+    faced = min(seen, key=lambda target: abs(target.bearing_rad - yaw_rad))
+    assert faced.position_ned_m is not None
+    place = faced.position_ned_m
+    return min(world.objects, key=lambda item: range_to(item, place)).class_name
+
+
+def _synthetic_camera(settings: Settings, scene: Scene, seed: int) -> SyntheticCamera:
+    """The scene's objects as upright boxes, those that no class stands for only hide others."""
+    model, mount = scene.camera.model, scene.camera.mount
+    objects = [_as_box(item) for item in scene.objects_at(0.0)]
+    detector = SyntheticDetector(objects, model, mount, seed=seed, with_depth=True)
+    return SyntheticCamera(
+        settings,
+        detect=detector,
+        size=(model.width, model.height),
+        rate_hz=CAMERA_RATE_HZ,
+        latency_s=LATENCY_S,
+        tracker=replace(settings.tracker.following(settings.detector.confidence)),
+    )
+
+
+def _as_box(item: WorldObject) -> SceneObject:
+    rear, front, left, right = item.footprint_m
+    shape = shape_of(item.class_name, variant_of(item.class_name, item.appearance))
+    pose = ScenePose(item.position_ned_m[0], item.position_ned_m[1], item.yaw_rad)
+    height_m = float(-shape.low[2] * item.scale)
+    class_name = item.class_name if item.class_name in CLASS_NAMES else ""
+    return SceneObject(class_name, (front - rear, right - left, height_m), lambda _: pose)
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} m"

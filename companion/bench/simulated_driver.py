@@ -1,0 +1,247 @@
+"""A driver for flights in lockstep: guidance's requests and setpoints to the built-in vehicle, no sockets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from companion.guidance.interface import (
+    Answer,
+    Arm,
+    FindGimbal,
+    PointGimbal,
+    ReleaseGimbal,
+    Request,
+    SetMode,
+    TakeGimbal,
+    TakeOff,
+)
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
+from companion.vehicle.landing_target import LandingTarget, landing_target_fields
+from companion.vehicle.manners import HOME_POSITION_ID, PX4, Px4Manners
+from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import VehicleState
+from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+from mavlink_sim.lockstep import COMPANION, LockstepVehicle
+from mavlink_sim.wire.messages import dialect
+
+START_NS = 1_000_000_000_000
+# As the drivers wait.
+SHOWN_TIMEOUT_S = 3.0
+GIMBAL_INFORMATION_ID = 280
+# What the drivers ask of an autopilot, home, and the same where there is a gimbal (`gimbal_commands`).
+RATES_HZ = {
+    **{dialect.mavlink_map[number].msgname: rate_hz for number, rate_hz in Px4Manners.rates_hz.items()},
+    dialect.mavlink_map[HOME_POSITION_ID].msgname: 0.5,
+    "HEARTBEAT": 1.0,
+}
+GIMBAL_RATES_HZ = {"GIMBAL_DEVICE_ATTITUDE_STATUS": 50.0, "GIMBAL_MANAGER_STATUS": 5.0}
+
+
+class LockstepDriver(Protocol):
+    """What a flight in lockstep needs of a vehicle: a clock, a state, and time that passes when told to."""
+
+    @property
+    def now_ns(self) -> int:
+        """The flight's clock, as CLOCK_MONOTONIC would be."""
+
+    @property
+    def state(self) -> VehicleState:
+        """The newest snapshot."""
+
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        """One setpoint, now."""
+
+    def send_landing_target(self, target: LandingTarget) -> None:
+        """One landing target, now."""
+
+    def start(self, request: Request) -> None:
+        """Begin to carry out a request of guidance."""
+
+    def cancel(self, identifier: int) -> None:
+        """Nobody waits for it any more."""
+
+    def take_answers(self) -> tuple[Answer, ...]:
+        """Those that have come since the last call."""
+
+    def step(self, dt_s: float) -> None:
+        """Let time pass."""
+
+
+@dataclass
+class _Pending:
+    identifier: int
+    command: int
+    refusal: str
+    shown: Callable[[], bool] | None
+    until_ns: float
+
+
+class SimulatedDriver:
+    """The built-in vehicle. A request is answered as `companion.vehicle.flight_commands` answers it.
+
+    Args:
+        vehicle: PX4-like, with the streams of `RATES_HZ` on its first link.
+        boot_ns: the flight's clock when the vehicle booted.
+    """
+
+    def __init__(self, vehicle: LockstepVehicle, boot_ns: int = START_NS) -> None:
+        self.vehicle, self._boot_ns = vehicle, boot_ns
+        self._state = VehicleState()
+        self._manners = Px4Manners()
+        self._mode_ns = 0
+        self._pending: list[_Pending] = []
+        self._answers: list[Answer] = []
+        if vehicle.vehicle.gimbal is not None:
+            # As the drivers do when a link opens.
+            self.vehicle.send(self._long(dialect.MAV_CMD_REQUEST_MESSAGE, GIMBAL_INFORMATION_ID))
+            self.vehicle.step(0.1)
+        self.receive()
+
+    @property
+    def now_ns(self) -> int:
+        return self._boot_ns + round(self.vehicle.now_s * 1e9)
+
+    @property
+    def state(self) -> VehicleState:
+        return self._state
+
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        self.vehicle.send(setpoint_message(setpoint, self.vehicle.vehicle.system_id))
+
+    def send_landing_target(self, target: LandingTarget) -> None:
+        self.vehicle.send(dialect.MAVLink_landing_target_message(**landing_target_fields(target, PX4)))
+
+    def start(self, request: Request) -> None:
+        mav, state = dialect, self._state
+        match request.action:
+            case SetMode(mode):
+                asked_ns = self.now_ns
+                shown_mode, main, sub = self._manners.mode_request(mode, state)
+                self._command(
+                    request,
+                    f"the vehicle refused mode {mode}",
+                    lambda: self._mode_ns > asked_ns and self._state.mode is shown_mode,
+                    mav.MAV_CMD_DO_SET_MODE,
+                    1.0,
+                    main,
+                    sub,
+                )
+            case Arm():
+                refusal = "the vehicle refused to arm"
+                self._command(
+                    request, refusal, lambda: self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0
+                )
+            case TakeOff(altitude_m):
+                try:
+                    values = self._manners.takeoff_parameters(altitude_m, state)
+                except CommandRefusedError as error:
+                    self._answers.append(Answer(request.identifier, str(error)))
+                    return
+                self._command(
+                    request, "the vehicle refused to take off", None, mav.MAV_CMD_NAV_TAKEOFF, *values
+                )
+            case FindGimbal():
+                self._command(
+                    request,
+                    "no gimbal answers",
+                    None,
+                    mav.MAV_CMD_REQUEST_MESSAGE,
+                    GIMBAL_INFORMATION_ID,
+                )
+            case TakeGimbal():
+                values = (*COMPANION, UNCHANGED, UNCHANGED)
+                self._command(request, "the vehicle refused control of the gimbal", None, CONFIGURE, *values)
+            case PointGimbal(aim):
+                values = (
+                    math.degrees(aim.pitch_rad),
+                    math.degrees(aim.yaw_rad),
+                    math.nan,
+                    math.nan,
+                    FOLLOWING_NOSE,
+                )
+                self._command(request, "the vehicle refused to point the gimbal", None, PITCHYAW, *values)
+            case ReleaseGimbal():
+                values = (RELEASE, RELEASE, UNCHANGED, UNCHANGED)
+                self._command(
+                    request, "the vehicle refused to give the gimbal back", None, CONFIGURE, *values
+                )
+
+    def cancel(self, identifier: int) -> None:
+        self._pending = [pending for pending in self._pending if pending.identifier != identifier]
+
+    def take_answers(self) -> tuple[Answer, ...]:
+        answers, self._answers = tuple(self._answers), []
+        return answers
+
+    def step(self, dt_s: float) -> None:
+        self.vehicle.step(dt_s)
+        self.receive()
+
+    def receive(self) -> None:
+        """Messages into the state, acknowledgements into answers."""
+        now_ns = self.now_ns
+        for message in self.vehicle.receive():
+            name = message.get_type()
+            if name in FOLDED_MESSAGES:
+                if name in ("HEARTBEAT", "CURRENT_MODE"):
+                    self._mode_ns = now_ns
+                self._state = fold(self._state, name, message.to_dict(), now_ns)
+            elif name == "COMMAND_ACK":
+                self._acknowledge(message)
+        for pending in list(self._pending):
+            if pending.shown is not None and pending.shown():
+                self._answer(pending, None)
+            elif now_ns > pending.until_ns:
+                self._answer(pending, f"{pending.refusal}: nothing shows after {SHOWN_TIMEOUT_S:g} s")
+
+    def _command(
+        self,
+        request: Request,
+        refusal: str,
+        shown: Callable[[], bool] | None,
+        number: int,
+        *parameters: float,
+    ) -> None:
+        """One COMMAND_LONG. `shown`: what ends it besides a refusal; None: its acknowledgement."""
+        until_ns = self.now_ns + SHOWN_TIMEOUT_S * 1e9
+        self._pending.append(_Pending(request.identifier, number, refusal, shown, until_ns))
+        self.vehicle.send(self._long(number, *parameters))
+
+    def _long(self, number: int, *parameters: float) -> object:
+        values = (*parameters, *[0.0] * (7 - len(parameters)))
+        return dialect.MAVLink_command_long_message(self.vehicle.vehicle.system_id, 1, number, 0, *values)
+
+    def _acknowledge(self, message: Any) -> None:
+        pending = next((one for one in self._pending if one.command == message.command), None)
+        if pending is None or message.result == IN_PROGRESS:
+            return
+        if message.result != ACCEPTED:
+            self._answer(pending, f"{pending.refusal} ({result_name(message.result)})")
+        elif pending.shown is None:
+            self._answer(pending, None)
+
+    def _answer(self, pending: _Pending, refused: str | None) -> None:
+        self._pending.remove(pending)
+        self._answers.append(Answer(pending.identifier, refused))
+
+
+def setpoint_message(setpoint: Setpoint, system_id: int = 1) -> object:
+    """SET_POSITION_TARGET_LOCAL_NED as the drivers send it."""
+    zero = (0.0, 0.0, 0.0)  # the type mask says what counts
+    return dialect.MAVLink_set_position_target_local_ned_message(
+        0,
+        system_id,
+        1,
+        dialect.MAV_FRAME_LOCAL_NED,
+        setpoint.type_mask,
+        *(setpoint.position_ned_m or zero),
+        *(setpoint.velocity_ned_mps or zero),
+        *zero,
+        setpoint.yaw_rad or 0.0,
+        setpoint.yaw_rate_radps or 0.0,
+    )

@@ -1,0 +1,561 @@
+"""Guidance as a function: `Guidance.step(now_ns, GuidanceInput) -> GuidanceOutput`.
+
+One behaviour is active at a time. Guidance engages OFFBOARD for it, keeps its setpoints inside the envelope
+and yields to the pilot. There is no asyncio, no clock and no I/O here: the service, the campaigns and the
+tests call this one function, and nothing else drives a behaviour.
+
+When the vehicle shows a mode that was not requested, our command ends at once and nothing is streamed any
+more until an operator's next command, even if OFFBOARD comes back by itself.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from companion.guidance.authority import Authority
+from companion.guidance.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryWatch
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.command_queue import CommandQueue
+from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.gimbal_controller import ENDING, GimbalController, GimbalMounting
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import (
+    Answer,
+    CommandInput,
+    EventKind,
+    GuidanceInput,
+    GuidanceOutput,
+    OutputCollector,
+    SetMode,
+)
+from companion.guidance.mode_sequence import ModeSequence
+from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
+from companion.guidance.refusal import refusal
+from companion.vehicle.gimbal import Address
+from companion.vehicle.landing_target import LandingTarget
+from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
+from companion.vehicle.state import FlightMode, Vector3
+from companion.vehicle.streamer import SILENCE_S, StreamState
+
+logger = logging.getLogger(__name__)
+
+# PX4 takes OFFBOARD after one setpoint; a few more cost 60 ms and survive a lost packet.
+SETPOINTS_BEFORE_OFFBOARD = 3
+ENGAGE_TIMEOUT_S = 3.0
+# In OFFBOARD without a known position: brake for this long, then leave the vehicle to the autopilot.
+POSITION_LOSS_S = 2.0
+
+
+class Phase(StrEnum):
+    """How far our command of the vehicle has come."""
+
+    IDLE = "idle"  # not in command
+    READY = "ready"  # in command, nothing requested of the vehicle yet
+    ENGAGING = "engaging"  # streaming a brake and requesting OFFBOARD
+    OFFBOARD = "offboard"  # the vehicle flies our setpoints
+    REQUESTING = "requesting"  # requesting one of the autopilot's own modes
+    DELEGATED = "delegated"  # the autopilot flies that mode
+
+
+@dataclass(frozen=True, slots=True)
+class GuidanceOptions:
+    """What an operator sets.
+
+    Attributes:
+        own_address: system and component id of our messages.
+        lifetime_s: how long a setpoint counts, whatever its behaviour wrote.
+        perception_max_age_s: what is seen is not steered by when it is older.
+    """
+
+    limits: Limits = Limits()  # noqa: RUF009 - frozen
+    own_address: Address = (1, 191)
+    lifetime_s: float = DEFAULT_LIFETIME_S
+    battery: BatteryMinimum = NO_MINIMUM
+    obstacles: ObstacleRules = NO_RULES
+    perception_max_age_s: float = 0.5
+    gimbal: GimbalMounting = GimbalMounting()  # noqa: RUF009 - frozen
+
+
+class Guidance:
+    """One vehicle's guidance.
+
+    After a behaviour that flew by setpoints a hold goes on, until the next command; after one that ended in a
+    mode of the autopilot's own nothing is streamed.
+
+    Attributes:
+        asked: the last setpoint that a behaviour gave; None while none is flown.
+        sent: what the envelope made of it (or the brake that is streamed while a mode is requested).
+        limited_by: which limits acted on it.
+        phase: how far our command has come.
+        gimbal: what is asked of the gimbal; for its status.
+    """
+
+    def __init__(self, options: GuidanceOptions | None = None) -> None:
+        self.options = options = options or GuidanceOptions()
+        self.gimbal = GimbalController(options.own_address, options.gimbal)
+        self.asked: Setpoint | None = None
+        self.sent: Setpoint | None = None
+        self.limited_by: tuple[str, ...] = ()
+        self.phase = Phase.IDLE
+        self._out = OutputCollector()
+        self._envelope = Envelope(options.limits)
+        self._authority = Authority()
+        self._battery = BatteryWatch(options.battery)
+        self._memory = ObstacleMemory()
+        self._queue = CommandQueue(self.gimbal)
+        self._behaviour: Behaviour | None = None
+        self._command: CommandInput | None = None
+        self._busy = self._after_battery = False
+        self._activated = False
+        self._situation: Situation | None = None
+        self._class_names: tuple[str, ...] | None = None
+        self._stepped_ns: int | None = None
+        self._streaming = False
+        self._sequence: ModeSequence | None = None
+        self._request: int | None = None
+        self._requested: ModeRequest | None = None
+        self._engaging_since_ns = 0
+        self._sent_before_engaging = 0
+        self._position_lost_ns: int | None = None
+        self._blind = False
+        self._goal_ned_m: Vector3 | None = None
+        self._landing_target_ns = 0
+
+    @property
+    def behaviour(self) -> Behaviour | None:
+        """What is active now, also the hold that goes on when nothing else is; None: nothing."""
+        return self._behaviour
+
+    @property
+    def situation(self) -> Situation | None:
+        """What behaviours saw at the newest step; None before the first."""
+        return self._situation
+
+    @property
+    def busy(self) -> bool:
+        """A commanded behaviour has not ended yet."""
+        return self._busy
+
+    @property
+    def in_command(self) -> bool:
+        """The vehicle does what we ask, as far as we know."""
+        return self.phase is not Phase.IDLE
+
+    @property
+    def status(self) -> str:
+        """A few words for people."""
+        if self._behaviour is None:
+            return "not in command"
+        words = self._behaviour.status
+        if self.phase is Phase.ENGAGING:
+            words += ", engaging offboard"
+        return words if self.busy else f"{words}, no command"
+
+    def step(self, now_ns: int, inputs: GuidanceInput) -> GuidanceOutput:
+        """One step: from everything that is known now to everything that is to be done.
+
+        Args:
+            now_ns: CLOCK_MONOTONIC nanoseconds; it never goes back.
+        """
+        out = self._out
+        out.begin(now_ns)
+        before, situation = self._situation, self._look_at(now_ns, inputs)
+        self._situation, self._class_names = situation, inputs.class_names
+        for answer in inputs.answers:
+            self.gimbal.take_answer(answer, now_ns, out)
+        if inputs.ending:
+            self._queue.supersede("the end of the service", out)
+            for command in inputs.commands:
+                out.result(command.identifier, Outcome(False, ENDING))
+            self._end(Outcome(False, ENDING))
+            self._release()
+            self.gimbal.end(now_ns, inputs.state, out)
+            return self._output(None, released=self.gimbal.released)
+        self._queue.watch(inputs.mode_changes, inputs.state, out)
+        for command in inputs.commands:
+            self._queue.add(command, now_ns, inputs.state, self._behaviour, out)
+        for command in self._queue.take_due(now_ns, inputs.state, out):
+            self._begin_command(command, situation)
+        if self._behaviour is not None:
+            paused_s = 0.0 if before is None else (now_ns - before.now_ns) / 1e9
+            self._update(situation, inputs, paused_s)
+        self._answer_endless(inputs)
+        self.gimbal.update(now_ns, inputs.state, self._behaviour, out)
+        return self._output(self._new_landing_target())
+
+    def check_requirements(self, behaviour: Behaviour) -> str | None:
+        """Why this behaviour could not begin now, in words; None: it could."""
+        options, situation = self.options, self._situation
+        missing = refusal(behaviour, situation, self._class_names, options.battery, options.obstacles)
+        if missing is not None or situation is None:
+            return missing
+        for goal in behaviour.goals(situation):
+            if (why := self._envelope.why_not_there(goal, situation.state)) is not None:
+                return f"{behaviour.name} would leave the limits: {why}"
+        return None
+
+    def _look_at(self, now_ns: int, inputs: GuidanceInput) -> Situation:
+        """What behaviours see. Targets that are too old, or of a camera that looks nobody knows where, are
+        left out."""
+        gimbal = self.gimbal.sight(now_ns, inputs.state)
+        age_s = None if inputs.seen_ns is None else (now_ns - inputs.seen_ns) / 1e9
+        fresh = age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.undirected
+        return Situation(
+            now_ns,
+            inputs.state,
+            inputs.targets if fresh else (),
+            age_s,
+            fresh,
+            inputs.obstacles,
+            self.sent,
+            markers=inputs.markers,
+            neighbourhood=inputs.neighbourhood,
+            min_separation_m=self.options.limits.min_separation_m,
+            max_acceleration_mps2=self.options.limits.max_acceleration_mps2,
+            goal_ned_m=self._goal_ned_m,
+            gimbal=gimbal,
+            ranging=inputs.ranging,
+        )
+
+    def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:
+        out = self._out
+        return GuidanceOutput(
+            self.sent if self._streaming else None,
+            tuple(out.requests),
+            tuple(out.cancelled),
+            landing_target,
+            tuple(out.events),
+            tuple(out.results),
+            released,
+        )
+
+    # --- commands ----------------------------------------------------------------------------------------
+
+    def _begin_command(self, command: CommandInput, situation: Situation) -> None:
+        """Let a command's behaviour take the place of the active one; refused, the active one goes on."""
+        behaviour = command.behaviour
+        assert behaviour is not None
+        if (missing := self.check_requirements(behaviour)) is not None:
+            outcome = Outcome(False, missing)
+            self._out.result(command.identifier, outcome)
+            self._out.event(EventKind.REFUSED, behaviour.name, f"refused: {missing}", outcome)
+            return
+        self._end(Outcome(False, f"replaced by {behaviour.name}"))
+        if self.phase is Phase.IDLE:
+            self._authority.take(situation.state)
+            self.phase = Phase.READY
+        elif self.phase is Phase.REQUESTING:
+            self._drop_request()
+        elif self.phase is Phase.DELEGATED:
+            self.phase, self._requested = Phase.READY, None
+        self._battery.reset()
+        self._begin(behaviour, command)
+        self._out.event(EventKind.STARTED, behaviour.name, "started")
+
+    def _answer_endless(self, inputs: GuidanceInput) -> None:
+        """A command without an end of its own is answered when the vehicle flies it."""
+        command = self._command
+        if command is None or not command.endless or self.phase is not Phase.OFFBOARD:
+            return
+        if inputs.state.mode is FlightMode.OFFBOARD and inputs.stream.state is StreamState.FRESH:
+            self._out.result(command.identifier, Outcome(True, "in progress"))
+            self._command = None
+
+    def _new_landing_target(self) -> LandingTarget | None:
+        """What the autopilot lands on by itself, once for every frame that shows it."""
+        target = None if self._behaviour is None else self._behaviour.landing_target
+        if target is None or target.captured_ns <= self._landing_target_ns:
+            return None
+        self._landing_target_ns = target.captured_ns
+        return target
+
+    # --- one step of what is active ----------------------------------------------------------------------
+
+    def _update(self, situation: Situation, inputs: GuidanceInput, paused_s: float) -> None:
+        assert self._behaviour is not None
+        why = self._silent(inputs.stream.state, paused_s) or self._authority.lost(
+            situation.state,
+            situation.now_ns,
+            flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
+        )
+        if why is not None:
+            self._lose(why)
+            return
+        self._watch_battery(self._behaviour, situation)
+        for answer in inputs.answers:
+            if answer.identifier == self._request:
+                self._take_answer(answer, situation)
+        self._ask_next(situation)
+        if self.phase is Phase.ENGAGING and self._activated:
+            self._engage(situation, inputs.stream.sent_count)
+        elif self._behaviour is not None:
+            self._run(self._behaviour, situation, inputs.stream.sent_count)
+        if self._streaming and self.phase is not Phase.OFFBOARD:
+            self._brake(situation)
+
+    def _begin(self, behaviour: Behaviour, command: CommandInput | None, *, busy: bool = True) -> None:
+        self._behaviour, self._command, self._busy = behaviour, command, busy
+        self._activated, self._position_lost_ns, self._blind = False, None, False
+
+    def _run(self, behaviour: Behaviour, situation: Situation, sent_count: int) -> None:
+        """One update of the behaviour, and what follows from it."""
+        if Requirement.POSITION in behaviour.requirements and not self._position_known(situation):
+            return
+        try:
+            if not self._activated:
+                self._activated, self._stepped_ns = True, None
+                behaviour.on_activate(situation)
+                if self.busy:
+                    self._goal_ned_m = None
+            dt_s = 0.0 if self._stepped_ns is None else (situation.now_ns - self._stepped_ns) / 1e9
+            step: Step = behaviour.update(dt_s, situation)
+            for note in behaviour.take_notes():
+                self._out.event(EventKind.NOTED, behaviour.name, note)
+        except Exception as error:
+            # Whatever a behaviour does wrong, the vehicle must be held; the traceback is in the log.
+            logger.exception("%s failed", behaviour.name)
+            if not self.busy:
+                self._lose(f"{behaviour.name} failed: {type(error).__name__}: {error}")
+                return
+            dt_s, step = 0.0, Outcome(False, f"{behaviour.name} failed: {type(error).__name__}: {error}")
+        self._stepped_ns = situation.now_ns
+        match step:
+            case Outcome():
+                self._conclude(step, situation, sent_count)
+            case ModeRequest():
+                if step != self._requested:
+                    self._start_request(step, situation)
+            case Setpoint() if self.phase is Phase.OFFBOARD:
+                self._limit(behaviour, step, situation, dt_s)
+            case Setpoint() if self.phase is not Phase.ENGAGING:
+                self._start_engaging(situation, sent_count)
+
+    def _limit(self, behaviour: Behaviour, setpoint: Setpoint, situation: Situation, dt_s: float) -> None:
+        """What the envelope leaves of a setpoint is streamed; without the depth that it needs, a brake."""
+        rules = self.options.obstacles
+        # How long a setpoint counts is the operator's setting, whatever its behaviour wrote.
+        asked = replace(setpoint, deadline_ns=situation.now_ns + round(self.options.lifetime_s * 1e9))
+        blind = rules.blind(situation)
+        self._tell_blindness(behaviour, blind)
+        if blind is not None:
+            self._brake(situation)
+            self.asked, self.limited_by = asked, (blind,)
+            return
+        self._envelope.near = rules.rows(self._memory.filled(situation))
+        self.asked = asked
+        self.sent, self.limited_by = self._envelope.apply(
+            asked,
+            situation.state,
+            situation.now_ns,
+            dt_s,
+            situation.neighbours,
+            landing=behaviour.flown.landing,
+        )
+
+    def _tell_blindness(self, behaviour: Behaviour, blind: str | None) -> None:
+        """Tell once that the vehicle brakes for want of depth, and once that it flies on."""
+        if (blind is not None) is not self._blind:
+            self._blind = blind is not None
+            if blind is None:
+                self._out.event(EventKind.NOTED, behaviour.name, "depth is back")
+            else:
+                self._out.event(EventKind.BLIND, behaviour.name, f"braking: {blind}", warning=True)
+
+    def _conclude(self, outcome: Outcome, situation: Situation, sent_count: int) -> None:
+        """It ended by itself: hold where setpoints are flown, else leave it to the autopilot."""
+        self._end(outcome)
+        self._goal_ned_m = outcome.goal_ned_m
+        if self.phase is Phase.REQUESTING:
+            self._drop_request()
+        if not self._streaming:
+            self._release()
+            return
+        hold = HoldBehaviour()
+        self._begin(hold, None, busy=False)
+        if self.phase is Phase.OFFBOARD:
+            self._run(hold, replace(situation, goal_ned_m=self._goal_ned_m), sent_count)
+
+    def _watch_battery(self, behaviour: Behaviour, situation: Situation) -> None:
+        """Too little charge ends what is flown; the vehicle brakes until what the operator chose begins."""
+        state, now_ns = situation.state, situation.now_ns
+        if (why := self._battery.unknown(behaviour, state, now_ns)) is not None:
+            self._battery_event(behaviour, why)
+        if (why := self._battery.ending(behaviour, state, now_ns)) is None:
+            return
+        ending = ENDINGS[self._battery.minimum.action]()
+        self._battery_event(behaviour, f"{why}: {behaviour.name} ends, {ending.name} follows")
+        self._end(Outcome(False, why))
+        if self.phase in (Phase.REQUESTING, Phase.DELEGATED):
+            self._drop_request()
+        self._begin(ending, None)
+        self._after_battery = True
+
+    def _battery_event(self, behaviour: Behaviour, message: str) -> None:
+        self._out.event(EventKind.BATTERY, behaviour.name, message, warning=True)
+        self._queue.supersede(f"an event ({message})", self._out)
+
+    def _silent(self, stream: StreamState, paused_s: float) -> str | None:
+        """Why our setpoints failed to go out, if they did.
+
+        PX4 would take OFFBOARD up again by itself if setpoints came back; only an operator may.
+        """
+        if not self._streaming:
+            return None
+        if paused_s > SILENCE_S:
+            return f"our own guidance stood still for {paused_s:.1f} s"
+        if stream is StreamState.EXPIRED:
+            return "no setpoint left for too long, the autopilot's failsafe has the vehicle"
+        return None
+
+    def _position_known(self, situation: Situation) -> bool:
+        """False: brake for now; for too long: give the command up."""
+        if situation.state.position_fresh(situation.now_ns):
+            self._position_lost_ns = None
+            return True
+        if self._position_lost_ns is None:
+            logger.warning("position or attitude is too old: braking")
+            self._position_lost_ns = situation.now_ns
+        if situation.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
+            self._lose(f"position or attitude has been missing for {POSITION_LOSS_S:g} s")
+        elif self.phase is Phase.OFFBOARD:
+            self._brake(situation)
+        return False
+
+    def _brake(self, situation: Situation) -> None:
+        self.asked, self.limited_by = None, ()
+        self.sent = Setpoint.brake(situation.now_ns, self.options.lifetime_s)
+        self._envelope.reset()
+
+    # --- requests to the vehicle -------------------------------------------------------------------------
+
+    def _start_engaging(self, situation: Situation, sent_count: int) -> None:
+        """Setpoints first; OFFBOARD is requested when some have left."""
+        self._drop_request()
+        self.phase, self._streaming = Phase.ENGAGING, True
+        self._engaging_since_ns = situation.now_ns
+        self._sent_before_engaging = sent_count
+        self._authority.request(FlightMode.OFFBOARD, situation.state)
+
+    def _engage(self, situation: Situation, sent_count: int) -> None:
+        if self._request is not None:
+            return
+        if sent_count - self._sent_before_engaging >= SETPOINTS_BEFORE_OFFBOARD:
+            self._request = self._out.request(SetMode(FlightMode.OFFBOARD))
+        elif situation.now_ns - self._engaging_since_ns > ENGAGE_TIMEOUT_S * 1e9:
+            self._fail(f"offboard not requested: no setpoint left within {ENGAGE_TIMEOUT_S:g} s")
+
+    def _start_request(self, request: ModeRequest, situation: Situation) -> None:
+        """Request a mode of the autopilot's own. Out of OFFBOARD, a brake is streamed until it shows."""
+        self._drop_request()
+        self.phase, self._requested = Phase.REQUESTING, request
+        self._authority.request(request.mode, situation.state, request.altitude_m)
+        self._sequence = ModeSequence(request, situation.state)
+        self._ask_next(situation)
+
+    def _ask_next(self, situation: Situation) -> None:
+        """The next action of a requested mode, once the one before is done."""
+        if self._sequence is not None and self._request is None:
+            action = self._sequence.next(situation.now_ns, situation.state)
+            if action is not None:
+                self._request = self._out.request(action)
+
+    def _take_answer(self, answer: Answer, situation: Situation) -> None:
+        """The request is over: it was done, or refused."""
+        self._request = None
+        if answer.refused is not None:
+            self._sequence = None
+            self._fail(answer.refused)
+            return
+        if self._sequence is not None and not self._sequence.finished:
+            return
+        self._sequence = None
+        self._authority.settled(situation.now_ns)
+        if self.phase is Phase.ENGAGING:
+            self.phase, self._stepped_ns = Phase.OFFBOARD, None
+            self._envelope.reset()
+            if self._behaviour is not None:
+                self._out.event(EventKind.ENGAGED, self._behaviour.name, "offboard engaged")
+        else:
+            self.phase = Phase.DELEGATED
+            self._silence()
+
+    def _fail(self, why: str) -> None:
+        """The autopilot did not do what was requested."""
+        behaviour, situation = self._behaviour, self._situation
+        if behaviour is not None and situation is not None and behaviour.request_failed(why):
+            flying = self.phase is Phase.REQUESTING and self._streaming
+            if not flying:
+                self._silence()
+            # What shows now is the mode from before: a pilot's would have ended our command already.
+            self._authority.refused(FlightMode.OFFBOARD if flying else situation.state.mode)
+            self.phase, self._requested = Phase.OFFBOARD if flying else Phase.READY, None
+            return
+        self._end(Outcome(False, why))
+        if self.phase is Phase.REQUESTING and self._streaming:
+            # Still flying setpoints: hold. If the mode changed after all, that ends our command.
+            self._authority.refused(FlightMode.OFFBOARD)
+            self.phase, self._requested = Phase.OFFBOARD, None
+            self._begin(HoldBehaviour(), None, busy=False)
+        else:
+            self._release()
+
+    # --- the end of a behaviour, or of our command -------------------------------------------------------
+
+    def _lose(self, why: str) -> None:
+        """Command was taken from us: not one setpoint more."""
+        self._silence()
+        self._goal_ned_m = None
+        behaviour, outcome = self._behaviour, Outcome(False, why)
+        self._end(outcome, told=True)
+        self._release()
+        if behaviour is not None:
+            message = f"command lost: {why}"
+            self._out.event(EventKind.LOST, behaviour.name, message, outcome, warning=True)
+            self._queue.supersede(f"an event ({message})", self._out)
+
+    def _end(self, outcome: Outcome, *, told: bool = False) -> None:
+        """Take the active behaviour off, and answer the command that asked for it."""
+        behaviour, command, busy = self._behaviour, self._command, self._busy
+        after_battery, self._after_battery = self._after_battery, False
+        self._behaviour = self._command = None
+        self._busy = False
+        if behaviour is None:
+            return
+        if self._activated:
+            try:
+                behaviour.on_deactivate()
+            except Exception:
+                logger.exception("%s failed to deactivate", behaviour.name)
+        if command is not None:
+            self._out.result(command.identifier, outcome)
+        if after_battery:
+            # Nobody asked for it, so nobody else tells how it ended.
+            self._battery_event(behaviour, f"{behaviour.name} after low battery: {outcome.reason}")
+        if busy and not told:
+            self._out.event(EventKind.ENDED, behaviour.name, outcome.reason, outcome)
+
+    def _release(self) -> None:
+        """Not in command any more."""
+        self._drop_request()
+        self._silence()
+        self._authority.release()
+        self.phase = Phase.IDLE
+
+    def _silence(self) -> None:
+        self._envelope.reset()
+        self._streaming = False
+        self.asked = self.sent = None
+        self.limited_by = ()
+
+    def _drop_request(self) -> None:
+        """Forget a request: it is not repeated, but it may still take effect."""
+        self._requested = self._sequence = None
+        if self._request is not None:
+            self._out.cancel(self._request)
+            self._request = None
+            if self._situation is not None:
+                self._authority.dropped(self._situation.now_ns)
+        if self.phase in (Phase.REQUESTING, Phase.DELEGATED):
+            self.phase = Phase.READY

@@ -1,0 +1,74 @@
+"""From a command's text to its answer: read, flown by guidance, answered."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from companion.guidance.arguments import GrammarError
+from companion.guidance.behaviour import Outcome
+from companion.guidance.interface import CommandInput, CommandResult
+from companion.guidance.sequence import SequenceBehaviour
+from companion.missions.mission_file import MissionError
+
+
+class CommandHandler:
+    """The one place where commands come in.
+
+    Args:
+        read: makes a guidance command of an identifier and a text; raises GrammarError or MissionError.
+        on_command: called when one waits for guidance's next step.
+        on_event: called with (level, text) for what a person should know.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[int, str], CommandInput],
+        on_command: Callable[[], None],
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self._read, self._on_command, self._on_event = read, on_command, on_event
+        self._identifiers = itertools.count(1)
+        self._new: list[CommandInput] = []
+        self._awaited: dict[int, asyncio.Future[Outcome]] = {}
+
+    async def execute(self, text: str) -> dict[str, Any]:
+        """Do what a command says; the reply tells how it ended. See `Service.command`."""
+        try:
+            command = self._read(next(self._identifiers), text)
+        except (GrammarError, MissionError) as error:
+            first_line = text.strip().partition("\n")[0]
+            return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
+        self._on_event("info", f"command: {command.text}")
+        ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+        self._awaited[command.identifier] = ended
+        self._new.append(command)
+        self._on_command()
+        # A caller who stops waiting does not stop what is flown.
+        outcome = await asyncio.shield(ended)
+        more: dict[str, Any] = {}
+        if isinstance(command.behaviour, SequenceBehaviour):
+            outcome = command.behaviour.told(outcome)
+            more = {"steps": [asdict(step) for step in command.behaviour.records]}
+        self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
+        answer = {"success": outcome.success, "reason": outcome.reason}
+        return {"command": command.text, **answer, **more}
+
+    def take_commands(self) -> tuple[CommandInput, ...]:
+        """Those that have come since the last call."""
+        commands, self._new = tuple(self._new), []
+        return commands
+
+    def on_result(self, result: CommandResult) -> None:
+        """Guidance has answered a command."""
+        ended = self._awaited.pop(result.identifier, None)
+        if ended is not None and not ended.done():
+            ended.set_result(result.outcome)
+
+    def close(self, reason: str) -> None:
+        """Answer every command that guidance will not answer any more."""
+        for identifier in list(self._awaited):
+            self.on_result(CommandResult(identifier, Outcome(False, reason)))

@@ -1,0 +1,57 @@
+"""With every step of guidance: the link, our heartbeat, systemd's watchdog, the text in the video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from companion.perception.views import WorkerView
+from companion.service.status import hud_lines
+from companion.service.systemd_notify import SystemdNotifier
+from companion.vehicle.driver import Driver, SystemStatus
+
+HEARTBEAT_PERIOD_S = 1.0
+HUD_PERIOD_S = 0.2
+
+
+class Health:
+    """Fed by the loop that steers: what hangs there stops the heartbeat and the watchdog too.
+
+    Args:
+        on_event: called with (level, text) for what a person should know.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        views: Sequence[WorkerView],
+        notifier: SystemdNotifier,
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self._driver, self._views, self._notifier = driver, views, notifier
+        self._on_event = on_event
+        self._heartbeat_due_ns = self._hud_due_ns = 0
+        self._linked = False
+
+    def healthy(self, now_ns: int) -> bool:
+        """Every camera delivers, and the autopilot is there."""
+        return all(view.seeing(now_ns) for view in self._views) and self._driver.state.connected(now_ns)
+
+    def after_step(self, now_ns: int, status: str) -> None:
+        """Once for every step. `status`: guidance's, in words."""
+        linked = self._driver.state.connected(now_ns)
+        if linked != self._linked:
+            self._linked = linked
+            if linked:
+                self._on_event("info", "autopilot heartbeat received")
+            else:
+                self._on_event("error", "autopilot heartbeat lost")
+        if now_ns >= self._heartbeat_due_ns:
+            self._heartbeat_due_ns = now_ns + round(HEARTBEAT_PERIOD_S * 1e9)
+            healthy = self.healthy(now_ns)
+            self._driver.send_heartbeat(SystemStatus.ACTIVE if healthy else SystemStatus.CRITICAL)
+            self._notifier.alive()
+        if now_ns >= self._hud_due_ns:
+            self._hud_due_ns = now_ns + round(HUD_PERIOD_S * 1e9)
+            lines = hud_lines(self._driver.state, status)
+            for view in self._views:
+                view.keeper.send_hud(lines)

@@ -1,0 +1,138 @@
+"""What guidance is told: the vehicle's states, what the cameras saw and the other vehicles, as one input.
+
+No asyncio and no clock: the service and a flight in lockstep assemble their inputs here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from companion.guidance.arguments import GrammarError
+from companion.guidance.behaviour import Behaviour
+from companion.guidance.commands import Command, Gimbal, Mission
+from companion.guidance.grammar import parse
+from companion.guidance.interface import Answer, CommandInput, GuidanceInput, StreamStatus
+from companion.guidance.pose_sharing import PoseSharing
+from companion.guidance.registry import behaviour_for
+from companion.guidance.search_pattern import Footprint
+from companion.guidance.targets import StateHistory
+from companion.missions.mission_file import mission_behaviour
+from companion.perception.views import View
+from companion.perception.views_markers import MarkerWatch
+from companion.settings import Settings
+from companion.vehicle.state import FlightMode, VehicleState
+from vision.obstacle_sectors import ObstacleSectors
+from vision.pipeline import PerceptionResult
+
+
+class InputAssembler:
+    """Gathers what comes in between two steps of guidance.
+
+    Args:
+        views: the cameras; the one that `guidance.view` names steers.
+        on_event: called with (level, text) for what a person should know.
+
+    Attributes:
+        steering: the view whose targets behaviours see.
+        history: where the vehicle was in the last few seconds.
+        poses: the other vehicles.
+    """
+
+    def __init__(
+        self, settings: Settings, views: Sequence[View], on_event: Callable[[str, str], None]
+    ) -> None:
+        self._settings = settings
+        self.steering = next(view for view in views if view.name == settings.guidance.view)
+        self.history = StateHistory()
+        self.poses = PoseSharing(settings.vehicle.name, on_event)
+        self._markers = MarkerWatch(views)
+        self._obstacles: ObstacleSectors | None = None
+        self._shown: tuple[FlightMode, bool] | None = None
+        self._mode_changes = 0
+
+    def on_state(self, state: VehicleState) -> None:
+        """A new snapshot of the vehicle."""
+        if (state.mode, state.armed) != self._shown:
+            self._shown = (state.mode, state.armed)
+            self._mode_changes += 1
+        self.history.add(state)
+
+    def on_result(self, view: View, result: PerceptionResult, now_ns: int) -> dict[str, Any] | None:
+        """What a view saw in one frame. Returns the message about its markers, where some are looked for."""
+        markers = None
+        if result.markers is not None:
+            name = self._settings.vehicle.name
+            markers = self._markers.take(view, result, self.history, name, now_ns)
+        if view is self.steering:
+            view.place(result, self.history)
+            if result.obstacles is not None:
+                self._obstacles = result.obstacles
+        return markers
+
+    def assemble(
+        self,
+        now_ns: int,
+        state: VehicleState,
+        stream: StreamStatus,
+        *,
+        answers: Sequence[Answer] = (),
+        commands: Sequence[CommandInput] = (),
+        ending: bool = False,
+    ) -> GuidanceInput:
+        """Everything that is known now."""
+        steering, newest = self.steering, self.steering.newest
+        return GuidanceInput(
+            state,
+            stream,
+            steering.targets,
+            None if newest is None else newest.captured_ns,
+            self._obstacles,
+            self._markers.sight(now_ns, self._settings.guidance.perception_max_age_s),
+            self.poses.around(state, now_ns),
+            steering.ranging(self.camera_pitch_rad(state)),
+            steering.class_names,
+            self._mode_changes,
+            tuple(answers),
+            tuple(commands),
+            ending,
+        )
+
+    def camera_pitch_rad(self, state: VehicleState) -> float:
+        """Of the steering camera above the horizon, with the vehicle level."""
+        camera, gimbal = self.steering.settings.camera, state.gimbal
+        held_rad = gimbal.pitch_rad if camera.gimbal and gimbal is not None else None
+        return math.radians(camera.mount_pitch_deg) + (held_rad or 0.0)
+
+    def read_command(
+        self,
+        identifier: int,
+        text: str,
+        state: VehicleState,
+        check_requirements: Callable[[Behaviour], str | None],
+    ) -> CommandInput:
+        """A command as guidance takes it.
+
+        Args:
+            text: one line; of a mission that is not on this computer its own lines may follow.
+            check_requirements: guidance's own, asked by a mission at each of its steps.
+
+        Raises:
+            GrammarError, MissionError: with what is wrong, a line for each.
+        """
+        text, _, enclosed = text.strip().partition("\n")
+        names = self.steering.class_names
+        command: Command = parse(text, names)
+        if isinstance(command, Gimbal):
+            return CommandInput(identifier, str(command), aim=command.aim)
+        camera = self.steering.settings.camera
+        footprint = Footprint(camera.field_rad, -self.camera_pitch_rad(state))
+        behaviour: Behaviour
+        if isinstance(command, Mission):
+            behaviour = mission_behaviour(command, enclosed, names, check_requirements, footprint)
+        elif enclosed:
+            raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
+        else:
+            behaviour = behaviour_for(command, footprint)
+        return CommandInput(identifier, str(command), behaviour, endless=command.endless)

@@ -1,0 +1,94 @@
+"""Publishes what the service knows: results of the cameras, vehicle, pose, setpoints."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from companion.bus import topics
+from companion.bus.messages import (
+    detections_message,
+    labels_message,
+    setpoint_message,
+    tracks_message,
+    vehicle_message,
+)
+from companion.bus.session import Bus
+from companion.guidance.core import Guidance
+from companion.guidance.obstacles import obstacles_message
+from companion.perception.messages import Preview
+from companion.perception.views import WorkerView
+from companion.service.inputs import InputAssembler
+from companion.vehicle.driver import Driver
+from companion.vehicle.streamer import Streamer
+from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__package__)
+
+
+class Publisher:
+    """Everything but `status` and `events`, which the service publishes itself."""
+
+    def __init__(self, vehicle: str, bus: Bus, driver: Driver, inputs: InputAssembler) -> None:
+        self._vehicle, self._bus, self._driver, self._inputs = vehicle, bus, driver, inputs
+
+    def publish_result(
+        self, view: WorkerView, result: PerceptionResult, markers: dict[str, Any] | None
+    ) -> None:
+        """What a view saw in one frame."""
+        try:
+            self._publish_result(view, result, markers)
+        except Exception as error:
+            # It was flown by, and that goes on; that it was not published must not pass in silence.
+            logger.exception("a detection message could not be published")
+            view.unplaced = f"{type(error).__name__}: {error}"
+
+    def _publish_result(
+        self, view: WorkerView, result: PerceptionResult, markers: dict[str, Any] | None
+    ) -> None:
+        bus, name, now_ns = self._bus, self._vehicle, time.monotonic_ns()
+        message = detections_message(result, name, now_ns, view.name, self._driver.state.clock)
+        bus.publish(topics.DETECTIONS, message, view.name)
+        bus.publish(topics.LABELS, labels_message(result), view.name)
+        if result.track_events:
+            bus.publish(topics.TRACKS, tracks_message(result, name, now_ns, view.name), view.name)
+        if markers is not None:
+            bus.publish(topics.MARKERS, {**markers, "published_ns": now_ns}, view.name)
+        if view is self._inputs.steering and result.obstacles is not None:
+            bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
+        view.keeper.published(result)
+
+    def publish_preview(self, view: WorkerView, preview: Preview) -> None:
+        """A picture for whoever watches, with what it is of."""
+        stamps = {"view": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
+        self._bus.publish_picture(topics.IMAGE, preview.jpeg, stamps, view.name)
+
+    async def publish_vehicle(
+        self, guidance: Guidance, streamer: Streamer, views: Sequence[WorkerView]
+    ) -> None:
+        """The vehicle, its pose for the others, and the setpoints, at the rate of `vehicle`, for ever."""
+        period_s = 1 / (topics.VEHICLE.rate_hz or 10.0)
+        while True:
+            now_ns, state = time.monotonic_ns(), self._driver.state
+            self._bus.publish(topics.VEHICLE, vehicle_message(state, now_ns))
+            pose = self._inputs.poses.message(state, guidance.behaviour, now_ns)
+            if pose is not None:
+                self._bus.publish(topics.POSE, pose)
+            for view in views:
+                view.keeper.watch(self._bus.watched(topics.IMAGE, view.name))
+            if guidance.in_command:
+                self._bus.publish(
+                    topics.SETPOINT,
+                    {
+                        "stamp_ns": now_ns,
+                        "asked": setpoint_message(guidance.asked),
+                        "sent": setpoint_message(streamer.last_sent),
+                        "sent_ns": streamer.last_sent_ns,
+                        "stream": streamer.state.value,
+                        "limited_by": list(guidance.limited_by),
+                    },
+                )
+            await asyncio.sleep(period_s)

@@ -1,0 +1,91 @@
+"""Carries guidance's requests out with the driver; what became of each is an answer for its next step."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from companion.guidance.interface import (
+    Action,
+    Answer,
+    Arm,
+    FindGimbal,
+    PointGimbal,
+    ReleaseGimbal,
+    Request,
+    SetMode,
+    TakeGimbal,
+    TakeOff,
+)
+from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
+
+logger = logging.getLogger(__name__)
+
+
+class RequestRunner:
+    """Each request is a task of its own. Called from the loop in which the driver lives.
+
+    Args:
+        on_answer: called when there is a new answer.
+    """
+
+    def __init__(self, driver: Driver, on_answer: Callable[[], None]) -> None:
+        self._driver, self._on_answer = driver, on_answer
+        self._tasks: dict[int, asyncio.Task[None]] = {}
+        self._answers: list[Answer] = []
+
+    def start(self, request: Request) -> None:
+        """Begin to carry it out."""
+        task = asyncio.get_running_loop().create_task(self._run(request))
+        self._tasks[request.identifier] = task
+        task.add_done_callback(lambda _: self._tasks.pop(request.identifier, None))
+
+    def cancel(self, identifier: int) -> None:
+        """Nobody waits for it any more; what has been sent may still take effect."""
+        task = self._tasks.get(identifier)
+        if task is not None:
+            task.cancel()
+
+    def take_answers(self) -> tuple[Answer, ...]:
+        """Those that have come since the last call."""
+        answers, self._answers = tuple(self._answers), []
+        return answers
+
+    async def close(self) -> None:
+        """End what is still asked."""
+        tasks = list(self._tasks.values())
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _run(self, request: Request) -> None:
+        refused: str | None = None
+        try:
+            refused = await self._do(request.action)
+        except (CommandRefusedError, LinkError) as error:
+            refused = str(error) or type(error).__name__
+        except Exception as error:
+            # Unanswered, guidance would wait for ever.
+            logger.exception("%s: the request failed", request.action)
+            refused = f"{type(error).__name__}: {error}"
+        self._answers.append(Answer(request.identifier, refused))
+        self._on_answer()
+
+    async def _do(self, action: Action) -> str | None:
+        match action:
+            case SetMode(mode):
+                await self._driver.set_mode(mode)
+            case Arm():
+                await self._driver.arm()
+            case TakeOff(altitude_m):
+                await self._driver.takeoff(altitude_m)
+            case FindGimbal():
+                return None if await self._driver.find_gimbal() else "no gimbal answers"
+            case TakeGimbal():
+                await self._driver.take_gimbal()
+            case PointGimbal(aim):
+                await self._driver.point_gimbal(aim)
+            case ReleaseGimbal():
+                await self._driver.give_gimbal_back()
+        return None

@@ -1,0 +1,379 @@
+"""Guidance in lockstep with a scripted autopilot: PX4's modes and landed states in memory, a turned clock."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from kinematic_vehicle import KinematicVehicle, SeenObject, look
+
+from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.core import Guidance, GuidanceOptions, Phase
+from companion.guidance.envelope import Limits
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import (
+    Answer,
+    Arm,
+    CommandInput,
+    EventKind,
+    GuidanceEvent,
+    GuidanceInput,
+    GuidanceOutput,
+    Request,
+    SetMode,
+    StreamStatus,
+    TakeOff,
+)
+from companion.guidance.target import Target
+from companion.vehicle.gimbal import GimbalAim
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.streamer import Streamer
+
+CLIMB_MPS = 1.5
+DISARM_AFTER_LANDING_S = 2.0
+STEP_S = 0.02
+SHOWN_TIMEOUT_S = 3.0
+
+
+class ScriptedAutopilot:
+    """Answers guidance's requests. Modes show `lag_s` after they changed, as a HEARTBEAT does."""
+
+    def __init__(self, vehicle: KinematicVehicle, lag_s: float = 0.0) -> None:
+        self.vehicle = vehicle
+        self.lag_s = lag_s
+        self.refuse: dict[FlightMode, str] = {}
+        self.refuse_arming: str | None = None
+        self.linked = True
+        self.failsafe = False
+        self.position_alive = True
+        self.battery_fraction: float | None = 0.9
+        self.battery_alive = True
+        self._battery_ns = vehicle.now_ns
+        self.takeoff_short_m = 0.0
+        self.requests: list[str] = []
+        self.setpoints: list[Setpoint] = []
+        self.mode_changes = 0
+        self._shown = (vehicle.armed, vehicle.mode)
+        self._changes: list[tuple[int, tuple[bool, FlightMode]]] = []
+        self._takeoff_m = 0.0
+        self._landed_ns: int | None = None
+        self._mode_before_landing = vehicle.mode
+        self._heartbeat_ns = vehicle.now_ns
+        self._position_ns = vehicle.now_ns
+        self._pending: list[tuple[int, int, Callable[[], bool]]] = []
+        self._answers: list[Answer] = []
+
+    @property
+    def state(self) -> VehicleState:
+        armed, mode = self._shown
+        return replace(
+            self.vehicle.state,
+            heartbeat_ns=self._heartbeat_ns,
+            position_ns=self._position_ns,
+            attitude_ns=self._position_ns,
+            armed=armed,
+            mode=mode,
+            failsafe=self.failsafe,
+            battery_fraction=self.battery_fraction,
+            battery_ns=self._battery_ns,
+        )
+
+    def start(self, request: Request) -> None:
+        """Begin to carry out a request of guidance."""
+        match request.action:
+            case SetMode(mode):
+                self.requests.append(mode.value)
+                if mode in self.refuse:
+                    self._answers.append(Answer(request.identifier, self.refuse[mode]))
+                    return
+                self.change_mode(mode)
+                self._wait(request, lambda: self._shown[1] is mode)
+            case Arm() if self.refuse_arming is not None:
+                self._answers.append(Answer(request.identifier, self.refuse_arming))
+            case Arm():
+                self.requests.append("arm")
+                self.vehicle.armed = True
+                self._wait(request, lambda: self._shown[0])
+            case TakeOff(altitude_m):
+                self.requests.append(f"takeoff {altitude_m:g}")
+                self._takeoff_m = altitude_m
+                self.change_mode(FlightMode.TAKEOFF)
+                self._answers.append(Answer(request.identifier))
+            case _:
+                self._answers.append(Answer(request.identifier, "no gimbal answers"))
+
+    def cancel(self, identifier: int) -> None:
+        """Nobody waits for it any more."""
+        self._pending = [pending for pending in self._pending if pending[0] != identifier]
+
+    def take_answers(self) -> tuple[Answer, ...]:
+        """Those that have come since the last call."""
+        now_ns = self.vehicle.now_ns
+        for pending in list(self._pending):
+            identifier, since_ns, shown = pending
+            late = now_ns - since_ns > SHOWN_TIMEOUT_S * 1e9
+            if shown() or late:
+                self._pending.remove(pending)
+                words = None if shown() else f"it did not show in 3 s: {self._shown[1].value} mode"
+                self._answers.append(Answer(identifier, words))
+        answers, self._answers = tuple(self._answers), []
+        return answers
+
+    def change_mode(self, mode: FlightMode) -> None:
+        """By us or by a pilot: the vehicle does not tell them apart."""
+        if mode is FlightMode.LAND and self.vehicle.mode is not FlightMode.LAND:
+            self._mode_before_landing = self.vehicle.mode
+        self.vehicle.mode = mode
+
+    def step(self, dt_s: float) -> None:
+        """Fly on, and let what changed show after the lag."""
+        vehicle, dt_ns = self.vehicle, round(dt_s * 1e9)
+        altitude = -vehicle.position[2]
+        still = Setpoint.brake(vehicle.now_ns)
+        if vehicle.mode is FlightMode.OFFBOARD and vehicle.armed and self.setpoints:
+            vehicle.fly(self.setpoints[-1], dt_s)
+        elif vehicle.mode is FlightMode.TAKEOFF and vehicle.armed:
+            vehicle.landed = LandedState.TAKING_OFF
+            vehicle.fly(Setpoint.velocity((0, 0, -CLIMB_MPS), vehicle.now_ns), dt_s)
+            if altitude >= self._takeoff_m - self.takeoff_short_m - 0.3:
+                vehicle.mode, vehicle.landed = FlightMode.HOLD, LandedState.IN_AIR
+        elif vehicle.mode in (FlightMode.LAND, FlightMode.RETURN) and altitude > 0.0:
+            vehicle.landed = LandedState.LANDING
+            vehicle.fly(Setpoint.velocity((0, 0, 1.0), vehicle.now_ns), dt_s)
+        elif vehicle.landed is LandedState.IN_AIR:
+            vehicle.fly(still, dt_s)
+        else:
+            vehicle.now_ns += dt_ns
+        if vehicle.landed is LandedState.LANDING and vehicle.position[2] >= 0.0:
+            vehicle.landed, self._landed_ns = LandedState.ON_GROUND, vehicle.now_ns
+        if self._landed_ns and vehicle.now_ns - self._landed_ns > DISARM_AFTER_LANDING_S * 1e9:
+            vehicle.armed, vehicle.mode, self._landed_ns = False, self._mode_before_landing, None
+        self._changes.append((vehicle.now_ns, (vehicle.armed, vehicle.mode)))
+        while self._changes and vehicle.now_ns - self._changes[0][0] >= self.lag_s * 1e9:
+            shown = self._changes.pop(0)[1]
+            self.mode_changes += shown != self._shown
+            self._shown = shown
+        if self.linked:
+            self._heartbeat_ns = vehicle.now_ns
+            if self.position_alive:
+                self._position_ns = vehicle.now_ns
+            if self.battery_alive:
+                self._battery_ns = vehicle.now_ns
+
+    def _wait(self, request: Request, shown: Callable[[], bool]) -> None:
+        self._pending.append((request.identifier, self.vehicle.now_ns, shown))
+
+
+class Pending:
+    """A command that was given, and its outcome when it has one."""
+
+    def __init__(self, results: dict[int, Outcome], identifier: int) -> None:
+        self._results, self._identifier = results, identifier
+
+    def done(self) -> bool:
+        return self._identifier in self._results
+
+    def result(self) -> Outcome:
+        return self._results[self._identifier]
+
+
+class GuidanceHarness:
+    """Autopilot, streamer and guidance, 50 times a second of a turned clock.
+
+    Args:
+        options: of guidance.
+        inputs: changes what guidance is told, besides vehicle, stream, answers and commands.
+
+    Attributes:
+        streaming: the streamer runs.
+        perception_age_s: of the newest frame, in which nothing is seen; None: none came.
+        outputs: what guidance put out, one for each step.
+    """
+
+    def __init__(
+        self,
+        vehicle: KinematicVehicle,
+        lag_s: float = 0.0,
+        class_names: tuple[str, ...] | None = None,
+        options: GuidanceOptions | None = None,
+        inputs: Callable[[GuidanceInput], GuidanceInput] = lambda inputs: inputs,
+    ) -> None:
+        self.autopilot = ScriptedAutopilot(vehicle, lag_s)
+        self.events: list[GuidanceEvent] = []
+        self.outputs: list[GuidanceOutput] = []
+        self.streamer = Streamer(self.autopilot.setpoints.append, clock_ns=lambda: vehicle.now_ns)
+        self.guidance = Guidance(options)
+        self.vehicle = vehicle
+        self.streaming = True
+        self.perception_age_s: float | None = 0.05
+        self.results: dict[int, Outcome] = {}
+        self._class_names, self._inputs = class_names, inputs
+        self._identifiers = itertools.count(1)
+
+    def run(self, seconds: float = STEP_S) -> None:
+        """Let time pass."""
+        for _ in range(max(1, round(seconds / STEP_S))):
+            self.autopilot.step(STEP_S)
+            self.step()
+            if self.streaming:
+                self.streamer.tick(self.vehicle.now_ns)
+
+    def step(self, *commands: CommandInput, ending: bool = False) -> GuidanceOutput:
+        """One step of guidance, now."""
+        now_ns, age_s = self.vehicle.now_ns, self.perception_age_s
+        inputs = GuidanceInput(
+            self.autopilot.state,
+            StreamStatus(self.streamer.state, self.streamer.sent_count),
+            seen_ns=None if age_s is None else now_ns - round(age_s * 1e9),
+            class_names=self._class_names,
+            mode_changes=self.autopilot.mode_changes,
+            answers=self.autopilot.take_answers(),
+            commands=commands,
+            ending=ending,
+        )
+        output = self.guidance.step(now_ns, self._inputs(inputs))
+        if output.setpoint is None:
+            self.streamer.stop()
+        else:
+            self.streamer.submit(output.setpoint)
+        for identifier in output.cancelled:
+            self.autopilot.cancel(identifier)
+        for request in output.requests:
+            self.autopilot.start(request)
+        self.events += output.events
+        self.outputs.append(output)
+        self.results |= {result.identifier: result.outcome for result in output.results}
+        return output
+
+    def command(
+        self, behaviour: Behaviour | None = None, *, aim: GimbalAim | None = None, endless: bool = False
+    ) -> Pending:
+        """Give a command; guidance takes it at once."""
+        identifier = next(self._identifiers)
+        text = "gimbal" if behaviour is None else behaviour.name
+        self.step(CommandInput(identifier, text, behaviour, aim, endless))
+        return Pending(self.results, identifier)
+
+    def close(self) -> None:
+        """The service ends."""
+        self.step(ending=True)
+
+    def until(self, condition: Callable[[], object], seconds: float = 60.0) -> None:
+        """Let time pass until something is so. Raises AssertionError if it does not come to be."""
+        for _ in range(round(seconds / STEP_S)):
+            if condition():
+                return
+            self.run()
+        raise AssertionError(f"not in {seconds} s of flight: {[e.message for e in self.events]}")
+
+    def outcome(self, pending: Pending, seconds: float = 120.0) -> Outcome:
+        """Of a command, when it has ended."""
+        self.until(pending.done, seconds)
+        return pending.result()
+
+
+def flying(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:
+    """In the air."""
+    return KinematicVehicle(mode=mode)
+
+
+def parked(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:
+    """On the ground, disarmed."""
+    return KinematicVehicle(position=[0.0, 0.0, 0.0], mode=mode, armed=False, landed=LandedState.ON_GROUND)
+
+
+def engaged(harness: GuidanceHarness, behaviour: Behaviour | None = None) -> Pending:
+    """Flying a behaviour in OFFBOARD."""
+    harness.run(0.1)
+    pending = harness.command(behaviour or HoldBehaviour())
+    harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 5.0)
+    harness.run(0.5)
+    return pending
+
+
+def kinds(harness: GuidanceHarness) -> list[EventKind]:
+    """What guidance has told of, in order."""
+    return [event.kind for event in harness.events]
+
+
+@dataclass
+class Flight:
+    """A behaviour flown through guidance, with a camera at 10 Hz whose results come 0.1 s late.
+
+    Attributes:
+        steps: what the behaviour gave in OFFBOARD, the last one its outcome.
+        track: where the vehicle was.
+    """
+
+    behaviour: Behaviour
+    vehicle: KinematicVehicle = field(default_factory=KinematicVehicle)
+    objects: list[SeenObject] = field(default_factory=list)
+    perception_alive: bool = True
+    noise: Callable[[], float] = lambda: 0.0
+    limits: Limits = field(default_factory=Limits)
+    camera_hz: float = 10.0
+    latency_s: float = 0.1
+    steps: list[Any] = field(default_factory=list)
+    track: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def run(
+        self, seconds: float, each: Callable[[float, KinematicVehicle], None] = lambda t, v: None
+    ) -> Outcome | None:
+        """Fly until it ends or the time is over (None). `each(seconds, vehicle)` runs every step."""
+        self.vehicle.mode = FlightMode.HOLD
+        pending: list[tuple[int, tuple[Target, ...]]] = []
+        shown: tuple[Target, ...] = ()
+        newest_ns, next_frame_ns = 0, self.vehicle.now_ns
+
+        def seen(inputs: GuidanceInput) -> GuidanceInput:
+            return replace(inputs, targets=shown, seen_ns=newest_ns or None)
+
+        harness = GuidanceHarness(self.vehicle, options=GuidanceOptions(self.limits), inputs=seen)
+        recording = _Recording(self.behaviour, self.steps)
+        command: Pending | None = None
+        start_ns = self.vehicle.now_ns
+        while self.vehicle.now_ns - start_ns < seconds * 1e9:
+            now_ns = self.vehicle.now_ns
+            each((now_ns - start_ns) / 1e9, self.vehicle)
+            if now_ns >= next_frame_ns and self.perception_alive:
+                pending.append((now_ns, look(self.vehicle, self.objects, now_ns, noise=self.noise)))
+                next_frame_ns += round(1e9 / self.camera_hz)
+            while pending and now_ns - pending[0][0] >= self.latency_s * 1e9:
+                newest_ns, shown = pending.pop(0)
+            if command is None:
+                command = harness.command(recording)
+            harness.run()
+            self.track.append(self.vehicle.place)
+            if command.done():
+                return command.result()
+        return None
+
+
+class _Recording(Behaviour):
+    """Another behaviour, with a list of what it gives. Needs nothing before it begins."""
+
+    def __init__(self, inner: Behaviour, steps: list[Step]) -> None:
+        self._inner, self._steps = inner, steps
+        self.name = inner.name
+
+    def on_activate(self, situation: Situation) -> None:
+        self._inner.on_activate(situation)
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        step = self._inner.update(dt_s, situation)
+        self._steps.append(step)
+        return step
+
+    def on_deactivate(self) -> None:
+        self._inner.on_deactivate()
+
+    @property
+    def flown(self) -> Behaviour:
+        return self._inner.flown
+
+    @property
+    def status(self) -> str:
+        return self._inner.status

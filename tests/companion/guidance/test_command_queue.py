@@ -1,0 +1,131 @@
+"""A command that waits for the gimbal does not begin once something newer has happened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+from guidance_harness import GuidanceHarness, Pending, flying, kinds
+
+from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.gimbal_controller import FIND_TIMEOUT_S
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import EventKind, FindGimbal, GuidanceInput, Request
+from companion.guidance.orbit import OrbitBehaviour
+from companion.vehicle.gimbal import GimbalAim
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode
+
+
+class NeedsGimbal(Behaviour):
+    name = "needs-gimbal"
+    requirements = frozenset({Requirement.GIMBAL})
+
+    def update(self, dt_s: float, situation: Situation) -> Setpoint:
+        return Setpoint.brake(situation.now_ns)
+
+
+class Waiting:
+    """A harness whose autopilot does not answer whether it has a gimbal, and a command that waits for it."""
+
+    def __init__(self) -> None:
+        self.harness = GuidanceHarness(flying())
+        self.find: list[Request] = []
+        start = self.harness.autopilot.start
+
+        def hold_back(request: Request) -> None:
+            if isinstance(request.action, FindGimbal):
+                self.find.append(request)
+            else:
+                start(request)
+
+        self.harness.autopilot.start = hold_back  # type: ignore[method-assign]
+        self.harness.run(0.1)
+        self.command = self.harness.command(NeedsGimbal())
+
+    def reason(self) -> str:
+        return self.harness.outcome(self.command, 1.0).reason
+
+
+def test_without_an_answer_it_goes_on_after_its_time_and_is_refused() -> None:
+    waiting = Waiting()
+    waiting.harness.run(FIND_TIMEOUT_S - 0.5)
+    assert not waiting.command.done()
+    assert len(waiting.find) == 1
+    waiting.harness.run(1.0)
+    assert "a gimbal (none answers)" in waiting.reason()
+
+
+@pytest.mark.parametrize("newer", ["behaviour", "aim"])
+def test_a_newer_command_supersedes_it(newer: str) -> None:
+    waiting = Waiting()
+    if newer == "behaviour":
+        later: Pending = waiting.harness.command(HoldBehaviour())
+        assert waiting.reason() == "superseded by hold while waiting for the gimbal"
+        assert not later.done()
+    else:
+        waiting.harness.command(aim=GimbalAim(-0.5))
+        assert waiting.reason() == "superseded by gimbal while waiting for the gimbal"
+
+
+def test_a_gimbal_command_waits_on_while_others_come() -> None:
+    harness = Waiting().harness
+    pointing = harness.command(aim=GimbalAim(-0.5))
+    harness.command(HoldBehaviour())
+    harness.run(0.5)
+    assert not pointing.done(), "it moves no vehicle"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda harness: harness.autopilot.change_mode(FlightMode.POSITION), "(now position, armed)"),
+        (lambda harness: setattr(harness.vehicle, "armed", False), "(now hold, disarmed)"),
+    ],
+)
+def test_a_change_of_mode_or_arming_supersedes_it(
+    change: Callable[[GuidanceHarness], None], words: str
+) -> None:
+    waiting = Waiting()
+    change(waiting.harness)
+    waiting.harness.run(0.1)
+    assert waiting.reason() == (f"superseded by a change of the vehicle {words} while waiting for the gimbal")
+
+
+def test_a_change_that_was_reverted_between_two_steps_supersedes_it() -> None:
+    harness = GuidanceHarness(flying())
+    changes = 0
+
+    def counted(inputs: GuidanceInput) -> GuidanceInput:
+        return replace(inputs, mode_changes=changes)
+
+    harness._inputs = counted
+    harness.run(0.1)
+    harness.autopilot.start = lambda request: None  # type: ignore[method-assign]
+    command = harness.command(NeedsGimbal())
+    harness.run(0.1)
+    assert not command.done()
+    changes += 2
+    harness.run(0.1)
+    assert "(now hold, armed)" in command.result().reason
+
+
+def test_the_end_of_the_service_supersedes_it() -> None:
+    waiting = Waiting()
+    waiting.harness.close()
+    assert waiting.reason() == "superseded by the end of the service while waiting for the gimbal"
+
+
+def test_a_loss_of_command_supersedes_it() -> None:
+    waiting = Waiting()
+    harness = waiting.harness
+    harness.command(OrbitBehaviour())
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    later = harness.command(NeedsGimbal())
+    harness.streaming = False
+    harness.run(1.5)
+    harness.streaming = True
+    harness.run(0.1)
+    assert EventKind.LOST in kinds(harness)
+    assert later.result().reason.startswith("superseded by an event (command lost: ")

@@ -1,0 +1,192 @@
+"""What guidance asks of a gimbal, in which order, and what it does when that is refused or not answered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from kinematic_vehicle import KinematicVehicle
+
+from companion.guidance.gimbal_controller import (
+    FIND_TIMEOUT_S,
+    RELEASE_TIMEOUT_S,
+    GimbalController,
+    GimbalMounting,
+    direction_text,
+)
+from companion.guidance.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.interface import (
+    Answer,
+    FindGimbal,
+    OutputCollector,
+    PointGimbal,
+    ReleaseGimbal,
+    TakeGimbal,
+)
+from companion.vehicle.gimbal import NOBODY, GimbalAim, GimbalState
+from companion.vehicle.state import VehicleState
+
+DOWN = PointGimbalBehaviour(GimbalAim(-0.5, 0.3))
+OWN, STATION = (1, 191), (245, 190)
+
+
+class ControllerHarness:
+    """A controller, stepped every 50 ms; requests are answered at the next step, with `refuse`'s words."""
+
+    def __init__(self, mounting: GimbalMounting = GimbalMounting()) -> None:  # noqa: B008 - frozen
+        self.controller = GimbalController(OWN, mounting)
+        self.out = OutputCollector()
+        self.vehicle = KinematicVehicle()
+        self.began_ns = self.vehicle.now_ns
+        # Only this is known of it: that nobody has it.
+        self.gimbal: GimbalState | None = GimbalState(1, status_ns=self.began_ns, primary_control=NOBODY)
+        self.refuse: dict[type, str] = {}
+        self.answering = True
+        self.asked: list[str] = []
+        self.messages: list[str] = []
+        self._answers: list[Answer] = []
+
+    @property
+    def state(self) -> VehicleState:
+        return replace(self.vehicle.state, gimbal=self.gimbal)
+
+    def run(self, behaviour: PointGimbalBehaviour | None, count: int = 5, *, ending: bool = False) -> None:
+        for _ in range(count):
+            self.vehicle.now_ns += 50_000_000
+            now_ns = self.vehicle.now_ns
+            self.out.begin(now_ns)
+            answers, self._answers = self._answers, []
+            for answer in answers:
+                self.controller.take_answer(answer, now_ns, self.out)
+            if ending:
+                self.controller.end(now_ns, self.state, self.out)
+            else:
+                self.controller.update(now_ns, self.state, behaviour, self.out)
+            self.messages += [event.message for event in self.out.events]
+            for request in self.out.requests:
+                self.asked.append(_words(request.action))
+                if self.answering:
+                    refused = self.refuse.get(type(request.action))
+                    self._answers.append(Answer(request.identifier, refused))
+
+    def problem(self) -> str:
+        return self.controller.sight(self.vehicle.now_ns, self.state).problem
+
+
+def _words(action: object) -> str:
+    match action:
+        case TakeGimbal():
+            return "take"
+        case PointGimbal(aim):
+            return f"point {direction_text(aim)}"
+        case ReleaseGimbal():
+            return "release"
+        case FindGimbal():
+            return "find"
+    raise AssertionError(action)
+
+
+def test_it_is_taken_pointed_and_released_for_a_behaviour() -> None:
+    harness = ControllerHarness()
+    harness.run(None)
+    assert harness.asked == []
+    harness.run(DOWN)
+    assert harness.asked == ["take", "point 29° down, 17° to the right"]
+    harness.run(None)
+    assert harness.asked[2:] == ["release"]
+    harness.run(None, ending=True)
+    assert len(harness.asked) == 3, "released once"
+    assert harness.controller.released
+
+
+def test_what_is_held_when_the_service_ends_is_released() -> None:
+    harness = ControllerHarness()
+    harness.run(DOWN)
+    harness.run(DOWN, 2, ending=True)
+    assert harness.asked[-1] == "release"
+    assert harness.controller.released
+
+
+def test_a_refused_aim_is_told_once_and_nothing_more_is_asked() -> None:
+    harness = ControllerHarness()
+    harness.refuse[PointGimbal] = "the vehicle refused to point the gimbal (denied)"
+    harness.run(DOWN, 40)
+    assert harness.asked == ["take", "point 29° down, 17° to the right"]
+    assert len(harness.messages) == 1
+    assert "(denied)" in harness.messages[0]
+    assert "(denied)" in harness.problem()
+
+
+def test_another_client_that_took_it_is_named_at_once() -> None:
+    harness = ControllerHarness()
+    harness.run(DOWN)
+    now_ns = harness.vehicle.now_ns
+    taken = replace(harness.state, gimbal=GimbalState(1, status_ns=now_ns, primary_control=STATION))
+    assert harness.controller.sight(now_ns, taken).elsewhere == "245/190"
+    assert harness.controller.sight(now_ns, harness.state).elsewhere == ""
+
+
+def test_what_is_granted_while_the_service_ends_is_released() -> None:
+    harness = ControllerHarness()
+    harness.answering = False
+    harness.run(DOWN)
+    harness.run(DOWN, 3, ending=True)
+    assert harness.asked == ["take"]
+    assert not harness.controller.released
+    harness._answers.append(Answer(1))
+    harness.answering = True
+    harness.run(DOWN, 2, ending=True)
+    assert harness.asked == ["take", "release"]
+    assert harness.controller.released
+
+
+@pytest.mark.parametrize(("shown", "asked"), [(OWN, ["take", "release"]), (STATION, ["take"])])
+def test_an_unanswered_request_is_released_if_the_manager_shows_it_as_ours(
+    shown: tuple[int, int], asked: list[str]
+) -> None:
+    harness = ControllerHarness()
+    harness.answering = False
+    harness.run(DOWN)
+    steps = round(RELEASE_TIMEOUT_S / 0.05) + 2
+    for _ in range(2 * steps):
+        harness.gimbal = GimbalState(1, status_ns=harness.vehicle.now_ns + 60_000_000, primary_control=shown)
+        harness.run(DOWN, 1, ending=True)
+    assert harness.asked == asked
+    assert harness.controller.released
+
+
+def test_a_failed_release_is_told() -> None:
+    harness = ControllerHarness()
+    harness.refuse[ReleaseGimbal] = "the vehicle refused to give the gimbal back (failed)"
+    harness.run(DOWN)
+    harness.run(None)
+    assert harness.messages == [
+        "the gimbal could not be given back: the vehicle refused to give the gimbal back (failed)"
+    ]
+
+
+def test_a_point_command_that_waits_is_answered_when_the_service_ends() -> None:
+    harness = ControllerHarness()
+    now_ns = harness.vehicle.now_ns
+    harness.gimbal = GimbalState(
+        1,
+        status_ns=now_ns,
+        primary_control=NOBODY,
+        attitude_ns=now_ns,
+        attitude=(1.0, 0.0, 0.0, 0.0),
+        information_ns=now_ns,
+    )
+    harness.out.begin(now_ns)
+    harness.controller.point(7, GimbalAim(-0.5), now_ns, harness.state, harness.out)
+    assert harness.out.results == []
+    harness.run(None, 1, ending=True)
+    assert [result.identifier for result in harness.out.results] == [7]
+    assert not harness.out.results[0].outcome.success
+
+
+def test_a_camera_gimbal_that_does_not_answer_is_looked_for_again() -> None:
+    harness = ControllerHarness(GimbalMounting(carries_camera=True))
+    harness.gimbal = None
+    harness.run(None, round(11.0 / 0.05))
+    assert harness.asked == ["find"] * 3
+    assert FIND_TIMEOUT_S < 5.0

@@ -1,0 +1,202 @@
+"""The pilot runs one behaviour at a time: how it engages, goes from one to the next, and ends."""
+
+import math
+
+import pytest
+from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+
+from companion.guidance.behaviour import Behaviour, Outcome
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import EventKind
+from companion.guidance.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.stop import StopBehaviour
+from companion.guidance.takeoff import TakeoffBehaviour
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.05, 1.0])
+def test_setpoints_leave_before_offboard_is_asked_for(lag_s):
+    harness = GuidanceHarness(flying(), lag_s)
+    harness.run(0.1 + lag_s)
+    harness.command(HoldBehaviour())
+    harness.until(lambda: "offboard" in harness.autopilot.requests, 5.0)
+    assert len(harness.autopilot.setpoints) >= 2
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    harness.run(3.0)
+    assert kinds(harness) == [EventKind.STARTED, EventKind.ENGAGED]
+    assert math.dist(harness.vehicle.position, (0, 0, -5)) < 0.05
+    assert "arm" not in harness.autopilot.requests
+
+
+def test_after_a_behaviour_a_hold_goes_on_until_the_next_command():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness, HoldBehaviour(duration_s=1.0))
+    assert (harness.outcome(future)).success
+    sent = len(harness.autopilot.setpoints)
+    harness.run(2.0)
+    assert len(harness.autopilot.setpoints) >= sent + 99
+    assert harness.guidance.behaviour.name == "hold"
+    assert not harness.guidance.busy
+    assert "no command" in harness.guidance.status
+
+
+def test_a_new_command_replaces_the_current_one_without_leaving_offboard():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness, HoldBehaviour())
+    second = harness.command(OrbitBehaviour(10.0, 2.0))
+    assert future.result() == Outcome(False, "replaced by orbit")
+    harness.run(3.0)
+    assert harness.autopilot.requests.count("offboard") == 1
+    assert not second.done()
+    assert math.hypot(*harness.vehicle.velocity) > 1.0
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 1.0])
+@pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.OFFBOARD])
+def test_takeoff_arms_climbs_and_leaves_the_holding_to_the_autopilot(mode, lag_s):
+    harness = GuidanceHarness(parked(mode), lag_s)
+    harness.run(1.2)
+    assert harness.autopilot.requests == []
+    outcome = harness.outcome(harness.command(TakeoffBehaviour(5.0)))
+    assert outcome.success, outcome.reason
+    assert harness.autopilot.requests[-2:] == ["arm", "takeoff 5"]
+    harness.run(2.0)
+    assert harness.autopilot.setpoints == []
+    assert not harness.guidance.in_command
+
+
+def test_a_takeoff_that_px4_ends_short_is_climbed_to_its_end():
+    harness = GuidanceHarness(parked())
+    harness.autopilot.takeoff_short_m = 0.6
+    harness.run(0.2)
+    outcome = harness.outcome(harness.command(TakeoffBehaviour(2.5)))
+    assert outcome.success, outcome.reason
+    assert "offboard" in harness.autopilot.requests
+    harness.run(5.0)
+    assert harness.vehicle.position[2] == pytest.approx(-2.5, abs=0.45)
+    assert harness.guidance.phase == "offboard"
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 1.0])
+@pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour])
+def test_landing_from_offboard_ends_disarmed_with_nothing_sent_after_it(behaviour, lag_s):
+    harness = GuidanceHarness(flying(), lag_s)
+    engaged(harness)
+    outcome = harness.outcome(harness.command(behaviour()))
+    assert outcome.success, outcome.reason
+    assert "disarmed" in outcome.reason
+    assert not harness.autopilot.state.armed
+    sent = len(harness.autopilot.setpoints)
+    harness.run(2.0)
+    assert len(harness.autopilot.setpoints) == sent
+    assert EventKind.LOST not in kinds(harness)
+
+
+def test_stop_gives_the_vehicle_to_the_autopilot_and_sends_nothing():
+    harness = GuidanceHarness(flying(), lag_s=0.5)
+    future = engaged(harness)
+    outcome = harness.outcome(harness.command(StopBehaviour()), 10.0)
+    assert outcome.success
+    assert future.result().reason == "replaced by stop"
+    sent = len(harness.autopilot.setpoints)
+    harness.run(2.0)
+    assert len(harness.autopilot.setpoints) == sent
+    assert not harness.guidance.in_command
+    assert EventKind.LOST not in kinds(harness)
+
+
+def test_while_a_mode_is_asked_for_out_of_offboard_a_brake_is_sent():
+    harness = GuidanceHarness(flying(), lag_s=0.8)
+    engaged(harness, OrbitBehaviour(10.0, 3.0))
+    harness.command(LandBehaviour())
+    harness.run(0.4)
+    assert harness.autopilot.setpoints[-1].velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert not harness.autopilot.setpoints[-1].expired(harness.vehicle.now_ns)
+
+
+def test_a_landing_replaced_before_it_shows_is_taken_back():
+    harness = GuidanceHarness(flying(), lag_s=1.0)
+    engaged(harness)
+    harness.command(LandBehaviour())
+    harness.run(0.3)
+    future = harness.command(HoldBehaviour())
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    harness.run(3.0)
+    assert not future.done()
+    assert harness.autopilot.state.mode is FlightMode.OFFBOARD
+    assert EventKind.LOST not in kinds(harness)
+
+
+class Broken(Behaviour):
+    name = "broken"
+
+    def __init__(self, after):
+        self.updates_left = after
+        self.deactivated = 0
+
+    def update(self, dt_s, situation):
+        self.updates_left -= 1
+        if self.updates_left < 0:
+            raise ZeroDivisionError("a bug")
+        return Setpoint.velocity((1.0, 0.0, 0.0), situation.now_ns)
+
+    def on_deactivate(self):
+        self.deactivated += 1
+
+
+@pytest.mark.parametrize("after", [0, 20])
+def test_an_exception_in_a_behaviour_is_logged_ends_it_and_holds(after, caplog):
+    harness = GuidanceHarness(flying())
+    engaged(harness)
+    behaviour = Broken(after)
+    outcome = harness.outcome(harness.command(behaviour), 5.0)
+    assert outcome == Outcome(False, "broken failed: ZeroDivisionError: a bug")
+    assert "Traceback" in caplog.text
+    assert behaviour.deactivated == 1
+    harness.run(2.0)
+    assert harness.guidance.phase == "offboard"
+    assert math.hypot(*harness.vehicle.velocity) < 0.1
+
+
+class Curious(Behaviour):
+    name = "curious"
+    requirements = frozenset()
+
+    def __init__(self):
+        self.seen = []
+
+    def update(self, dt_s, situation):
+        self.seen.append((dt_s, situation.sent))
+        return Setpoint.velocity((9.0, 0.0, 0.0), situation.now_ns)
+
+
+def test_what_was_sent_is_told_to_the_behaviour_and_published_beside_what_was_asked():
+    harness = GuidanceHarness(flying())
+    behaviour = Curious()
+    engaged(harness, behaviour)
+    harness.run(5.0)
+    assert harness.guidance.asked.velocity_ned_mps == (9.0, 0.0, 0.0)
+    assert harness.guidance.sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
+    assert harness.guidance.limited_by
+    assert behaviour.seen[-1][0] == pytest.approx(0.02)
+    assert behaviour.seen[-1][1].velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
+
+
+def test_nothing_is_asked_for_without_a_command():
+    harness = GuidanceHarness(parked())
+    harness.run(5.0)
+    assert harness.autopilot.requests == []
+    assert harness.autopilot.setpoints == []
+
+
+def test_closing_ends_the_behaviour_and_the_stream():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    harness.close()
+    assert future.result() == Outcome(False, "the service ends")
+    sent = len(harness.autopilot.setpoints)
+    harness.run(0.5)
+    assert len(harness.autopilot.setpoints) == sent
+    assert harness.step(ending=True).released

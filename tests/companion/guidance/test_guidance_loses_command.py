@@ -1,0 +1,182 @@
+"""What ends our command of the vehicle: a pilot, the autopilot, a lost link, a loop that hung."""
+
+import pytest
+from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+
+from companion.guidance.behaviour import Outcome
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import EventKind
+from companion.guidance.land import LandBehaviour
+from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.takeoff import TakeoffBehaviour
+from companion.vehicle.state import FlightMode
+
+OTHER_MODES = [
+    FlightMode.POSITION,
+    FlightMode.ALTITUDE,
+    FlightMode.HOLD,
+    FlightMode.LAND,
+    FlightMode.RETURN,
+    FlightMode.MISSION,
+]
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 1.0])
+@pytest.mark.parametrize("mode", OTHER_MODES)
+def test_a_mode_we_did_not_ask_for_ends_our_command_at_once_and_for_good(mode, lag_s):
+    harness = GuidanceHarness(flying(), lag_s)
+    future = engaged(harness, OrbitBehaviour())
+    harness.autopilot.change_mode(mode)
+    harness.until(lambda: harness.autopilot.state.mode is mode, 2.0)
+    sent = len(harness.autopilot.setpoints)
+    outcome = future.result()
+    assert outcome == Outcome(False, f"the pilot took over: {mode.value} mode")
+    assert kinds(harness)[-1] is EventKind.LOST
+    harness.run(2.0)
+    harness.autopilot.change_mode(FlightMode.OFFBOARD)  # PX4 does this when setpoints come back
+    harness.run(3.0)
+    assert len(harness.autopilot.setpoints) == sent
+    assert not harness.guidance.in_command
+    assert harness.guidance.sent is None
+    # Only an operator's command resumes.
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.run(1.2)
+    harness.command(HoldBehaviour())
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    assert len(harness.autopilot.setpoints) > sent
+
+
+def test_a_pilot_who_takes_over_during_the_request_for_offboard_wins():
+    harness = GuidanceHarness(flying(), lag_s=1.0)
+    harness.run(1.2)
+    future = harness.command(HoldBehaviour())
+    harness.until(lambda: "offboard" in harness.autopilot.requests, 2.0)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    outcome = harness.outcome(future, 5.0)
+    assert outcome.reason == "the pilot took over: position mode"
+    sent = len(harness.autopilot.setpoints)
+    harness.run(3.0)
+    assert len(harness.autopilot.setpoints) == sent
+
+
+def test_the_idle_hold_yields_to_the_pilot_as_well():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness, HoldBehaviour(duration_s=1.0))
+    assert (harness.outcome(future)).success
+    harness.run(1.0)
+    assert harness.streamer.last_sent.yaw_rad is not None  # a hold's; a brake has a yaw rate
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.run(0.04)
+    sent = len(harness.autopilot.setpoints)
+    harness.run(1.0)
+    assert len(harness.autopilot.setpoints) == sent
+    assert harness.events[-1].kind is EventKind.LOST
+
+
+def test_a_pilot_who_stops_a_takeoff_half_way_wins():
+    harness = GuidanceHarness(parked())
+    harness.run(0.2)
+    future = harness.command(TakeoffBehaviour(10.0))
+    harness.until(lambda: harness.vehicle.position[2] < -3.0)
+    harness.autopilot.change_mode(FlightMode.HOLD)
+    outcome = harness.outcome(future, 2.0)
+    assert outcome.reason == "the pilot took over: hold mode"
+    assert harness.autopilot.setpoints == []
+
+
+def test_a_pilot_who_catches_a_landing_wins():
+    harness = GuidanceHarness(flying())
+    engaged(harness)
+    future = harness.command(LandBehaviour())
+    harness.until(lambda: harness.vehicle.position[2] > -3.0)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    assert (harness.outcome(future, 2.0)).reason == "the pilot took over: position mode"
+
+
+def test_a_streamer_that_does_not_run_is_noticed():
+    harness = GuidanceHarness(flying())
+    harness.streaming = False
+    harness.run(0.1)
+    outcome = harness.outcome(harness.command(HoldBehaviour()), 10.0)
+    assert "no setpoint left" in outcome.reason
+
+
+def test_a_failsafe_of_the_autopilot_ends_our_command():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    harness.autopilot.failsafe = True
+    harness.autopilot.change_mode(FlightMode.RETURN)
+    harness.run(0.04)
+    assert future.result() == Outcome(False, "autopilot failsafe: return mode")
+    # An operator can take it back out of the failsafe.
+    harness.command(HoldBehaviour())
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+
+
+def test_a_loop_that_hung_gives_up_its_command_and_sends_not_one_setpoint_more():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    sent = len(harness.autopilot.setpoints)
+    # The whole loop stands still; the vehicle flies on, and its failsafe is not known here yet.
+    harness.autopilot.step(2.0)
+    harness.run(1.0)
+    assert future.result().reason == "our own guidance stood still for 2.0 s"
+    assert len(harness.autopilot.setpoints) == sent
+    harness.command(HoldBehaviour())
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+
+
+def test_a_lost_link_ends_our_command_and_its_return_does_not_resume_it():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    harness.autopilot.linked = False
+    harness.autopilot.position_alive = True
+    outcome = harness.outcome(future, 10.0)
+    assert not outcome.success
+    sent = len(harness.autopilot.setpoints)
+    harness.autopilot.linked = True
+    harness.run(3.0)
+    assert len(harness.autopilot.setpoints) == sent
+
+
+def test_a_landing_whose_link_is_lost_says_so():
+    harness = GuidanceHarness(flying())
+    harness.run(0.1)
+    future = harness.command(LandBehaviour())
+    harness.run(0.5)
+    harness.autopilot.linked = False
+    outcome = harness.outcome(future, 10.0)
+    assert "no heartbeat for 3" in outcome.reason
+
+
+def test_without_a_position_the_vehicle_brakes_and_then_command_is_given_up():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness, OrbitBehaviour())
+    harness.autopilot.position_alive = False
+    harness.run(1.0)
+    assert harness.autopilot.setpoints[-1].velocity_ned_mps == (0.0, 0.0, 0.0)
+    outcome = harness.outcome(future, 5.0)
+    assert "position" in outcome.reason
+    sent = len(harness.autopilot.setpoints)
+    harness.run(1.0)
+    assert len(harness.autopilot.setpoints) == sent
+
+
+def test_a_disarmed_vehicle_is_not_ours_any_more():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    harness.vehicle.armed = False
+    harness.run(0.04)
+    assert future.result() == Outcome(False, "the vehicle was disarmed")
+
+
+def test_a_stream_that_fell_silent_ends_the_command_with_its_reason():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    harness.streaming = False
+    harness.run(1.5)
+    harness.streaming = True
+    harness.run(0.1)
+    assert future.result() == Outcome(
+        False, "no setpoint left for too long, the autopilot's failsafe has the vehicle"
+    )

@@ -1,0 +1,137 @@
+"""What cannot be done is refused and named, by us before the flight or by the autopilot in it."""
+
+import pytest
+from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+
+from companion.geometry.fence import Fence
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement
+from companion.guidance.core import GuidanceOptions
+from companion.guidance.envelope import Limits
+from companion.guidance.figure_eight import FigureEightBehaviour
+from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.goto import GotoBehaviour
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import EventKind
+from companion.guidance.land import LandBehaviour
+from companion.guidance.patrol import PatrolBehaviour
+from companion.guidance.seek import SeekBehaviour
+from companion.guidance.takeoff import TakeoffBehaviour
+from companion.vehicle.state import FlightMode
+
+
+def test_a_refused_landing_holds_in_offboard():
+    harness = GuidanceHarness(flying())
+    engaged(harness)
+    harness.autopilot.refuse[FlightMode.LAND] = "land refused: no position"
+    outcome = harness.outcome(harness.command(LandBehaviour()), 5.0)
+    assert outcome == Outcome(False, "land refused: no position")
+    harness.run(1.0)
+    assert harness.guidance.phase == "offboard"
+    assert not harness.streamer.last_sent.expired(harness.vehicle.now_ns)
+
+
+def test_a_refused_offboard_ends_the_command_and_sends_nothing_more():
+    harness = GuidanceHarness(flying())
+    harness.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
+    harness.run(0.1)
+    outcome = harness.outcome(harness.command(HoldBehaviour()), 5.0)
+    assert outcome == Outcome(False, "offboard refused")
+    sent = len(harness.autopilot.setpoints)
+    harness.run(1.0)
+    assert len(harness.autopilot.setpoints) == sent
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "behaviour", "words"),
+    [
+        (parked, HoldBehaviour, ["hold needs", "in the air", "disarmed, on ground"]),
+        (flying, TakeoffBehaviour, ["takeoff needs", "on the ground", "armed, in air"]),
+        (flying, lambda: SeekBehaviour("zebra"), ["seek needs", "zebra"]),
+    ],
+)
+def test_a_refusal_names_what_is_missing(vehicle, behaviour, words):
+    harness = GuidanceHarness(vehicle(), class_names=("car", "person"))
+    harness.run(0.1)
+    future = harness.command(behaviour())
+    assert future.done()
+    for word in words:
+        assert word in future.result().reason
+    assert kinds(harness) == [EventKind.REFUSED]
+    assert not harness.guidance.in_command
+
+
+@pytest.mark.parametrize("age_s", [None, 2.0])
+def test_without_perception_seek_is_refused_with_its_age(age_s):
+    harness = GuidanceHarness(flying())
+    harness.perception_age_s = age_s
+    harness.run(0.1)
+    reason = harness.command(SeekBehaviour("car")).result().reason
+    assert "perception" in reason
+    assert ("2.0 s old" if age_s else "nothing came") in reason
+
+
+def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_steer_it_either():
+    harness = GuidanceHarness(flying())
+    harness.perception_age_s = 0.8
+    harness.run(0.1)
+    future = harness.command(SeekBehaviour("car"))
+    harness.run(0.5)
+    assert not future.done()
+    assert harness.guidance.phase == "offboard"
+    assert harness.guidance.asked.yaw_rate_radps in (None, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "where"),
+    [
+        (GotoBehaviour(from_home_m=(30.0, 5000.0)), "30.0 m north and 5000.0 m east of home is farther than"),
+        (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "0.0 m north and -7000.0 m east of home"),
+        (PatrolBehaviour([(0.0, 0.0), (9000.0, 0.0)], ("car",)), "9000.0 m north"),
+        (FigureEightBehaviour(6000.0, 3.0, 1.0), "is farther than guidance.max_distance_m"),
+    ],
+)
+def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(behaviour, where):
+    harness = GuidanceHarness(flying())
+    harness.run(0.1)
+    outcome = harness.command(behaviour).result()
+    assert not outcome.success
+    assert outcome.reason.startswith(f"{behaviour.name} would leave the limits: ")
+    assert where in outcome.reason
+    assert not harness.autopilot.setpoints
+
+
+def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not():
+    fence = Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)))
+    harness = GuidanceHarness(flying(), options=GuidanceOptions(Limits(fence=fence)))
+    harness.run(0.1)
+    outcome = harness.command(GotoBehaviour(from_home_m=(30.0, 0.0))).result()
+    assert outcome.reason == (
+        "goto would leave the limits: 30.0 m north and 0.0 m east of home is not inside the fence "
+        "(guidance.fence_include, fence_exclude)"
+    )
+    assert not harness.command(GotoBehaviour(from_home_m=(10.0, 0.0))).done()
+
+
+def test_a_refusal_leaves_the_current_behaviour_flying():
+    harness = GuidanceHarness(flying())
+    future = engaged(harness)
+    assert harness.command(TakeoffBehaviour()).done()
+    harness.run(0.2)
+    assert not future.done()
+    assert harness.guidance.phase == "offboard"
+
+
+class Daring(Behaviour):
+    name = "daring"
+    requirements = frozenset({Requirement.ON_GROUND})
+
+    def update(self, dt_s, situation):
+        return ModeRequest(FlightMode.LAND, arm=True)
+
+
+def test_only_a_takeoff_arms():
+    harness = GuidanceHarness(parked())
+    harness.run(0.1)
+    harness.command(Daring())
+    harness.run(1.0)
+    assert "arm" not in harness.autopilot.requests
