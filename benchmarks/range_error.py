@@ -204,7 +204,7 @@ def samples(view: View, detector: FrameDetector, truth: str = "surface") -> list
             target = targets[index]
             error_m = math.nan
             if target.range_source == source.removesuffix("_exact"):
-                error_m = target.range_m - true_m
+                error_m = target.ground_range_m - true_m
             measured.append(
                 Sample(source, item.class_name, true_m, error_m, target.range_sigma_m, not inside)
             )

@@ -284,7 +284,7 @@ def _target(
         captured_ns=captured_ns,
         bearing_rad=math.atan2(direction[1], direction[0]),
         elevation_rad=math.asin(max(-1.0, min(1.0, -direction[2]))),
-        range_m=math.hypot(offset[0], offset[1]) if known else math.nan,
+        ground_range_m=math.hypot(offset[0], offset[1]) if known else math.nan,
         range_source=source,
         position_ned_m=(north, east, down) if known else None,
         box_xyxy=(left, top, right, bottom),

@@ -136,8 +136,8 @@ def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, s
     assert target.range_source is RangeSource.GROUND_PLANE
     away = math.dist(point[:2], target.position_ned_m[:2])
     assert away == pytest.approx(CONTACT_INSET_M, abs=0.02 * distance)
-    assert target.range_m == pytest.approx(distance - CONTACT_INSET_M, abs=0.02 * distance)
-    assert target.distance_m == pytest.approx(math.hypot(target.range_m, height), rel=1e-6)
+    assert target.ground_range_m == pytest.approx(distance - CONTACT_INSET_M, abs=0.02 * distance)
+    assert target.distance_m == pytest.approx(math.hypot(target.ground_range_m, height), rel=1e-6)
     assert target.range_sigma_m > 0.3
 
 
@@ -158,7 +158,7 @@ def test_a_point_in_space_is_found_again_from_its_depth(scene, down):
     )
     assert target.range_source is RangeSource.DEPTH
     assert target.position_ned_m == pytest.approx(point, abs=1e-6)
-    assert target.range_m == pytest.approx(distance, abs=1e-6)
+    assert target.ground_range_m == pytest.approx(distance, abs=1e-6)
     assert target.depth_m == pytest.approx(optical[2])
     assert target.distance_m == pytest.approx(math.hypot(distance, down), abs=1e-6)
     # The bearing is that of the camera's ray; the camera sits a little before the vehicle's origin.
@@ -172,11 +172,11 @@ def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner():
     (target,) = targets_from_detections(
         [detection((420, 200, 520, 280), (0.5, 0.2, 6.0))], T0, CAMERA, level, history
     )
-    assert target.range_m == pytest.approx(math.hypot(0.5, 6.0))
+    assert target.ground_range_m == pytest.approx(math.hypot(0.5, 6.0))
     bearing = math.atan((469.5 - CAMERA.cx) / CAMERA.fx)
     assert target.bearing_rad == pytest.approx(bearing)
     north, east, down = target.position_ned_m
-    assert (math.hypot(north, east), down) == pytest.approx((target.range_m, -7.8))
+    assert (math.hypot(north, east), down) == pytest.approx((target.ground_range_m, -7.8))
     assert math.atan2(east, north) == pytest.approx(bearing)
 
 
@@ -230,7 +230,7 @@ def test_a_known_height_tells_the_range_where_the_ground_does_not():
     assert known.range_source is RangeSource.KNOWN_HEIGHT
     # By hand: rows of a pinhole of 381 px, elevations -20° - atan((row - 239.5) / 381).
     top, bottom = (math.tan(math.radians(-20) - math.atan((row - 239.5) / 381.36)) for row in (50, 100))
-    assert known.range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
+    assert known.ground_range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
 
 
 def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells():
@@ -253,7 +253,7 @@ def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range():
     (target,) = targets_from_detections([detection((300, 300, 339, 479))], T0, CAMERA, MOUNT, history)
     assert target.range_source is RangeSource.NONE
     assert target.position_ned_m is None
-    assert math.isnan(target.range_m)
+    assert math.isnan(target.ground_range_m)
     assert target.bearing_rad == pytest.approx(0.7, abs=0.01)
     assert target.elevation_rad < 0
 
