@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -33,8 +33,8 @@ from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 from mavlink_sim.camera.image_effects import MILD_EFFECTS
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Renderer, VisibleObject
 from mavlink_sim.camera.scene_file import load_scene
-from mavlink_sim.world.mesh import mesh_of
-from mavlink_sim.world.shapes import CLASS_NAMES, variant_of
+from mavlink_sim.world.mesh import surface_range_to
+from mavlink_sim.world.shapes import CLASS_NAMES
 from mavlink_sim.world.world import World, WorldObject, demo_world, range_to
 from vision.attitude import quaternion_from_euler
 from vision.depth import nearest_points
@@ -171,18 +171,6 @@ def _place(
     return north, east, down_m
 
 
-def surface_range_m(item: WorldObject, position_ned_m: Sequence[float]) -> float:
-    """Horizontal metres from a point outside to the nearest point of the object's surface."""
-    mesh = mesh_of(item.class_name, variant_of(item.class_name, item.appearance), item.size_m)
-    cosine, sine = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
-    north, east = (position_ned_m[axis] - item.position_ned_m[axis] for axis in (0, 1))
-    point = np.array([cosine * north + sine * east, cosine * east - sine * north]) / item.scale
-    ways, to = mesh.ways[:, :2], point - mesh.starts[:, :2]
-    share = (to * ways).sum(axis=1) / np.maximum((ways * ways).sum(axis=1), 1e-12)
-    away = to - np.clip(share, 0.0, 1.0)[:, None] * ways
-    return float(np.hypot(away[:, 0], away[:, 1]).min()) * item.scale
-
-
 def samples(view: View, detector: FrameDetector, truth: str = "surface") -> list[Sample]:
     """Every source's range to every object that the detector has found in a frame."""
     detections = detector.detect(view.image)
@@ -197,7 +185,7 @@ def samples(view: View, detector: FrameDetector, truth: str = "surface") -> list
     for index, seen in matched:
         item = seen.world_object
         from_m = view.position_ned_m
-        true_m = surface_range_m(item, from_m) if truth == "surface" else range_to(item, from_m)
+        true_m = surface_range_to(item, from_m) if truth == "surface" else range_to(item, from_m)
         left, top, right, bottom = seen.xyxy
         inside = min(left, top, DEFAULT_CAMERA.width - right, DEFAULT_CAMERA.height - bottom) > EDGE_PX
         for source, targets in by_source.items():

@@ -37,6 +37,7 @@ from companion.settings import Settings
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo
 from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.shapes import CLASS_NAMES, shape_of, variant_of
 from mavlink_sim.world.world import World, WorldObject, range_to
 
@@ -47,11 +48,12 @@ CAMERA_RATE_HZ, LATENCY_S = 10.0, 0.12
 
 @dataclass(frozen=True, slots=True)
 class DemoFlight:
-    """One demonstration. Ranges are horizontal, from the vehicle to the car's nearest surface, metres.
+    """One demonstration. Ranges are horizontal and true, from the vehicle to the car's nearest surface, metres.
 
     Attributes:
         confirmed: class of the object that `seek` ended at, by truth; None: it found none.
         arrival_range_m: when the approach said that it had arrived. hold_range_m: after the hold.
+        footprint_range_m: after the hold, to the rectangle around the car, which is somewhat nearer.
         time_s: simulated, from the command to its answer.
         failure: why it failed; None: it did not.
     """
@@ -61,6 +63,7 @@ class DemoFlight:
     confirmed: str | None
     arrival_range_m: float | None
     hold_range_m: float | None
+    footprint_range_m: float | None
     time_s: float
     failure: str | None
 
@@ -86,7 +89,7 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     flight.tick()
     behaviour = flight.guidance.behaviour
     confirmed: str | None = None
-    ranges_m: dict[str, float] = {}
+    ranges_m: dict[str, tuple[float, float]] = {}
     while flight.seconds < LIMIT_S and flight.outcome(identifier) is None:
         flight.tick()
         records = behaviour.records if isinstance(behaviour, SequenceBehaviour) else []
@@ -95,7 +98,8 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
             if records[-1].title == FIND:
                 confirmed = _faced(scene.world, flight)
     outcome = flight.outcome(identifier)
-    arrival_m, hold_m = ranges_m.get(REACH), ranges_m.get(STAND)
+    arrival_m, _ = ranges_m.get(REACH, (None, None))
+    hold_m, footprint_m = ranges_m.get(STAND, (None, None))
     failure = None
     if outcome is None:
         failure = f"not finished in {LIMIT_S:g} s: {flight.guidance.status}"
@@ -112,6 +116,7 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
         confirmed,
         None if arrival_m is None else round(arrival_m, 2),
         None if hold_m is None else round(hold_m, 2),
+        None if footprint_m is None else round(footprint_m, 2),
         round(flight.seconds, 1),
         failure,
     )
@@ -131,10 +136,14 @@ def fly_demos(seeds: Sequence[int], *, processes: int = 1, synthetic: bool = Fal
 def demos_summary(flights: Sequence[DemoFlight]) -> dict[str, Any]:
     """Plain values, ready for JSON."""
     errors_m = [abs(f.hold_range_m - STOP_DISTANCE_M) for f in flights if f.hold_range_m is not None]
+    footprint_errors_m = [
+        abs(f.footprint_range_m - STOP_DISTANCE_M) for f in flights if f.footprint_range_m is not None
+    ]
     return {
         "flights": len(flights),
         "successes": sum(flight.success for flight in flights),
         "worst_range_error_m": round(max(errors_m), 2) if errors_m else None,
+        "worst_footprint_error_m": round(max(footprint_errors_m), 2) if footprint_errors_m else None,
         "seeds": [asdict(flight) for flight in flights],
     }
 
@@ -143,7 +152,15 @@ def demos_table(flights: Sequence[DemoFlight]) -> Table:
     """The same for people."""
     succeeded = sum(flight.success for flight in flights)
     table = Table(title=f"demonstration: {succeeded} of {len(flights)} succeeded")
-    for heading in ("seed", "success", "confirmed", "range at arrival", "after the hold", "time"):
+    for heading in (
+        "seed",
+        "success",
+        "confirmed",
+        "range at arrival",
+        "after the hold",
+        "footprint",
+        "time",
+    ):
         table.add_column(heading, justify="right")
     table.add_column("why it failed", justify="left")
     for flight in flights:
@@ -153,6 +170,7 @@ def demos_table(flights: Sequence[DemoFlight]) -> Table:
             flight.confirmed or "-",
             _metres(flight.arrival_range_m),
             _metres(flight.hold_range_m),
+            _metres(flight.footprint_range_m),
             f"{flight.time_s:.1f} s",
             flight.failure or "",
         )
@@ -184,10 +202,12 @@ def _fly(task: tuple[int, bool]) -> DemoFlight:
     return fly_demo(task[0], synthetic=task[1])
 
 
-def _range_to_target(world: World, vehicle: LockstepVehicle) -> float:
-    """To the nearest car, by truth."""
+def _range_to_target(world: World, vehicle: LockstepVehicle) -> tuple[float, float]:
+    """To the nearest car, by truth: its surface, and its footprint."""
     place = vehicle.truth.position_ned_m
-    return min(range_to(item, place) for item in world.objects if item.class_name == TARGET_CLASS)
+    cars = [item for item in world.objects if item.class_name == TARGET_CLASS]
+    nearest = min(cars, key=lambda item: range_to(item, place))
+    return surface_range_to(nearest, place), range_to(nearest, place)
 
 
 def _faced(world: World, flight: LockstepFlight) -> str | None:

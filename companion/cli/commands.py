@@ -107,7 +107,7 @@ async def _run_until_signal(settings: Settings, make: type[Service]) -> None:
 
 @app.command()
 def demo(
-    duration: Annotated[float, typer.Option(min=20, help="give up after so many seconds")] = 90.0,
+    duration: Annotated[float, typer.Option(min=20, help="give up after so many seconds")] = 150.0,
     output: Annotated[Path, typer.Option(help="where the video and summary.json go")] = Path("demo-output"),
     seed: Annotated[int, typer.Option(min=0, help="of the world: where the car stands, the wind")] = 1,
     seeds: Annotated[

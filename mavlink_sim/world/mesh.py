@@ -7,6 +7,7 @@ that are drawn, without what is painted on them, so that what is seen is what is
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -14,8 +15,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mavlink_sim.world.shapes import Shape, shape_of
+from mavlink_sim.world.shapes import Shape, shape_of, variant_of
 from mavlink_sim.world.solids import Points, Triple
+from mavlink_sim.world.world import WorldObject
 
 # Where the ray of `contains` goes: not along anything that is built at right angles.
 _ASKEW = np.array([0.5413, 0.3127, 0.7805]) / math.sqrt(0.5413**2 + 0.3127**2 + 0.7805**2)
@@ -129,3 +131,18 @@ def _mesh(faces: list[Points]) -> Mesh:
     lengths = np.maximum(np.einsum("ij,ij->i", ways, ways), 1e-18)
     inwards = np.cross(normals[face_of], ways)
     return Mesh(first, normals, offsets, face_of, starts, ends, ways, 1.0 / lengths, inwards)
+
+
+def surface_range_to(item: WorldObject, position_ned_m: Sequence[float]) -> float:
+    """Horizontal metres from a point outside to the nearest point of the object's surface.
+
+    `world.range_to` measures to its footprint, the rectangle around it, which is up to 0.3 m nearer.
+    """
+    mesh = mesh_of(item.class_name, variant_of(item.class_name, item.appearance), item.size_m)
+    cosine, sine = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
+    north, east = (position_ned_m[axis] - item.position_ned_m[axis] for axis in (0, 1))
+    point = np.array([cosine * north + sine * east, cosine * east - sine * north]) / item.scale
+    ways, to = mesh.ways[:, :2], point - mesh.starts[:, :2]
+    share = (to * ways).sum(axis=1) / np.maximum((ways * ways).sum(axis=1), 1e-12)
+    away = to - np.clip(share, 0.0, 1.0)[:, None] * ways
+    return float(np.hypot(away[:, 0], away[:, 1]).min()) * item.scale

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.range_error import View, rows, samples, surface_range_m, views
+from benchmarks.range_error import View, rows, samples, views
+from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import WorldObject, range_to
 from vision.detector import Detector
 
@@ -25,7 +26,7 @@ def test_surface_is_within_the_footprint() -> None:
     car = WorldObject(0, "car", (0.0, 0.0, 0.0), 0.4)
     for angle in np.linspace(0.0, 6.0, 13):
         place = (8.0 * np.cos(angle), 8.0 * np.sin(angle))
-        assert 0.0 <= surface_range_m(car, place) - range_to(car, place) < 0.5
+        assert 0.0 <= surface_range_to(car, place) - range_to(car, place) < 0.5
 
 
 def test_ranges_of_the_detector_are_near_the_truth(seen: list[View]) -> None:
