@@ -88,7 +88,11 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         seen = ", ".join(_words(record) for record in detections.records())
         return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {seen or 'no objects detected'}"
     # Nobody measures ranges here, and without a tracker there are no tracks.
-    left_out = ("range_m",) if detections.track_id is not None else ("range_m", *TRACK_FIELDS)
+    left_out = (
+        ("depth_m", "nearest_camera_m")
+        if detections.track_id is not None
+        else ("depth_m", "nearest_camera_m", *TRACK_FIELDS)
+    )
     message: dict[str, Any] = {
         "sequence": frame.sequence,
         "captured_ns": frame.captured_ns,

@@ -138,9 +138,9 @@ def _draw_plate(
     class_id = int(detections.class_id[index])
     text = f"{detections.class_names[class_id]}{_identity(detections, index)} "
     text += f"{float(detections.confidence[index]):.2f}"
-    range_m = float(detections.range_m[index])
-    if not np.isnan(range_m):
-        text += f"  {range_m:.1f} m"
+    depth_m = float(detections.depth_m[index])
+    if not np.isnan(depth_m):
+        text += f"  depth {depth_m:.1f} m"
     (text_width, text_height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
     plate_width = text_width + 2 * sizes.padding
     plate_height = text_height + baseline + sizes.padding

@@ -20,6 +20,7 @@ class _TrackRecord(TypedDict):
 class DetectionRecord(_TrackRecord):
     """One detection as plain values, ready for JSON. `xyxy` and `center` are pixels of the frame.
 
+    `depth_m` and `nearest_camera_m` are as in `Detections`, None where unknown.
     `track_id` and `track_score` are None for a detection that belongs to no track; `track_state` is then
     `none`, and None if nobody looked for tracks.
     """
@@ -29,7 +30,8 @@ class DetectionRecord(_TrackRecord):
     confidence: float
     xyxy: list[float]
     center: list[float]
-    range_m: float | None
+    depth_m: float | None
+    nearest_camera_m: list[float] | None
 
 
 TRACK_NONE, TRACK_TENTATIVE, TRACK_CONFIRMED = "none", "tentative", "confirmed"
@@ -47,7 +49,8 @@ class Detections:
         confidence: (N,) float32 in 0..1.
         class_id: (N,) int64, index into `class_names`.
         class_names: the model's own table, id → name.
-        range_m: (N,) float32, metres along the optical axis to the object's surface, NaN where unknown.
+        nearest_camera_m: (N, 3) float32, optical frame, metres right, down and forward of the lens: the point
+            of the object's visible surface that is horizontally nearest. NaN where unknown.
         track_id: (N,) int64, 1 or more, `NO_TRACK` for none. Together with the next two; all None if nobody
             looked for tracks.
         track_score: (N,) float32, the track's median confidence, NaN without a track.
@@ -58,18 +61,21 @@ class Detections:
     confidence: NDArray[np.float32]
     class_id: NDArray[np.int64]
     class_names: tuple[str, ...]
-    range_m: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    nearest_camera_m: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     track_id: NDArray[np.int64] | None = None
     track_score: NDArray[np.float32] | None = None
     track_confirmed: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.xyxy)
-        if self.range_m.shape == (0,) and count:
-            object.__setattr__(self, "range_m", np.full(count, np.nan, np.float32))
+        if self.nearest_camera_m.shape == (0, 3) and count:
+            object.__setattr__(self, "nearest_camera_m", np.full((count, 3), np.nan, np.float32))
         if self.xyxy.shape != (count, 4):
             raise ValueError(f"Detections.xyxy must be (N, 4), got {self.xyxy.shape}")
-        for name in ("confidence", "class_id", "range_m"):
+        if self.nearest_camera_m.shape != (count, 3):
+            shape = self.nearest_camera_m.shape
+            raise ValueError(f"Detections.nearest_camera_m must be ({count}, 3) like xyxy, got {shape}")
+        for name in ("confidence", "class_id"):
             shape = getattr(self, name).shape
             if shape != (count,):
                 raise ValueError(f"Detections.{name} must be ({count},) like xyxy, got {shape}")
@@ -92,7 +98,7 @@ class Detections:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """As three runs of bytes, which can be written to again: seven arrays took ten times as long."""
-        floats, numbers = [self.xyxy.ravel(), self.confidence, self.range_m], [self.class_id]
+        floats, numbers = [self.xyxy.ravel(), self.confidence, self.nearest_camera_m.ravel()], [self.class_id]
         tracked, truths = False, bytearray()
         if self.track_id is not None and self.track_score is not None and self.track_confirmed is not None:
             floats.append(self.track_score)
@@ -115,11 +121,16 @@ class Detections:
             self.confidence[index],
             self.class_id[index],
             self.class_names,
-            self.range_m[index],
+            self.nearest_camera_m[index],
             None if self.track_id is None else self.track_id[index],
             None if self.track_score is None else self.track_score[index],
             None if self.track_confirmed is None else self.track_confirmed[index],
         )
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """(N,) float32, metres along the optical axis to `nearest_camera_m`, NaN where unknown."""
+        return self.nearest_camera_m[:, 2]
 
     @property
     def center(self) -> NDArray[np.float32]:
@@ -142,7 +153,7 @@ class Detections:
             self.confidence.tolist(),
             self.xyxy.tolist(),
             self.center.tolist(),
-            self.range_m.tolist(),
+            self.nearest_camera_m.tolist(),
             strict=True,
         )
         return [
@@ -152,10 +163,11 @@ class Detections:
                 confidence=round(confidence, 4),
                 xyxy=[round(edge, 2) for edge in xyxy],
                 center=[round(middle, 2) for middle in center],
-                range_m=None if math.isnan(range_m) else round(range_m, 3),
+                depth_m=None if math.isnan(nearest[2]) else round(nearest[2], 3),
+                nearest_camera_m=None if math.isnan(nearest[2]) else [round(value, 3) for value in nearest],
                 **self._track_record(index),
             )
-            for index, (class_id, confidence, xyxy, center, range_m) in enumerate(values)
+            for index, (class_id, confidence, xyxy, center, nearest) in enumerate(values)
         ]
 
     def _track_record(self, index: int) -> _TrackRecord:
@@ -184,8 +196,8 @@ def _unpickled(
         floats[4 * count : 5 * count],
         numbers[:count],
         class_names,
-        floats[5 * count : 6 * count],
+        floats[5 * count : 8 * count].reshape(count, 3),
         numbers[count:] if tracked else None,
-        floats[6 * count :] if tracked else None,
+        floats[8 * count :] if tracked else None,
         np.frombuffer(of_truths, np.bool_) if tracked else None,
     )

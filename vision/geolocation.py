@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.camera_model import CameraModel, CameraMount
+
+# How deep an object is taken to be along the line of sight, against its width across. On rendered people,
+# cars and bicycles 0.6 has the smallest median error, and 0.4 fewer ranges that are too far.
+DEPTH_OF_WIDTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,28 +76,33 @@ def foot_of_upright(
     camera: CameraModel,
     mount: CameraMount,
     ned_from_body: NDArray[np.float64],
-    top_and_foot: NDArray[Any],
+    xyxy: Sequence[float],
     height_m: float,
     min_spread: float = 0.005,
 ) -> NDArray[np.float64]:
     """(3,) NED offset from the vehicle of the foot of something upright that is `height_m` tall.
 
     Its top and its foot are in one direction and as far away: that distance is the height, divided by the
-    difference of the tangents of their elevations. What is as deep as it is tall seems taller from above, and
-    so nearer.
+    difference of the tangents of their elevations. Seen from above, its top is its far edge: it is taken as
+    `DEPTH_OF_WIDTH` as deep as it is wide.
 
     Args:
-        top_and_foot: (2, 2) pixels.
+        xyxy: edges of its box, pixels.
         min_spread: the difference of the tangents below which the answer is NaN: it is too small to measure.
     """
-    lines = Sightlines.of(camera, mount, ned_from_body, top_and_foot)
+    left, top, right, bottom = (edge - 0.5 for edge in xyxy)
+    x, y = (left + right) / 2, (top + bottom) / 2
+    pixels = np.array([[x, top], [x, bottom], [left, y], [right, y]])
+    lines = Sightlines.of(camera, mount, ned_from_body, pixels)
     directions = lines.directions
     level = np.hypot(directions[:, 0], directions[:, 1])
     # Nearly straight above something its height is not seen.
     if level.min() < 0.1:
         return np.full(3, np.nan)
     tangents = -directions[:, 2] / level
-    spread = tangents[0] - tangents[1]
+    bearings = np.arctan2(directions[2:, 1], directions[2:, 0])
+    width = abs(math.remainder(bearings[1] - bearings[0], math.tau))
+    spread = tangents[0] - tangents[1] - DEPTH_OF_WIDTH * width * max(-tangents[0], 0.0)
     if not spread > min_spread:
         return np.full(3, np.nan)
     foot: NDArray[np.float64] = lines.camera_ned_m + directions[1] / level[1] * (height_m / spread)

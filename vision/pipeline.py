@@ -11,7 +11,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.depth import range_of_boxes
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
@@ -34,8 +33,8 @@ class PerceptionResult:
         captured_ns: CLOCK_MONOTONIC nanoseconds of the frame's capture.
         inferred_ns: of the moment when the detections were known.
         width, height: the frame's size, pixels.
-        detections: in the frame's pixels, with tracks if there is a tracker, and with ranges where the frame
-            has depth.
+        detections: in the frame's pixels, with tracks if there is a tracker, and with their nearest points
+            where the frame has depth.
         timing_ms: stage → milliseconds. `capture`: from the capture stamp until its bytes were there;
             `decode`; `wait`: until the frame was picked up; then `preprocess`, `inference`, `postprocess`,
             `track`, `range`; `total`: from picking it up to here.
@@ -106,6 +105,7 @@ class Pipeline:
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
         find_markers: Callable[[Frame], tuple[Marker, ...]] | None = None,
         obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
+        nearest_in: Callable[[Frame, NDArray[np.float32]], NDArray[np.float32]] | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """
@@ -119,6 +119,8 @@ class Pipeline:
                 after the detection, when what the vehicle told of that moment has come.
             find_markers: is given every frame that is looked at, beside the detector.
             obstacles_in: finds them in a frame with depth.
+            nearest_in: gives the nearest points (N, 3) of the objects in boxes (N, 4) of a frame with depth,
+                see `vision.depth.nearest_points`; None: no ranges are measured.
             clock_ns: the clock of the frames' stamps, CLOCK_MONOTONIC nanoseconds.
         """
         self._source = source
@@ -129,6 +131,7 @@ class Pipeline:
         self._view_at = view_at
         self._find_markers = find_markers
         self._obstacles_in = obstacles_in
+        self._nearest_in = nearest_in
         self._clock_ns = clock_ns
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
@@ -210,7 +213,9 @@ class Pipeline:
         obstacles = None
         if frame.depth_m is not None:
             obstacles = self._obstacles_in(frame)
-            detections = replace(detections, range_m=range_of_boxes(frame.depth_m, detections.xyxy))
+            if self._nearest_in is not None:
+                nearest = self._nearest_in(frame, detections.xyxy)
+                detections = replace(detections, nearest_camera_m=nearest)
         ranged_ns = time.perf_counter_ns()
         timing_ms["range"] = (ranged_ns - tracked_ns) / 1e6
         markers = None if self._find_markers is None else self._find_markers(frame)

@@ -78,7 +78,7 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     if synthetic:
         camera = _synthetic_camera(settings, scene, seed)
     else:
-        camera = RenderedCamera(settings, scene, rate_hz=CAMERA_RATE_HZ, latency_s=LATENCY_S)
+        camera = RenderedCamera(settings, scene, vehicle, rate_hz=CAMERA_RATE_HZ, latency_s=LATENCY_S)
     flight = LockstepFlight(SimulatedDriver(vehicle), settings, [camera])
     flight.run_until(lambda: flight.state.ready_to_arm, 30.0)
     flight.begun_ns = flight.now_ns

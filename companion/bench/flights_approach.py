@@ -17,6 +17,7 @@ from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.approach import ApproachBehaviour
+from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -55,18 +56,23 @@ def fly(seed: int, *, with_depth: bool, tolerance_m: float, rendered: bool = Fal
         _standing(rng, "dog", yaw + float(rng.uniform(-0.4, 0.4)), (10.0, 20.0)),
     ]
     settings = camera_settings(CAMERA, MOUNT, {"detector.image_size": "320", "detector.threads": "1"})
-    camera: Camera
     if rendered:
         scene, (goal, *_) = rendered_scene(things, CAMERA, MOUNT, seed, depth=with_depth)
-        camera = RenderedCamera(settings, scene, by_flight=True, depth=with_depth)
+
+        def camera(vehicle: LockstepVehicle) -> Camera:
+            return RenderedCamera(settings, scene, vehicle, by_flight=True, depth=with_depth)
+
     else:
         detector = SyntheticDetector(things, CAMERA, MOUNT, seed=seed, with_depth=with_depth)
-        camera = SyntheticCamera(settings, detect=detector)
+
+        def camera(vehicle: LockstepVehicle) -> Camera:
+            return SyntheticCamera(settings, detect=detector)
+
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        camera=lambda _: camera,
+        camera=camera,
     )
     flight.turn_to(
         math.atan2(goal.pose(0.0).east_m, goal.pose(0.0).north_m) + float(rng.uniform(-0.15, 0.15))

@@ -26,6 +26,7 @@ from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.follow import FollowBehaviour
+from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 
@@ -48,18 +49,23 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
     goal = _goal(rng, class_name, yaw)
     objects = [goal, *_like_it(rng, goal)]
     settings = camera_settings(CAMERA, MOUNT, {"detector.image_size": "320", "detector.threads": "1"})
-    camera: Camera
     if rendered:
         scene, (goal, *_) = rendered_scene(objects, CAMERA, MOUNT, seed)
-        camera = RenderedCamera(settings, scene, by_flight=True, depth=False)
+
+        def camera(vehicle: LockstepVehicle) -> Camera:
+            return RenderedCamera(settings, scene, vehicle, by_flight=True, depth=False)
+
     else:
         detector = SyntheticDetector(objects, CAMERA, MOUNT, seed=seed)
-        camera = SyntheticCamera(settings, detect=detector)
+
+        def camera(vehicle: LockstepVehicle) -> Camera:
+            return SyntheticCamera(settings, detect=detector)
+
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=float(rng.uniform(0.0, 3.0)),
-        camera=lambda _: camera,
+        camera=camera,
     )
     flight.turn_to(yaw)
     on_target: list[bool] = []

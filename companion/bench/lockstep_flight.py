@@ -23,6 +23,7 @@ from companion.guidance.envelope import Limits
 from companion.guidance.interface import CommandInput, GuidanceEvent, StreamStatus
 from companion.guidance.motion import position_and_yaw
 from companion.guidance.obstacles import ObstacleRules
+from companion.guidance.targets import StateHistory
 from companion.perception.views import View
 from companion.service.factory import guidance_options
 from companion.service.inputs import InputAssembler
@@ -54,8 +55,8 @@ class Camera(Protocol):
     rate_hz: float
     latency_s: float
 
-    def on_state(self, state: VehicleState) -> None:
-        """A new snapshot of the vehicle, as the perception worker is told it."""
+    def on_state(self, state: VehicleState, history: StateHistory) -> None:
+        """A new snapshot of the vehicle, already in the history, as the perception worker is told it."""
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
         """Take a frame now. What is returned is called when its result is due; None: the frame is lost."""
@@ -331,7 +332,7 @@ class LockstepFlight:
             self._seen_state = state
             self.inputs.on_state(state)
             for camera in self.cameras:
-                camera.on_state(state)
+                camera.on_state(state, self.inputs.history)
 
     def _moment(self) -> Moment | None:
         guidance = self.guidance

@@ -1,42 +1,30 @@
-"""The rendered camera in lockstep, with the real detector, tracker, markers and ranging behind it.
-
-The pictures are those of the simulator's camera process, and what looks at them is the perception worker's
-pipeline, made by the same functions of the same settings. Simulated time stands still meanwhile.
-"""
+"""The rendered camera with the real detector, tracker, markers and ranging, in flights in lockstep."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.rendered_perception import RenderedPerception
 from companion.bench.synthetic_detector import SceneObject
-from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
+from companion.guidance.targets import HistoryError, StateHistory
 from companion.perception.views import View
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
-from mavlink_sim.camera.simulated_camera import SimulatedCamera
-from mavlink_sim.spectators import camera_turn_rad
+from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
-from vision.frame import Frame
 from vision.pipeline import PerceptionResult
-from vision.rotation import matrix_from_quaternion
-from vision.sources import EndOfStream, Source, SourceStatistics
 
 # Where what is hidden is taken to.
 AWAY_M = 2000.0
-
-if TYPE_CHECKING:
-    from vision.detector import Detector
 
 
 class RenderedCamera:
@@ -54,55 +42,36 @@ class RenderedCamera:
         self,
         settings: Settings,
         scene: Scene,
+        vehicle: LockstepVehicle,
         *,
         rate_hz: float = 10.0,
         latency_s: float = 0.1,
         by_flight: bool = False,
         depth: bool = True,
     ) -> None:
-        cv2.setNumThreads(1)
-        detector = _detector(settings.model_dump_json()) if settings.detector.enabled else None
-        self.view = View(settings, None, None if detector is None else detector.class_names)
+        self._perception = RenderedPerception(settings, vehicle, scene)
+        self.view = View(settings, None, self._perception.class_names or None)
         self.rate_hz, self.latency_s = rate_hz, latency_s
-        self.scene, self._by_flight, self._depth = scene, by_flight, depth
-        self._camera = SimulatedCamera(scene)
-        self._frames = _OneFrame()
-        self._telemetry = CameraTelemetry()
-        self._now_ns = 0
-        self._pipeline = build_pipeline(
-            settings, self._frames, detector, self._telemetry, clock_ns=lambda: self._now_ns
-        )
+        self._by_flight, self._depth = by_flight, depth
 
-    def on_state(self, state: VehicleState) -> None:
+    def on_state(self, state: VehicleState, history: StateHistory) -> None:
         """As `WorkerView.send_state` tells the worker."""
         if state.attitude is not None:
-            self._telemetry.attitudes.add(state.attitude_ns, state.attitude)
-            self._telemetry.height_m = state.altitude_m
+            self._perception.add_attitude(state.attitude_ns, state.attitude, state.altitude_m)
+        gimbal = state.gimbal
+        if gimbal is not None and gimbal.attitude is not None and self.view.settings.camera.gimbal:
+            with contextlib.suppress(HistoryError):
+                self._perception.add_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
-        truth, vehicle = flight.vehicle.truth, flight.vehicle.vehicle
-        attitude = matrix_from_quaternion(truth.quaternion)
-        turn_rad = camera_turn_rad(vehicle)
-        mount = None
-        if turn_rad is not None:
-            roll, pitch, yaw = turn_rad
-            mount = replace(self.scene.camera.mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
-            gimbal = flight.state.gimbal
-            if gimbal is not None and gimbal.attitude is not None:
-                self._telemetry.gimbal.add(
-                    gimbal.attitude_ns, flight.inputs.history.gimbal_at(gimbal.attitude_ns)
-                )
-        time_s = flight.seconds if self._by_flight else vehicle.now_s
-        taken = self._camera.capture(truth.position_ned_m, attitude, flight.now_ns, time_s, mount=mount)
+        time_s = flight.seconds if self._by_flight else None
+        taken = self._perception.capture(flight.now_ns, time_s=time_s)
 
         def finish() -> PerceptionResult | None:
             if taken is None:
                 return None
-            results: list[PerceptionResult] = []
             frame = taken.frame if self._depth else replace(taken.frame, depth_m=None)
-            self._frames.frame, self._now_ns = frame, flight.now_ns
-            self._pipeline.step(0.0, results.append)
-            return results[0] if results else None
+            return self._perception.process(frame, flight.now_ns)
 
         return finish
 
@@ -141,31 +110,3 @@ class _ObjectMotion:
         pose = self.item.pose(time_s)
         away_m = AWAY_M if self.item.hidden(time_s) else 0.0
         return (pose.north_m + away_m, pose.east_m, 0.0), pose.yaw_rad
-
-
-class _OneFrame(Source):
-    """Gives the frame that was put in."""
-
-    uri, live = "rendered", True
-
-    def __init__(self) -> None:
-        self.frame: Frame | None = None
-
-    def read(self, timeout_s: float = 1.0) -> Frame | None:
-        if self.frame is None:
-            raise EndOfStream("no frame was put in")
-        frame, self.frame = self.frame, None
-        return frame
-
-    @property
-    def statistics(self) -> SourceStatistics:
-        return SourceStatistics()
-
-    def close(self) -> None:
-        self.frame = None
-
-
-@lru_cache(maxsize=2)
-def _detector(settings: str) -> Detector:
-    """One for each settings and process: to load it takes as long as many frames."""
-    return load_detector(Settings.model_validate_json(settings))

@@ -97,12 +97,15 @@ class RenderedPerception:
         """Receive the gimbal's attitude (its frame to NED, as `StateHistory.gimbal_at` gives it)."""
         self._telemetry.gimbal.add(stamp_ns, wxyz)
 
-    def capture(self, now_ns: int, others: tuple[Aircraft, ...] = ()) -> Captured | None:
+    def capture(
+        self, now_ns: int, others: tuple[Aircraft, ...] = (), time_s: float | None = None
+    ) -> Captured | None:
         """Render the camera at the vehicle's true pose; None: the scene's camera loses this frame.
 
         Args:
             now_ns: the frame's capture stamp.
             others: other aircraft in view.
+            time_s: the scene's time, by which its objects move; None: the vehicle's.
         """
         vehicle = self._vehicle.vehicle
         turn_rad = camera_turn_rad(vehicle)
@@ -111,9 +114,8 @@ class RenderedPerception:
             roll, pitch, yaw = turn_rad
             mount = replace(self.scene.camera.mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
         attitude = matrix_from_quaternion(vehicle.quaternion)
-        return self._camera.capture(
-            place_in_world(vehicle), attitude, now_ns, vehicle.faults.now_s, mount, others=others
-        )
+        time_s = vehicle.faults.now_s if time_s is None else time_s
+        return self._camera.capture(place_in_world(vehicle), attitude, now_ns, time_s, mount, others=others)
 
     def process(self, frame: Frame, now_ns: int) -> PerceptionResult | None:
         """Run the pipeline on a frame; None: `[detector]` leaves it out (`every`, `rate_hz`, `max_age_s`).

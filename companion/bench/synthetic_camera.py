@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.targets import HistoryError, mount_at
+from companion.guidance.targets import HistoryError, StateHistory, mount_at
 from companion.perception.views import View
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState
@@ -55,7 +55,7 @@ class SyntheticCamera:
         self._attitudes = AttitudeHistory()
         self._sequence = -1
 
-    def on_state(self, state: VehicleState) -> None:
+    def on_state(self, state: VehicleState, history: StateHistory) -> None:
         if state.attitude is not None:
             self._attitudes.add(state.attitude_ns, state.attitude)
 

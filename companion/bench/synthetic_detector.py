@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
-from vision.depth import CENTRAL_FRACTION, NEAR_PERCENTILE
 from vision.detections import Detections
 from vision.rotation import matrix_from_quaternion
 
@@ -25,7 +24,7 @@ LEAST_VISIBLE = 0.35
 LEAST_PIXELS = 5.0
 NEAR_M = 0.1
 # Rays of a box, from its middle in halves of its sides.
-GRID = np.array([[x, y] for x in np.linspace(-1.0, 1.0, 7) for y in np.linspace(-1.0, 1.0, 7)])
+GRID = np.array([[x, y] for x in np.linspace(-0.98, 0.98, 13) for y in np.linspace(-0.98, 0.98, 13)])
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-1.0, 0.0)])
 
 
@@ -118,7 +117,7 @@ class SyntheticDetector:
         optical_from_ned = mount.ned_from_optical(ned_from_body).T
         rng, faults = self._rng, self._faults
         boxes: list[NDArray[np.float64]] = []
-        confidences, classes, ranges = [], [], []
+        confidences, classes, nearest = [], [], []
         outlines = [
             outline
             for index, thing in enumerate(self._things)
@@ -142,8 +141,10 @@ class SyntheticDetector:
             boxes.append(box)
             confidences.append(0.15 + 0.65 * min(1.0, visible / 0.8) + unsure)
             classes.append(self.class_names.index(thing.class_name))
-            depth = self._depth(thing, box, eye, optical_from_ned, seconds) if self._with_depth else math.nan
-            ranges.append(depth * (1.0 + far))
+            point = np.full(3, math.nan)
+            if self._with_depth:
+                point = self._nearest(thing, box, eye, optical_from_ned, seconds)
+            nearest.append(point * (1.0 + far))
         for _ in range(int(rng.poisson(faults.false_per_frame))):
             width, height = rng.uniform(10, 80, 2)
             left = rng.uniform(0, self._camera.width - width)
@@ -151,16 +152,18 @@ class SyntheticDetector:
             boxes.append(np.array([left, top, left + width, top + height]))
             confidences.append(rng.uniform(0.1, 0.5))
             classes.append(int(rng.integers(len(self.class_names))))
-            ranges.append(rng.uniform(2.0, 30.0) if self._with_depth else math.nan)
+            depth_m = rng.uniform(2.0, 30.0) if self._with_depth else math.nan
+            ray = self._camera.rays(np.array([[left + width / 2, top + height / 2]]))[0]
+            nearest.append(ray / ray[2] * depth_m)
         if not boxes:
             return Detections.empty(self.class_names)
-        limits = (self._camera.width - 1.0, self._camera.height - 1.0) * 2
+        limits = (float(self._camera.width), float(self._camera.height)) * 2
         return Detections(
             np.clip(np.array(boxes), 0.0, limits).astype(np.float32),
             np.clip(confidences, 0.02, 0.98).astype(np.float32),
             np.array(classes, np.int64),
             self.class_names,
-            np.array(ranges, np.float32),
+            np.array(nearest, np.float32),
         )
 
     def _outline(
@@ -179,41 +182,45 @@ class SyntheticDetector:
         if points[:, 2].min() < NEAR_M:
             return None
         pixels = self._camera.project(points)
-        whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-        limits = np.array((self._camera.width - 1.0, self._camera.height - 1.0) * 2)
+        whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]) + 0.5  # edges, not pixels
+        limits = np.array((float(self._camera.width), float(self._camera.height)) * 2)
         shown = np.clip(whole, 0.0, limits)
         area, kept = float(np.prod(whole[2:] - whole[:2])), float(np.prod(shown[2:] - shown[:2]))
         if kept <= 0.0:
             return None
         return _Outline(index, shown, float(np.linalg.norm(points, axis=1).min()), kept / area)
 
-    def _depth(
+    def _nearest(
         self,
         thing: SceneObject,
         box: NDArray[np.float64],
         eye: NDArray[np.float64],
         optical_from_ned: NDArray[np.float64],
         seconds: float,
-    ) -> float:
-        """Along the optical axis to the object's near surface in its box, as `vision.depth` takes it.
+    ) -> NDArray[np.float64]:
+        """(3,) the horizontally nearest point of the object in its box, optical frame, as in `vision.depth`.
 
-        Rays through the central part of the box meet the object's sides (slab method).
+        Rays through the box meet the object's sides (slab method).
         """
         pose = thing.pose(seconds)
         c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
         to_object = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * CENTRAL_FRACTION
+        middle, half = (box[:2] + box[2:]) / 2 - 0.5, (box[2:] - box[:2]) / 2
         pixels = middle + GRID * half
         rays = self._camera.rays(pixels)
-        directions = (rays / rays[:, 2:]) @ (to_object @ optical_from_ned.T).T
+        rays /= rays[:, 2:]
+        directions = rays @ (to_object @ optical_from_ned.T).T
         origin = to_object @ (eye - (pose.north_m, pose.east_m, 0.0))
         length, width, height = thing.size_m
         low, high = np.array([-length / 2, -width / 2, -height]), np.array([length / 2, width / 2, 0.0])
         with np.errstate(divide="ignore"):
             first, second = (low - origin) / directions, (high - origin) / directions
         enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
-        met = enters[(leaves >= enters) & (enters > 0.0)]
-        return float(np.percentile(met, NEAR_PERCENTILE)) if len(met) else math.nan
+        met = (leaves >= enters) & (enters > 0.0)
+        ranges_m = np.where(met, enters * np.hypot(directions[:, 0], directions[:, 1]), np.inf)
+        index = int(ranges_m.argmin())
+        point: NDArray[np.float64] = rays[index] * (enters[index] if met[index] else math.nan)
+        return point
 
 
 def _hidden(outline: _Outline, outlines: Sequence[_Outline]) -> float:

@@ -206,14 +206,14 @@ class ApproachBehaviour(Behaviour):
             if not target.trusted or lost.is_another(target):
                 continue
             off = abs(wrap_angle(target.bearing_rad - bearing))
-            if off < SAME_BEARING_RAD and 0.5 * range_m < target.range_m < 2.0 * range_m:
+            if off < SAME_BEARING_RAD and 0.5 * range_m < target.ground_range_m < 2.0 * range_m:
                 self._track, self._seen_ns = lost.anew(target, position), target.captured_ns
                 return
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
         self._track = ObjectTrack(target, position)
         self._seen_ns = target.captured_ns
-        way_m = abs(target.range_m - self._distance_m)
+        way_m = abs(target.ground_range_m - self._distance_m)
         self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * way_m / self._speed_mps) * 1e9
 
     def _goal(self, place: Vector3, position: Vector3, bearing: float, dt_s: float) -> Vector3 | None:

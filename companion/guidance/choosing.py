@@ -73,7 +73,7 @@ class Choice:
 def _nearest(targets: Sequence[Target], yaw_rad: float) -> Target:
     def rank(target: Target) -> tuple[float, float, float]:
         off_rad = abs(wrap_angle(target.bearing_rad - yaw_rad))
-        range_m = target.range_m if math.isfinite(target.range_m) else math.inf
+        range_m = target.ground_range_m if math.isfinite(target.ground_range_m) else math.inf
         return (max(off_rad, BEFORE_RAD), range_m, off_rad)
 
     return min(targets, key=rank)

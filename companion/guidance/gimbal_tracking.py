@@ -71,7 +71,7 @@ class GimbalTracking:
             range_m = max(range_m, NEAREST_M)
             if newest is not self._seen:
                 self._seen = newest
-                then_m = newest.range_m if math.isfinite(newest.range_m) else range_m
+                then_m = newest.ground_range_m if math.isfinite(newest.ground_range_m) else range_m
                 elevation_rad = max(-STEEPEST_RAD, min(STEEPEST_RAD, newest.elevation_rad))
                 down_m = position[2] - max(then_m, NEAREST_M) * math.tan(elevation_rad)
                 before_m = down_m if self._down_m is None else self._down_m

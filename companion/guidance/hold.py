@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.motion import PositionController, speed_of, stopping_point
+from companion.guidance.motion import (
+    HOLD_VELOCITY_GAIN,
+    PositionController,
+    ground_speed,
+    pressed,
+    speed_of,
+    stopping_point,
+)
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
@@ -47,9 +54,11 @@ class HoldBehaviour(Behaviour):
             return Outcome(True, f"held for {self._duration_s:g} s", self._place)
         if self._place is None and speed_of(state) < STANDING_MPS:
             self._place = stopping_point(state)
-        velocity = (
-            (0.0, 0.0, 0.0) if self._place is None else self._controller.velocity(self._place, state, dt_s)
-        )
+        if self._place is None:
+            # The other way: PX4's integral would carry the vehicle on for seconds.
+            braking = pressed((0.0, 0.0), state, ground_speed(state), HOLD_VELOCITY_GAIN)
+            return Setpoint.velocity((*braking, 0.0), now_ns, yaw_rad=self._yaw_rad)
+        velocity = self._controller.velocity(self._place, state, dt_s)
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
 
     @property

@@ -32,7 +32,7 @@ class MarkerTarget:
         identifier: in its dictionary. pad: the marker whose pad it lies on, its own unless settings say else.
         captured_ns: CLOCK_MONOTONIC stamp of the frame.
         bearing_rad: clockwise from north, -π..π. elevation_rad: above the horizon. Both from the vehicle.
-        distance_m: straight from the vehicle. range_m: over ground.
+        distance_m: straight from the vehicle. ground_range_m: over ground.
         position_ned_m: of its centre, local NED. pad_ned_m: of its pad's centre.
         pad_offset_frd_m: from the vehicle to the pad's centre in the body frame of that moment.
         heading_rad: where its upper edge points, clockwise from north.
@@ -45,7 +45,7 @@ class MarkerTarget:
     bearing_rad: float
     elevation_rad: float
     distance_m: float
-    range_m: float
+    ground_range_m: float
     position_ned_m: Vector3
     pad_ned_m: Vector3
     pad_offset_frd_m: Vector3
@@ -139,15 +139,15 @@ def _target(
         right = np.array([-upper[1], upper[0], 0.0])
         pad_offset = offset - right * on_pad.right_m - upper * on_pad.up_m
     origin = np.array(pose.position_ned_m)
-    range_m = math.hypot(offset[0], offset[1])
+    ground_range_m = math.hypot(offset[0], offset[1])
     return MarkerTarget(
         identifier=marker.identifier,
         pad=marker.identifier if on_pad is None else on_pad.pad,
         captured_ns=captured_ns,
         bearing_rad=math.atan2(offset[1], offset[0]),
-        elevation_rad=math.atan2(-offset[2], range_m),
+        elevation_rad=math.atan2(-offset[2], ground_range_m),
         distance_m=float(np.linalg.norm(offset)),
-        range_m=range_m,
+        ground_range_m=ground_range_m,
         position_ned_m=_vector(origin + offset),
         pad_ned_m=_vector(origin + pad_offset),
         pad_offset_frd_m=_vector(pose.ned_from_body.T @ pad_offset),

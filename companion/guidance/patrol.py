@@ -227,7 +227,7 @@ class PatrolBehaviour(Behaviour):
             return f"bearing {math.degrees(target.bearing_rad) % 360:.0f}°, range unknown"
         home = home_of(situation.state)
         north, east = place[0] - home[0], place[1] - home[1]
-        return f"{target.range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
+        return f"{target.ground_range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
 
     def _note(self, text: str) -> None:
         self._notes.append(f"patrol: {text}")

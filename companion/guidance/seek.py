@@ -216,5 +216,5 @@ def _within_reach(target: Target, situation: Situation) -> float:
 
 def found_text(target: Target) -> str:
     """What was found, and where."""
-    range_text = "range unknown" if target.position_ned_m is None else f"{target.range_m:.1f} m away"
+    range_text = "range unknown" if target.position_ned_m is None else f"{target.ground_range_m:.1f} m away"
     return f"found a {target.class_name}: bearing {in_degrees(target.bearing_rad)}°, {range_text}"

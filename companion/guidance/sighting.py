@@ -143,8 +143,8 @@ class Candidates:
                 candidate.frames += 1
             else:
                 candidate.doubted += 1
-            if math.isfinite(target.range_m):
-                candidate.range_m = target.range_m
+            if math.isfinite(target.ground_range_m):
+                candidate.range_m = target.ground_range_m
             candidate.found = candidate.found or target in found
 
     def best(self) -> Target | None:

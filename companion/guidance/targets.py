@@ -39,6 +39,16 @@ MIN_DEPRESSION_RAD = math.radians(2.0)
 MIN_HEIGHT_M = 0.3
 # A range from a height needs a box so tall: one pixel more or less is a twelfth of it.
 LEAST_HEIGHT_PX = 12.0
+# The lowest that is seen of an object is its wheels, its feet or its underside; the nearest surface is so
+# much nearer: the median over all classes in benchmarks/range_error.py, on other seeds than the published.
+CONTACT_INSET_M = 0.2
+# One sigma of the range, metres, from the same measurement. Depth: fixed, and per metre of range.
+DEPTH_SIGMA = (0.15, 0.02)
+# Of a box cut off by the picture's edge, what is nearest may be outside.
+CUT_SIGMA_M = 0.3
+# Ground: fixed, and per radian of depression; two pixels of the box's edge and half a degree of attitude.
+GROUND_SIGMA_M, GROUND_SIGMA_RAD = 0.3, 0.015
+HEIGHT_SIGMA = (0.3, 0.2)
 # Boxes that overlap by so much are of one thing; those of a rider and the bicycle do not. A name must be
 # surer by this than any other it is given.
 SAME_THING_IOU, CLEARLY_SURER = 0.7, 0.1
@@ -148,11 +158,11 @@ def targets_from_detections(
 ) -> tuple[Target, ...]:
     """The targets of one frame, in the order of its detections.
 
-    Range comes from the detection's depth where it has one (`range_m`, along the optical axis, at the box's
-    centre), else from where the ray through the middle of the box's lower edge meets the ground. The ground
-    is taken as flat and level with home. There is no range if the box touches the picture's lower edge, or
-    the ray points less than 2° down. Then the class's height in `heights_m` tells it, if the whole object is
-    in the picture.
+    Range comes from the detection's nearest point where it has one (`nearest_camera_m`, from depth), else
+    from where the ray through the middle of the box's lower edge meets the ground, less `CONTACT_INSET_M`.
+    The ground is taken as flat and level with home. There is no range if the box touches the picture's lower
+    edge, or the ray points less than 2° down. Then the class's height in `heights_m` tells it, if the whole
+    object is in the picture.
 
     What the detector also calls something else, (nearly) as surely, is not `trusted`: a car that may be a
     truck is not flown to.
@@ -185,13 +195,15 @@ class _Sight(NamedTuple):
 
     Attributes:
         direction: unit, to the box's centre.
-        at_depth: to what is seen there, by its depth.
+        nearest: to the nearest point of its surface, by depth.
         on_ground: to where the middle of its lower edge meets the ground.
+        lens: to the optical centre.
     """
 
     direction: list[float]
-    at_depth: list[float]
+    nearest: list[float]
     on_ground: list[float]
+    lens: list[float]
 
 
 def _sights(
@@ -199,16 +211,20 @@ def _sights(
 ) -> list[_Sight]:
     """Of all boxes at once: a frame's targets are worked out between its arrival and the next setpoint."""
     count = len(detections)
-    left, top, right, bottom = np.array([detection["xyxy"] for detection in detections]).T
-    depths_m = np.array([detection["range_m"] for detection in detections], np.float64)  # None is NaN
+    # From edges to the centres of pixels, which rays go through.
+    left, top, right, bottom = np.array([detection["xyxy"] for detection in detections]).T - 0.5
+    unknown = [math.nan] * 3
+    nearest = np.array([detection["nearest_camera_m"] or unknown for detection in detections], np.float64)
     pixels = np.empty((2 * count, 2))
     pixels[:count, 0] = pixels[count:, 0] = (left + right) / 2
     pixels[:count, 1], pixels[count:, 1] = (top + bottom) / 2, bottom
     lines = Sightlines.of(camera, mount, pose.ned_from_body, pixels)
     centres, feet = lines[:count], lines[count:]
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
-    of_each = (centres.directions, centres.at_depth(depths_m), on_ground)
-    return [_Sight(*rows) for rows in zip(*(values.tolist() for values in of_each), strict=True)]
+    offsets = lines.camera_ned_m + nearest @ mount.ned_from_optical(pose.ned_from_body).T
+    of_each, lens = (centres.directions, offsets, on_ground), lines.camera_ned_m.tolist()
+    rows = zip(*(values.tolist() for values in of_each), strict=True)
+    return [_Sight(direction, at, foot, lens) for direction, at, foot in rows]
 
 
 def _named_otherwise(detections: Sequence[DetectionRecord]) -> list[bool]:
@@ -241,20 +257,25 @@ def _target(
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
     direction = sight.direction
-    source, offset = RangeSource.NONE, [math.nan] * 3
-    depth_m = detection["range_m"]
-    if depth_m is not None and math.isfinite(depth_m) and depth_m > 0.0:
+    source, offset, fixed_m, growing_m = RangeSource.NONE, [math.nan] * 3, math.nan, math.nan
+    whole_below = bottom < camera.height - 1 - EDGE_PX
+    inside = left > EDGE_PX and right < camera.width - EDGE_PX and whole_below
+    cut_m = 0.0 if inside else CUT_SIGMA_M
+    if all(map(math.isfinite, sight.nearest)):
         source = RangeSource.DEPTH
-        offset = sight.at_depth
-    elif bottom < camera.height - 1 - EDGE_PX and pose.height_m > MIN_HEIGHT_M:
-        offset = sight.on_ground
-        if math.isfinite(offset[0]):
-            source = RangeSource.GROUND_PLANE
-    if source is RangeSource.NONE and height_m is not None and _measurable(camera, top, bottom):
-        ends = np.array([[(left + right) / 2, top], [(left + right) / 2, bottom]])
-        offset = foot_of_upright(camera, mount, pose.ned_from_body, ends, height_m).tolist()
+        offset = _towards(sight.lens, direction, sight.nearest)
+        fixed_m = DEPTH_SIGMA[0] + cut_m
+        growing_m = DEPTH_SIGMA[1] * math.hypot(offset[0], offset[1])
+    elif whole_below and pose.height_m > MIN_HEIGHT_M and math.isfinite(sight.on_ground[0]):
+        source = RangeSource.GROUND_PLANE
+        offset = _nearer(sight.lens, sight.on_ground, CONTACT_INSET_M)
+        fixed_m = GROUND_SIGMA_M + cut_m
+        growing_m = GROUND_SIGMA_RAD * (math.hypot(offset[0], offset[1]) ** 2 / offset[2] + offset[2])
+    elif height_m is not None and _measurable(camera, top, bottom):
+        offset = foot_of_upright(camera, mount, pose.ned_from_body, detection["xyxy"], height_m).tolist()
         if all(map(math.isfinite, offset)):
             source = RangeSource.KNOWN_HEIGHT
+            fixed_m, growing_m = HEIGHT_SIGMA[0], HEIGHT_SIGMA[1] * math.hypot(offset[0], offset[1])
     known = source is not RangeSource.NONE
     north, east, down = (origin + away for origin, away in zip(pose.position_ned_m, offset, strict=True))
     return Target(
@@ -263,14 +284,32 @@ def _target(
         captured_ns=captured_ns,
         bearing_rad=math.atan2(direction[1], direction[0]),
         elevation_rad=math.asin(max(-1.0, min(1.0, -direction[2]))),
-        range_m=math.hypot(offset[0], offset[1]) if known else math.nan,
+        ground_range_m=math.hypot(offset[0], offset[1]) if known else math.nan,
         range_source=source,
         position_ned_m=(north, east, down) if known else None,
         box_xyxy=(left, top, right, bottom),
         track_id=detection.get("track_id"),
         track_score=detection.get("track_score"),
         trusted=trusted and detection.get("track_state") in (None, TRACK_CONFIRMED),
+        depth_m=math.nan if detection["depth_m"] is None else detection["depth_m"],
+        distance_m=math.hypot(*offset),
+        range_sigma_m=math.hypot(fixed_m, growing_m),
     )
+
+
+def _towards(lens: list[float], direction: list[float], nearest: list[float]) -> list[float]:
+    """The offset in a direction from the lens that is as far away over ground, and as high, as `nearest`."""
+    range_m = math.hypot(nearest[0] - lens[0], nearest[1] - lens[1])
+    share = range_m / max(math.hypot(direction[0], direction[1]), 1e-9)
+    return [lens[0] + direction[0] * share, lens[1] + direction[1] * share, nearest[2]]
+
+
+def _nearer(lens: list[float], offset: list[float], by_m: float) -> list[float]:
+    """An offset moved towards the lens over ground, no farther than below it."""
+    range_m = math.hypot(offset[0] - lens[0], offset[1] - lens[1])
+    share = max(range_m - by_m, 0.0) / max(range_m, 1e-9)
+    north, east = (near + (far - near) * share for near, far in zip(lens[:2], offset[:2], strict=True))
+    return [north, east, offset[2]]
 
 
 def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:

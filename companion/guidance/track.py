@@ -21,15 +21,11 @@ from vision.attitude import wrap_angle
 
 # How far an object may wander: 1 m in a second, one sigma. A walking person's pace.
 WANDER_M2_PER_S = 1.0
-# Noise of one measurement, one sigma: a few pixels and a degree of attitude across; along, depth is good to a
-# few per cent while a ground-plane range moves with every pixel of the box's lower edge, and people differ.
+# Noise of one measurement across the line of sight, one sigma: a few pixels and a degree of attitude.
 BEARING_SIGMA_RAD = 0.03
 ACROSS_SIGMA_M = 0.25
-ALONG_SIGMA = {
-    RangeSource.DEPTH: (0.15, 0.03),
-    RangeSource.GROUND_PLANE: (0.3, 0.12),
-    RangeSource.KNOWN_HEIGHT: (0.3, 0.2),
-}
+# Along it, the target states its own; of one that does not: fixed, and per metre of range.
+UNSTATED_SIGMA = (0.3, 0.12)
 UNKNOWN_RANGE_SIGMA_M = 1e3
 # χ² with two degrees of freedom, 99.9 %.
 GATE = 13.8
@@ -153,9 +149,10 @@ def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDA
     across = np.array([-along[1], along[0]])
     if target.range_source is RangeSource.NONE:
         sigma_along = UNKNOWN_RANGE_SIGMA_M
+    elif math.isfinite(target.range_sigma_m):
+        sigma_along = target.range_sigma_m
     else:
-        fixed, relative = ALONG_SIGMA[target.range_source]
-        sigma_along = math.hypot(fixed, relative * range_m)
+        sigma_along = math.hypot(UNSTATED_SIGMA[0], UNSTATED_SIGMA[1] * range_m)
     sigma_across = math.hypot(ACROSS_SIGMA_M, BEARING_SIGMA_RAD * range_m)
     covariance: NDArray[np.float64] = sigma_along**2 * np.outer(along, along) + sigma_across**2 * np.outer(
         across, across

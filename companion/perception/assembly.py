@@ -7,9 +7,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from companion.settings import Settings
 from vision.camera_model import CameraMount
+from vision.depth import nearest_points
 from vision.frame import Frame
 from vision.loading import uncollected
 from vision.markers import Marker, MarkerDetector
@@ -61,6 +64,7 @@ def build_pipeline(
         view_at=_view_at(settings, telemetry),
         find_markers=_find_markers(settings),
         obstacles_in=_obstacles_in(settings, telemetry),
+        nearest_in=_nearest_in(settings, telemetry),
         clock_ns=clock_ns,
     )
 
@@ -171,3 +175,31 @@ def _obstacles_in(
         return obstacle_sectors(frame.depth_m, frame.captured_ns, camera, *held, telemetry.height_m)
 
     return obstacles_in
+
+
+def _nearest_in(
+    settings: Settings, telemetry: CameraTelemetry
+) -> Callable[[Frame, NDArray[np.float32]], NDArray[np.float32]]:
+    """The nearest points of the objects in a frame's boxes.
+
+    Without the attitude of the capture the vehicle is taken as level. The attitude decides which point of the
+    surface counts as the nearest over ground, not where that point lies in the optical frame.
+    """
+    held_at = _held_at(settings, telemetry)
+    mount = settings.camera.mount()
+
+    def nearest_in(frame: Frame, xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
+        assert frame.depth_m is not None
+        held = held_at(frame.captured_ns)
+        attitude: Array = np.eye(3)
+        used = mount.held(attitude) if mount.on_gimbal else mount
+        lens_height_m = None
+        if held is not None:
+            used, attitude = held
+            if telemetry.height_m is not None:
+                lens_height_m = telemetry.height_m - float(attitude[2] @ used.position_frd_m)
+        camera = settings.camera.model(frame.width, frame.height)
+        down = used.ned_from_optical(attitude)[2]
+        return nearest_points(frame.depth_m, xyxy, camera, down, lens_height_m)
+
+    return nearest_in

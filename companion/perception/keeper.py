@@ -208,9 +208,8 @@ class PerceptionKeeper:
 
     @property
     def _attitudes_wanted(self) -> bool:
-        tracker = self._settings.tracker
-        tracked = tracker.enabled and tracker.camera_motion and self._settings.detector.enabled
-        return tracked or self._settings.guidance.obstacles != "off"
+        # The tracker removes the camera's turning; ranges from depth need to know where down is.
+        return self._settings.detector.enabled or self._settings.guidance.obstacles != "off"
 
     @property
     def state(self) -> PerceptionState:

@@ -106,7 +106,7 @@ class View:
         if self.newest is not None:
             self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
         self.newest = result
-        if result.obstacles is not None or bool(np.isfinite(result.detections.range_m).any()):
+        if result.obstacles is not None or bool(np.isfinite(result.detections.depth_m).any()):
             self._depth_came = True
 
 

@@ -102,7 +102,7 @@ def _message(marker: Marker, target: MarkerTarget | None) -> dict[str, Any]:
         "ambiguity": round(marker.ambiguity, 3),
     }
     placed = {} if target is None else asdict(target)
-    for name in ("pad", "bearing_rad", "elevation_rad", "distance_m", "range_m", "heading_rad"):
+    for name in ("pad", "bearing_rad", "elevation_rad", "distance_m", "ground_range_m", "heading_rad"):
         message[name] = None if target is None else round(placed[name], 4)
     for name in ("position_ned_m", "pad_ned_m"):
         message[name] = None if target is None else [round(value, 3) for value in placed[name]]

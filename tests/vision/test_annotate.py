@@ -18,7 +18,7 @@ NAMES = ("person", "bicycle", "car")
 
 
 def seen(
-    boxes: list[list[float]], class_ids: list[int] | None = None, ranges_m: list[float] | None = None
+    boxes: list[list[float]], class_ids: list[int] | None = None, depths_m: list[float] | None = None
 ) -> Detections:
     count = len(boxes)
     return Detections(
@@ -26,7 +26,9 @@ def seen(
         np.linspace(0.9, 0.4, count, dtype=np.float32),
         np.array(class_ids or [2] * count, np.int64),
         NAMES,
-        np.array(ranges_m or [np.nan] * count, np.float32),
+        np.array([[0.0, 0.0, depth_m] for depth_m in depths_m or [np.nan] * count], np.float32).reshape(
+            -1, 3
+        ),
     )
 
 
@@ -65,7 +67,7 @@ def test_a_box_is_in_its_class_s_colour_where_it_was_seen() -> None:
 def test_the_range_makes_the_label_longer() -> None:
     box = [[100.0, 150.0, 120.0, 170.0]]
     without = changed(picture(), annotate(picture(), seen(box)))
-    with_range = changed(picture(), annotate(picture(), seen(box, ranges_m=[12.3])))
+    with_range = changed(picture(), annotate(picture(), seen(box, depths_m=[12.3])))
     assert with_range[2] > without[2]
 
 

@@ -1,30 +1,43 @@
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from vision.depth import CENTRAL_FRACTION, NEAR_PERCENTILE, range_of_boxes
+from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
+from vision.camera_model import CameraModel, CameraMount
+from vision.depth import nearest_points
+from vision.rotation import matrix_from_euler
 
 HEIGHT, WIDTH = 48, 64
+SMALL = CameraModel.from_horizontal_fov(WIDTH, HEIGHT, math.radians(70.0))
+CAMERA = CameraModel.from_horizontal_fov(320, 240, math.radians(70.0))
+LEVEL = np.array([0.0, 1.0, 0.0])
 
 
 def depth_of(background_m: float) -> np.ndarray:
     return np.full((HEIGHT, WIDTH), background_m, np.float32)
 
 
+def depth_at(depth_m: np.ndarray, *box: float) -> float:
+    return float(nearest_points(depth_m, np.array([box]), SMALL, LEVEL)[0, 2])
+
+
 def test_the_range_is_that_of_the_object_and_not_of_what_is_behind_it() -> None:
     depth_m = depth_of(30.0)
     depth_m[10:30, 20:40] = 7.0
     # A box a third larger than the object on every side.
-    assert range_of_boxes(depth_m, np.array([[13, 3, 47, 37]])) == pytest.approx([7.0])
+    assert depth_at(depth_m, 13, 3, 47, 37) == pytest.approx(7.0)
 
 
 def test_a_thin_object_is_nearer_than_what_is_seen_through_it() -> None:
     depth_m = depth_of(30.0)
     depth_m[:, 28:32] = 5.0
-    assert range_of_boxes(depth_m, np.array([[22, 0, 38, 48]])) == pytest.approx([5.0])
+    assert depth_at(depth_m, 22, 0, 38, 48) == pytest.approx(5.0)
 
 
 def test_unknown_pixels_do_not_count() -> None:
@@ -32,56 +45,184 @@ def test_unknown_pixels_do_not_count() -> None:
     depth_m[::2] = np.nan
     depth_m[1::4] = 0.0
     depth_m[3, :] = np.inf
-    assert range_of_boxes(depth_m, np.array([[0, 0, 64, 48]])) == pytest.approx([9.0])
+    assert depth_at(depth_m, 0, 0, 64, 48) == pytest.approx(9.0)
 
 
 def test_single_wrong_near_pixels_do_not_decide() -> None:
     depth_m = depth_of(12.0)
     depth_m[20:24, 30:34] = 0.3
-    assert range_of_boxes(depth_m, np.array([[10, 5, 54, 43]])) == pytest.approx([12.0])
+    assert depth_at(depth_m, 10, 5, 54, 43) == pytest.approx(12.0)
 
 
 def test_a_box_of_almost_unknown_depth_has_no_range() -> None:
     depth_m = depth_of(np.nan)
     depth_m[24, 32] = 4.0
-    assert np.isnan(range_of_boxes(depth_m, np.array([[0, 0, 64, 48]]))).all()
+    assert math.isnan(depth_at(depth_m, 0, 0, 64, 48))
 
 
 def test_boxes_outside_the_image_or_not_finite_have_no_range() -> None:
     boxes = np.array([[100, 100, 120, 120], [-50, -50, -10, -10], [np.nan, 0, 10, 10], [0, 0, np.inf, 10]])
-    assert np.isnan(range_of_boxes(depth_of(5.0), boxes)).all()
+    assert np.isnan(nearest_points(depth_of(5.0), boxes, SMALL, LEVEL)).all()
 
 
-def test_no_boxes_give_no_ranges() -> None:
-    ranges = range_of_boxes(depth_of(5.0), np.zeros((0, 4), np.float32))
-    assert ranges.shape == (0,)
-    assert ranges.dtype == np.float32
+def test_no_boxes_give_no_points() -> None:
+    points = nearest_points(depth_of(5.0), np.zeros((0, 4), np.float32), SMALL, LEVEL)
+    assert points.shape == (0, 3)
+    assert points.dtype == np.float32
 
 
-def test_a_box_of_one_pixel_has_that_pixels_range() -> None:
+def test_a_box_of_one_pixel_has_that_pixels_point() -> None:
     depth_m = depth_of(5.0)
     depth_m[7, 9] = 2.5
-    assert range_of_boxes(depth_m, np.array([[9.2, 7.2, 9.8, 7.8]])) == pytest.approx([2.5])
+    (point,) = nearest_points(depth_m, np.array([[9.2, 7.2, 9.8, 7.8]]), SMALL, LEVEL)
+    ray = SMALL.rays(np.array([[9, 7]]))[0]
+    assert point == pytest.approx(ray / ray[2] * 2.5, rel=1e-5)
 
 
 corner = st.floats(-100, 200)
 
 
 @given(st.tuples(corner, corner, corner, corner), st.floats(0.125, 100, width=32))
-def test_in_front_of_a_wall_every_box_that_meets_the_image_has_the_walls_range_or_none(
+def test_in_front_of_a_wall_every_box_has_the_walls_depth_or_none(
     box: tuple[float, float, float, float], wall_m: float
 ) -> None:
-    (range_m,) = range_of_boxes(depth_of(wall_m), np.array([box]))
-    assert np.isnan(range_m) or range_m == pytest.approx(wall_m)
+    found_m = depth_at(depth_of(wall_m), *box)
+    assert math.isnan(found_m) or found_m == pytest.approx(wall_m, rel=1e-5)
     x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
     if 0 <= x < WIDTH - 1 and 0 <= y < HEIGHT - 1:
-        assert range_m == pytest.approx(wall_m)
+        assert found_m == pytest.approx(wall_m, rel=1e-5)
 
 
-@given(st.integers(1, 40), st.integers(0, 2**32 - 1))
-def test_it_is_numpys_percentile_of_the_middle(side: int, seed: int) -> None:
-    depth = np.random.default_rng(seed).uniform(0.5, 60.0, (side, side)).astype(np.float32)
-    box = np.array([[-side / 2, -side / 2, side * 1.5, side * 1.5]])  # the picture is its middle half
-    assert CENTRAL_FRACTION == 0.5
-    (range_m,) = range_of_boxes(depth, box)
-    assert range_m == pytest.approx(np.percentile(depth, NEAR_PERCENTILE), rel=1e-6)
+@dataclass(frozen=True)
+class Scene:
+    """A cuboid on level ground before a camera whose lens is above the origin.
+
+    Attributes:
+        depth_m: (240, 320) exact. box: edges around what is seen of the cuboid.
+        down: gravity in the optical frame. ned_from_optical: (3, 3).
+        true_m: horizontal, from the lens to the cuboid.
+    """
+
+    depth_m: np.ndarray
+    box: tuple[float, float, float, float]
+    down: np.ndarray
+    ned_from_optical: np.ndarray
+    true_m: float
+
+
+def cuboid_scene(
+    *,
+    north_m: float = 8.0,
+    east_m: float = 0.0,
+    yaw_rad: float = 0.0,
+    size_m: tuple[float, float, float] = (4.4, 1.8, 1.5),
+    height_m: float = 4.0,
+    pitch_rad: float = math.radians(-25.0),
+    roll_rad: float = 0.0,
+) -> Scene:
+    """By intersecting each pixel's ray with the ground and with the cuboid (slab method)."""
+    ned_from_optical = CameraMount().ned_from_optical(matrix_from_euler(roll_rad, pitch_rad, 0.0))
+    columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = CAMERA.rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    rays /= rays[:, 2:]
+    directions = rays @ ned_from_optical.T
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    to_cuboid = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    origin = to_cuboid @ np.array([-north_m, -east_m, -height_m])
+    length, width, tall = size_m
+    low, high = np.array([-length / 2, -width / 2, -tall]), np.array([length / 2, width / 2, 0.0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground_m = np.where(directions[:, 2] > 1e-6, height_m / directions[:, 2], np.nan)
+        ways = directions @ to_cuboid.T
+        first, second = (low - origin) / ways, (high - origin) / ways
+    enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+    seen = (leaves >= enters) & (enters > 0.0)
+    depth_m = np.where(seen, enters, ground_m).reshape(CAMERA.height, CAMERA.width).astype(np.float32)
+    where = np.nonzero(seen.reshape(depth_m.shape))
+    box = (0.0, 0.0, 0.0, 0.0)
+    if len(where[0]):
+        box = (where[1].min(), where[0].min(), where[1].max() + 1.0, where[0].max() + 1.0)
+    outside = np.maximum(np.abs(origin[:2]) - (length / 2, width / 2), 0.0)
+    return Scene(depth_m, box, ned_from_optical[2], ned_from_optical, float(np.hypot(*outside)))
+
+
+def ground_range_m(scene: Scene, depth_m: np.ndarray, box: tuple[float, float, float, float]) -> float:
+    (point,) = nearest_points(depth_m, np.array([box]), CAMERA, scene.down, lens_height_m=4.0)
+    north, east, _ = scene.ned_from_optical @ point
+    return math.hypot(north, east)
+
+
+def inside(scene: Scene, margin: float = 4.0) -> bool:
+    left, top, right, bottom = scene.box
+    near_edge = min(left, top, CAMERA.width - right, CAMERA.height - bottom) < margin
+    return not near_edge and (right - left) * (bottom - top) > 200.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    yaw_rad=st.floats(-math.pi, math.pi),
+    north_m=st.floats(4.0, 14.0),
+    east_m=st.floats(-3.0, 3.0),
+    pitch_deg=st.floats(-45.0, -10.0),
+    roll_deg=st.floats(-10.0, 10.0),
+)
+def test_nearest_corner_of_a_cuboid_askew_is_found(
+    yaw_rad: float, north_m: float, east_m: float, pitch_deg: float, roll_deg: float
+) -> None:
+    scene = cuboid_scene(
+        yaw_rad=yaw_rad,
+        north_m=north_m,
+        east_m=east_m,
+        pitch_rad=math.radians(pitch_deg),
+        roll_rad=math.radians(roll_deg),
+    )
+    assume(inside(scene))
+    assume(scene.true_m > 2.0)
+    assert ground_range_m(scene, scene.depth_m, scene.box) == pytest.approx(scene.true_m, abs=0.15)
+
+
+def test_range_is_over_ground_and_not_along_the_axis() -> None:
+    scene = cuboid_scene(yaw_rad=0.7, north_m=6.0, height_m=4.0, pitch_rad=math.radians(-35.0))
+    (point,) = nearest_points(scene.depth_m, np.array([scene.box]), CAMERA, scene.down)
+    assert ground_range_m(scene, scene.depth_m, scene.box) == pytest.approx(scene.true_m, abs=0.1)
+    assert float(point[2]) > scene.true_m + 0.5
+
+
+def test_ground_below_a_box_that_is_too_large_is_not_the_object() -> None:
+    scene = cuboid_scene(north_m=9.0, yaw_rad=0.4)
+    left, top, right, bottom = scene.box
+    larger = (left - 5, top - 5, right + 5, bottom + 12)
+    assert ground_range_m(scene, scene.depth_m, larger) == pytest.approx(scene.true_m, abs=0.15)
+
+
+def test_in_a_box_cut_off_below_the_lens_height_tells_the_ground() -> None:
+    scene = cuboid_scene(north_m=8.0)
+    left, top, right, _ = scene.box
+    down_to_the_edge = np.array([[left, top, right, float(CAMERA.height)]])
+    ranges_m = [
+        math.hypot(*(scene.ned_from_optical @ point)[:2])
+        for height_m in (4.0, None)
+        for point in nearest_points(scene.depth_m, down_to_the_edge, CAMERA, scene.down, height_m)
+    ]
+    assert ranges_m[0] == pytest.approx(scene.true_m, abs=0.15)
+    assert ranges_m[1] < scene.true_m - 0.5
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.5, 1.2])
+def test_noise_of_a_stereo_camera_does_not_make_it_nearer(yaw_rad: float) -> None:
+    scene = cuboid_scene(north_m=13.0, yaw_rad=yaw_rad)
+    rng = np.random.default_rng(1)
+    errors_m = []
+    for _ in range(10):
+        measured = measured_depth(scene.depth_m, CAMERA.fx, DepthSensor(baseline_m=0.1), rng)
+        errors_m.append(ground_range_m(scene, measured, scene.box) - scene.true_m)
+    assert abs(float(np.median(errors_m))) < 0.25
+    assert max(map(abs, errors_m)) < 0.6
+
+
+def test_a_small_object_before_it_is_not_the_object() -> None:
+    scene = cuboid_scene(north_m=10.0)
+    left, top, *_ = map(int, scene.box)
+    depth_m = scene.depth_m.copy()
+    depth_m[top + 4 : top + 12, left + 10 : left + 13] = 3.0
+    assert ground_range_m(scene, depth_m, scene.box) == pytest.approx(scene.true_m, abs=0.15)

@@ -19,7 +19,7 @@ def three(**tracks: Any) -> Detections:
         np.array([0.9, 0.5, 0.2], np.float32),
         np.array([0, 1, 1]),
         ("person", "car"),
-        np.array([1.0, np.nan, 3.0], np.float32),
+        np.array([[0.1, 0.2, 1.0], [np.nan] * 3, [0.3, 0.4, 3.0]], np.float32),
         **tracks,
     )
 

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from vision.camera_model import CameraModel
+from vision.depth import nearest_points
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_selection import Selection
@@ -72,6 +74,12 @@ def frame_of(sequence: int, *, spot_x: int = 40, depth_m: float | None = None) -
     return Frame(image, time.monotonic_ns(), sequence, depth)
 
 
+def nearest_in(frame: Frame, xyxy: np.ndarray) -> np.ndarray:
+    assert frame.depth_m is not None
+    camera = CameraModel.from_horizontal_fov(WIDTH, HEIGHT, 1.0)
+    return nearest_points(frame.depth_m, xyxy, camera, np.array([0.0, 1.0, 0.0]))
+
+
 def run(pipeline: Pipeline) -> list[PerceptionResult]:
     results: list[PerceptionResult] = []
     while True:
@@ -101,9 +109,10 @@ def test_the_time_of_every_stage_is_told() -> None:
 
 
 def test_depth_gives_every_detection_its_range() -> None:
-    near, none = run(Pipeline(Frames(frame_of(0, depth_m=6.5), frame_of(1)), BrightSpot()))
-    assert near.detections.range_m == pytest.approx([6.5])
-    assert np.isnan(none.detections.range_m).all()
+    frames = Frames(frame_of(0, depth_m=6.5), frame_of(1))
+    near, none = run(Pipeline(frames, BrightSpot(), nearest_in=nearest_in))
+    assert near.detections.depth_m == pytest.approx([6.5])
+    assert np.isnan(none.detections.depth_m).all()
 
 
 def test_only_every_nth_frame_is_looked_at() -> None:
@@ -211,8 +220,10 @@ def test_a_tracker_names_what_is_seen_and_keeps_the_weak_that_belong_to_it() -> 
 
 
 def test_ranges_are_measured_for_tracked_detections_too() -> None:
-    (result,) = run(Pipeline(Frames(frame_of(0, depth_m=6.5)), Flickering(), tracker=Tracker()))
-    assert result.detections.range_m == pytest.approx([6.5])
+    (result,) = run(
+        Pipeline(Frames(frame_of(0, depth_m=6.5)), Flickering(), tracker=Tracker(), nearest_in=nearest_in)
+    )
+    assert result.detections.depth_m == pytest.approx([6.5])
 
 
 def test_where_the_camera_looked_is_asked_for_every_frame_after_it_was_looked_at() -> None:

@@ -151,7 +151,7 @@ async def test_result_is_the_worker_s_result(airborne: LockstepVehicle, segment:
     assert there is not None
     assert rows(there) == rows(here)
     assert len(here.detections) > 0
-    assert np.isfinite(here.detections.range_m).any()
+    assert np.isfinite(here.detections.depth_m).any()
     assert here.obstacles is not None
     assert there.obstacles is not None
     np.testing.assert_array_equal(there.obstacles.distance_m, here.obstacles.distance_m)

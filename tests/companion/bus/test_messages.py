@@ -35,13 +35,13 @@ def strictly(value: object) -> object:
     return json.loads(json.dumps(value, allow_nan=False))
 
 
-def one_car(range_m: float) -> Detections:
+def one_car(depth_m: float) -> Detections:
     return Detections(
         np.array([[10, 20, 30, 60]], np.float32),
         np.array([0.9], np.float32),
         np.array([1], np.int64),
         NAMES,
-        np.array([range_m], np.float32),
+        np.array([[0.5, -0.25 + 0.0 * depth_m, depth_m]], np.float32),
     )
 
 
@@ -67,7 +67,8 @@ def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
                 "confidence": 0.9,
                 "xyxy": [10.0, 20.0, 30.0, 60.0],
                 "center": [20.0, 40.0],
-                "range_m": 11.5,
+                "depth_m": 11.5,
+                "nearest_camera_m": [0.5, -0.25, 11.5],
                 "track_id": None,
                 "track_score": None,
                 "track_state": None,
@@ -135,7 +136,9 @@ def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> Non
 
 def test_an_unknown_range_is_null() -> None:
     message = strictly(detections_message(result(one_car(math.nan)), "alpha", 3_000))
-    assert message["detections"][0]["range_m"] is None  # type: ignore[index]
+    (car,) = message["detections"]  # type: ignore[index]
+    assert car["depth_m"] is None
+    assert car["nearest_camera_m"] is None
 
 
 def test_labels_are_names_in_order_or_say_that_there_is_nothing() -> None:

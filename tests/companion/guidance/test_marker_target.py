@@ -54,7 +54,7 @@ def test_a_banking_vehicle_does_not_swing_its_marker(roll, pitch, yaw, north, ea
     target = seen(position, roll, pitch, yaw, (12.0 + north, -7.0 + east), heading)
     assert target.position_ned_m == pytest.approx((12.0 + north, -7.0 + east, 0.0), abs=0.02)
     assert target.pad_ned_m == target.position_ned_m
-    assert target.range_m == pytest.approx(math.hypot(north, east), abs=0.02)
+    assert target.ground_range_m == pytest.approx(math.hypot(north, east), abs=0.02)
     assert abs(wrap_angle(target.heading_rad - heading)) < 0.05
     body = matrix_from_quaternion(quaternion_from_euler(roll, pitch, yaw)).T @ (north, east, height)
     assert target.pad_offset_frd_m == pytest.approx(tuple(body), abs=0.03)

@@ -126,7 +126,7 @@ def test_its_own_identity_is_taken_again_without_a_range_and_in_doubt(road: Road
         target = (
             replace(target, trusted=False)
             if doubted
-            else replace(target, position_ned_m=None, range_m=math.nan, range_source=RangeSource.NONE)
+            else replace(target, position_ned_m=None, ground_range_m=math.nan, range_source=RangeSource.NONE)
         )
         assert road.track.update([target], road.vehicle)
 

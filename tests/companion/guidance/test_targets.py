@@ -7,7 +7,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from companion.guidance.target import RangeSource
-from companion.guidance.targets import HistoryError, StateHistory, slerp, targets_from_detections
+from companion.guidance.targets import (
+    CONTACT_INSET_M,
+    HistoryError,
+    StateHistory,
+    slerp,
+    targets_from_detections,
+)
 from companion.vehicle.state import VehicleState
 from vision.attitude import euler_from_quaternion, quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
@@ -37,7 +43,7 @@ def history_of(attitude, position=(0.0, 0.0, -8.0), home=(0.0, 0.0, 0.0)):
     return history
 
 
-def detection(xyxy, range_m=None, name="car"):
+def detection(xyxy, nearest=None, name="car"):
     left, top, right, bottom = xyxy
     return {
         "class_id": 2,
@@ -45,7 +51,8 @@ def detection(xyxy, range_m=None, name="car"):
         "confidence": 0.8,
         "xyxy": list(xyxy),
         "center": [(left + right) / 2, (top + bottom) / 2],
-        "range_m": range_m,
+        "depth_m": None if nearest is None else nearest[2],
+        "nearest_camera_m": None if nearest is None else list(nearest),
     }
 
 
@@ -124,11 +131,14 @@ def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, s
     assume(20 < x < 620 and 40 < y < 470)
     assume(math.atan2(height, distance) > math.radians(4))
     history = history_of(attitude, position, (0.0, 0.0, home_down))
-    box = (x - 10, y - 30, x + 10, y)
+    box = (x - 9.5, y - 29.5, x + 10.5, y + 0.5)  # edges, half a pixel beyond the centres of pixels
     (target,) = targets_from_detections([detection(box)], T0 + 50_000_000, camera, MOUNT, history)
     assert target.range_source is RangeSource.GROUND_PLANE
-    assert target.position_ned_m == pytest.approx(point, abs=0.02 * distance)
-    assert target.range_m == pytest.approx(distance, rel=0.02)
+    away = math.dist(point[:2], target.position_ned_m[:2])
+    assert away == pytest.approx(CONTACT_INSET_M, abs=0.02 * distance)
+    assert target.ground_range_m == pytest.approx(distance - CONTACT_INSET_M, abs=0.02 * distance)
+    assert target.distance_m == pytest.approx(math.hypot(target.ground_range_m, height), rel=1e-6)
+    assert target.range_sigma_m > 0.3
 
 
 @given(scene=scenes, down=st.floats(-4.0, 4.0))
@@ -142,15 +152,44 @@ def test_a_point_in_space_is_found_again_from_its_depth(scene, down):
     assume(optical[2] > 0.5)
     x, y = CAMERA.project(optical)[0]
     assume(0 < x < 640 and 0 < y < 480)
-    box = (x - 12, y - 7, x + 12, y + 7)
+    box = (x - 11.5, y - 6.5, x + 12.5, y + 7.5)
     (target,) = targets_from_detections(
-        [detection(box, float(optical[2]))], T0, CAMERA, MOUNT, history_of(attitude, position)
+        [detection(box, optical)], T0, CAMERA, MOUNT, history_of(attitude, position)
     )
     assert target.range_source is RangeSource.DEPTH
     assert target.position_ned_m == pytest.approx(point, abs=1e-6)
-    assert target.range_m == pytest.approx(distance, abs=1e-6)
+    assert target.ground_range_m == pytest.approx(distance, abs=1e-6)
+    assert target.depth_m == pytest.approx(optical[2])
+    assert target.distance_m == pytest.approx(math.hypot(distance, down), abs=1e-6)
     # The bearing is that of the camera's ray; the camera sits a little before the vehicle's origin.
     assert abs(wrap_angle(target.bearing_rad - bearing)) < 0.2 / (distance - 0.2)
+
+
+def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner():
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -8.0))
+    # A wall square to the view, 6 m ahead, of which the right half is in the box.
+    level = CameraMount()
+    (target,) = targets_from_detections(
+        [detection((420, 200, 520, 280), (0.5, 0.2, 6.0))], T0, CAMERA, level, history
+    )
+    assert target.ground_range_m == pytest.approx(math.hypot(0.5, 6.0))
+    bearing = math.atan((469.5 - CAMERA.cx) / CAMERA.fx)
+    assert target.bearing_rad == pytest.approx(bearing)
+    north, east, down = target.position_ned_m
+    assert (math.hypot(north, east), down) == pytest.approx((target.ground_range_m, -7.8))
+    assert math.atan2(east, north) == pytest.approx(bearing)
+
+
+def test_a_box_cut_by_the_edge_has_a_less_certain_range():
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    whole, cut = targets_from_detections(
+        [detection((10, 300, 60, 400), (-4, 1, 7)), detection((0, 300, 60, 400), (-4, 1, 7))],
+        T0,
+        CAMERA,
+        MOUNT,
+        history,
+    )
+    assert cut.range_sigma_m > whole.range_sigma_m + 0.2
 
 
 @given(scene=scenes, tall_m=st.floats(0.8, 4.0))
@@ -167,7 +206,10 @@ def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene, tal
     ]
     assume(min(end[2] for end in ends) > 0.5)
     pixels = np.array([CAMERA.project(end)[0] for end in ends])
-    found = foot_of_upright(CAMERA, MOUNT, matrix_from_quaternion(attitude), pixels, tall_m, min_spread=0.0)
+    (x, top), (foot_x, bottom) = pixels + 0.5
+    assume(abs(x - foot_x) < 1.0)  # upright in the picture
+    box = ((x + foot_x) / 2, top, (x + foot_x) / 2, bottom)  # and thin: as deep as it is wide
+    found = foot_of_upright(CAMERA, MOUNT, matrix_from_quaternion(attitude), box, tall_m, min_spread=0.0)
     assert np.array(position) + found == pytest.approx(foot, abs=0.02 * distance)
 
 
@@ -188,14 +230,14 @@ def test_a_known_height_tells_the_range_where_the_ground_does_not():
     assert known.range_source is RangeSource.KNOWN_HEIGHT
     # By hand: rows of a pinhole of 381 px, elevations -20° - atan((row - 239.5) / 381).
     top, bottom = (math.tan(math.radians(-20) - math.atan((row - 239.5) / 381.36)) for row in (50, 100))
-    assert known.range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
+    assert known.ground_range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
 
 
 def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells():
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     heights = {"car": 1.5}
     (by_ground, by_depth) = targets_from_detections(
-        [detection((310, 300, 330, 400)), detection((10, 300, 30, 400), range_m=7.0)],
+        [detection((310, 300, 330, 400)), detection((10, 300, 30, 400), (-4.0, 1.0, 7.0))],
         T0,
         CAMERA,
         MOUNT,
@@ -211,7 +253,7 @@ def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range():
     (target,) = targets_from_detections([detection((300, 300, 339, 479))], T0, CAMERA, MOUNT, history)
     assert target.range_source is RangeSource.NONE
     assert target.position_ned_m is None
-    assert math.isnan(target.range_m)
+    assert math.isnan(target.ground_range_m)
     assert target.bearing_rad == pytest.approx(0.7, abs=0.01)
     assert target.elevation_rad < 0
 
@@ -233,7 +275,7 @@ def test_on_the_ground_there_is_no_ground_plane_range():
 def test_a_depth_that_is_no_number_falls_back_to_the_ground():
     history = history_of(quaternion_from_euler(0, 0, 0))
     (target,) = targets_from_detections(
-        [detection((310, 300, 330, 400), math.nan)], T0, CAMERA, MOUNT, history
+        [detection((310, 300, 330, 400), (math.nan,) * 3)], T0, CAMERA, MOUNT, history
     )
     assert target.range_source is RangeSource.GROUND_PLANE
 
@@ -245,7 +287,7 @@ def test_the_attitude_is_that_of_the_capture_not_of_now():
         history.add(state_at(T0 + step * 50_000_000, quaternion_from_euler(0, 0, yaw)))
     captured_ns = T0 + 425_000_000  # half way between two samples
     (target,) = targets_from_detections(
-        [detection((309.5, 200, 329.5, 300))], captured_ns, CAMERA, MOUNT, history
+        [detection((310, 200, 330, 300))], captured_ns, CAMERA, MOUNT, history
     )
     assert target.bearing_rad == pytest.approx(0.425, abs=1e-6)
 

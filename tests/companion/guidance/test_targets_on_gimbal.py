@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.guidance.marker_target import looks_down
+from companion.guidance.target import RangeSource
 from companion.guidance.targets import HistoryError, StateHistory, mount_at, targets_from_detections
 from companion.vehicle.gimbal import GimbalState, YawFrame
 from companion.vehicle.state import VehicleState
@@ -23,9 +24,10 @@ MIDDLE = {
     "class_id": 0,
     "class_name": "car",
     "confidence": 0.8,
-    "xyxy": [CAMERA.cx - 8, CAMERA.cy - 8, CAMERA.cx + 8, CAMERA.cy + 8],
+    "xyxy": [CAMERA.cx - 7.5, CAMERA.cy - 7.5, CAMERA.cx + 8.5, CAMERA.cy + 8.5],
     "center": [CAMERA.cx, CAMERA.cy],
-    "range_m": None,
+    "depth_m": None,
+    "nearest_camera_m": None,
 }
 
 
@@ -75,6 +77,27 @@ def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(f
     (target,) = targets_from_detections([MIDDLE], captured_ns, CAMERA, MOUNT, history)
     assert target.elevation_rad == pytest.approx(-0.2 - 0.4 * step * 0.02, abs=2e-3)
     assert target.bearing_rad == pytest.approx(0.6 * step * 0.02, abs=4e-3)
+
+
+@pytest.mark.parametrize("frame", list(YawFrame))
+@given(step=st.floats(0.0, 49.0), right_m=st.floats(-2.0, 2.0), below_m=st.floats(-1.0, 1.0))
+def test_nearest_point_is_turned_by_the_gimbal_of_the_capture(frame, step, right_m, below_m):
+    point = np.array([right_m, below_m, 8.0])
+    captured_ns = T0 + round(step * STEP_NS)
+    box = dict(MIDDLE, nearest_camera_m=point.tolist(), depth_m=8.0)
+    history = history_of(frame)
+    (target,) = targets_from_detections([box], captured_ns, CAMERA, MOUNT, history)
+    # By hand: the lens 0.1 m ahead of a leaning body, the camera pitched and turned by the gimbal alone.
+    pitch, yaw = -0.2 - 0.4 * step * 0.02, 0.6 * step * 0.02
+    forward = 8.0 * math.cos(pitch) + below_m * math.sin(pitch)
+    down = below_m * math.cos(pitch) - 8.0 * math.sin(pitch)
+    lens = history.at(captured_ns).ned_from_body @ MOUNT.position_frd_m
+    assert target.position_ned_m is not None
+    assert target.position_ned_m[2] == pytest.approx(-8.0 + lens[2] + down, abs=0.02)
+    from_lens = np.array(target.position_ned_m[:2]) - lens[:2]
+    assert math.hypot(*from_lens) == pytest.approx(math.hypot(forward, right_m), abs=0.02)
+    assert math.atan2(from_lens[1], from_lens[0]) == pytest.approx(yaw, abs=5e-3)
+    assert (target.depth_m, target.range_source) == (8.0, RangeSource.DEPTH)
 
 
 def test_without_the_gimbals_attitude_a_box_has_no_direction_and_the_reason_is_told():

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -23,7 +24,19 @@ def seen(place, vehicle=(0.0, 0.0, -5.0), frame=0, *, source=RangeSource.GROUND_
         math.hypot(north, east) if known else math.nan,
         source,
         (place[0], place[1], 0.0) if known else None,
+        range_sigma_m=0.5 if known else math.nan,
     )
+
+
+def test_range_sigma_of_the_target_decides_how_much_it_counts():
+    vehicle = (0.0, 0.0, -5.0)
+    places = []
+    for sigma_m in (0.2, 3.0):
+        track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+        assert track.update([replace(seen((21.0, 0.0), frame=1), range_sigma_m=sigma_m)], vehicle)
+        places.append(track.position_ned_m[0])
+    assert places[0] > 20.7
+    assert places[1] < 20.2
 
 
 def test_a_track_cannot_begin_without_a_place():

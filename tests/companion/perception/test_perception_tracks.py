@@ -250,14 +250,12 @@ def test_at_most_fifty_attitudes_a_second_go_to_the_worker_and_none_twice(rate_h
     assert 0.85 * 4 * min(rate_hz, 50) <= len(told.stamps_ns) <= 4 * min(rate_hz, 50) + 2
 
 
-@pytest.mark.parametrize("key", ["tracker.enabled", "tracker.camera_motion", "detector.enabled"])
-def test_an_attitude_nobody_wants_is_not_sent(key: str) -> None:
+@pytest.mark.parametrize(
+    ("detector", "obstacles", "wanted"),
+    [("false", "off", False), ("false", "auto", True), ("true", "off", True), ("true", "auto", True)],
+)
+def test_an_attitude_nobody_wants_is_not_sent(detector: str, obstacles: str, wanted: bool) -> None:
     told = Turned()
-    blind = {"guidance.obstacles": "off"}
-    keeper_with(told, **blind, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
-    assert told.stamps_ns == []
-    keeper_with(told, **{key: "false"}).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
-    assert told.stamps_ns == [1], "obstacles need it"
-    told.stamps_ns.clear()
-    keeper_with(told).send_attitude(1, (1.0, 0.0, 0.0, 0.0))
-    assert told.stamps_ns == [1]
+    keeper = keeper_with(told, **{"detector.enabled": detector, "guidance.obstacles": obstacles})
+    keeper.send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    assert told.stamps_ns == ([1] if wanted else [])

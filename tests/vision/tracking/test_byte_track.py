@@ -308,10 +308,10 @@ def test_ranges_stay_with_their_detections() -> None:
         np.array([0.15, 0.9], np.float32),
         np.array([0, 1], np.int64),
         NAMES,
-        np.array([3.0, 7.0], np.float32),
+        np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 7.0]], np.float32),
     )
     frame = Film().give(found)
-    assert frame.detections.range_m.tolist() == [7.0]
+    assert frame.detections.depth_m.tolist() == [7.0]
     assert frame.detections.names == ["car"]
 
 

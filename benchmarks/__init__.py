@@ -1,0 +1,1 @@
+"""Measurements for development, not installed with the packages."""

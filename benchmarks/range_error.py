@@ -1,0 +1,318 @@
+"""Error of the range to objects: rendered frames, the bundled detector, the functions that fly.
+
+    python -m benchmarks.range_error --frames 300 --seeds 11,12 [--json]
+
+Conditions: the built-in camera (640x480, 70° across, 20° down on the body, no distortion) in demo worlds and
+in the scene `village`; 2.5 to 8 m above level ground, roll and pitch of the vehicle up to 10°, objects at all
+headings, 3 to 25 m away, in the whole width of the picture. Boxes are the detector's (image size 320), those
+that agree with the truth in class and by an IoU of 0.5, of objects of which 60 % is seen; boxes that the
+picture's edge cuts are among them. Depth is that of a stereo camera with a baseline of 5 cm (`DepthSensor`).
+The pose is exact. The truth is the horizontal distance from the vehicle to the nearest point of the object's
+surface, or to its footprint, the rectangle around it (`--truth footprint`).
+
+Sources: `depth`; `depth_exact`, without the sensor's noise; `ground_plane`; `known_height` with the default
+heights, as if nothing were known of the ground.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.guidance.target import Target
+from companion.guidance.targets import StateHistory, targets_from_detections
+from companion.settings.perception import DetectorSection
+from companion.vehicle.state import VehicleState
+from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
+from mavlink_sim.camera.image_effects import MILD_EFFECTS
+from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Renderer, VisibleObject
+from mavlink_sim.camera.scene_file import load_scene
+from mavlink_sim.world.mesh import mesh_of
+from mavlink_sim.world.shapes import CLASS_NAMES, variant_of
+from mavlink_sim.world.world import World, WorldObject, demo_world, range_to
+from vision.attitude import quaternion_from_euler
+from vision.depth import nearest_points
+from vision.detections import Detections
+from vision.detector import Detector
+from vision.pipeline import FrameDetector
+from vision.rotation import matrix_from_quaternion
+from vision.tracking.association import overlaps
+
+CAPTURED_NS = 1_000_000_000
+HEIGHT_M, RANGE_M, TILT_RAD = (2.5, 8.0), (3.0, 25.0), math.radians(10.0)
+# Near frames are where most is decided: this share of them is within 15 m.
+NEAR_SHARE, NEAR_M = 0.6, 15.0
+VILLAGE_SHARE, CAR_SHARE, FRAMES_PER_WORLD = 0.2, 0.4, 12
+LEAST_VISIBLE, LEAST_IOU, EDGE_PX = 0.6, 0.5, 1.0
+BANDS = {
+    "depth": ((3.0, 6.0), (6.0, 10.0), (10.0, 15.0), (3.0, 15.0)),
+    "depth_exact": ((3.0, 6.0), (6.0, 10.0), (10.0, 15.0), (3.0, 15.0)),
+    "ground_plane": ((5.0, 10.0), (10.0, 15.0), (15.0, 25.0), (5.0, 25.0)),
+    "known_height": ((5.0, 10.0), (10.0, 15.0), (15.0, 25.0), (5.0, 25.0)),
+}
+TRUTHS = ("surface", "footprint")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One frame and what is in it.
+
+    Attributes:
+        image: (H, W, 3) uint8 BGR. depth_m: (H, W) float32, what the sensor says; exact_m: without its noise.
+        position_ned_m: of the vehicle. attitude: (w, x, y, z), body FRD to NED.
+        objects: those seen.
+    """
+
+    image: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    exact_m: NDArray[np.float32]
+    position_ned_m: tuple[float, float, float]
+    attitude: tuple[float, float, float, float]
+    objects: list[VisibleObject]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One range against the truth.
+
+    Attributes:
+        true_m: horizontal, from the vehicle. error_m: what was measured less that; NaN: nothing was measured.
+        sigma_m: the target's own `range_sigma_m`.
+        cut: the object goes beyond the picture's edge.
+    """
+
+    source: str
+    class_name: str
+    true_m: float
+    error_m: float
+    sigma_m: float
+    cut: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The errors of one source in one band of true ranges, metres."""
+
+    source: str
+    group: str
+    count: int
+    median_m: float
+    median_abs_m: float
+    p95_abs_m: float
+    within_two_sigma: float
+
+
+def views(seed: int, count: int) -> Iterator[View]:
+    """Frames of random worlds from random poses; the same seed gives the same."""
+    rng = np.random.default_rng((seed, 41))
+    drawn = 0
+    while drawn < count:
+        renderer = _renderer(rng)
+        for _ in range(FRAMES_PER_WORLD):
+            view = _view(renderer, rng)
+            if view is not None and drawn < count:
+                drawn += 1
+                yield view
+
+
+def _renderer(rng: np.random.Generator) -> Renderer:
+    if rng.random() < VILLAGE_SHARE:
+        world = load_scene("village").world_at(float(rng.uniform(0.0, 60.0)))
+    else:
+        world = demo_world(int(rng.integers(2**30)))
+    return Renderer(world, effects=MILD_EFFECTS, rng=np.random.default_rng(rng.integers(2**30)))
+
+
+def _view(renderer: Renderer, rng: np.random.Generator) -> View | None:
+    """None: no pose was found from which the object drawn is in the picture."""
+    item = _object(renderer.world, rng)
+    for _ in range(60):
+        range_m = rng.uniform(RANGE_M[0], NEAR_M if rng.random() < NEAR_SHARE else RANGE_M[1])
+        from_object_rad, off_rad = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(-38.0, 38.0))
+        roll_rad, pitch_rad = rng.uniform(-TILT_RAD, TILT_RAD, 2)
+        position = _place(item, float(range_m), float(from_object_rad), -float(rng.uniform(*HEIGHT_M)))
+        attitude = quaternion_from_euler(roll_rad, pitch_rad, from_object_rad + math.pi + off_rad)
+        ned_from_body = matrix_from_quaternion(attitude)
+        eye = np.array(position) + ned_from_body @ DEFAULT_MOUNT.position_frd_m
+        middle = np.array(item.position_ned_m) - (0.0, 0.0, item.height_m / 2)
+        x, y = DEFAULT_CAMERA.project((middle - eye) @ DEFAULT_MOUNT.ned_from_optical(ned_from_body))[0]
+        if -40.0 < x < DEFAULT_CAMERA.width + 40.0 and -40.0 < y < DEFAULT_CAMERA.height + 20.0:
+            break
+    else:
+        return None
+    rendered = renderer.render(position, ned_from_body)
+    exact_m = rendered.depth_m.astype(np.float32, copy=False)
+    depth_m = measured_depth(exact_m, DEFAULT_CAMERA.fx, DepthSensor(), rng)
+    image = np.ascontiguousarray(rendered.image)
+    return View(image, depth_m, exact_m, position, attitude, rendered.objects)
+
+
+def _object(world: World, rng: np.random.Generator) -> WorldObject:
+    wanted = ("car",) if rng.random() < CAR_SHARE else CLASS_NAMES
+    items = [item for item in world.objects if item.class_name in wanted]
+    return items[int(rng.integers(len(items)))]
+
+
+def _place(
+    item: WorldObject, range_m: float, bearing_rad: float, down_m: float
+) -> tuple[float, float, float]:
+    """In a direction from the object's middle, so far from its footprint."""
+    away_m = range_m
+    for _ in range(20):
+        north = item.position_ned_m[0] + away_m * math.cos(bearing_rad)
+        east = item.position_ned_m[1] + away_m * math.sin(bearing_rad)
+        away_m += range_m - range_to(item, (north, east))
+    return north, east, down_m
+
+
+def surface_range_m(item: WorldObject, position_ned_m: Sequence[float]) -> float:
+    """Horizontal metres from a point outside to the nearest point of the object's surface."""
+    mesh = mesh_of(item.class_name, variant_of(item.class_name, item.appearance), item.size_m)
+    cosine, sine = math.cos(item.yaw_rad), math.sin(item.yaw_rad)
+    north, east = (position_ned_m[axis] - item.position_ned_m[axis] for axis in (0, 1))
+    point = np.array([cosine * north + sine * east, cosine * east - sine * north]) / item.scale
+    ways, to = mesh.ways[:, :2], point - mesh.starts[:, :2]
+    share = (to * ways).sum(axis=1) / np.maximum((ways * ways).sum(axis=1), 1e-12)
+    away = to - np.clip(share, 0.0, 1.0)[:, None] * ways
+    return float(np.hypot(away[:, 0], away[:, 1]).min()) * item.scale
+
+
+def samples(view: View, detector: FrameDetector, truth: str = "surface") -> list[Sample]:
+    """Every source's range to every object that the detector has found in a frame."""
+    detections = detector.detect(view.image)
+    matched = list(_matched(detections, view))
+    by_source = {
+        "depth": _targets(_with_depth(detections, view, view.depth_m), view),
+        "depth_exact": _targets(_with_depth(detections, view, view.exact_m), view),
+        "ground_plane": _targets(detections, view),
+        "known_height": _targets(detections, view, ground=False),
+    }
+    measured = []
+    for index, seen in matched:
+        item = seen.world_object
+        from_m = view.position_ned_m
+        true_m = surface_range_m(item, from_m) if truth == "surface" else range_to(item, from_m)
+        left, top, right, bottom = seen.xyxy
+        inside = min(left, top, DEFAULT_CAMERA.width - right, DEFAULT_CAMERA.height - bottom) > EDGE_PX
+        for source, targets in by_source.items():
+            target = targets[index]
+            error_m = math.nan
+            if target.range_source == source.removesuffix("_exact"):
+                error_m = target.ground_range_m - true_m
+            measured.append(
+                Sample(source, item.class_name, true_m, error_m, target.range_sigma_m, not inside)
+            )
+    return measured
+
+
+def _matched(detections: Detections, view: View) -> Iterator[tuple[int, VisibleObject]]:
+    names = np.array(detections.names)
+    for seen in view.objects:
+        item = seen.world_object
+        if item.class_name not in CLASS_NAMES or seen.visible_fraction < LEAST_VISIBLE or not len(detections):
+            continue
+        overlap = np.where(
+            names == item.class_name, overlaps(detections.xyxy, np.array([seen.xyxy]))[:, 0], 0.0
+        )
+        if overlap.max() >= LEAST_IOU:
+            yield int(overlap.argmax()), seen
+
+
+def _with_depth(detections: Detections, view: View, depth_m: NDArray[np.float32]) -> Detections:
+    ned_from_body = matrix_from_quaternion(view.attitude)
+    lens_height_m = -view.position_ned_m[2] - float(ned_from_body[2] @ DEFAULT_MOUNT.position_frd_m)
+    down = DEFAULT_MOUNT.ned_from_optical(ned_from_body)[2]
+    nearest = nearest_points(depth_m, detections.xyxy, DEFAULT_CAMERA, down, lens_height_m)
+    return replace(detections, nearest_camera_m=nearest)
+
+
+def _targets(detections: Detections, view: View, *, ground: bool = True) -> tuple[Target, ...]:
+    """Without `ground`, home is taken to be at the vehicle's height, and the ground tells nothing."""
+    history = StateHistory()
+    history.add(
+        VehicleState(
+            attitude_ns=CAPTURED_NS,
+            position_ns=CAPTURED_NS,
+            attitude=view.attitude,
+            position_ned_m=view.position_ned_m,
+            home_position_ned_m=(0.0, 0.0, 0.0 if ground else view.position_ned_m[2]),
+        )
+    )
+    heights_m = DetectorSection().heights()
+    return targets_from_detections(
+        detections.records(), CAPTURED_NS, DEFAULT_CAMERA, DEFAULT_MOUNT, history, heights_m
+    )
+
+
+def rows(measured: Iterable[Sample]) -> list[Row]:
+    """By source and band of true ranges; of the widest band also by class, and what the picture cuts."""
+    measured = list(measured)
+    table = []
+    for source, bands in BANDS.items():
+        own = [sample for sample in measured if sample.source == source and math.isfinite(sample.error_m)]
+        groups = {f"{low:g}-{high:g} m": _within(own, low, high) for low, high in bands}
+        every = _within(own, *bands[-1])
+        groups["cut by the edge"] = [sample for sample in every if sample.cut]
+        for name in CLASS_NAMES:
+            groups[name] = [sample for sample in every if sample.class_name == name]
+        table += [_row(source, group, chosen) for group, chosen in groups.items() if chosen]
+    return table
+
+
+def _within(chosen: list[Sample], low_m: float, high_m: float) -> list[Sample]:
+    return [sample for sample in chosen if low_m <= sample.true_m < high_m]
+
+
+def _row(source: str, group: str, chosen: list[Sample]) -> Row:
+    errors = np.array([sample.error_m for sample in chosen])
+    sigmas = np.array([sample.sigma_m for sample in chosen])
+    return Row(
+        source,
+        group,
+        len(chosen),
+        round(float(np.median(errors)), 3),
+        round(float(np.median(np.abs(errors))), 3),
+        round(float(np.percentile(np.abs(errors), 95)), 3),
+        round(float(np.mean(np.abs(errors) <= 2.0 * sigmas)), 3),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Error of the range to detected objects")
+    parser.add_argument("--frames", type=int, default=300, help="frames of each seed")
+    parser.add_argument("--seeds", default="1", help="comma separated")
+    parser.add_argument("--truth", choices=TRUTHS, default="surface", help="what the range is compared to")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    arguments = parser.parse_args()
+    seeds = [int(seed) for seed in arguments.seeds.split(",")]
+    detector = Detector(image_size=320, threads=1)
+    measured = [
+        sample
+        for seed in seeds
+        for view in views(seed, arguments.frames)
+        for sample in samples(view, detector, arguments.truth)
+    ]
+    table = rows(measured)
+    if arguments.json:
+        print(
+            json.dumps({"seeds": seeds, "frames": arguments.frames, "rows": [asdict(row) for row in table]})
+        )
+        return
+    print(
+        f"{'source':13} {'group':16} {'n':>5} {'median':>8} {'|median|':>8} {'|p95|':>7} {'in 2 sigma':>10}"
+    )
+    for row in table:
+        print(
+            f"{row.source:13} {row.group:16} {row.count:5d} {row.median_m:+8.2f} {row.median_abs_m:8.2f} "
+            f"{row.p95_abs_m:7.2f} {row.within_two_sigma:10.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""The benchmark's measurement on a few frames; its bounds leave room for what few frames can show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.range_error import View, rows, samples, surface_range_m, views
+from mavlink_sim.world.world import WorldObject, range_to
+from vision.detector import Detector
+
+
+@pytest.fixture(scope="module")
+def seen() -> list[View]:
+    return list(views(5, 24))
+
+
+def test_a_seed_gives_the_same_frames(seen: list[View]) -> None:
+    again = next(views(5, 1))
+    assert np.array_equal(again.image, seen[0].image)
+    assert np.array_equal(again.depth_m, seen[0].depth_m, equal_nan=True)
+
+
+def test_surface_is_within_the_footprint() -> None:
+    car = WorldObject(0, "car", (0.0, 0.0, 0.0), 0.4)
+    for angle in np.linspace(0.0, 6.0, 13):
+        place = (8.0 * np.cos(angle), 8.0 * np.sin(angle))
+        assert 0.0 <= surface_range_m(car, place) - range_to(car, place) < 0.5
+
+
+def test_ranges_of_the_detector_are_near_the_truth(seen: list[View]) -> None:
+    detector = Detector(image_size=320, threads=1)
+    measured = [sample for view in seen for sample in samples(view, detector)]
+    table = {(row.source, row.group): row for row in rows(measured)}
+    depth, exact = table["depth", "3-15 m"], table["depth_exact", "3-15 m"]
+    assert depth.count >= 10
+    assert depth.median_abs_m < 0.2
+    assert exact.median_abs_m < 0.2
+    assert table["ground_plane", "5-25 m"].median_abs_m < 0.6
