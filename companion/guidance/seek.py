@@ -17,7 +17,7 @@ from vision.attitude import wrap_angle
 BLIND_TIMEOUT_S = 5.0
 # A turn may take this many times what it should, plus the looks on the way.
 SLOWEST_TURN = 3.0
-# The nose is so near to an object's direction that the camera sees the object.
+# Nose and gimbal are so near to an object's direction that the camera sees the object.
 POINTED_RAD = math.radians(8.0)
 # A gimbal that swept in vain is let back to where it looked before, so long at most.
 BACK_TIMEOUT_S = 5.0
@@ -172,10 +172,10 @@ class SeekBehaviour(Behaviour):
 
     def _face(self, gaze: Gaze, situation: Situation, yaw_rad: float, stay: Vector3) -> Step:
         now_ns = situation.now_ns
+        pitch_off_rad = 0.0
+        if self._sweep is not None:
+            pitch_off_rad = abs(_within_reach(gaze.target, situation) - _gimbal_pitch(situation))
         if not self._pointed:
-            pitch_off_rad = 0.0
-            if self._sweep is not None:
-                pitch_off_rad = abs(_within_reach(gaze.target, situation) - _gimbal_pitch(situation))
             self._pointed = max(gaze.off_rad(yaw_rad), pitch_off_rad) <= POINTED_RAD
             gaze.expect_later(now_ns)
         if gaze.lost(now_ns):
@@ -184,7 +184,7 @@ class SeekBehaviour(Behaviour):
             self._candidates.drop(gaze.target)
             self._sightings.forget()
             return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
-        if gaze.faced(yaw_rad, now_ns):
+        if gaze.faced(yaw_rad, now_ns) and pitch_off_rad <= POINTED_RAD:
             return Outcome(True, found_text(gaze.target))
         return Setpoint.velocity(stay, now_ns, yaw_rad=gaze.target.bearing_rad)
 
