@@ -48,7 +48,7 @@ CAMERA_RATE_HZ, LATENCY_S = 10.0, 0.12
 
 @dataclass(frozen=True, slots=True)
 class DemoFlight:
-    """One demonstration. Ranges are horizontal and true, from the vehicle to the car's nearest surface, metres.
+    """One demonstration. Ranges are true, horizontal, to the car's nearest surface, metres.
 
     Attributes:
         confirmed: class of the object that `seek` ended at, by truth; None: it found none.
