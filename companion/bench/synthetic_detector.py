@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.guidance.targets import CONTACT_INSET_M
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
@@ -26,6 +27,7 @@ NEAR_M = 0.1
 # Rays of a box, from its middle in halves of its sides.
 GRID = np.array([[x, y] for x in np.linspace(-0.98, 0.98, 13) for y in np.linspace(-0.98, 0.98, 13)])
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-1.0, 0.0)])
+ON_GROUND = CORNERS[:, 2] == 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +179,11 @@ class SyntheticDetector:
         pose = thing.pose(seconds)
         c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        corners = (CORNERS * thing.size_m) @ turn.T + (pose.north_m, pose.east_m, 0.0)
+        corners = CORNERS * thing.size_m
+        # As of real things, wheels and feet stand behind the surface; small things stand on nearly all of it.
+        inset_m = np.minimum(np.array(thing.size_m[:2]) / 8, CONTACT_INSET_M)
+        corners[ON_GROUND, :2] -= CORNERS[ON_GROUND, :2] * 2 * inset_m
+        corners = corners @ turn.T + (pose.north_m, pose.east_m, 0.0)
         points = (corners - eye) @ optical_from_ned.T
         if points[:, 2].min() < NEAR_M:
             return None
