@@ -60,7 +60,8 @@ class Film:
 
 def ids(frame: TrackedFrame) -> list[int]:
     assert frame.detections.track_id is not None
-    return frame.detections.track_id.tolist()
+    found: list[int] = frame.detections.track_id.tolist()
+    return found
 
 
 def test_an_object_keeps_its_identity_while_it_moves() -> None:
@@ -122,6 +123,7 @@ def test_a_track_counts_as_true_past_the_second_threshold_of_its_median() -> Non
     for confidence in (0.36, 0.9, 0.4, 0.45, 0.6, 0.6, 0.6, 0.6, 0.6):
         frame = film.show((100, 100, confidence))
         (record,) = frame.detections.records()
+        assert record["track_score"] is not None
         states.append((record["track_state"], round(record["track_score"], 3)))
     assert states == [
         ("tentative", 0.36),
