@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plan_client import listen
 
 from mavlink_sim.flight.collision_prevention import (
     FRAME_BODY_FRD,
@@ -21,6 +20,7 @@ from mavlink_sim.flight.collision_prevention import (
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.plan_client import listen
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
 STILL = (0.0, 0.0)

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from mavsdk.asyncio.plugins.component_metadata import ComponentMetadataAsync
 from mavsdk.asyncio.plugins.ftp import FtpAsync, FtpError
 from mavsdk.plugins.component_metadata import MetadataType
-from mavsdk_client import mavsdk_client
 from pymavlink import mavftp, mavutil
 
 from mavlink_sim.px4.parameters import INT32, Parameters, default_parameters
@@ -26,6 +25,7 @@ from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Pack
 from mavlink_sim.services.vehicle_files import bson, offer_packed_parameters, packed_parameters
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.mavsdk_client import mavsdk_client
 
 
 class Client:

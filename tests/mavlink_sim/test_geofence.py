@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from plan_client import circle, listen, polygon, upload
 
 from mavlink_sim.missions.geofence import Area, inside_polygon
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.wire.announcements import event_identifier
+from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
 metres = st.floats(-100.0, 100.0)

@@ -76,7 +76,7 @@ def test_its_two_poses_agree(roll: float, pitch: float, yaw: float, tilt: float,
     device.point(Target(Aim.ANGLES, tilt, pan))
     attitude = quaternion_from_euler(roll, pitch, yaw)
     settled(device, attitude)
-    assert (device.pan_rad, device.tilt_rad) == (pytest.approx(pan, abs=1e-6), pytest.approx(tilt, abs=1e-6))
+    assert (device.pan_rad, device.tilt_rad) == pytest.approx((pan, tilt), abs=1e-6)
     whole = matrix_from_quaternion(attitude) @ matrix_from_quaternion(device.body_quaternion)
     assert np.allclose(whole, matrix_from_quaternion(device.quaternion), atol=1e-9)
 
@@ -94,16 +94,10 @@ def test_the_stops_hold() -> None:
     device = gimbal(MNT_MAX_PITCH=30, MNT_MIN_PITCH=-60, MNT_RANGE_YAW=180)
     device.point(Target(Aim.ANGLES, 1.5, 3.0))
     settled(device)
-    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == (
-        pytest.approx(30.0),
-        pytest.approx(90.0),
-    )
+    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == pytest.approx((30.0, 90.0))
     device.point(Target(Aim.ANGLES, -1.5, -3.0))
     settled(device)
-    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == (
-        pytest.approx(-60.0),
-        pytest.approx(-90.0),
-    )
+    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == pytest.approx((-60.0, -90.0))
     device = gimbal(MNT_LND_P_MIN=-10)
     device.point(Target(Aim.ANGLES, -1.0, 0.0))
     assert math.degrees(settled(device, landed=True).tilt_rad) == pytest.approx(-10.0)
@@ -119,7 +113,7 @@ def test_it_takes_its_time_and_turns_at_a_rate_until_that_is_silent() -> None:
     device.point(Target(Aim.ANGLES, yaw_rate_radps=0.2, pitch_rate_radps=-0.1))
     for _ in range(100):
         device.step(0.01, LEVEL, (0.0, 0.0, 0.0), False)
-    assert (device.pan_rad, device.tilt_rad) == (pytest.approx(0.2, abs=0.01), pytest.approx(-0.1, abs=0.01))
+    assert (device.pan_rad, device.tilt_rad) == pytest.approx((0.2, -0.1), abs=0.01)
     assert device.angular_velocity((0.0, 0.0, 0.0))[1] == pytest.approx(-0.1, abs=1e-6)
     settled(device)
     assert device.pan_rad == pytest.approx(0.4, abs=0.01)  # 2 s after the last word it stands
@@ -198,10 +192,7 @@ def test_messages_move_it_too(steered: Any) -> None:
     q = list(quaternion_from_euler(0.0, -0.5, 0.8))
     steered.send(dialect.MAVLink_gimbal_manager_set_attitude_message(1, 1, 12, 0, q, NAN, NAN, NAN))
     steered.fly(2.0)
-    assert degrees(steered) == (
-        pytest.approx(math.degrees(-0.5), abs=0.1),
-        pytest.approx(math.degrees(0.8), abs=0.1),
-    )
+    assert degrees(steered) == pytest.approx((math.degrees(-0.5), math.degrees(0.8)), abs=0.1)
     steered.send(dialect.MAVLink_gimbal_manager_set_pitchyaw_message(1, 1, 12, 0, -1.0, 0.0, NAN, NAN))
     steered.fly(2.0)
     assert degrees(steered)[0] == pytest.approx(math.degrees(-1.0), abs=0.1)
@@ -222,7 +213,7 @@ def test_a_location_is_looked_at_and_forgotten(steered: Any) -> None:
     assert degrees(steered)[1] == pytest.approx(45.0, abs=1.0)
     assert steered.command(197) == [0]
     steered.fly(2.0)
-    assert degrees(steered) == (pytest.approx(0.0, abs=0.1), pytest.approx(0.0, abs=0.1))
+    assert degrees(steered) == pytest.approx((0.0, 0.0), abs=0.1)
     assert steered.command(195, 0, 0, 0, 0, NAN, NAN, NAN) == [2]
 
 

@@ -6,7 +6,9 @@ import math
 from typing import Any
 
 import pytest
-from plan_client import (
+
+from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.plan_client import (
     NAN,
     RETURN,
     circle,
@@ -19,8 +21,6 @@ from plan_client import (
     upload,
     waypoint,
 )
-
-from mavlink_sim.wire.messages import dialect
 
 SHORT = [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]
 

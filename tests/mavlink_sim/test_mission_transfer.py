@@ -9,7 +9,11 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plan_client import (
+
+from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
+from mavlink_sim.services.mission_messages import MissionCurrent
+from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.plan_client import (
     COMPANION,
     RETURN,
     circle,
@@ -25,10 +29,6 @@ from plan_client import (
     upload,
     waypoint,
 )
-
-from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
-from mavlink_sim.services.mission_messages import MissionCurrent
-from mavlink_sim.wire.messages import dialect, parser
 
 NAN = math.nan
 SQUARE = [(-50.0, -50.0), (-50.0, 50.0), (50.0, 50.0), (50.0, -50.0)]

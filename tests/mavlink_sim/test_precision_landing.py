@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import pytest
-from plan_client import land, listen, takeoff, upload
 
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.plan_client import land, listen, takeoff, upload
 
 TARGET = (2.0, -1.5)
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from plan_client import upload, waypoint
 
 from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
 from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.plan_client import upload, waypoint
 
 pytestmark = pytest.mark.hears("everything")
 

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
 
 from mavlink_sim.missions.items import item_of
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.missions.return_flight import Goal, destination, mission_route
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.parameters import Parameters
+from tests.mavlink_sim.plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
 
 HOME = (0.0, 0.0, 0.0)
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from plan_client import circle, land, rally, takeoff, upload, waypoint
 
 from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.plan_client import circle, land, rally, takeoff, upload, waypoint
 
 NAN = math.nan
 HOLD = 0x03040000

@@ -58,7 +58,7 @@ def test_it_is_in_air_as_hold_begins_and_not_before(cockpit: Any) -> None:
         state = (cockpit.mode, int(cockpit.vehicle.autopilot.landed_state))
         if states[-1:] != [state]:
             states.append(state)
-        return state[0] == "HOLD"
+        return bool(state[0] == "HOLD")
 
     cockpit.until(watch)
     assert states == [("TAKEOFF", 1), ("TAKEOFF", 3), ("HOLD", 2)]
