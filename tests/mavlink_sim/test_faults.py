@@ -13,7 +13,7 @@ from mavlink_sim.wire.messages import dialect, parser
 from tests.mavlink_sim.conftest import Cockpit
 
 
-def fly(cockpit: Any, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
+def fly(cockpit: Cockpit, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
     """What a client gets, and when."""
     got = []
     for _ in range(round(seconds / STEP_S)):
