@@ -38,7 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
     watch = Watch(Path(folder.name) / "notes")
     config.add_cleanup(watch.close)
     os.environ[NOTES] = str(watch.notes)
-    config.add_cleanup(lambda: os.environ.pop(NOTES))
+    config.add_cleanup(partial(os.environ.__delitem__, NOTES))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -120,7 +120,7 @@ class CameraSettings:
         mount: where it sits and looks; on a gimbal, where it looks until told otherwise.
         rate_hz: frames a second.
         shutter: rolling shutter and exposure; None for an instant of all rows at once.
-        effects: what lens and sensor do to colours.
+        effects: what lens and sensor do to colours; None: nothing.
         depth: the depth camera; None for true depth.
         loss: share of frames that never arrive, 0..1.
         latency_s: from a frame's capture to its arrival.
@@ -131,7 +131,7 @@ class CameraSettings:
     mount: CameraMount = DEFAULT_MOUNT
     rate_hz: float = 30.0
     shutter: Shutter | None = None
-    effects: ImageEffects = MILD_EFFECTS
+    effects: ImageEffects | None = MILD_EFFECTS
     depth: DepthSensor | None = None
     loss: float = 0.0
     latency_s: float = 0.0

@@ -54,14 +54,14 @@ class ServiceProcess:
         deadline = time.monotonic() + timeout_s
         while True:
             try:
-                line = self._queue.get(timeout=max(0.0, deadline - time.monotonic()))
+                new = self._queue.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
                 raise TimeoutError(f"{text!r} was not said; said: {self.lines}") from None
-            if line is None:
+            if new is None:
                 raise TimeoutError(f"the service ended before it said {text!r}; said: {self.lines}")
-            self.lines.append(line)
-            if text in line:
-                return line
+            self.lines.append(new)
+            if text in new:
+                return new
 
     @contextmanager
     def client(self) -> Iterator[zenoh.Session]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 NAN = math.nan
 COMPANION = (1, 191)
@@ -77,14 +78,14 @@ def message(sequence: int, fields: dict[str, Any], current: int = 0) -> Any:
     return dialect.MAVLink_mission_item_int_message(1, 1, sequence, current=current, **fields)
 
 
-def newest(cockpit: Any, kind: str, before: int) -> Any:
+def newest(cockpit: Cockpit, kind: str, before: int) -> Any:
     """The one message of a kind that came after the `before`th, waited for."""
     if len(cockpit.received(kind)) <= before:
         cockpit.until(lambda: len(cockpit.received(kind)) > before, 1.0)
     return cockpit.received(kind)[before]
 
 
-def upload(cockpit: Any, items: list[dict[str, Any]], plan: int = 0, current: int = 0) -> int:
+def upload(cockpit: Cockpit, items: list[dict[str, Any]], plan: int = 0, current: int = 0) -> int:
     """Upload a plan; the MAV_MISSION_RESULT."""
     requests = len(cockpit.received("MISSION_REQUEST_INT"))
     acks = len(cockpit.received("MISSION_ACK"))
@@ -101,7 +102,7 @@ def upload(cockpit: Any, items: list[dict[str, Any]], plan: int = 0, current: in
     return int(ack.type)
 
 
-def download(cockpit: Any, plan: int = 0) -> list[Any]:
+def download(cockpit: Cockpit, plan: int = 0) -> list[Any]:
     """The MISSION_ITEM_INTs on board."""
     counts = len(cockpit.received("MISSION_COUNT"))
     cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, plan))
@@ -115,7 +116,7 @@ def download(cockpit: Any, plan: int = 0) -> list[Any]:
     return found
 
 
-def reached(cockpit: Any) -> list[int]:
+def reached(cockpit: Cockpit) -> list[int]:
     """The items reached, in order, repetitions left out."""
     found: list[int] = []
     for told in cockpit.received("MISSION_ITEM_REACHED"):
@@ -124,7 +125,7 @@ def reached(cockpit: Any) -> list[int]:
     return found
 
 
-def listen(cockpit: Any) -> None:
+def listen(cockpit: Cockpit) -> None:
     """A ground station on the second link, so that status texts are sent."""
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.fly(1.1)

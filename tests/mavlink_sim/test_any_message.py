@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.conftest import Cockpit
 
 HANDLED = {m.id: m for m in dialect.mavlink_map.values() if m.msgname in HANDLERS}
 OTHERS = {m.id: m for m in dialect.mavlink_map.values() if m.msgname not in HANDLERS}
@@ -46,7 +47,7 @@ def _offsets(kind: Any) -> dict[str, int]:
     return found
 
 
-def fly_through(cockpit: Any, datagrams: list[bytes]) -> None:
+def fly_through(cockpit: Cockpit, datagrams: list[bytes]) -> None:
     reader = parser()
     for datagram in datagrams:
         for message in reader.parse_buffer(datagram) or []:
@@ -61,7 +62,7 @@ def fly_through(cockpit: Any, datagrams: list[bytes]) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(packets(HANDLED), min_size=1, max_size=12))
-def test_messages_it_handles(make_cockpit: Any, datagrams: list[bytes]) -> None:
+def test_messages_it_handles(make_cockpit: type[Cockpit], datagrams: list[bytes]) -> None:
     cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     cockpit.command(400, 1)
     fly_through(cockpit, datagrams)
@@ -69,7 +70,7 @@ def test_messages_it_handles(make_cockpit: Any, datagrams: list[bytes]) -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(packets(OTHERS), min_size=1, max_size=12))
-def test_messages_it_does_not_handle(make_cockpit: Any, datagrams: list[bytes]) -> None:
+def test_messages_it_does_not_handle(make_cockpit: type[Cockpit], datagrams: list[bytes]) -> None:
     cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     cockpit.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", (245, 190))
     fly_through(cockpit, datagrams)
@@ -103,7 +104,7 @@ PARAMETERS = [
 
 @settings(max_examples=10, deadline=None)
 @given(st.dictionaries(st.sampled_from(PARAMETERS), finite, min_size=1, max_size=5))
-def test_parameters_out_of_every_range(make_cockpit: Any, values: dict[str, float]) -> None:
+def test_parameters_out_of_every_range(make_cockpit: type[Cockpit], values: dict[str, float]) -> None:
     cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     for name, value in values.items():
         cockpit.vehicle.parameters.set(name, value)

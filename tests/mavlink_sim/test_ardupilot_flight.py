@@ -39,7 +39,7 @@ def texts(vehicle: LockstepVehicle) -> list[tuple[int, str]]:
 
 def target(mask: int, values: tuple[float, ...], frame: int = 1, yaw: float = 0.0, rate: float = 0.0) -> Any:
     """SET_POSITION_TARGET_LOCAL_NED with its values put where the mask says that they count."""
-    groups = [(0.0,) * 3] * 3
+    groups: list[tuple[float, ...]] = [(0.0,) * 3] * 3
     groups[(POSITION, VELOCITY, ACCELERATION).index(mask | 0b110000000000)] = values
     flat = [value for group in groups for value in group]
     return dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, mask, *flat, yaw, rate)

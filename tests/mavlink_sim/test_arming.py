@@ -5,17 +5,19 @@ from typing import Any
 
 import pytest
 
+from tests.mavlink_sim.conftest import Cockpit
+
 PREARM_CHECK = 0x10000000
 REJECTED = 1
 
 
-def prearm(cockpit: Any) -> bool:
+def prearm(cockpit: Cockpit) -> bool:
     cockpit.forget()
     cockpit.fly(0.25)
     return bool(cockpit.received("SYS_STATUS")[-1].onboard_control_sensors_health & PREARM_CHECK)
 
 
-def test_it_boots_in_hold_and_becomes_ready_after_a_moment(cockpit: Any) -> None:
+def test_it_boots_in_hold_and_becomes_ready_after_a_moment(cockpit: Cockpit) -> None:
     assert not prearm(cockpit)
     first = cockpit.heartbeat()
     assert (first.type, first.autopilot, first.mavlink_version) == (2, 12, 3)
@@ -25,13 +27,13 @@ def test_it_boots_in_hold_and_becomes_ready_after_a_moment(cockpit: Any) -> None
     assert cockpit.heartbeat().system_status == 3
 
 
-def test_arming_too_early_is_temporarily_rejected(cockpit: Any) -> None:
+def test_arming_too_early_is_temporarily_rejected(cockpit: Cockpit) -> None:
     cockpit.fly(1.0)
     assert cockpit.command(400, 1) == [REJECTED]
     assert not cockpit.armed
 
 
-def test_arming_when_ready_is_accepted_and_shown(cockpit: Any) -> None:
+def test_arming_when_ready_is_accepted_and_shown(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.command(400, 1) == [0]
     beat = cockpit.heartbeat()
@@ -39,7 +41,7 @@ def test_arming_when_ready_is_accepted_and_shown(cockpit: Any) -> None:
     assert cockpit.command(400, 1) == [0]  # once more is no error
 
 
-def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(cockpit: Any) -> None:
+def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.command(400, 1)
     assert cockpit.command(400, 0) == [0]
@@ -47,7 +49,7 @@ def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(cockpit: 
     assert cockpit.command(400, 0) == [0]
 
 
-def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Any) -> None:
+def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Cockpit) -> None:
     cockpit.take_off()
     assert cockpit.command(400, 0) == [REJECTED]
     assert cockpit.armed
@@ -57,7 +59,7 @@ def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Any) 
     assert cockpit.height_m == 0.0
 
 
-def test_a_strange_arming_value_is_told_in_words_and_not_answered(cockpit: Any) -> None:
+def test_a_strange_arming_value_is_told_in_words_and_not_answered(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.wait_ready()
     for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
@@ -67,7 +69,9 @@ def test_a_strange_arming_value_is_told_in_words_and_not_answered(cockpit: Any) 
 
 
 @pytest.mark.parametrize(("arms", "disarms"), [(0.5, 0.4), (257.0, 256.0), (1.4, math.nan), (1.0, math.inf)])
-def test_the_arming_value_is_rounded_and_kept_in_a_byte(cockpit: Any, arms: float, disarms: float) -> None:
+def test_the_arming_value_is_rounded_and_kept_in_a_byte(
+    cockpit: Cockpit, arms: float, disarms: float
+) -> None:
     cockpit.wait_ready()
     assert cockpit.command(400, arms) == [0]
     assert cockpit.armed
@@ -75,13 +79,13 @@ def test_the_arming_value_is_rounded_and_kept_in_a_byte(cockpit: Any, arms: floa
     assert not cockpit.armed
 
 
-def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(cockpit: Any) -> None:
+def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.command(400, 1)
     assert 10.8 < cockpit.until(lambda: not cockpit.armed, 15.0) < 11.6
 
 
-def test_the_time_to_the_preflight_disarm_is_a_parameter(make_cockpit: Any) -> None:
+def test_the_time_to_the_preflight_disarm_is_a_parameter(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={"COM_DISARM_PRFLT": 2.0})
     cockpit.wait_ready()
     cockpit.command(400, 1)
@@ -100,7 +104,7 @@ def test_the_time_to_the_preflight_disarm_is_a_parameter(make_cockpit: Any) -> N
         (6, 0, False),  # OFFBOARD, without setpoints
     ],
 )
-def test_readiness_depends_on_the_mode(cockpit: Any, main: int, sub: int, ready: bool) -> None:
+def test_readiness_depends_on_the_mode(cockpit: Cockpit, main: int, sub: int, ready: bool) -> None:
     cockpit.wait_ready()
     assert cockpit.set_mode(main, sub) == [0, 0]
     assert prearm(cockpit) is ready
@@ -108,14 +112,14 @@ def test_readiness_depends_on_the_mode(cockpit: Any, main: int, sub: int, ready:
     assert cockpit.command(400, 1) == [0 if ready else REJECTED]
 
 
-def test_a_remote_control_makes_position_mode_ready(cockpit: Any) -> None:
+def test_a_remote_control_makes_position_mode_ready(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.vehicle.autopilot.pilot_takes_over() == 0
     assert cockpit.mode == "POSCTL"
     assert cockpit.command(400, 1) == [0]
 
 
-def test_an_offboard_stream_makes_offboard_ready(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_an_offboard_stream_makes_offboard_ready(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.wait_ready()
     cockpit.offboard(velocity_setpoint(0, 0, 0))
     assert prearm(cockpit)

@@ -14,6 +14,7 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_TH
 from mavlink_sim.physics.quaternions import inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 from vision.attitude import euler_from_quaternion, quaternion_from_euler
 from vision.rotation import matrix_from_quaternion
 
@@ -63,7 +64,7 @@ def test_a_thrust_vector_counts_by_its_vertical_part() -> None:
 
 @pytest.mark.parametrize(("mask", "counts"), [(7, True), (128, True), (0, True), (129, False), (135, False)])
 def test_what_controls_something_keeps_the_offboard_signal_alive(
-    cockpit: Any, mask: int, counts: bool
+    cockpit: Cockpit, mask: int, counts: bool
 ) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.fly(0.1)
@@ -75,7 +76,7 @@ def test_what_controls_something_keeps_the_offboard_signal_alive(
 
 @pytest.mark.parametrize(("system", "component", "counts"), [(1, 0, True), (0, 0, True), (2, 1, False)])
 def test_it_counts_if_it_is_addressed_to_the_autopilot(
-    cockpit: Any, system: int, component: int, counts: bool
+    cockpit: Cockpit, system: int, component: int, counts: bool
 ) -> None:
     cockpit.fly(0.1)
     message = attitude()
@@ -87,7 +88,7 @@ def test_it_counts_if_it_is_addressed_to_the_autopilot(
 # ---- flying by attitude
 
 
-def test_level_at_hover_thrust_it_stays_where_it_is(cockpit: Any) -> None:
+def test_level_at_hover_thrust_it_stays_where_it_is(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     cockpit.offboard(attitude())
     before = cockpit.vehicle.airframe.position
@@ -96,7 +97,7 @@ def test_level_at_hover_thrust_it_stays_where_it_is(cockpit: Any) -> None:
     assert cockpit.mode == "OFFBOARD"
 
 
-def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpit: Any) -> None:
+def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpit: Cockpit) -> None:
     cockpit.take_off(20.0)
     tilted = attitude(roll=20.0, pitch=-10.0, yaw=60.0)
     cockpit.offboard(tilted)
@@ -112,7 +113,7 @@ def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpi
     assert airframe.velocity[2] > 0.2  # hover thrust, tilted, does not carry the weight
 
 
-def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(cockpit: Any) -> None:
+def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     cockpit.offboard(attitude(yaw=170.0))
     cockpit.fly(5.0, attitude(yaw=170.0))
@@ -125,7 +126,7 @@ def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(cockpit: Any) ->
     assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(-170.0, abs=3.0)
 
 
-def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(cockpit: Any) -> None:
+def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(cockpit: Cockpit) -> None:
     cockpit.take_off(30.0)
     cockpit.offboard(attitude())
     cockpit.fly(1.0, attitude())
@@ -136,7 +137,7 @@ def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(cockpit: 
     assert cockpit.vehicle.airframe.thrust_mps2 < 0.01
 
 
-def test_a_tumbling_vehicle_comes_upright(cockpit: Any) -> None:
+def test_a_tumbling_vehicle_comes_upright(cockpit: Cockpit) -> None:
     cockpit.take_off(60.0)
     flip = rates(8.0, 0.0, 0.0)
     cockpit.offboard(flip)
@@ -146,7 +147,7 @@ def test_a_tumbling_vehicle_comes_upright(cockpit: Any) -> None:
     assert abs(cockpit.vehicle.airframe.pitch_rad) < 0.02
 
 
-def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(cockpit: Any) -> None:
+def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     cockpit.offboard(rates(0.0, 0.0, 0.5))
     cockpit.fly(3.0, rates(0.0, 0.0, 0.5))
@@ -161,7 +162,7 @@ def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turne
 # ---- flying by rates
 
 
-def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(cockpit: Any) -> None:
+def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     spin = rates(0.0, 0.0, 0.8)
     cockpit.offboard(spin)
@@ -173,7 +174,7 @@ def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(cockpi
     assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_whole_flip_is_possible_by_rates(cockpit: Any) -> None:
+def test_a_whole_flip_is_possible_by_rates(cockpit: Cockpit) -> None:
     cockpit.take_off(60.0)
     cockpit.offboard(attitude())
     flip = rates(0.0, 6.0, 0.0, thrust=0.3)
@@ -186,7 +187,7 @@ def test_a_whole_flip_is_possible_by_rates(cockpit: Any) -> None:
 
 @pytest.mark.parametrize("first", [attitude(roll=5.0), rates(0.1, 0.0, 0.0)], ids=["attitude", "rates"])
 def test_a_position_may_follow_an_attitude_and_is_flown(
-    cockpit: Any, position_setpoint: Any, first: Any
+    cockpit: Cockpit, position_setpoint: Any, first: Any
 ) -> None:
     cockpit.take_off(8.0)
     cockpit.offboard(first)
@@ -199,7 +200,7 @@ def test_a_position_may_follow_an_attitude_and_is_flown(
 # ---- taking off, landing, losing it
 
 
-def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_ground(cockpit: Any) -> None:
+def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_ground(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     climb = attitude(thrust=HOVER + 0.03)
     cockpit.offboard(climb)
@@ -212,7 +213,7 @@ def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_groun
     assert "landed" in cockpit.events
 
 
-def test_without_the_stream_the_failsafe_flies_home_by_position(cockpit: Any) -> None:
+def test_without_the_stream_the_failsafe_flies_home_by_position(cockpit: Cockpit) -> None:
     cockpit.take_off(8.0)
     stream = attitude(roll=3.0)
     cockpit.offboard(stream)
@@ -227,7 +228,7 @@ def test_without_the_stream_the_failsafe_flies_home_by_position(cockpit: Any) ->
 
 @pytest.mark.hears("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
 def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
-    cockpit: Any, position_setpoint: Any
+    cockpit: Cockpit, position_setpoint: Any
 ) -> None:
     cockpit.take_off(10.0)
     wanted = attitude(roll=6.0, yaw=30.0, thrust=0.52)
@@ -256,7 +257,7 @@ def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
 
 @pytest.mark.hears("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
 def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_attitude(
-    cockpit: Any, position_setpoint: Any
+    cockpit: Cockpit, position_setpoint: Any
 ) -> None:
     cockpit.take_off(5.0)
     facing_north = position_setpoint(0, 0, -5, 0.0)
@@ -271,7 +272,7 @@ def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_
 
 @pytest.mark.parametrize(("setpoint", "base"), [(attitude(), 145), (rates(0, 0, 0), 129)])
 def test_the_heartbeat_is_stabilized_unless_rates_alone_are_flown(
-    cockpit: Any, setpoint: Any, base: int
+    cockpit: Cockpit, setpoint: Any, base: int
 ) -> None:
     cockpit.take_off(10.0)
     cockpit.offboard(setpoint)
@@ -338,7 +339,7 @@ def test_what_is_no_rotation_has_no_unit_quaternion(values: tuple[float, float, 
     )
 )
 def test_no_attitude_target_can_stop_the_vehicle(
-    make_cockpit: Any, requests: list[tuple[int, list[float]]]
+    make_cockpit: type[Cockpit], requests: list[tuple[int, list[float]]]
 ) -> None:
     cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     cockpit.offboard(attitude())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,6 +11,7 @@ from hypothesis import strategies as st
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
 from mavlink_sim.physics.battery import Battery, BatteryWarning
 from mavlink_sim.px4.parameters import Parameters
+from tests.mavlink_sim.conftest import Cockpit
 
 GROUND_STATION = (245, 190)
 CHECKED = {"CBRK_SUPPLY_CHK": 0, "SIM_BAT_MIN_PCT": 0}
@@ -31,7 +31,8 @@ def test_the_simulated_battery_drains_and_sinks_as_recorded() -> None:
     assert battery.current_a == -1.0
     assert battery.discharged_mah == pytest.approx(-2.8, abs=0.1)
     battery = drained(60.0)
-    assert (battery.charge, battery.volts) == (0.5, pytest.approx(15.3))  # SIM_BAT_MIN_PCT
+    assert battery.charge == 0.5  # SIM_BAT_MIN_PCT
+    assert battery.volts == pytest.approx(15.3)
     for _ in range(40):
         battery.step(0.1, False, 0.0)
     assert battery.remaining == pytest.approx(1.0, abs=0.02)  # disarmed, it is full again
@@ -74,7 +75,7 @@ def test_a_battery_stays_within_its_bounds(
 def test_the_warnings_follow_the_thresholds() -> None:
     parameters = Parameters({"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 100, "CBRK_SUPPLY_CHK": 0})
     battery = Battery(parameters)
-    seen = {}
+    seen: dict[BatteryWarning, float] = {}
     for number in range(1100):
         battery.step(0.1, True, 9.8)
         seen.setdefault(battery.warning, battery.remaining)
@@ -93,14 +94,14 @@ def test_a_battery_that_is_not_checked_warns_nobody() -> None:
     assert battery.checked_warning is BatteryWarning.NONE
 
 
-def flying(make_cockpit: Any, **values: float) -> Any:
+def flying(make_cockpit: type[Cockpit], **values: float) -> Cockpit:
     cockpit = make_cockpit(parameters={**CHECKED, "COM_FAIL_ACT_T": 1, **values})
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.take_off(11.0)
     return cockpit
 
 
-def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_cockpit: Any) -> None:
+def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_cockpit: type[Cockpit]) -> None:
     cockpit = flying(make_cockpit, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
     cockpit.vehicle.autopilot.supervision.battery.charge = 0.12
     cockpit.until(lambda: any(line.startswith("battery low") for line in cockpit.events), 8.0)
@@ -117,7 +118,7 @@ def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_cockpi
     assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4
 
 
-def test_by_default_a_battery_does_not_end_a_flight(make_cockpit: Any) -> None:
+def test_by_default_a_battery_does_not_end_a_flight(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 10})
     cockpit.take_off()
     cockpit.fly(4.0)
@@ -125,7 +126,7 @@ def test_by_default_a_battery_does_not_end_a_flight(make_cockpit: Any) -> None:
     assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4
 
 
-def test_arming_is_refused_on_an_empty_battery(make_cockpit: Any) -> None:
+def test_arming_is_refused_on_an_empty_battery(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters=CHECKED)
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.wait_ready()
@@ -139,7 +140,7 @@ def test_arming_is_refused_on_an_empty_battery(make_cockpit: Any) -> None:
     assert cockpit.command(400, 1) == [0]
 
 
-def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_cockpit: Any) -> None:
+def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={**CHECKED, "COM_ARM_BAT_MIN": 0.9, "BAT1_V_CHARGED": 4.2})
     cockpit.wait_ready()
     battery = cockpit.vehicle.autopilot.supervision.battery
@@ -152,7 +153,7 @@ def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_cockpit: Any) ->
     assert cockpit.command(400, 1) == [0]
 
 
-def test_a_vehicle_without_a_battery_says_so(make_cockpit: Any) -> None:
+def test_a_vehicle_without_a_battery_says_so(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={"SIM_BAT_ENABLE": 0})
     cockpit.fly(2.2)
     assert cockpit.received("BATTERY_STATUS") == []

@@ -54,9 +54,11 @@ def camera(name: str) -> Iterator[CameraProcess]:
 def first_frame(camera: CameraProcess, position: tuple[float, float, float], yaw_rad: float) -> Frame:
     stamp_ns = time.monotonic_ns()
     camera.send_pose(position, quaternion_from_euler(0.0, 0.0, yaw_rad), stamp_ns)
-    until(lambda: segment_path(camera.shared_name).exists(), "the camera's shared memory")
+    name = camera.shared_name
+    assert name is not None
+    until(lambda: segment_path(name).exists(), "the camera's shared memory")
     got: list[Frame] = []
-    with SharedFrameReader(camera.shared_name) as reader:
+    with SharedFrameReader(name) as reader:
 
         def look() -> bool:
             frame = reader.latest()
@@ -84,6 +86,7 @@ def test_the_newest_of_many_poses_wins(camera: CameraProcess) -> None:
     first_frame(camera, (0.0, 0.0, -2.0), 0.0)
     for number in range(200):
         camera.send_pose((0.0, 0.0, -2.0), (1.0, 0.0, 0.0, 0.0), number + 1)
+    assert camera.shared_name is not None
     with SharedFrameReader(camera.shared_name) as reader:
 
         def newest() -> bool:
@@ -118,10 +121,11 @@ def test_a_camera_that_is_still_starting_ends_at_once_and_without_a_word(
     vast = World((), Ground(("meadow", "grass", "rows"), 0, 2048, 0.05))  # seconds of painting
     camera = CameraProcess(vast, CAMERA, CameraMount(), 60.0, name)
     camera.start()
-    assert camera.pid is not None
+    pid = camera.pid
+    assert pid is not None
     if painting:
-        until(lambda: _ignores_interrupts(camera.pid), "the camera's own code")
-    os.kill(camera.pid, signal.SIGINT)  # Ctrl-C reaches it as well
+        until(lambda: _ignores_interrupts(pid), "the camera's own code")
+    os.kill(pid, signal.SIGINT)  # Ctrl-C reaches it as well
     camera.stop()
     assert not camera.alive
     assert not camera.ready  # it did not go on until then

@@ -19,9 +19,9 @@ from mavsdk.asyncio.plugins.offboard import (
 )
 from mavsdk.asyncio.plugins.param import ParamAsync, ParamError
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
-from mavsdk_client import MavsdkClient, mavsdk_client, wait_for
 
 from mavlink_sim.testing import RunningSimulator, vehicle
+from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, wait_for
 
 SPEED = 4.0
 

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plan_client import listen
 
 from mavlink_sim.flight.collision_prevention import (
     FRAME_BODY_FRD,
@@ -21,6 +20,8 @@ from mavlink_sim.flight.collision_prevention import (
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import listen
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
 STILL = (0.0, 0.0)
@@ -184,7 +185,9 @@ def test_whatever_is_around_the_answer_is_finite(
     assert all(map(math.isfinite, got.acceleration))
 
 
-def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(make_cockpit: Any) -> None:
+def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(
+    make_cockpit: type[Cockpit],
+) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
     cockpit.take_off()
     cockpit.vehicle.autopilot.pilot_takes_over()
@@ -202,7 +205,7 @@ def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(mak
 
 
 def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
-    make_cockpit: Any, velocity_setpoint: Any
+    make_cockpit: type[Cockpit], velocity_setpoint: Any
 ) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
     listen(cockpit)
@@ -225,7 +228,7 @@ class Wall:
     `at_m`: north of where the vehicle was when the wall was put up.
     """
 
-    def __init__(self, make_cockpit: Any, at_m: float, **values: float) -> None:
+    def __init__(self, make_cockpit: type[Cockpit], at_m: float, **values: float) -> None:
         self.cockpit = make_cockpit(parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, **values})
         self.vehicle = self.cockpit.vehicle
         self.vehicle.transmitter.on = True
@@ -259,7 +262,7 @@ class Wall:
             self.cockpit.fly(0.1, setpoint)
 
 
-def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: Any) -> None:
+def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: type[Cockpit]) -> None:
     wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     assert wall.cockpit.set_mode(3, 0) == [0, 0]
     wall.fly(8.0, pitch=1.0)
@@ -270,14 +273,16 @@ def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: Any) -> None:
     assert wall.distance_m > 3.5
 
 
-def test_without_collision_prevention_the_same_stick_leads_through_the_wall(make_cockpit: Any) -> None:
+def test_without_collision_prevention_the_same_stick_leads_through_the_wall(
+    make_cockpit: type[Cockpit],
+) -> None:
     wall = Wall(make_cockpit, 3.0, CP_DIST=-1.0)
     wall.cockpit.set_mode(3, 0)
     wall.fly(4.0, pitch=1.0)
     assert wall.distance_m < 0.0
 
 
-def test_in_offboard_nothing_is_held_back(make_cockpit: Any, velocity_setpoint: Any) -> None:
+def test_in_offboard_nothing_is_held_back(make_cockpit: type[Cockpit], velocity_setpoint: Any) -> None:
     wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     north = velocity_setpoint(2, 0, 0)
     wall.cockpit.offboard(north)
@@ -286,7 +291,7 @@ def test_in_offboard_nothing_is_held_back(make_cockpit: Any, velocity_setpoint: 
     assert wall.distance_m < 0.0
 
 
-def test_a_sensor_that_falls_silent_ends_position_mode(make_cockpit: Any) -> None:
+def test_a_sensor_that_falls_silent_ends_position_mode(make_cockpit: type[Cockpit]) -> None:
     wall = Wall(make_cockpit, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     wall.cockpit.set_mode(3, 0)
     wall.fly(1.0)

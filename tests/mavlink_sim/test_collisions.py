@@ -201,7 +201,8 @@ def test_no_contact_gives_energy_and_the_touching_point_does_not_go_in(
 
     def energy(velocity: Any, rates: Any) -> float:
         turning = zip(rates, (INERTIA_XY_KGM2, INERTIA_XY_KGM2, INERTIA_Z_KGM2), strict=True)
-        return sum(v * v for v in velocity) / 2 + sum(i * r * r for r, i in turning) / 2
+        total: float = sum(v * v for v in velocity) / 2 + sum(i * r * r for r, i in turning) / 2
+        return total
 
     into, after, turned_rates = after_contact(velocity, rates, matrix, normal)
     if into < 0.0:

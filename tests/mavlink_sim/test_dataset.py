@@ -8,6 +8,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,7 +39,7 @@ def files(folder: Path) -> dict[str, str]:
     }
 
 
-def truth_of(folder: Path) -> list[dict]:
+def truth_of(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "truth.jsonl").read_text("utf-8").splitlines()]
 
 
@@ -55,11 +56,13 @@ def test_yolo_labels_say_what_the_truth_says(tmp_path: Path) -> None:
     counted = 0
     for entry in truth_of(folder):
         picture = cv2.imread(str(folder / entry["image"]))
+        assert picture is not None
         assert picture.shape == (120, 160, 3)
         depth = cv2.imread(
             str(folder / entry["image"].replace("images", "depth").replace("jpg", "png")),
             cv2.IMREAD_UNCHANGED,
         )
+        assert depth is not None
         assert depth.dtype == np.uint16
         label = folder / entry["image"].replace("images", "labels").replace("jpg", "txt")
         lines = label.read_text("utf-8").splitlines()
@@ -90,6 +93,7 @@ def test_coco_files_are_read_by_cocos_own_tools(tmp_path: Path) -> None:
         assert len(book.getImgIds()) == 3
         for image in book.loadImgs(book.getImgIds()):
             picture = cv2.imread(str(folder / "images" / split / image["file_name"]))
+            assert picture is not None
             assert picture.shape[:2] == (image["height"], image["width"]) == (128, 160)
         for item in book.loadAnns(book.getAnnIds()):
             left, top, width, height = item["bbox"]
@@ -140,7 +144,7 @@ def test_a_scene_with_no_place_to_look_from_is_refused(tmp_path: Path) -> None:
         ({"seed": -1}, "seed must be 0 or more"),
     ],
 )
-def test_options_that_cannot_be_are_refused(changes: dict, says: str) -> None:
+def test_options_that_cannot_be_are_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(DatasetError, match=says):
         DatasetOptions(**{"frames": 1, **changes})
 

@@ -15,6 +15,7 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import Text, event_identifier
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 GROUND_STATION = (245, 190)
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}
@@ -266,7 +267,7 @@ def test_a_flickering_condition_uses_up_the_delay() -> None:
 # ---- on the vehicle
 
 
-def flying(make_cockpit: Any, **values: float) -> Any:
+def flying(make_cockpit: type[Cockpit], **values: float) -> Cockpit:
     cockpit = make_cockpit(parameters={**REMOTE_CONTROL, **values})
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.vehicle.transmitter.on = True
@@ -277,7 +278,7 @@ def flying(make_cockpit: Any, **values: float) -> Any:
     return cockpit
 
 
-def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_cockpit: Any) -> None:
+def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_cockpit: type[Cockpit]) -> None:
     cockpit = flying(make_cockpit)
     cockpit.vehicle.transmitter.on = False
     holding_s = cockpit.until(lambda: cockpit.mode == "HOLD", 2.0)
@@ -291,7 +292,7 @@ def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_cockpit: 
     assert "failsafe: manual control lost, RTL" in cockpit.events
 
 
-def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(make_cockpit: Any) -> None:
+def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(make_cockpit: type[Cockpit]) -> None:
     cockpit = flying(make_cockpit)
     transmitter = cockpit.vehicle.transmitter
     transmitter.on = False
@@ -306,7 +307,9 @@ def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(make_co
     )
 
 
-def test_nobody_misses_a_remote_control_in_offboard(make_cockpit: Any, velocity_setpoint: Any) -> None:
+def test_nobody_misses_a_remote_control_in_offboard(
+    make_cockpit: type[Cockpit], velocity_setpoint: Any
+) -> None:
     cockpit = flying(make_cockpit)
     cockpit.offboard(velocity_setpoint(0, 0, 0))
     cockpit.vehicle.transmitter.on = False
@@ -314,7 +317,7 @@ def test_nobody_misses_a_remote_control_in_offboard(make_cockpit: Any, velocity_
     assert cockpit.mode == "OFFBOARD"
 
 
-def test_losing_the_ground_station_returns_after_the_hold(make_cockpit: Any) -> None:
+def test_losing_the_ground_station_returns_after_the_hold(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 3})
     cockpit.until(lambda: cockpit.vehicle.autopilot.sensors_ready, 5.0)
     cockpit.fly(0.2)
@@ -332,7 +335,7 @@ def test_losing_the_ground_station_returns_after_the_hold(make_cockpit: Any) -> 
     assert cockpit.mode == "RTL"
 
 
-def test_a_ground_station_that_never_was_is_not_missed_by_default(cockpit: Any) -> None:
+def test_a_ground_station_that_never_was_is_not_missed_by_default(cockpit: Cockpit) -> None:
     cockpit.take_off()
     cockpit.fly(15.0)
     assert cockpit.mode == "HOLD"
@@ -350,7 +353,9 @@ def test_a_ground_station_that_never_was_is_not_missed_by_default(cockpit: Any) 
         pytest.param(0, False, id="off"),
     ],
 )
-def test_sticks_moved_in_an_auto_mode_take_over(make_cockpit: Any, override: int, taken: bool) -> None:
+def test_sticks_moved_in_an_auto_mode_take_over(
+    make_cockpit: type[Cockpit], override: int, taken: bool
+) -> None:
     cockpit = flying(make_cockpit, COM_RC_OVERRIDE=override)
     cockpit.set_mode(4, 3)
     cockpit.fly(0.5)
@@ -364,7 +369,7 @@ def test_sticks_moved_in_an_auto_mode_take_over(make_cockpit: Any, override: int
     ("override", "taken"), [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")]
 )
 def test_sticks_moved_in_offboard_take_over_if_asked_for(
-    make_cockpit: Any, velocity_setpoint: Any, override: int, taken: bool
+    make_cockpit: type[Cockpit], velocity_setpoint: Any, override: int, taken: bool
 ) -> None:
     cockpit = flying(make_cockpit, COM_RC_OVERRIDE=override)
     cockpit.offboard(velocity_setpoint(0.5, 0, 0))
@@ -373,7 +378,7 @@ def test_sticks_moved_in_offboard_take_over_if_asked_for(
     assert cockpit.mode == ("POSCTL" if taken else "OFFBOARD")
 
 
-def test_sticks_moved_slowly_do_not_take_over(make_cockpit: Any) -> None:
+def test_sticks_moved_slowly_do_not_take_over(make_cockpit: type[Cockpit]) -> None:
     cockpit = flying(make_cockpit)
     cockpit.set_mode(4, 3)
     cockpit.fly(0.5)

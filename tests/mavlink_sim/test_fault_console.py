@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from mavlink_sim.faults.console import FaultConsole
+from mavlink_sim.faults.schedule import Outcome
 from mavlink_sim.vehicle import Vehicle
 
 
@@ -21,13 +22,15 @@ def said() -> list[str]:
 
 
 @pytest.fixture
-def command() -> Callable:
+def command() -> Callable[[str], Outcome]:
     vehicle = Vehicle()
     vehicle.add_link("onboard")
     return vehicle.faults.command
 
 
-def test_lines_are_carried_out_when_they_are_whole(command, said) -> None:
+def test_lines_are_carried_out_when_they_are_whole(
+    command: Callable[[str], Outcome], said: list[str]
+) -> None:
     reading, writing = os.pipe()
     console = FaultConsole(reading, command, said.append)
     console.poll()  # nothing typed: nothing waits
@@ -50,7 +53,7 @@ def test_lines_are_carried_out_when_they_are_whole(command, said) -> None:
     os.close(reading)
 
 
-def test_a_file_is_read_whole(command, said, tmp_path: Path) -> None:
+def test_a_file_is_read_whole(command: Callable[[str], Outcome], said: list[str], tmp_path: Path) -> None:
     path = tmp_path / "faults"
     path.write_text("link_loss for=3\nstall at=9")
     descriptor = os.open(path, os.O_RDONLY)
@@ -62,7 +65,7 @@ def test_a_file_is_read_whole(command, said, tmp_path: Path) -> None:
     os.close(descriptor)
 
 
-def test_a_terminal_is_read_and_may_go_away(command, said) -> None:
+def test_a_terminal_is_read_and_may_go_away(command: Callable[[str], Outcome], said: list[str]) -> None:
     controller, terminal = pty.openpty()
     tty.setraw(terminal)
     console = FaultConsole(terminal, command, said.append)
@@ -77,7 +80,9 @@ def test_a_terminal_is_read_and_may_go_away(command, said) -> None:
     os.close(terminal)
 
 
-def test_bytes_that_are_no_text_and_lines_without_end_do_no_harm(command, said) -> None:
+def test_bytes_that_are_no_text_and_lines_without_end_do_no_harm(
+    command: Callable[[str], Outcome], said: list[str]
+) -> None:
     reading, writing = os.pipe()
     console = FaultConsole(reading, command, said.append)
     os.write(writing, b"\xff\xfe\x00\n")

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from mavlink_sim.physics.geography import local
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 DO_SET_MODE, LAND, ARM, REQUEST_MESSAGE = 176, 21, 400, 512
 GPS_ID, ESTIMATOR_ID = 24, 230
 
 
-def newest(cockpit: Any, kind: str, within_s: float = 2.5) -> Any:
+def newest(cockpit: Cockpit, kind: str, within_s: float = 2.5) -> Any:
     """The next message of a kind."""
     cockpit.forget()
     cockpit.until(lambda: bool(cockpit.received(kind)), within_s)
     return cockpit.received(kind)[-1]
 
 
-def begin(cockpit: Any, line: str) -> int:
+def begin(cockpit: Cockpit, line: str) -> int:
     return cockpit.vehicle.faults.begin(line)
 
 
@@ -29,7 +31,7 @@ def begin(cockpit: Any, line: str) -> int:
 
 
 @pytest.mark.hears("everything")
-def test_of_a_vehicle_with_heartbeats_only_answers_still_come(cockpit) -> None:
+def test_of_a_vehicle_with_heartbeats_only_answers_still_come(cockpit: Cockpit) -> None:
     cockpit.fly(6.0)  # what a start alone sends is over
     begin(cockpit, "heartbeat_only link=onboard")
     cockpit.forget()
@@ -44,7 +46,7 @@ def test_of_a_vehicle_with_heartbeats_only_answers_still_come(cockpit) -> None:
     assert cockpit.received("ATTITUDE")
 
 
-def test_acknowledgements_are_lost_all_or_the_nth(cockpit) -> None:
+def test_acknowledgements_are_lost_all_or_the_nth(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "lost_ack")
     assert cockpit.command(178) == []
@@ -61,7 +63,7 @@ def test_acknowledgements_are_lost_all_or_the_nth(cockpit) -> None:
 
 
 @pytest.mark.hears("everything")
-def test_the_boot_clock_jumps_in_every_stamp_and_back(cockpit) -> None:
+def test_the_boot_clock_jumps_in_every_stamp_and_back(cockpit: Cockpit) -> None:
     cockpit.fly(2.0)
     begin(cockpit, "time_jump 100 for=3")
     cockpit.forget()
@@ -82,7 +84,7 @@ def test_the_boot_clock_jumps_in_every_stamp_and_back(cockpit) -> None:
 
 
 @pytest.mark.hears("everything")
-def test_a_second_autopilot_speaks_and_answers(cockpit) -> None:
+def test_a_second_autopilot_speaks_and_answers(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot 9")
     cockpit.forget()
@@ -103,7 +105,7 @@ def test_a_second_autopilot_speaks_and_answers(cockpit) -> None:
 
 
 @pytest.mark.hears("GLOBAL_POSITION_INT")
-def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(cockpit) -> None:
+def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot")
     cockpit.fly(0.5)
@@ -116,7 +118,7 @@ def test_a_second_autopilot_of_the_same_system_gives_every_answer_twice(cockpit)
 
 
 @pytest.mark.hears("everything")
-def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(cockpit) -> None:
+def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "stall for=2")
     boot_ms = cockpit.vehicle.boot_ms
@@ -133,7 +135,7 @@ def test_a_stalled_vehicle_stands_still_and_reads_all_afterwards(cockpit) -> Non
     assert cockpit.vehicle.boot_ms == pytest.approx(boot_ms + 400, abs=10)
 
 
-def test_a_slow_vehicle_goes_at_a_part_of_its_pace(cockpit) -> None:
+def test_a_slow_vehicle_goes_at_a_part_of_its_pace(cockpit: Cockpit) -> None:
     begin(cockpit, "stall 0.25")
     for _ in range(1000):
         cockpit.vehicle.step(0.004)
@@ -145,7 +147,9 @@ def test_a_slow_vehicle_goes_at_a_part_of_its_pace(cockpit) -> None:
 
 
 @pytest.mark.hears("GPS_RAW_INT", "LOCAL_POSITION_NED", "ODOMETRY")
-def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(cockpit, position_setpoint) -> None:
+def test_offboard_by_position_ends_blind_when_gps_is_lost_and_resumes(
+    cockpit: Cockpit, position_setpoint: Callable[..., Any]
+) -> None:
     cockpit.heartbeats = [("gcs", (245, 190), 6)]
     cockpit.take_off(20.0)
     setpoint = position_setpoint(0, 0, -20)
@@ -185,7 +189,7 @@ def test_offboard_by_attitude_needs_no_position() -> None:
     assert not asks_for_position(object())
 
 
-def test_hold_without_gps_descends_and_a_pilot_gets_altitude_mode(cockpit) -> None:
+def test_hold_without_gps_descends_and_a_pilot_gets_altitude_mode(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     begin(cockpit, "gps_loss")
     cockpit.until(lambda: cockpit.mode == "LAND", 6.0)
@@ -196,7 +200,7 @@ def test_hold_without_gps_descends_and_a_pilot_gets_altitude_mode(cockpit) -> No
     assert cockpit.command(ARM, 1) == [1]
 
 
-def test_position_mode_falls_to_altitude_where_a_pilot_has_sticks(cockpit) -> None:
+def test_position_mode_falls_to_altitude_where_a_pilot_has_sticks(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     begin(cockpit, "pilot_takeover POSCTL")
     assert cockpit.mode == "POSCTL"
@@ -206,7 +210,7 @@ def test_position_mode_falls_to_altitude_where_a_pilot_has_sticks(cockpit) -> No
 
 
 @pytest.mark.hears("GLOBAL_POSITION_INT", "GPS_RAW_INT")
-def test_a_drifting_gps_takes_the_vehicle_along(cockpit) -> None:
+def test_a_drifting_gps_takes_the_vehicle_along(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     begin(cockpit, "gps_drift 0.5 towards=0")
     cockpit.fly(10.0)
@@ -218,7 +222,9 @@ def test_a_drifting_gps_takes_the_vehicle_along(cockpit) -> None:
 
 
 @pytest.mark.hears("LOCAL_POSITION_NED", "ODOMETRY")
-def test_an_estimator_reset_moves_the_estimate_and_not_the_vehicle(cockpit, position_setpoint) -> None:
+def test_an_estimator_reset_moves_the_estimate_and_not_the_vehicle(
+    cockpit: Cockpit, position_setpoint: Callable[..., Any]
+) -> None:
     cockpit.take_off(10.0)
     setpoint = position_setpoint(0, 0, -10)
     cockpit.offboard(setpoint)
@@ -241,7 +247,7 @@ def test_an_estimator_reset_moves_the_estimate_and_not_the_vehicle(cockpit, posi
 # ---- power, rotors, air
 
 
-def test_a_battery_has_what_it_is_given_and_is_used_up(cockpit) -> None:
+def test_a_battery_has_what_it_is_given_and_is_used_up(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     begin(cockpit, "battery 0.5")
     assert newest(cockpit, "SYS_STATUS").battery_remaining == 50
@@ -251,7 +257,7 @@ def test_a_battery_has_what_it_is_given_and_is_used_up(cockpit) -> None:
     assert newest(cockpit, "SYS_STATUS").battery_remaining > 60
 
 
-def test_a_battery_that_fails_brings_the_vehicle_down(make_cockpit) -> None:
+def test_a_battery_that_fails_brings_the_vehicle_down(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={"COM_FAIL_ACT_T": 0})
     cockpit.take_off(5.0)
     begin(cockpit, "battery emergency")
@@ -270,7 +276,7 @@ def test_a_battery_that_fails_brings_the_vehicle_down(make_cockpit) -> None:
     ],
 )
 def test_a_battery_warning_holds_and_has_its_failsafe_by_default(
-    cockpit, warning, percent, charge_state, text, mode
+    cockpit: Cockpit, warning: str, percent: int, charge_state: int, text: str, mode: str
 ) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))  # texts go to a ground station that speaks
     cockpit.take_off(30.0)
@@ -284,7 +290,7 @@ def test_a_battery_warning_holds_and_has_its_failsafe_by_default(
     assert cockpit.mode == mode
 
 
-def test_after_a_battery_fault_the_breaker_counts_again(cockpit) -> None:
+def test_after_a_battery_fault_the_breaker_counts_again(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "battery critical")
     cockpit.fly(0.1)
@@ -298,7 +304,9 @@ def test_after_a_battery_fault_the_breaker_counts_again(cockpit) -> None:
     assert not cockpit.vehicle.autopilot.supervision.battery.is_checked
 
 
-def test_of_two_failsafes_the_worse_one_is_flown(make_cockpit, velocity_setpoint) -> None:
+def test_of_two_failsafes_the_worse_one_is_flown(
+    make_cockpit: type[Cockpit], velocity_setpoint: Callable[..., Any]
+) -> None:
     cockpit = make_cockpit(parameters={"CBRK_SUPPLY_CHK": 0, "COM_FAIL_ACT_T": 0})
     cockpit.take_off(8.0)
     cockpit.offboard(velocity_setpoint(0, 0, 0))
@@ -311,7 +319,7 @@ def test_of_two_failsafes_the_worse_one_is_flown(make_cockpit, velocity_setpoint
 
 
 @pytest.mark.parametrize("motor", [1, 4])
-def test_a_vehicle_that_loses_a_motor_comes_down(cockpit, motor) -> None:
+def test_a_vehicle_that_loses_a_motor_comes_down(cockpit: Cockpit, motor: int) -> None:
     cockpit.take_off(15.0)
     begin(cockpit, f"motor_failure {motor}")
     cockpit.fly(1.0)
@@ -320,7 +328,7 @@ def test_a_vehicle_that_loses_a_motor_comes_down(cockpit, motor) -> None:
     cockpit.until(lambda: cockpit.height_m < 0.3, 30.0)
 
 
-def test_wind_blows_from_where_it_comes_and_stops(cockpit) -> None:
+def test_wind_blows_from_where_it_comes_and_stops(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     calm = cockpit.vehicle.airframe.pitch_rad
     begin(cockpit, "wind 5 from=0 for=8")
@@ -331,7 +339,7 @@ def test_wind_blows_from_where_it_comes_and_stops(cockpit) -> None:
     assert cockpit.vehicle.airframe.wind == (0.0, 0.0, 0.0)
 
 
-def test_a_gust_rises_and_falls_once(cockpit) -> None:
+def test_a_gust_rises_and_falls_once(cockpit: Cockpit) -> None:
     begin(cockpit, "gust 8 from=90 for=2")
     seen = []
     for _ in range(int(2.2 / 0.004)):
@@ -346,7 +354,9 @@ def test_a_gust_rises_and_falls_once(cockpit) -> None:
 # ---- command
 
 
-def test_a_pilot_takes_the_vehicle_out_of_offboard(cockpit, velocity_setpoint) -> None:
+def test_a_pilot_takes_the_vehicle_out_of_offboard(
+    cockpit: Cockpit, velocity_setpoint: Callable[..., Any]
+) -> None:
     cockpit.take_off(5.0)
     setpoint = velocity_setpoint(1, 0, 0)
     cockpit.offboard(setpoint)
@@ -355,14 +365,16 @@ def test_a_pilot_takes_the_vehicle_out_of_offboard(cockpit, velocity_setpoint) -
     assert cockpit.mode == "POSCTL"
 
 
-def test_a_pilot_who_goes_away_again_leaves_the_mode_behind(cockpit) -> None:
+def test_a_pilot_who_goes_away_again_leaves_the_mode_behind(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     begin(cockpit, "pilot_takeover for=1")
     cockpit.fly(3.0)
     assert cockpit.mode == "POSCTL"
 
 
-def test_where_a_remote_control_counts_its_pilot_going_away_is_a_failsafe(make_cockpit) -> None:
+def test_where_a_remote_control_counts_its_pilot_going_away_is_a_failsafe(
+    make_cockpit: type[Cockpit],
+) -> None:
     cockpit = make_cockpit(parameters={"COM_RC_IN_MODE": 0})
     cockpit.take_off(5.0)
     begin(cockpit, "pilot_takeover for=2")
@@ -374,7 +386,7 @@ def test_where_a_remote_control_counts_its_pilot_going_away_is_a_failsafe(make_c
     assert "failsafe: manual control lost, RTL" in cockpit.events
 
 
-def test_a_mode_is_refused_so_often_and_then_taken(cockpit) -> None:
+def test_a_mode_is_refused_so_often_and_then_taken(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     begin(cockpit, "refuse_mode LAND count=2")
     assert cockpit.command(LAND) == [1]
@@ -387,7 +399,7 @@ def test_a_mode_is_refused_so_often_and_then_taken(cockpit) -> None:
 
 
 @pytest.mark.hears("everything")
-def test_a_reboot_in_flight_is_silent_then_new_and_disarmed(cockpit) -> None:
+def test_a_reboot_in_flight_is_silent_then_new_and_disarmed(cockpit: Cockpit) -> None:
     cockpit.take_off(30.0)
     assert cockpit.command(511, 30, 50_000) == [0]  # a setting, and settings are forgotten
     begin(cockpit, "reboot 2")
@@ -404,7 +416,7 @@ def test_a_reboot_in_flight_is_silent_then_new_and_disarmed(cockpit) -> None:
     cockpit.until(lambda: cockpit.height_m < 0.1, 10.0)
 
 
-def test_a_reboot_on_the_ground_is_ready_again(cockpit) -> None:
+def test_a_reboot_on_the_ground_is_ready_again(cockpit: Cockpit) -> None:
     cockpit.fly(10.0)
     begin(cockpit, "reboot 2")
     cockpit.fly(2.1)
@@ -413,7 +425,7 @@ def test_a_reboot_on_the_ground_is_ready_again(cockpit) -> None:
     assert cockpit.command(ARM, 1) == [0]
 
 
-def test_what_needs_a_position_is_refused_without_one_and_land_is_not(cockpit) -> None:
+def test_what_needs_a_position_is_refused_without_one_and_land_is_not(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.take_off(8.0)
     begin(cockpit, "gps_loss")
@@ -439,7 +451,7 @@ def test_what_needs_a_position_is_refused_without_one_and_land_is_not(cockpit) -
     assert type(cockpit.vehicle.autopilot.task).__name__ == "Descend"
 
 
-def test_a_landing_goes_on_blindly_when_gps_is_lost(cockpit) -> None:
+def test_a_landing_goes_on_blindly_when_gps_is_lost(cockpit: Cockpit) -> None:
     cockpit.take_off(8.0)
     begin(cockpit, "gps_loss")
     cockpit.fly(2.0)

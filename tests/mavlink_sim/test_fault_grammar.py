@@ -24,7 +24,9 @@ from mavlink_sim.faults.kinds import EFFECTS, KINDS
         ("stall for=2 at=1", "stall", {"pace": 0.0}, 1.0, 2.0),
     ],
 )
-def test_words_may_stand_in_any_order(text, name, values, at_s, duration_s) -> None:
+def test_words_may_stand_in_any_order(
+    text: str, name: str, values: dict[str, object], at_s: float | None, duration_s: float | None
+) -> None:
     fault = parse_fault(text, KINDS)
     assert fault.kind.name == name
     assert values.items() <= dict(fault.values).items()
@@ -52,7 +54,7 @@ def test_words_may_stand_in_any_order(text, name, values, at_s, duration_s) -> N
         ("gps_loss seed=x", "a whole number"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(text, said) -> None:
+def test_what_cannot_be_is_refused_in_one_line(text: str, said: str) -> None:
     with pytest.raises(FaultError) as refusal:
         parse_fault(text, KINDS)
     assert said in str(refusal.value)
@@ -63,7 +65,7 @@ def test_what_cannot_be_is_refused_in_one_line(text, said) -> None:
     st.text(max_size=80)
     | st.lists(st.sampled_from([*KINDS, "at=1", "for=2", "0.5", "x", "link=all"])).map(" ".join)
 )
-def test_any_text_is_a_fault_or_a_refusal(text) -> None:
+def test_any_text_is_a_fault_or_a_refusal(text: str) -> None:
     try:
         fault = parse_fault(text, KINDS)
     except FaultError:

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from plan_client import land, takeoff, upload, waypoint
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.physics.geography import local
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import land, takeoff, upload, waypoint
 
 ORBIT, CHANGE_ALTITUDE, SET_HOME = 34, 186, 179
 RETURN_ACTION, TERMINATE_ACTION = 3, 4  # GF_ACTION
 
 
-def begin(cockpit: Any, line: str) -> int:
+def begin(cockpit: Cockpit, line: str) -> int:
     return cockpit.vehicle.faults.begin(line)
 
 
-def lose_position(cockpit: Any) -> int:
+def lose_position(cockpit: Cockpit) -> int:
     """Begin a gps_loss and wait until the position is invalid and the vehicle sinks."""
     number = begin(cockpit, "gps_loss")
     cockpit.until(lambda: not cockpit.vehicle.autopilot.position_valid, 6.0)
@@ -29,7 +31,7 @@ def lose_position(cockpit: Any) -> int:
     return number
 
 
-def position_comes_back(cockpit: Any) -> None:
+def position_comes_back(cockpit: Cockpit) -> None:
     cockpit.vehicle.faults.end("gps_loss")
     cockpit.until(lambda: cockpit.vehicle.autopilot.position_valid, 2.0)
     cockpit.fly(0.1)
@@ -38,7 +40,7 @@ def position_comes_back(cockpit: Any) -> None:
 # ---- a lost position and failsafes
 
 
-def breach_the_fence(cockpit: Any, action: int, waits_s: float = 0.0) -> None:
+def breach_the_fence(cockpit: Cockpit, action: int, waits_s: float = 0.0) -> None:
     """Too high for a moment; what GF_ACTION asks for then lasts longer than the breach."""
     parameters = cockpit.vehicle.parameters
     parameters.set("COM_FAIL_ACT_T", waits_s)
@@ -49,11 +51,11 @@ def breach_the_fence(cockpit: Any, action: int, waits_s: float = 0.0) -> None:
     cockpit.fly(0.1)
 
 
-def task_of(cockpit: Any) -> str:
+def task_of(cockpit: Cockpit) -> str:
     return type(cockpit.vehicle.autopilot.task).__name__
 
 
-def test_a_latched_failsafe_goes_on_when_the_position_is_back(cockpit) -> None:
+def test_a_latched_failsafe_goes_on_when_the_position_is_back(cockpit: Cockpit) -> None:
     cockpit.take_off(30.0)
     breach_the_fence(cockpit, RETURN_ACTION)
     assert cockpit.mode == "RTL"
@@ -66,7 +68,7 @@ def test_a_latched_failsafe_goes_on_when_the_position_is_back(cockpit) -> None:
     assert cockpit.mode == "RTL"
 
 
-def test_a_failsafe_without_a_position_sinks_and_returns_when_it_is_back(cockpit) -> None:
+def test_a_failsafe_without_a_position_sinks_and_returns_when_it_is_back(cockpit: Cockpit) -> None:
     cockpit.take_off(40.0)
     lose_position(cockpit)
     cockpit.vehicle.parameters.set("COM_FAIL_ACT_T", 0.0)
@@ -79,7 +81,7 @@ def test_a_failsafe_without_a_position_sinks_and_returns_when_it_is_back(cockpit
 
 @pytest.mark.parametrize("mode", ["HOLD", "TAKEOFF", "OFFBOARD", "RTL by the fence"])
 def test_a_vehicle_that_landed_blindly_stays_down_when_the_position_is_back(
-    cockpit, position_setpoint, mode
+    cockpit: Cockpit, position_setpoint: Callable[..., Any], mode: str
 ) -> None:
     up = position_setpoint(0.0, 0.0, -20.0)
     cockpit.take_off(4.0)
@@ -101,7 +103,7 @@ def test_a_vehicle_that_landed_blindly_stays_down_when_the_position_is_back(
     assert cockpit.height_m < 0.1
 
 
-def test_a_terminated_flight_is_disarmed_once_it_is_down(cockpit) -> None:
+def test_a_terminated_flight_is_disarmed_once_it_is_down(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     breach_the_fence(cockpit, TERMINATE_ACTION)
     assert cockpit.vehicle.autopilot.terminated
@@ -115,7 +117,9 @@ def test_a_terminated_flight_is_disarmed_once_it_is_down(cockpit) -> None:
     [(ORBIT, (10, 2, 0, 0, math.nan, math.nan, math.nan)), (CHANGE_ALTITUDE, (520.0,))],
     ids=["orbit", "altitude"],
 )
-def test_without_a_position_no_command_is_taken_that_needs_one(cockpit, command, values) -> None:
+def test_without_a_position_no_command_is_taken_that_needs_one(
+    cockpit: Cockpit, command: int, values: tuple[float, ...]
+) -> None:
     cockpit.take_off(30.0)
     lose_position(cockpit)
     assert cockpit.command(command, *values) == [1]
@@ -125,7 +129,7 @@ def test_without_a_position_no_command_is_taken_that_needs_one(cockpit, command,
 # ---- faults of the estimate
 
 
-def test_two_losses_of_gps_that_overlap_leave_no_error(cockpit) -> None:
+def test_two_losses_of_gps_that_overlap_leave_no_error(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     begin(cockpit, "gps_loss for=4")
     cockpit.fly(2.0)
@@ -137,7 +141,7 @@ def test_two_losses_of_gps_that_overlap_leave_no_error(cockpit) -> None:
     assert estimate.velocity == pytest.approx(cockpit.vehicle.airframe.velocity, abs=1e-6)
 
 
-def test_home_here_is_where_the_vehicle_believes_to_be(cockpit) -> None:
+def test_home_here_is_where_the_vehicle_believes_to_be(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "ekf_reset 3 0 0")
     assert cockpit.command(SET_HOME, 1) == [0]
@@ -149,7 +153,7 @@ def test_home_here_is_where_the_vehicle_believes_to_be(cockpit) -> None:
 # ---- commands
 
 
-def test_a_mode_that_is_refused_to_clients_is_not_refused_to_the_mission(cockpit) -> None:
+def test_a_mode_that_is_refused_to_clients_is_not_refused_to_the_mission(cockpit: Cockpit) -> None:
     """DO_SET_MODE among the items of a mission is PX4's own affair."""
     cockpit.take_off(5.0)
     begin(cockpit, "refuse_mode any")
@@ -164,7 +168,7 @@ def test_a_mode_that_is_refused_to_clients_is_not_refused_to_the_mission(cockpit
 
 
 @pytest.mark.hears("ATTITUDE", "ODOMETRY")
-def test_a_reboot_begins_a_new_boot(cockpit) -> None:
+def test_a_reboot_begins_a_new_boot(cockpit: Cockpit) -> None:
     cockpit.heartbeats = [("gcs", (245, 190), 6)]
     vehicle = cockpit.vehicle
     vehicle.parameters.set("MPC_XY_CRUISE", 4.0)
@@ -187,7 +191,7 @@ def test_a_reboot_begins_a_new_boot(cockpit) -> None:
     assert vehicle.autopilot.home.position[2] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_vehicle_that_boots_while_it_falls_is_in_the_air(cockpit) -> None:
+def test_a_vehicle_that_boots_while_it_falls_is_in_the_air(cockpit: Cockpit) -> None:
     cockpit.take_off(60.0)
     begin(cockpit, "reboot 0.5")
     cockpit.forget()
@@ -199,7 +203,7 @@ def test_a_vehicle_that_boots_while_it_falls_is_in_the_air(cockpit) -> None:
     assert cockpit.received("EXTENDED_SYS_STATE")[-1].landed_state == 1
 
 
-def test_after_a_reboot_a_ground_station_can_be_lost(cockpit) -> None:
+def test_after_a_reboot_a_ground_station_can_be_lost(cockpit: Cockpit) -> None:
     cockpit.heartbeats = [("gcs", (245, 190), 6)]
     cockpit.fly(60.0)
     begin(cockpit, "reboot 1")
@@ -210,7 +214,7 @@ def test_after_a_reboot_a_ground_station_can_be_lost(cockpit) -> None:
     assert cockpit.vehicle.autopilot.supervision.conditions.ground_station_lost
 
 
-def test_a_mission_and_its_place_outlive_a_reboot_but_not_what_was_reached(cockpit) -> None:
+def test_a_mission_and_its_place_outlive_a_reboot_but_not_what_was_reached(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert upload(cockpit, [takeoff(4.0), waypoint(4, 0, 4), waypoint(30, 0, 4), land(30, 0)]) == 0
     assert cockpit.set_mode(4, 4) == [0, 0]
@@ -226,7 +230,7 @@ def test_a_mission_and_its_place_outlive_a_reboot_but_not_what_was_reached(cockp
 
 
 @pytest.mark.hears("ATTITUDE")
-def test_a_jump_of_the_clock_outlives_a_reboot_and_ends_cleanly(cockpit) -> None:
+def test_a_jump_of_the_clock_outlives_a_reboot_and_ends_cleanly(cockpit: Cockpit) -> None:
     cockpit.fly(5.0)
     number = begin(cockpit, "time_jump 100")
     begin(cockpit, "reboot 1")
@@ -237,7 +241,7 @@ def test_a_jump_of_the_clock_outlives_a_reboot_and_ends_cleanly(cockpit) -> None
     assert cockpit.received("ATTITUDE")[-1].time_boot_ms == pytest.approx(2_500, abs=30)
 
 
-def test_a_reboot_without_a_fix_has_no_position_until_there_is_one(cockpit) -> None:
+def test_a_reboot_without_a_fix_has_no_position_until_there_is_one(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     number = begin(cockpit, "gps_loss")
     begin(cockpit, "reboot 1")
@@ -248,7 +252,7 @@ def test_a_reboot_without_a_fix_has_no_position_until_there_is_one(cockpit) -> N
     assert cockpit.vehicle.autopilot.can_arm
 
 
-def test_a_reboot_in_the_moment_of_reacquisition_finds_the_position(cockpit) -> None:
+def test_a_reboot_in_the_moment_of_reacquisition_finds_the_position(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "gps_loss")
     cockpit.fly(6.0)
@@ -274,7 +278,7 @@ def test_waiting_and_repeating_in_lockstep_go_on_through_a_reboot_and_a_standsti
 
 
 @pytest.mark.hears("ATTITUDE", "TIMESYNC")
-def test_after_a_standstill_every_clock_tells_the_same_time(cockpit) -> None:
+def test_after_a_standstill_every_clock_tells_the_same_time(cockpit: Cockpit) -> None:
     cockpit.fly(2.0)
     begin(cockpit, "stall for=3")
     cockpit.fly(4.0)
@@ -283,7 +287,9 @@ def test_after_a_standstill_every_clock_tells_the_same_time(cockpit) -> None:
     assert cockpit.received("ATTITUDE")[-1].time_boot_ms == pytest.approx(3000, abs=20)
 
 
-def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(make_cockpit) -> None:
+def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(
+    make_cockpit: type[Cockpit],
+) -> None:
     cockpit = make_cockpit(["GLOBAL_POSITION_INT"], start_ned_m=(100.0, 200.0))
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot 9")
@@ -299,7 +305,7 @@ def test_a_second_autopilot_stands_beside_the_vehicle_and_moves_nothing_of_it(ma
     assert places[9][:2] == pytest.approx((100.0, 225.0), abs=0.5)
 
 
-def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(cockpit) -> None:
+def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     begin(cockpit, "second_autopilot 9")
     begin(cockpit, "stall")
@@ -316,7 +322,7 @@ def test_a_second_autopilot_goes_on_while_the_vehicle_stands_still(cockpit) -> N
 
 
 @pytest.mark.hears("SERVO_OUTPUT_RAW")
-def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(cockpit) -> None:
+def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(cockpit: Cockpit) -> None:
     cockpit.take_off(20.0)
     begin(cockpit, "motor_failure 2")
     cockpit.forget()
@@ -330,7 +336,9 @@ def test_every_rotor_shows_its_own_command_and_a_dead_one_what_it_is_asked_for(c
     assert cockpit.vehicle.airframe.rotor_thrusts[1] < 0.01
 
 
-def test_offboard_right_after_the_first_setpoint_is_no_failsafe(make_cockpit, position_setpoint) -> None:
+def test_offboard_right_after_the_first_setpoint_is_no_failsafe(
+    make_cockpit: type[Cockpit], position_setpoint: Callable[..., Any]
+) -> None:
     for phase in (0, 2, 4):  # of the watch, which looks every other control step
         cockpit = make_cockpit()
         cockpit.take_off(5.0)

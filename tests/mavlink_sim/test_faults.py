@@ -10,9 +10,10 @@ from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.lockstep_link import LockstepLink
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.conftest import Cockpit
 
 
-def fly(cockpit: Any, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
+def fly(cockpit: Cockpit, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
     """What a client gets, and when."""
     got = []
     for _ in range(round(seconds / STEP_S)):
@@ -26,7 +27,7 @@ def decoded(datagrams: list[tuple[float, bytes]]) -> list[Any]:
     return [message for _, data in datagrams for message in codec.parse_buffer(data) or []]
 
 
-def test_a_fault_begins_and_ends_at_its_time(cockpit) -> None:
+def test_a_fault_begins_and_ends_at_its_time(cockpit: Cockpit) -> None:
     faults = cockpit.vehicle.faults
     number = faults.begin("heartbeat_only", at_s=2.0, duration_s=3.0)
     assert [one.number for one in faults.scheduled] == [number]
@@ -38,7 +39,7 @@ def test_a_fault_begins_and_ends_at_its_time(cockpit) -> None:
     assert cockpit.events[-1] == "fault 1 heartbeat_only for=3 ends"
 
 
-def test_faults_are_ended_by_number_by_name_and_all_together(cockpit) -> None:
+def test_faults_are_ended_by_number_by_name_and_all_together(cockpit: Cockpit) -> None:
     faults = cockpit.vehicle.faults
     numbers = [faults.begin(line) for line in ("link_delay 0.1", "link_delay 0.2", "wind 3", "stall at=99")]
     assert faults.end(numbers[0]) == 1
@@ -50,7 +51,7 @@ def test_faults_are_ended_by_number_by_name_and_all_together(cockpit) -> None:
         faults.end(1)
 
 
-def test_values_may_be_given_in_python(cockpit) -> None:
+def test_values_may_be_given_in_python(cockpit: Cockpit) -> None:
     faults = cockpit.vehicle.faults
     faults.begin("packet_loss", 0.25, link="gcs", way="out", duration_s=2.0, seed=5)
     assert str(faults.active[0]) == "1 packet_loss 0.25 link=gcs way=out for=2"
@@ -61,14 +62,14 @@ def test_values_may_be_given_in_python(cockpit) -> None:
     ("line", "said"),
     [("link_loss link=usb", "there are: all, onboard, gcs"), ("wind 3 at=0.5", "at=0.5 is over")],
 )
-def test_a_fault_that_cannot_begin_is_refused_at_once(cockpit, line, said) -> None:
+def test_a_fault_that_cannot_begin_is_refused_at_once(cockpit: Cockpit, line: str, said: str) -> None:
     cockpit.fly(1.0)
     with pytest.raises(FaultError, match=said):
         cockpit.vehicle.faults.begin(line)
     assert cockpit.vehicle.faults.listing() == ["no faults"]
 
 
-def test_a_scheduled_fault_that_cannot_begin_then_is_told_of(cockpit) -> None:
+def test_a_scheduled_fault_that_cannot_begin_then_is_told_of(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.command(400, 1) == [0]
     cockpit.vehicle.faults.begin("pilot_takeover MISSION at=5")
@@ -76,7 +77,7 @@ def test_a_scheduled_fault_that_cannot_begin_then_is_told_of(cockpit) -> None:
     assert not cockpit.vehicle.faults.active
 
 
-def test_commands_of_the_grammar_are_answered_for_a_person(cockpit) -> None:
+def test_commands_of_the_grammar_are_answered_for_a_person(cockpit: Cockpit) -> None:
     command = cockpit.vehicle.faults.command
     assert command("list").text == "no faults"
     assert command("link_delay 0.2 for=3").text == "fault 1 link_delay 0.2 for=3"
@@ -96,7 +97,7 @@ def test_commands_of_the_grammar_are_answered_for_a_person(cockpit) -> None:
     assert not command("help nothing").ok
 
 
-def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit) -> None:
+def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit: type[Cockpit]) -> None:
     def flight(seed: int) -> list[tuple[float, bytes]]:
         cockpit = make_cockpit(["everything"], seed=seed)
         link = LockstepLink(cockpit.vehicle, "onboard")
@@ -119,7 +120,7 @@ def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit) -> None:
 
 
 @pytest.mark.hears("everything")
-def test_a_dead_link_carries_nothing_either_way(cockpit) -> None:
+def test_a_dead_link_carries_nothing_either_way(cockpit: Cockpit) -> None:
     link = LockstepLink(cockpit.vehicle, "onboard")
     assert fly(cockpit, link, 0.5)
     cockpit.vehicle.faults.begin("link_loss link=onboard for=1")
@@ -130,7 +131,7 @@ def test_a_dead_link_carries_nothing_either_way(cockpit) -> None:
     assert "AUTOPILOT_VERSION" not in kinds
 
 
-def test_a_delay_holds_back_the_answer_both_ways(cockpit) -> None:
+def test_a_delay_holds_back_the_answer_both_ways(cockpit: Cockpit) -> None:
     link = LockstepLink(cockpit.vehicle, "onboard")
     cockpit.vehicle.faults.begin("link_delay 0.3")
     link.send(dialect.MAVLink_timesync_message(0, 77))
@@ -143,7 +144,7 @@ def test_a_delay_holds_back_the_answer_both_ways(cockpit) -> None:
     raise AssertionError("no answer")
 
 
-def test_one_direction_of_one_link_can_be_meant(cockpit) -> None:
+def test_one_direction_of_one_link_can_be_meant(cockpit: Cockpit) -> None:
     onboard, gcs = LockstepLink(cockpit.vehicle, "onboard"), LockstepLink(cockpit.vehicle, "gcs")
     cockpit.vehicle.faults.begin("link_loss link=onboard way=in")
     onboard.send(dialect.MAVLink_timesync_message(0, 77))

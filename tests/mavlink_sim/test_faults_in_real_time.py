@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from typing import Any
 
 import pytest
 import zenoh
@@ -111,7 +112,7 @@ def test_faults_come_from_the_command_line_and_the_console_over_real_sockets() -
         (["--control", "nonsense"], "--control nonsense: zenoh cannot listen there"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(arguments, said) -> None:
+def test_what_cannot_be_is_said_in_one_line(arguments: list[str], said: str) -> None:
     ports = ["--onboard-bind", "0", "--gcs-bind", "0"]
     command = [sys.executable, "-m", "mavlink_sim", *ports, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
@@ -138,10 +139,11 @@ def test_faults_come_over_zenoh_and_are_answered() -> None:
         client(port) as session,
     ):
 
-        def ask(selector: str, payload: str | None = None) -> dict:
+        def ask(selector: str, payload: str | None = None) -> dict[str, Any]:
             (reply,) = session.get(f"mavlink_sim/3/fault{selector}", payload=payload)
             assert reply.ok is not None
-            return json.loads(reply.ok.payload.to_string())
+            answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
+            return answer
 
         first = ask("", "link_delay 0.2 for=60")
         assert first["ok"]

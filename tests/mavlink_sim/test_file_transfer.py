@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from mavsdk.asyncio.plugins.component_metadata import ComponentMetadataAsync
 from mavsdk.asyncio.plugins.ftp import FtpAsync, FtpError
 from mavsdk.plugins.component_metadata import MetadataType
-from mavsdk_client import mavsdk_client
 from pymavlink import mavftp, mavutil
 
 from mavlink_sim.px4.parameters import INT32, Parameters, default_parameters
@@ -26,12 +25,14 @@ from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Pack
 from mavlink_sim.services.vehicle_files import bson, offer_packed_parameters, packed_parameters
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.mavsdk_client import mavsdk_client
 
 
 class Client:
     """A client in lockstep: one request, and the packets that came back within 20 ms."""
 
-    def __init__(self, cockpit: Any) -> None:
+    def __init__(self, cockpit: Cockpit) -> None:
         self.cockpit = cockpit
         self.sequence = 0
 
@@ -80,7 +81,7 @@ class Client:
 
 
 @pytest.fixture
-def client(cockpit: Any) -> Client:
+def client(cockpit: Cockpit) -> Client:
     cockpit.fly(0.1)
     return Client(cockpit)
 
@@ -282,7 +283,7 @@ def test_the_parameter_file_holds_what_differs_from_the_defaults_as_bson() -> No
     )  # fmt: skip
 
 
-def test_packed_parameters_are_read_by_pymavlinks_own_decoder(cockpit: Any) -> None:
+def test_packed_parameters_are_read_by_pymavlinks_own_decoder(cockpit: Cockpit) -> None:
     parameters = cockpit.vehicle.parameters
     decoded = mavftp.MAVFTP.ftp_param_decode(packed_parameters(parameters))
     assert decoded is not None
@@ -301,7 +302,7 @@ def test_packed_parameters_are_offered_on_wish(client: Client) -> None:
     assert client.ack(Opcode.OPEN_FILE_RO, b"@PARAM/param.pck").data == struct.pack("<I", size)
 
 
-def test_the_metadata_is_found_through_component_metadata(cockpit: Any) -> None:
+def test_the_metadata_is_found_through_component_metadata(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     assert cockpit.command(512, 397) == [0]
     (message,) = cockpit.received("COMPONENT_METADATA")

@@ -149,7 +149,7 @@ def test_a_range_of_ports_is_free() -> None:
 
 def test_a_machine_that_is_too_slow_is_told_of_and_how_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr(real_time.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr("mavlink_sim.real_time.time.monotonic", lambda: now_s)
     told: list[str] = []
     pace = real_time._Pace(20.0, told.append)
     pace.lose(25.0)

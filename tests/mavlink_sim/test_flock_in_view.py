@@ -102,6 +102,8 @@ def test_who_leaves_is_seen_no_more_and_nobody_costs_nothing() -> None:
     after = captured(camera)
     assert not drones(after)
     assert np.array_equal(after.frame.image, before.image)
+    assert after.frame.depth_m is not None
+    assert before.depth_m is not None
     assert np.array_equal(after.frame.depth_m, before.depth_m, equal_nan=True)
 
 

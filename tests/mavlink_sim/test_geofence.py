@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from plan_client import circle, listen, polygon, upload
 
 from mavlink_sim.missions.geofence import Area, inside_polygon
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.wire.announcements import event_identifier
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
 metres = st.floats(-100.0, 100.0)
@@ -22,7 +23,7 @@ centimetres = st.integers(-10_000, 10_000)
 
 
 @pytest.fixture
-def cockpit(make_cockpit: Any) -> Any:
+def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
     """A vehicle that is ready at once."""
     return make_cockpit(ready_after_s=0.0)
 
@@ -72,7 +73,7 @@ def test_a_polygon_of_nothing_holds_nothing() -> None:
 # ---- upload
 
 
-def test_a_fence_without_home_is_left_out_and_said(cockpit: Any) -> None:
+def test_a_fence_without_home_is_left_out_and_said(cockpit: Cockpit) -> None:
     listen(cockpit)
     assert upload(cockpit, polygon(FENCE, inclusion=False), 1) == 0
     cockpit.fly(0.1)
@@ -81,7 +82,7 @@ def test_a_fence_without_home_is_left_out_and_said(cockpit: Any) -> None:
     assert cockpit.vehicle.autopilot.can_arm
 
 
-def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpit: Any) -> None:
+def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpit: Cockpit) -> None:
     listen(cockpit)
     cockpit.take_off(4.0)
     cockpit.vehicle.airframe.position = (0.0, 40.0, -4.0)
@@ -96,7 +97,7 @@ def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpi
 # ---- arming
 
 
-def test_outside_the_fence_nobody_arms(make_cockpit: Any) -> None:
+def test_outside_the_fence_nobody_arms(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0)
     listen(cockpit)
     upload(cockpit, [circle(0, 0, 10.0)], 1)
@@ -109,7 +110,7 @@ def test_outside_the_fence_nobody_arms(make_cockpit: Any) -> None:
     assert cockpit.heartbeat().system_status == 0
 
 
-def test_without_an_action_the_fence_is_not_looked_at(make_cockpit: Any) -> None:
+def test_without_an_action_the_fence_is_not_looked_at(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 0})
     upload(cockpit, [circle(0, 0, 10.0)], 1)
     cockpit.vehicle.airframe.position = (15.0, 0.0, 0.0)
@@ -120,7 +121,7 @@ def test_without_an_action_the_fence_is_not_looked_at(make_cockpit: Any) -> None
 # ---- breaches
 
 
-def fly_out(cockpit: Any, velocity_setpoint: Any, **parameters: float) -> None:
+def fly_out(cockpit: Cockpit, velocity_setpoint: Any, **parameters: float) -> None:
     """Into the air, and north in OFFBOARD until the fence at 8 m is broken."""
     listen(cockpit)
     cockpit.take_off(4.0)
@@ -138,7 +139,7 @@ def fly_out(cockpit: Any, velocity_setpoint: Any, **parameters: float) -> None:
     [(1, "OFFBOARD"), (2, "HOLD"), (3, "RTL"), (5, "LAND")],
 )
 def test_a_breach_does_what_gf_action_says(
-    make_cockpit: Any, velocity_setpoint: Any, action: int, mode: str
+    make_cockpit: type[Cockpit], velocity_setpoint: Any, action: int, mode: str
 ) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
     fly_out(cockpit, velocity_setpoint)
@@ -152,7 +153,7 @@ def test_a_breach_does_what_gf_action_says(
 
 
 def test_before_it_returns_it_holds_for_a_pilot_to_take_over(
-    make_cockpit: Any, velocity_setpoint: Any
+    make_cockpit: type[Cockpit], velocity_setpoint: Any
 ) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 3})
     fly_out(cockpit, velocity_setpoint)
@@ -162,7 +163,7 @@ def test_before_it_returns_it_holds_for_a_pilot_to_take_over(
 
 
 def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     north = velocity_setpoint(4, 0, 0)
     fly_out(cockpit, velocity_setpoint)
@@ -176,7 +177,7 @@ def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
     cockpit.until(lambda: cockpit.mode == "HOLD", 10.0, north)  # and the next breach counts anew
 
 
-def test_a_place_outside_the_fence_is_not_flown_to(cockpit: Any) -> None:
+def test_a_place_outside_the_fence_is_not_flown_to(cockpit: Cockpit) -> None:
     listen(cockpit)
     cockpit.take_off(4.0)
     upload(cockpit, [circle(0, 0, 8.0)], 1)
@@ -188,7 +189,7 @@ def test_a_place_outside_the_fence_is_not_flown_to(cockpit: Any) -> None:
     assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 1.0
 
 
-def test_termination_stops_the_motors(make_cockpit: Any, velocity_setpoint: Any) -> None:
+def test_termination_stops_the_motors(make_cockpit: type[Cockpit], velocity_setpoint: Any) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 4})
     fly_out(cockpit, velocity_setpoint)
     assert cockpit.heartbeat().system_status == 8
@@ -205,7 +206,11 @@ def test_termination_stops_the_motors(make_cockpit: Any, velocity_setpoint: Any)
     ],
 )
 def test_the_greatest_distances_from_home_are_a_fence_too(
-    make_cockpit: Any, velocity_setpoint: Any, parameter: str, setpoint: tuple[float, ...], words: str
+    make_cockpit: type[Cockpit],
+    velocity_setpoint: Any,
+    parameter: str,
+    setpoint: tuple[float, ...],
+    words: str,
 ) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={parameter: 8.0})
     listen(cockpit)

@@ -15,6 +15,7 @@ from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.simulation import Simulation, SimulationOptions
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 from vision.attitude import quaternion_from_euler
 from vision.rotation import matrix_from_quaternion
 
@@ -76,7 +77,7 @@ def test_its_two_poses_agree(roll: float, pitch: float, yaw: float, tilt: float,
     device.point(Target(Aim.ANGLES, tilt, pan))
     attitude = quaternion_from_euler(roll, pitch, yaw)
     settled(device, attitude)
-    assert (device.pan_rad, device.tilt_rad) == (pytest.approx(pan, abs=1e-6), pytest.approx(tilt, abs=1e-6))
+    assert (device.pan_rad, device.tilt_rad) == pytest.approx((pan, tilt), abs=1e-6)
     whole = matrix_from_quaternion(attitude) @ matrix_from_quaternion(device.body_quaternion)
     assert np.allclose(whole, matrix_from_quaternion(device.quaternion), atol=1e-9)
 
@@ -94,16 +95,10 @@ def test_the_stops_hold() -> None:
     device = gimbal(MNT_MAX_PITCH=30, MNT_MIN_PITCH=-60, MNT_RANGE_YAW=180)
     device.point(Target(Aim.ANGLES, 1.5, 3.0))
     settled(device)
-    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == (
-        pytest.approx(30.0),
-        pytest.approx(90.0),
-    )
+    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == pytest.approx((30.0, 90.0))
     device.point(Target(Aim.ANGLES, -1.5, -3.0))
     settled(device)
-    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == (
-        pytest.approx(-60.0),
-        pytest.approx(-90.0),
-    )
+    assert (math.degrees(device.tilt_rad), math.degrees(device.pan_rad)) == pytest.approx((-60.0, -90.0))
     device = gimbal(MNT_LND_P_MIN=-10)
     device.point(Target(Aim.ANGLES, -1.0, 0.0))
     assert math.degrees(settled(device, landed=True).tilt_rad) == pytest.approx(-10.0)
@@ -119,7 +114,7 @@ def test_it_takes_its_time_and_turns_at_a_rate_until_that_is_silent() -> None:
     device.point(Target(Aim.ANGLES, yaw_rate_radps=0.2, pitch_rate_radps=-0.1))
     for _ in range(100):
         device.step(0.01, LEVEL, (0.0, 0.0, 0.0), False)
-    assert (device.pan_rad, device.tilt_rad) == (pytest.approx(0.2, abs=0.01), pytest.approx(-0.1, abs=0.01))
+    assert (device.pan_rad, device.tilt_rad) == pytest.approx((0.2, -0.1), abs=0.01)
     assert device.angular_velocity((0.0, 0.0, 0.0))[1] == pytest.approx(-0.1, abs=1e-6)
     settled(device)
     assert device.pan_rad == pytest.approx(0.4, abs=0.01)  # 2 s after the last word it stands
@@ -139,19 +134,20 @@ def test_a_rate_against_a_stop_does_not_wind_up() -> None:
 
 
 @pytest.fixture
-def steered(make_cockpit: Any) -> Any:
+def steered(make_cockpit: type[Cockpit]) -> Cockpit:
     cockpit = make_cockpit(gimbal=True)
     cockpit.wait_ready()
     assert cockpit.command(1001, *COMPANION, -1, -1) == [0]
     return cockpit
 
 
-def degrees(cockpit: Any) -> tuple[float, float]:
+def degrees(cockpit: Cockpit) -> tuple[float, float]:
     device = cockpit.vehicle.gimbal
+    assert device is not None
     return math.degrees(device.pitch_rad), math.degrees(device.yaw_rad)
 
 
-def test_a_vehicle_as_delivered_has_no_gimbal(cockpit: Any) -> None:
+def test_a_vehicle_as_delivered_has_no_gimbal(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.vehicle.gimbal is None
     assert cockpit.command(512, 280) == [2]
@@ -160,7 +156,7 @@ def test_a_vehicle_as_delivered_has_no_gimbal(cockpit: Any) -> None:
     assert "MNT_MODE_OUT" not in cockpit.vehicle.parameters
 
 
-def test_the_gimbal_is_told(make_cockpit: Any) -> None:
+def test_the_gimbal_is_told(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(gimbal=True)
     cockpit.wait_ready()
     assert cockpit.command(512, 280) == [0]
@@ -177,7 +173,7 @@ def test_the_gimbal_is_told(make_cockpit: Any) -> None:
     assert (status.primary_control_sysid, status.primary_control_compid) == (0, 0)
 
 
-def test_only_the_one_in_control_moves_it(make_cockpit: Any) -> None:
+def test_only_the_one_in_control_moves_it(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(gimbal=True)
     cockpit.wait_ready()
     assert cockpit.command(1000, -45, 0, NAN, NAN, 12) == [2]
@@ -187,6 +183,7 @@ def test_only_the_one_in_control_moves_it(make_cockpit: Any) -> None:
     cockpit.fly(2.0)
     assert degrees(cockpit)[0] == pytest.approx(-45.0, abs=0.1)
     assert cockpit.command(1001, *GROUND_STATION, -1, -1, source=GROUND_STATION, link="gcs") == [0]
+    assert cockpit.vehicle.gimbal_manager is not None
     assert cockpit.vehicle.gimbal_manager.primary == GROUND_STATION
     assert cockpit.command(1001, -3, -3, -1, -1) == [0]  # not ours to release
     assert cockpit.vehicle.gimbal_manager.primary == GROUND_STATION
@@ -194,14 +191,11 @@ def test_only_the_one_in_control_moves_it(make_cockpit: Any) -> None:
     assert cockpit.vehicle.gimbal_manager.primary == (0, 0)
 
 
-def test_messages_move_it_too(steered: Any) -> None:
+def test_messages_move_it_too(steered: Cockpit) -> None:
     q = list(quaternion_from_euler(0.0, -0.5, 0.8))
     steered.send(dialect.MAVLink_gimbal_manager_set_attitude_message(1, 1, 12, 0, q, NAN, NAN, NAN))
     steered.fly(2.0)
-    assert degrees(steered) == (
-        pytest.approx(math.degrees(-0.5), abs=0.1),
-        pytest.approx(math.degrees(0.8), abs=0.1),
-    )
+    assert degrees(steered) == pytest.approx((math.degrees(-0.5), math.degrees(0.8)), abs=0.1)
     steered.send(dialect.MAVLink_gimbal_manager_set_pitchyaw_message(1, 1, 12, 0, -1.0, 0.0, NAN, NAN))
     steered.fly(2.0)
     assert degrees(steered)[0] == pytest.approx(math.degrees(-1.0), abs=0.1)
@@ -213,7 +207,7 @@ def test_messages_move_it_too(steered: Any) -> None:
     assert degrees(steered)[1] - before == pytest.approx(30.0, abs=2.0)  # MNT_RATE_YAW
 
 
-def test_a_location_is_looked_at_and_forgotten(steered: Any) -> None:
+def test_a_location_is_looked_at_and_forgotten(steered: Cockpit) -> None:
     x, y, _ = steered.vehicle.airframe.position
     latitude, longitude, altitude = geographic((x + 20.0, y + 20.0, 0.0))
     place = (0, 0, 0, 0)
@@ -222,22 +216,23 @@ def test_a_location_is_looked_at_and_forgotten(steered: Any) -> None:
     assert degrees(steered)[1] == pytest.approx(45.0, abs=1.0)
     assert steered.command(197) == [0]
     steered.fly(2.0)
-    assert degrees(steered) == (pytest.approx(0.0, abs=0.1), pytest.approx(0.0, abs=0.1))
+    assert degrees(steered) == pytest.approx((0.0, 0.0), abs=0.1)
     assert steered.command(195, 0, 0, 0, 0, NAN, NAN, NAN) == [2]
 
 
-def test_the_attitude_told_is_the_gimbals(steered: Any) -> None:
+def test_the_attitude_told_is_the_gimbals(steered: Cockpit) -> None:
     assert steered.command(1000, -60, 30, NAN, NAN, 12) == [0]
     steered.fly(2.0)
     steered.forget()
     steered.fly(0.3)
     told = steered.received("GIMBAL_DEVICE_ATTITUDE_STATUS")[-1]
+    assert steered.vehicle.gimbal is not None
     assert list(told.q) == pytest.approx(steered.vehicle.gimbal.quaternion, abs=1e-6)
     assert told.flags & 64
     assert steered.received("MOUNT_ORIENTATION")[-1].pitch == pytest.approx(-60.0, abs=0.1)
 
 
-def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: Any) -> None:
+def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: Cockpit) -> None:
     assert steered.command(1000, -45, 0, NAN, NAN, 12) == [0]
     steered.take_off()
     steered.forget()
@@ -245,7 +240,9 @@ def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: Any
     steered.fly(3.0)
     sent = [m for m in steered.received("COMMAND_LONG") if m.command in (1000, 1001)]
     assert [m.command for m in sent] == [1001, 1000, 1001]
+    assert steered.vehicle.gimbal is not None
     assert steered.vehicle.gimbal.tilt_rad == pytest.approx(0.0, abs=0.01)
+    assert steered.vehicle.gimbal_manager is not None
     assert steered.vehicle.gimbal_manager.primary == (0, 0)
 
 

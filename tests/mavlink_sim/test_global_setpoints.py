@@ -17,6 +17,7 @@ from mavlink_sim.flight.setpoints import (
 from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 pytestmark = pytest.mark.hears("POSITION_TARGET_LOCAL_NED")
 
@@ -67,7 +68,7 @@ def test_a_home_above_the_origin_puts_relative_altitudes_too_low_as_in_px4() -> 
 
 
 @pytest.mark.parametrize("frame", [0, 1, 3, 8, 10])
-def test_a_position_in_another_frame_is_refused_in_words(cockpit: Any, frame: int) -> None:
+def test_a_position_in_another_frame_is_refused_in_words(cockpit: Cockpit, frame: int) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.wait_ready()
     cockpit.fly(0.1)
@@ -87,7 +88,7 @@ def test_one_ignored_axis_disables_the_whole_position_and_then_any_frame_will_do
     assert setpoint.velocity == (1.0, 2.0, 3.0)
 
 
-def test_force_is_refused_in_words_and_nothing_at_all_without_any(cockpit: Any) -> None:
+def test_force_is_refused_in_words_and_nothing_at_all_without_any(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.wait_ready()
     cockpit.fly(0.1)
@@ -99,7 +100,7 @@ def test_force_is_refused_in_words_and_nothing_at_all_without_any(cockpit: Any) 
     assert not cockpit.vehicle.autopilot.has_setpoints
 
 
-def test_before_the_vehicle_knows_its_place_a_global_position_is_dropped(cockpit: Any) -> None:
+def test_before_the_vehicle_knows_its_place_a_global_position_is_dropped(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     assert not cockpit.vehicle.autopilot.sensors_ready
     cockpit.send(globally(altitude_m=500.0))
@@ -150,7 +151,7 @@ def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
 
 
 @pytest.mark.parametrize(("frame", "altitude_m"), [(5, HOME_ALTITUDE_M + 6.0), (6, 6.0), (11, 6.0)])
-def test_a_global_position_is_flown_to_in_each_frame(cockpit: Any, frame: int, altitude_m: float) -> None:
+def test_a_global_position_is_flown_to_in_each_frame(cockpit: Cockpit, frame: int, altitude_m: float) -> None:
     cockpit.take_off(5.0)
     there = globally((4.0, -3.0, 0.0), altitude_m, frame, mask=0x9F8, yaw=0.5)
     cockpit.offboard(there)
@@ -169,7 +170,7 @@ def test_a_global_position_is_flown_to_in_each_frame(cockpit: Any, frame: int, a
     ids=["local", "global"],
 )
 def test_an_acceleration_alone_gains_the_velocity_that_drag_leaves_of_it(
-    cockpit: Any, make: Callable[[], Any]
+    cockpit: Cockpit, make: Callable[[], Any]
 ) -> None:
     cockpit.take_off(10.0)
     push = make()
@@ -197,7 +198,7 @@ def test_a_body_acceleration_is_turned_by_the_whole_attitude() -> None:
     assert rolled.acceleration == pytest.approx((0.0, -1.0, 0.0))
 
 
-def test_an_acceleration_beside_a_velocity_is_a_feed_forward(cockpit: Any) -> None:
+def test_an_acceleration_beside_a_velocity_is_a_feed_forward(cockpit: Cockpit) -> None:
     """With drag at 1/s, 2 m/s need 2 m/s² of thrust: given ahead, little is left to correct."""
     cockpit.take_off(10.0)
     errors = []
@@ -210,7 +211,7 @@ def test_an_acceleration_beside_a_velocity_is_a_feed_forward(cockpit: Any) -> No
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_height_by_position_and_the_rest_by_velocity(cockpit: Any) -> None:
+def test_height_by_position_and_the_rest_by_velocity(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     mixed = locally(0xDE3, z=-8.0, vx=1.5, vy=-0.5)
     cockpit.offboard(mixed)
@@ -221,7 +222,7 @@ def test_height_by_position_and_the_rest_by_velocity(cockpit: Any) -> None:
     assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 3
 
 
-def test_place_by_position_and_height_by_acceleration(cockpit: Any) -> None:
+def test_place_by_position_and_height_by_acceleration(cockpit: Cockpit) -> None:
     cockpit.take_off(10.0)
     mixed = locally(0xCFC, x=2.0, y=0.0, afz=-0.4)
     cockpit.offboard(mixed)
@@ -238,7 +239,7 @@ def test_place_by_position_and_height_by_acceleration(cockpit: Any) -> None:
     ids=["height alone", "north alone", "north and height"],
 )
 def test_what_leaves_an_axis_open_stops_the_vehicle_but_counts_as_a_signal(
-    cockpit: Any, fields: dict[str, Any]
+    cockpit: Cockpit, fields: dict[str, Any]
 ) -> None:
     cockpit.take_off(6.0)
     before = cockpit.vehicle.airframe.position

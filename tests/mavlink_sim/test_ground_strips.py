@@ -35,7 +35,9 @@ def drawn(width: int, height: int, strip_rows: int, pose: tuple[float, float, fl
     rows=st.sampled_from([1, 7, 64]),
     pose=st.tuples(st.floats(0.2, 40.0), st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5)),
 )
-def test_however_it_is_cut_the_picture_is_the_same(size, rows, pose):
+def test_however_it_is_cut_the_picture_is_the_same(
+    size: tuple[int, int], rows: int, pose: tuple[float, float, float]
+) -> None:
     """But for the last bit of a coordinate, which here and there chooses another mip level."""
     width, height = size
     whole, cut = (drawn(width, height, strip_rows, pose) for strip_rows in (height, rows))
@@ -47,13 +49,13 @@ def test_however_it_is_cut_the_picture_is_the_same(size, rows, pose):
     assert off.mean() < 0.2
 
 
-def test_a_picture_of_the_sky_alone_has_no_depth():
+def test_a_picture_of_the_sky_alone_has_no_depth() -> None:
     seen = drawn(64, 48, 16, (5.0, 0.0, 1.4))
     assert np.isnan(seen.depth_m).all()
     assert (seen.image.mean(axis=(0, 1)) > 60).all()
 
 
-def test_each_mip_level_lies_where_its_side_says_with_the_opposite_edge_beside_it():
+def test_each_mip_level_lies_where_its_side_says_with_the_opposite_edge_beside_it() -> None:
     tile = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
     atlas = mip_atlas(tile)
     assert (atlas.size, atlas.levels) == (32, 4)
@@ -67,4 +69,5 @@ def test_each_mip_level_lies_where_its_side_says_with_the_opposite_edge_beside_i
         np.testing.assert_array_equal(
             atlas.pixels[GUTTER - 1, columns], atlas.pixels[GUTTER + side - 1, columns]
         )
-        level = cv2.resize(level, (side // 2, side // 2), interpolation=cv2.INTER_AREA)
+        half = (side // 2, side // 2)
+        level = np.asarray(cv2.resize(level, half, interpolation=cv2.INTER_AREA), np.uint8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -71,7 +73,9 @@ def carry(
 
 
 @given(ANY, TRAFFIC)
-def test_every_datagram_is_delivered_lost_or_waiting(impairments, traffic) -> None:
+def test_every_datagram_is_delivered_lost_or_waiting(
+    impairments: list[Impairment], traffic: list[tuple[float, int]]
+) -> None:
     channel, sent, got = carry(impairments, traffic)
     counts = channel.counts
     assert counts.entered == len(sent)
@@ -80,21 +84,25 @@ def test_every_datagram_is_delivered_lost_or_waiting(impairments, traffic) -> No
 
 
 @given(KEEPING_BYTES, TRAFFIC)
-def test_nothing_is_invented(impairments, traffic) -> None:
+def test_nothing_is_invented(impairments: list[Impairment], traffic: list[tuple[float, int]]) -> None:
     channel, sent, got = carry(impairments, traffic)
     assert {data for _, data in got} <= set(sent)
     assert len(got) <= len(sent) + channel.counts.duplicated
 
 
 @given(KEEPING_ORDER, TRAFFIC)
-def test_without_reordering_the_order_is_kept(impairments, traffic) -> None:
+def test_without_reordering_the_order_is_kept(
+    impairments: list[Impairment], traffic: list[tuple[float, int]]
+) -> None:
     _, _, got = carry(impairments, traffic)
     numbers = [int.from_bytes(data[:4], "big") for _, data in got]
     assert numbers == sorted(numbers)
 
 
 @given(ANY, TRAFFIC)
-def test_nothing_arrives_before_it_was_sent(impairments, traffic) -> None:
+def test_nothing_arrives_before_it_was_sent(
+    impairments: list[Impairment], traffic: list[tuple[float, int]]
+) -> None:
     channel = Channel()
     for impairment in impairments:
         channel.impair(impairment)
@@ -106,7 +114,9 @@ def test_nothing_arrives_before_it_was_sent(impairments, traffic) -> None:
 
 
 @given(share, seeds, TRAFFIC)
-def test_corruption_changes_bytes_and_never_the_length(probability, seed, traffic) -> None:
+def test_corruption_changes_bytes_and_never_the_length(
+    probability: float, seed: int, traffic: list[tuple[float, int]]
+) -> None:
     channel, sent, got = carry([Corruption(probability, seed)], traffic)
     changed = 0
     for before, (_, after) in zip(sent, got, strict=True):
@@ -118,9 +128,9 @@ def test_corruption_changes_bytes_and_never_the_length(probability, seed, traffi
 
 
 @given(st.lists(st.sampled_from(["loss", "delay", "duplicate", "reorder", "corrupt"])), seeds, TRAFFIC)
-def test_the_same_seed_does_the_same(names, seed, traffic) -> None:
+def test_the_same_seed_does_the_same(names: list[str], seed: int, traffic: list[tuple[float, int]]) -> None:
     def made() -> list[Impairment]:
-        makers = {
+        makers: dict[str, Callable[[], Impairment]] = {
             "loss": lambda: Loss(0.3, seed),
             "delay": lambda: Delay(0.1, 0.2, seed),
             "duplicate": lambda: Duplication(0.3, seed),

@@ -6,6 +6,7 @@ import pytest
 
 from mavlink_sim.wire.announcements import INFO, Text
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 pytestmark = pytest.mark.hears("everything")
 
@@ -13,7 +14,7 @@ GCS = 6
 ONBOARD_CONTROLLER = 18
 
 
-def test_a_companion_gets_no_status_texts_but_gets_events(cockpit: Any) -> None:
+def test_a_companion_gets_no_status_texts_but_gets_events(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
     cockpit.take_off()
     assert cockpit.texts("onboard") == []
@@ -21,7 +22,7 @@ def test_a_companion_gets_no_status_texts_but_gets_events(cockpit: Any) -> None:
     assert cockpit.received("EVENT", "onboard")
 
 
-def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(cockpit: Any) -> None:
+def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), GCS))
     cockpit.take_off()
     assert cockpit.texts("gcs") == [
@@ -33,7 +34,7 @@ def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(cockpit: Any) -> 
     assert cockpit.texts("onboard") == []
 
 
-def test_a_ground_station_that_falls_silent_gets_no_more(cockpit: Any) -> None:
+def test_a_ground_station_that_falls_silent_gets_no_more(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), GCS))
     cockpit.wait_ready()
     cockpit.heartbeats.clear()
@@ -42,7 +43,7 @@ def test_a_ground_station_that_falls_silent_gets_no_more(cockpit: Any) -> None:
     assert cockpit.texts("gcs") == []
 
 
-def test_refusals_are_told_as_critical(cockpit: Any) -> None:
+def test_refusals_are_told_as_critical(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), GCS))
     cockpit.fly(1.0)
     cockpit.command(400, 1)
@@ -58,7 +59,7 @@ def test_refusals_are_told_as_critical(cockpit: Any) -> None:
     assert cockpit.texts()[-1] == "Unsupported main mode\t"
 
 
-def test_a_long_text_comes_in_chunks(cockpit: Any) -> None:
+def test_a_long_text_comes_in_chunks(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), GCS))
     cockpit.fly(0.1)
     long = "x" * 120 + "\t"
@@ -71,7 +72,7 @@ def test_a_long_text_comes_in_chunks(cockpit: Any) -> None:
     assert cockpit.texts() == [long]
 
 
-def test_the_loss_of_the_companions_heartbeat_is_told_after_seven_seconds(cockpit: Any) -> None:
+def test_the_loss_of_the_companions_heartbeat_is_told_after_seven_seconds(cockpit: Cockpit) -> None:
     cockpit.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
     cockpit.fly(3.0)
     del cockpit.heartbeats[1]
@@ -90,7 +91,7 @@ def heartbeat(kind: int = GCS) -> Any:
 
 
 def test_a_ground_stations_heartbeat_is_forwarded_byte_for_byte_to_where_somebody_listens(
-    cockpit: Any,
+    cockpit: Cockpit,
 ) -> None:
     cockpit.send(heartbeat(), "gcs", (245, 190))
     assert cockpit.inbox["onboard"] == []  # nobody was heard there yet
@@ -104,7 +105,7 @@ def test_a_ground_stations_heartbeat_is_forwarded_byte_for_byte_to_where_somebod
     assert cockpit.inbox["gcs"] == []
 
 
-def test_a_message_for_the_companion_reaches_it_and_one_for_the_autopilot_does_not(cockpit: Any) -> None:
+def test_a_message_for_the_companion_reaches_it_and_one_for_the_autopilot_does_not(cockpit: Cockpit) -> None:
     cockpit.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
     cockpit.forget()
     source = (245, 190)
@@ -115,6 +116,6 @@ def test_a_message_for_the_companion_reaches_it_and_one_for_the_autopilot_does_n
     assert forwarded == [191]
 
 
-def test_its_own_messages_coming_back_are_ignored(cockpit: Any) -> None:
+def test_its_own_messages_coming_back_are_ignored(cockpit: Cockpit) -> None:
     cockpit.send(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3), "onboard", (1, 1))
     assert cockpit.vehicle.links["onboard"].components == set()

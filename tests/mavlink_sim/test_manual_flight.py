@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -53,7 +52,7 @@ class Piloted:
         assert self.autopilot.set_mode(mode) == 0
 
     @property
-    def airframe(self) -> Any:
+    def airframe(self) -> Multirotor:
         return self.vehicle.airframe
 
     @property
@@ -88,11 +87,12 @@ class Piloted:
 
 @given(st.floats(-1.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.9))
 def test_stick_shapes_are_odd_bounded_and_reach_the_ends(stick: float, share: float, zone: float) -> None:
-    for shape in (
+    shapes: tuple[Callable[[float], float], ...] = (
         lambda value: expo(value, share),
         lambda value: with_dead_zone(value, zone),
         lambda value: super_expo(value, share, zone),
-    ):
+    )
+    for shape in shapes:
         assert shape(-stick) == pytest.approx(-shape(stick))
         assert abs(shape(stick)) <= 1.0 + 1e-9
         assert shape(1.0) == pytest.approx(1.0)

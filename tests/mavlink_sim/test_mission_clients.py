@@ -18,11 +18,11 @@ from mavsdk.plugins.geofence.geofence import Circle, FenceType, GeofenceData, Po
 from mavsdk.plugins.mission.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw.mission_raw import MissionItem as RawItem
 from mavsdk.plugins.mission_raw.mission_raw import MissionRawError, MissionRawResult
-from mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
-from plan_client import item, land, polygon, rally, takeoff, waypoint
 
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.testing import RunningSimulator, running_simulator
+from tests.mavlink_sim.mavsdk_client import LIMIT_S, MavsdkClient, mavsdk_client, meanwhile, wait_for
+from tests.mavlink_sim.plan_client import item, land, polygon, rally, takeoff, waypoint
 
 SPEED = 6.0
 

@@ -6,7 +6,10 @@ import math
 from typing import Any
 
 import pytest
-from plan_client import (
+
+from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import (
     NAN,
     RETURN,
     circle,
@@ -20,33 +23,31 @@ from plan_client import (
     waypoint,
 )
 
-from mavlink_sim.wire.messages import dialect
-
 SHORT = [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]
 
 
 @pytest.fixture
-def cockpit(make_cockpit: Any) -> Any:
+def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
     """A vehicle that is ready at once."""
     return make_cockpit(ready_after_s=0.0)
 
 
-def away(cockpit: Any, north: float, east: float) -> float:
+def away(cockpit: Cockpit, north: float, east: float) -> float:
     return math.dist(cockpit.vehicle.airframe.position[:2], (north, east))
 
 
-def current(cockpit: Any) -> int:
+def current(cockpit: Cockpit) -> int:
     return int(cockpit.vehicle.autopilot.navigator.mission.current)
 
 
-def status(cockpit: Any) -> tuple[int, int, int, int]:
+def status(cockpit: Cockpit) -> tuple[int, int, int, int]:
     """The newest MISSION_CURRENT: sequence, total, state, mode."""
     cockpit.fly(1.1)
     told = cockpit.received("MISSION_CURRENT")[-1]
     return told.seq, told.total, told.mission_state, told.mission_mode
 
 
-def test_a_mission_takes_off_flies_lands_and_disarms(cockpit: Any) -> None:
+def test_a_mission_takes_off_flies_lands_and_disarms(cockpit: Cockpit) -> None:
     listen(cockpit)
     assert status(cockpit) == (0, 65535, 1, 2)
     assert upload(cockpit, SHORT) == 0
@@ -74,7 +75,7 @@ def test_a_mission_takes_off_flies_lands_and_disarms(cockpit: Any) -> None:
     ]
 
 
-def test_mission_start_arms_and_begins_where_it_is_told(cockpit: Any) -> None:
+def test_mission_start_arms_and_begins_where_it_is_told(cockpit: Cockpit) -> None:
     assert cockpit.command(300, 0, 0) == [2]
     upload(cockpit, [takeoff(4.0), waypoint(30, 0, 4), waypoint(0, 6, 4)])
     assert cockpit.command(300, 3, 0) == [2]
@@ -88,7 +89,7 @@ def test_mission_start_arms_and_begins_where_it_is_told(cockpit: Any) -> None:
     assert status(cockpit)[2] == 5
 
 
-def test_reached_items_are_told_again_ten_times(cockpit: Any) -> None:
+def test_reached_items_are_told_again_ten_times(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(4.0), item(17, (0, 0, 4), 0, 0, 0, NAN)])
     cockpit.command(300)
     cockpit.until(lambda: current(cockpit) == 1, 30.0)
@@ -97,7 +98,7 @@ def test_reached_items_are_told_again_ten_times(cockpit: Any) -> None:
     assert cockpit.mode == "MISSION"  # loiter without end
 
 
-def test_a_waypoint_is_held_for_its_time_and_heading(cockpit: Any) -> None:
+def test_a_waypoint_is_held_for_its_time_and_heading(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(3.0), waypoint(5, 0, 3, 3.0, 1.0, 0.0, 90.0), waypoint(5, 5, 3)])
     cockpit.command(300)
     cockpit.until(lambda: away(cockpit, 5, 0) < 1.0, 30.0)
@@ -106,7 +107,7 @@ def test_a_waypoint_is_held_for_its_time_and_heading(cockpit: Any) -> None:
     assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(90.0, abs=12.0)
 
 
-def test_delay_and_speed_and_jump_items_do_what_they_say(cockpit: Any) -> None:
+def test_delay_and_speed_and_jump_items_do_what_they_say(cockpit: Cockpit) -> None:
     upload(
         cockpit,
         [
@@ -136,7 +137,7 @@ def test_delay_and_speed_and_jump_items_do_what_they_say(cockpit: Any) -> None:
     assert status(cockpit)[2:] == (5, 2)  # complete, though the vehicle is still on its way
 
 
-def test_a_pause_keeps_the_place_in_the_mission(cockpit: Any) -> None:
+def test_a_pause_keeps_the_place_in_the_mission(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(4.0), waypoint(12, 0, 4), waypoint(12, 8, 4)])
     cockpit.command(300)
     cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 4.0, 30.0)
@@ -153,7 +154,7 @@ def test_a_pause_keeps_the_place_in_the_mission(cockpit: Any) -> None:
     assert reached(cockpit) == [1, 2]
 
 
-def test_a_waypoint_on_the_way_is_passed_without_stopping(cockpit: Any) -> None:
+def test_a_waypoint_on_the_way_is_passed_without_stopping(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(4.0), waypoint(15, 0, 4), waypoint(30, 0, 4)])
     cockpit.command(300)
     cockpit.until(lambda: current(cockpit) == 2, 40.0)
@@ -169,7 +170,7 @@ def test_a_waypoint_on_the_way_is_passed_without_stopping(cockpit: Any) -> None:
     assert slowest > 2.0
 
 
-def test_camera_commands_are_sent_to_the_camera(cockpit: Any) -> None:
+def test_camera_commands_are_sent_to_the_camera(cockpit: Cockpit) -> None:
     upload(
         cockpit,
         [
@@ -188,7 +189,7 @@ def test_camera_commands_are_sent_to_the_camera(cockpit: Any) -> None:
     assert sent == [(2000, 100), (203, 100), (2001, 101), (203, 0)]
 
 
-def test_a_mission_uploaded_while_flying_one_is_flown_at_once(cockpit: Any) -> None:
+def test_a_mission_uploaded_while_flying_one_is_flown_at_once(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(4.0), waypoint(60, 0, 4)])
     cockpit.command(300)
     cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 3.0, 30.0)
@@ -197,7 +198,7 @@ def test_a_mission_uploaded_while_flying_one_is_flown_at_once(cockpit: Any) -> N
     assert away(cockpit, 0, 8) < 3.0
 
 
-def test_clearing_the_mission_in_flight_ends_in_hold(cockpit: Any) -> None:
+def test_clearing_the_mission_in_flight_ends_in_hold(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(4.0), waypoint(60, 0, 4)])
     cockpit.command(300)
     cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 3.0, 30.0)
@@ -207,7 +208,7 @@ def test_clearing_the_mission_in_flight_ends_in_hold(cockpit: Any) -> None:
     assert cockpit.set_mode(4, 4) == [0, 1]
 
 
-def test_a_finished_mission_begins_again_after_disarming(cockpit: Any) -> None:
+def test_a_finished_mission_begins_again_after_disarming(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(2.5), land()])
     cockpit.command(300)
     cockpit.until(lambda: not cockpit.armed, 60.0)
@@ -219,7 +220,7 @@ def test_a_finished_mission_begins_again_after_disarming(cockpit: Any) -> None:
     assert reached(cockpit)[-2:] == [0, 1]
 
 
-def test_numbers_that_are_none_do_not_stop_the_vehicle(cockpit: Any) -> None:
+def test_numbers_that_are_none_do_not_stop_the_vehicle(cockpit: Cockpit) -> None:
     nothing = [NAN] * 7
     strange = [
         takeoff(3.0),
@@ -238,7 +239,7 @@ def test_numbers_that_are_none_do_not_stop_the_vehicle(cockpit: Any) -> None:
     assert all(map(math.isfinite, cockpit.vehicle.airframe.position))
 
 
-def test_an_empty_mission_cannot_be_flown_or_armed_in(cockpit: Any) -> None:
+def test_an_empty_mission_cannot_be_flown_or_armed_in(cockpit: Cockpit) -> None:
     assert cockpit.set_mode(4, 4) == [0, 0]  # on the ground any mode may be chosen
     assert not cockpit.vehicle.autopilot.can_arm
     assert cockpit.command(400, 1) == [1]
@@ -290,7 +291,7 @@ def test_an_empty_mission_cannot_be_flown_or_armed_in(cockpit: Any) -> None:
     ],
 )
 def test_a_mission_that_cannot_be_flown_is_stored_but_refused(
-    make_cockpit: Any, parameters: dict[str, float], plan: list[Any], words: str
+    make_cockpit: type[Cockpit], parameters: dict[str, float], plan: list[Any], words: str
 ) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters=parameters)
     listen(cockpit)
@@ -302,7 +303,7 @@ def test_a_mission_that_cannot_be_flown_is_stored_but_refused(
     assert status(cockpit)[2] == 1
 
 
-def test_a_far_first_waypoint_is_only_warned_of(make_cockpit: Any) -> None:
+def test_a_far_first_waypoint_is_only_warned_of(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"MIS_DIST_1WP": 100.0})
     listen(cockpit)
     upload(cockpit, [waypoint(150.5, 0, 5)])
@@ -311,7 +312,7 @@ def test_a_far_first_waypoint_is_only_warned_of(make_cockpit: Any) -> None:
     assert cockpit.vehicle.autopilot.navigator.mission.valid
 
 
-def test_a_fence_that_comes_later_makes_the_mission_invalid(cockpit: Any) -> None:
+def test_a_fence_that_comes_later_makes_the_mission_invalid(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(5.0), waypoint(30, 0, 5)])
     assert cockpit.vehicle.autopilot.navigator.mission.valid
     upload(cockpit, [circle(0, 0, 20.0)], 1)

@@ -9,7 +9,12 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plan_client import (
+
+from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
+from mavlink_sim.services.mission_messages import MissionCurrent
+from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import (
     COMPANION,
     RETURN,
     circle,
@@ -26,16 +31,12 @@ from plan_client import (
     waypoint,
 )
 
-from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
-from mavlink_sim.services.mission_messages import MissionCurrent
-from mavlink_sim.wire.messages import dialect, parser
-
 NAN = math.nan
 SQUARE = [(-50.0, -50.0), (-50.0, 50.0), (50.0, 50.0), (50.0, -50.0)]
 
 
 @pytest.fixture
-def cockpit(make_cockpit: Any) -> Any:
+def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
     """A vehicle that is ready at once."""
     return make_cockpit(ready_after_s=0.0)
 
@@ -44,7 +45,7 @@ def count(number: int, plan: int = 0, target: tuple[int, int] = (1, 1)) -> Any:
     return dialect.MAVLink_mission_count_message(*target, number, plan)
 
 
-def test_an_uploaded_mission_is_given_back_as_px4_stores_it(cockpit: Any) -> None:
+def test_an_uploaded_mission_is_given_back_as_px4_stores_it(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     plan = [
         takeoff(5.0),
@@ -82,7 +83,7 @@ def test_an_uploaded_mission_is_given_back_as_px4_stores_it(cockpit: Any) -> Non
     ],
     ids=["fence", "rally"],
 )
-def test_fence_and_rally_points_go_there_and_back(cockpit: Any, plan: int, items: list[Any]) -> None:
+def test_fence_and_rally_points_go_there_and_back(cockpit: Cockpit, plan: int, items: list[Any]) -> None:
     cockpit.wait_ready()
     assert upload(cockpit, items, plan) == 0
     got = download(cockpit, plan)
@@ -92,7 +93,7 @@ def test_fence_and_rally_points_go_there_and_back(cockpit: Any, plan: int, items
     assert download(cockpit, 0) == []
 
 
-def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(cockpit: Any) -> None:
+def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.send(count(2))
     assert newest(cockpit, "MISSION_REQUEST_INT", 0).seq == 0
@@ -109,7 +110,7 @@ def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(cockpit: A
     assert (got.frame, got.x) == (3, pytest.approx(47.3977, abs=1e-6))
 
 
-def test_an_unanswered_question_is_repeated_and_in_the_end_given_up(cockpit: Any) -> None:
+def test_an_unanswered_question_is_repeated_and_in_the_end_given_up(cockpit: Cockpit) -> None:
     listen(cockpit)
     cockpit.send(count(2))
     cockpit.send(message(0, takeoff(5.0)))
@@ -123,14 +124,14 @@ def test_an_unanswered_question_is_repeated_and_in_the_end_given_up(cockpit: Any
     assert upload(cockpit, [takeoff(5.0), RETURN]) == 0
 
 
-def test_a_lost_acknowledgement_is_sent_again(cockpit: Any) -> None:
+def test_a_lost_acknowledgement_is_sent_again(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert upload(cockpit, [takeoff(5.0), waypoint(5, 0, 5)]) == 0
     cockpit.send(message(1, waypoint(5, 0, 5)))
     assert [m.type for m in cockpit.received("MISSION_ACK")] == [0, 0]
 
 
-def test_an_item_out_of_sequence_is_passed_over(cockpit: Any) -> None:
+def test_an_item_out_of_sequence_is_passed_over(cockpit: Cockpit) -> None:
     cockpit.send(count(2))
     cockpit.send(message(1, waypoint(5, 0, 5)))
     assert cockpit.received("MISSION_ACK") == []
@@ -139,7 +140,7 @@ def test_an_item_out_of_sequence_is_passed_over(cockpit: Any) -> None:
     assert newest(cockpit, "MISSION_ACK", 0).type == 0
 
 
-def test_an_item_without_a_transfer_is_an_error(cockpit: Any) -> None:
+def test_an_item_without_a_transfer_is_an_error(cockpit: Cockpit) -> None:
     listen(cockpit)
     cockpit.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
     cockpit.fly(0.01)
@@ -175,7 +176,7 @@ def test_an_item_without_a_transfer_is_an_error(cockpit: Any) -> None:
     ],
 )
 def test_an_item_px4_does_not_take_ends_the_upload(
-    cockpit: Any, fields: dict[str, Any], plan: int, result: int
+    cockpit: Cockpit, fields: dict[str, Any], plan: int, result: int
 ) -> None:
     cockpit.wait_ready()
     assert upload(cockpit, [fields, fields], plan) == result
@@ -183,7 +184,7 @@ def test_an_item_px4_does_not_take_ends_the_upload(
 
 
 @pytest.mark.parametrize(("plan", "most"), [(0, 10000), (1, 64), (2, 32)])
-def test_more_items_than_there_is_room_for_are_refused(cockpit: Any, plan: int, most: int) -> None:
+def test_more_items_than_there_is_room_for_are_refused(cockpit: Cockpit, plan: int, most: int) -> None:
     cockpit.send(count(most + 1, plan))
     assert newest(cockpit, "MISSION_ACK", 0).type == 4
     cockpit.send(count(most, plan))
@@ -191,13 +192,13 @@ def test_more_items_than_there_is_room_for_are_refused(cockpit: Any, plan: int, 
 
 
 @pytest.mark.parametrize(("items", "result"), [(1, 4), (0, 0)])
-def test_an_unknown_kind_of_plan_has_room_for_nothing(cockpit: Any, items: int, result: int) -> None:
+def test_an_unknown_kind_of_plan_has_room_for_nothing(cockpit: Cockpit, items: int, result: int) -> None:
     cockpit.send(count(items, 7))
     ack = newest(cockpit, "MISSION_ACK", 0)
     assert (ack.type, ack.mission_type) == (result, 7)
 
 
-def test_one_client_uploads_at_a_time_over_all_links(cockpit: Any) -> None:
+def test_one_client_uploads_at_a_time_over_all_links(cockpit: Cockpit) -> None:
     cockpit.send(count(2))
     cockpit.send(count(2), "onboard", (1, 195))
     assert [(m.type, m.target_component) for m in cockpit.received("MISSION_ACK")] == [(1, 195)]
@@ -209,7 +210,7 @@ def test_one_client_uploads_at_a_time_over_all_links(cockpit: Any) -> None:
     assert len(cockpit.received("MISSION_REQUEST_INT", "gcs")) == 1
 
 
-def test_a_cancelled_upload_leaves_the_old_mission(cockpit: Any) -> None:
+def test_a_cancelled_upload_leaves_the_old_mission(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert upload(cockpit, [takeoff(5.0)]) == 0
     cockpit.send(count(5))
@@ -221,7 +222,7 @@ def test_a_cancelled_upload_leaves_the_old_mission(cockpit: Any) -> None:
     assert [m.z for m in download(cockpit)] == [5.0]
 
 
-def test_a_download_asked_out_of_order_ends_with_an_error(cockpit: Any) -> None:
+def test_a_download_asked_out_of_order_ends_with_an_error(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     upload(cockpit, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
     cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
@@ -233,7 +234,7 @@ def test_a_download_asked_out_of_order_ends_with_an_error(cockpit: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 255])
-def test_clearing_takes_away_what_it_names(cockpit: Any, kind: int) -> None:
+def test_clearing_takes_away_what_it_names(cockpit: Cockpit, kind: int) -> None:
     cockpit.wait_ready()
     upload(cockpit, [takeoff(5.0)])
     upload(cockpit, polygon(SQUARE), 1)
@@ -245,7 +246,7 @@ def test_clearing_takes_away_what_it_names(cockpit: Any, kind: int) -> None:
     assert left == [0 if kind in (plan, 255) else full for plan, full in enumerate([1, 4, 1])]
 
 
-def test_messages_for_other_vehicles_or_everybody_are_not_taken(cockpit: Any) -> None:
+def test_messages_for_other_vehicles_or_everybody_are_not_taken(cockpit: Cockpit) -> None:
     cockpit.send(count(1, target=(2, 1)))
     cockpit.send(count(1, target=(0, 0)))
     assert cockpit.received("MISSION_REQUEST_INT") == cockpit.received("MISSION_ACK") == []
@@ -253,7 +254,7 @@ def test_messages_for_other_vehicles_or_everybody_are_not_taken(cockpit: Any) ->
     assert len(cockpit.received("MISSION_REQUEST_INT")) == 1
 
 
-def test_set_current_is_told_by_mission_current(cockpit: Any) -> None:
+def test_set_current_is_told_by_mission_current(cockpit: Cockpit) -> None:
     listen(cockpit)
     cockpit.wait_ready()
     upload(cockpit, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
@@ -267,7 +268,7 @@ def test_set_current_is_told_by_mission_current(cockpit: Any) -> None:
     assert cockpit.command(224, 1) == [3]  # DO_SET_MISSION_CURRENT is none of PX4's commands
 
 
-def test_the_same_mission_again_changes_nothing(cockpit: Any) -> None:
+def test_the_same_mission_again_changes_nothing(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     plan = [takeoff(5.0), waypoint(5, 0, 5), RETURN]
     upload(cockpit, plan)
@@ -278,7 +279,7 @@ def test_the_same_mission_again_changes_nothing(cockpit: Any) -> None:
     assert cockpit.vehicle.autopilot.navigator.mission.current == 0
 
 
-def test_plans_have_identifiers_that_newer_clients_can_read(cockpit: Any) -> None:
+def test_plans_have_identifiers_that_newer_clients_can_read(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     upload(cockpit, [takeoff(5.0), RETURN])
     identifier = cockpit.received("MISSION_ACK")[-1].opaque_id

@@ -5,13 +5,14 @@ from typing import Any
 import pytest
 
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
 FOLLOW, PRECISION_LAND, ORBIT = (4, 8), (4, 9), (3, 1)
 
 
 @pytest.mark.parametrize(("main", "sub"), ALL_MODES)
-def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Any, main: int, sub: int) -> None:
+def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Cockpit, main: int, sub: int) -> None:
     cockpit.fly(0.1)
     assert cockpit.set_mode(main, sub) == [0, 0]
     assert cockpit.heartbeat().custom_mode == main << 16 | sub << 24
@@ -26,7 +27,7 @@ def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Any, main: int, sub:
     ],
 )
 def test_a_disarmed_vehicle_takes_follow_precision_landing_and_orbit_too(
-    cockpit: Any, request_of: tuple[int, int], shown: int, base_mode: int
+    cockpit: Cockpit, request_of: tuple[int, int], shown: int, base_mode: int
 ) -> None:
     cockpit.wait_ready()
     assert cockpit.set_mode(*request_of) == [0, 0]
@@ -34,7 +35,7 @@ def test_a_disarmed_vehicle_takes_follow_precision_landing_and_orbit_too(
     assert (beat.custom_mode, beat.base_mode) == (shown, base_mode)
 
 
-def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(cockpit: Any) -> None:
+def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.forget()
     cockpit.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
@@ -43,7 +44,7 @@ def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds
     assert len(cockpit.received("COMMAND_ACK")) == 2
 
 
-def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(cockpit: Any) -> None:
+def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(cockpit: Cockpit) -> None:
     cockpit.take_off(4.0)
     for _ in range(3):
         cockpit.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
@@ -53,7 +54,7 @@ def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(cockpi
 
 
 @pytest.mark.parametrize(("main", "sub", "base"), [(8, 0, 1), (4, 1, 1), (4, 99, 1), (77, 0, 1), (4, 3, 0)])
-def test_what_is_no_mode_is_accepted_then_rejected(cockpit: Any, main: int, sub: int, base: int) -> None:
+def test_what_is_no_mode_is_accepted_then_rejected(cockpit: Cockpit, main: int, sub: int, base: int) -> None:
     cockpit.fly(0.1)
     assert cockpit.set_mode(main, sub, base) == [0, 1]
     assert cockpit.mode == "HOLD"
@@ -61,14 +62,14 @@ def test_what_is_no_mode_is_accepted_then_rejected(cockpit: Any, main: int, sub:
 
 @pytest.mark.parametrize(("main", "sub"), [(3, 0), (2, 0), (7, 0), (1, 0), (4, 4), (6, 0)])
 def test_in_the_air_a_mode_that_cannot_be_flown_is_accepted_then_rejected(
-    cockpit: Any, main: int, sub: int
+    cockpit: Cockpit, main: int, sub: int
 ) -> None:
     cockpit.take_off()
     assert cockpit.set_mode(main, sub) == [0, 1]
     assert cockpit.heartbeat().custom_mode == 0x03040000
 
 
-def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(cockpit: Any) -> None:
+def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.take_off()
     cockpit.forget()
@@ -83,7 +84,7 @@ def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(cockpit: An
     assert cockpit.texts()[1:] == ["Switching to Position is currently not available\t"]
 
 
-def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(cockpit: Any) -> None:
+def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(cockpit: Cockpit) -> None:
     cockpit.take_off()
     cockpit.forget()
     cockpit.send(dialect.MAVLink_set_mode_message(1, 1, 0x00030000))
@@ -95,7 +96,7 @@ def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(cockpit: 
     assert cockpit.mode == "RTL"
 
 
-def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(cockpit: Any) -> None:
+def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.heartbeat()
     cockpit.forget()
@@ -105,7 +106,7 @@ def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(cockpit: Any) -> N
 
 
 def test_current_mode_tells_the_mode_and_the_intention_twice_a_second_and_when_they_change(
-    cockpit: Any,
+    cockpit: Cockpit,
 ) -> None:
     """However often it is asked for: a real PX4 asked for 20 a second sent 1.75 to 2."""
     cockpit.fly(0.1)
@@ -123,7 +124,9 @@ def test_current_mode_tells_the_mode_and_the_intention_twice_a_second_and_when_t
     }
 
 
-def test_another_system_may_take_the_vehicle_from_the_companion(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_another_system_may_take_the_vehicle_from_the_companion(
+    cockpit: Cockpit, velocity_setpoint: Any
+) -> None:
     cockpit.take_off()
     stream = velocity_setpoint(1, 0, 0)
     cockpit.offboard(stream)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.flight.setpoints import SetpointRejectedError, trajectory_setpoint
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 
 def target(frame: int = 1, mask: int = 0, **fields: float) -> Any:
@@ -57,7 +58,7 @@ def test_in_the_body_frame_one_ignored_axis_disables_the_whole_velocity(bit: int
     ],
 )
 def test_what_px4_drops_is_dropped_and_told_to_the_ground_station(
-    cockpit: Any, frame: int, mask: int, text: str
+    cockpit: Cockpit, frame: int, mask: int, text: str
 ) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.fly(0.1)
@@ -86,7 +87,7 @@ def test_any_setpoint_is_either_refused_or_finite_where_it_controls(
     (1, 1, True), (1, 0, True), (0, 0, True), (2, 1, False), (1, 100, False),
 ])  # fmt: skip
 def test_a_setpoint_counts_if_it_is_addressed_to_the_autopilot(
-    cockpit: Any, system: int, component: int, counts: bool
+    cockpit: Cockpit, system: int, component: int, counts: bool
 ) -> None:
     cockpit.fly(0.1)
     cockpit.send(target(1, 0xDC7, vx=1, system=system, component=component))
@@ -96,13 +97,13 @@ def test_a_setpoint_counts_if_it_is_addressed_to_the_autopilot(
 # ---- entering
 
 
-def test_without_a_stream_the_mode_is_refused_in_the_air_and_nothing_changes(cockpit: Any) -> None:
+def test_without_a_stream_the_mode_is_refused_in_the_air_and_nothing_changes(cockpit: Cockpit) -> None:
     cockpit.take_off()
     assert cockpit.set_mode(6) == [0, 1]
     assert cockpit.mode == "HOLD"
 
 
-def test_one_setpoint_just_before_is_enough(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_one_setpoint_just_before_is_enough(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off()
     cockpit.send(velocity_setpoint(0, 0, 0))
     assert cockpit.set_mode(6) == [0, 0]
@@ -110,7 +111,7 @@ def test_one_setpoint_just_before_is_enough(cockpit: Any, velocity_setpoint: Any
     assert cockpit.mode == "OFFBOARD"
 
 
-def test_setpoints_before_offboard_only_count_as_a_signal(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_setpoints_before_offboard_only_count_as_a_signal(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off(5.0)
     cockpit.fly(0.5, velocity_setpoint(5, 0, 0))
     cockpit.set_mode(6)
@@ -119,7 +120,7 @@ def test_setpoints_before_offboard_only_count_as_a_signal(cockpit: Any, velocity
     assert math.hypot(*cockpit.vehicle.airframe.velocity) < 0.3
 
 
-def test_it_arms_in_offboard_and_climbs_by_the_setpoint(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_it_arms_in_offboard_and_climbs_by_the_setpoint(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.wait_ready()
     climb = velocity_setpoint(0, 0, -1)
     cockpit.offboard(climb)
@@ -134,7 +135,7 @@ def test_it_arms_in_offboard_and_climbs_by_the_setpoint(cockpit: Any, velocity_s
 # ---- flying
 
 
-def test_a_body_velocity_goes_where_the_nose_points(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_a_body_velocity_goes_where_the_nose_points(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off(5.0)
     turn = velocity_setpoint(0, 0, 0, yaw_rate=0.5)
     cockpit.offboard(turn)
@@ -149,7 +150,7 @@ def test_a_body_velocity_goes_where_the_nose_points(cockpit: Any, velocity_setpo
     assert math.atan2(vy, vx) == pytest.approx(heading, abs=0.1)
 
 
-def test_a_local_position_is_reached_and_its_yaw_taken(cockpit: Any, position_setpoint: Any) -> None:
+def test_a_local_position_is_reached_and_its_yaw_taken(cockpit: Cockpit, position_setpoint: Any) -> None:
     cockpit.take_off(5.0)
     there = position_setpoint(3, -2, -4, 1.0)
     cockpit.offboard(there)
@@ -159,7 +160,7 @@ def test_a_local_position_is_reached_and_its_yaw_taken(cockpit: Any, position_se
 
 
 def test_a_position_step_of_ten_metres_is_settled_within_six_seconds(
-    cockpit: Any, position_setpoint: Any
+    cockpit: Cockpit, position_setpoint: Any
 ) -> None:
     cockpit.take_off(5.0)
     cockpit.offboard(position_setpoint(0, 0, -5))
@@ -183,7 +184,7 @@ def test_a_position_step_of_ten_metres_is_settled_within_six_seconds(
 
 @pytest.mark.hears("POSITION_TARGET_LOCAL_NED")
 def test_the_position_target_is_echoed_with_the_inner_setpoints(
-    cockpit: Any, position_setpoint: Any, velocity_setpoint: Any
+    cockpit: Cockpit, position_setpoint: Any, velocity_setpoint: Any
 ) -> None:
     cockpit.fly(0.3)
     resting = cockpit.received("POSITION_TARGET_LOCAL_NED")[-1]
@@ -202,7 +203,7 @@ def test_the_position_target_is_echoed_with_the_inner_setpoints(
     assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 7
 
 
-def test_landing_by_setpoints_is_noticed_and_disarms(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_landing_by_setpoints_is_noticed_and_disarms(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off()
     down = velocity_setpoint(0, 0, 0.5)
     cockpit.offboard(down)
@@ -214,7 +215,7 @@ def test_landing_by_setpoints_is_noticed_and_disarms(cockpit: Any, velocity_setp
 
 
 @pytest.fixture
-def streaming(cockpit: Any, velocity_setpoint: Any) -> tuple[Any, Any]:
+def streaming(cockpit: Cockpit, velocity_setpoint: Any) -> tuple[Any, Any]:
     """A vehicle that flies in OFFBOARD by a stream, four metres up."""
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.take_off(4.0)
@@ -326,7 +327,7 @@ def test_with_a_remote_control_the_loss_leads_to_position_mode(streaming: tuple[
     assert cockpit.mode == "POSCTL"
 
 
-def test_the_time_until_the_loss_is_a_parameter(make_cockpit: Any, velocity_setpoint: Any) -> None:
+def test_the_time_until_the_loss_is_a_parameter(make_cockpit: type[Cockpit], velocity_setpoint: Any) -> None:
     cockpit = make_cockpit(parameters={"COM_OF_LOSS_T": 0.4})
     cockpit.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)

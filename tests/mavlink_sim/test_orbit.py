@@ -7,15 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mavlink_sim.flight.orbit import Orbit
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 NAN = math.nan
 CENTRE = (12.0, 5.0, 0.0)
 
 
 def orbit(
-    cockpit: Any,
+    cockpit: Cockpit,
     radius_m: float = 8.0,
     speed_mps: float = 3.0,
     yaw_behaviour: float = 0.0,
@@ -28,18 +30,24 @@ def orbit(
     return results
 
 
-def angle_rad(cockpit: Any) -> float:
+def angle_rad(cockpit: Cockpit) -> float:
     """Direction from the centre to the vehicle, clockwise from north."""
     x, y, _ = cockpit.vehicle.airframe.position
     return math.atan2(y - CENTRE[1], x - CENTRE[0])
 
 
-def distance_m(cockpit: Any) -> float:
+def distance_m(cockpit: Cockpit) -> float:
     x, y, _ = cockpit.vehicle.airframe.position
     return math.hypot(y - CENTRE[1], x - CENTRE[0])
 
 
-def circling(cockpit: Any, seconds: float = 20.0, **options: Any) -> Any:
+def task_of(cockpit: Cockpit) -> Orbit:
+    task = cockpit.vehicle.autopilot.task
+    assert isinstance(task, Orbit)
+    return task
+
+
+def circling(cockpit: Cockpit, seconds: float = 20.0, **options: Any) -> Any:
     cockpit.take_off(6.0)
     assert orbit(cockpit, **options) == [0]
     cockpit.fly(seconds)
@@ -51,7 +59,7 @@ def circling(cockpit: Any, seconds: float = 20.0, **options: Any) -> Any:
     [(8.0, 3.0, True), (-8.0, 3.0, False), (8.0, -3.0, False), (-8.0, -3.0, True)],
 )
 def test_it_circles_at_the_radius_and_speed_in_the_direction_of_the_signs(
-    cockpit: Any, radius_m: float, speed_mps: float, clockwise: bool
+    cockpit: Cockpit, radius_m: float, speed_mps: float, clockwise: bool
 ) -> None:
     circling(cockpit, radius_m=radius_m, speed_mps=speed_mps)
     assert cockpit.mode == "ORBIT"
@@ -66,7 +74,7 @@ def test_it_circles_at_the_radius_and_speed_in_the_direction_of_the_signs(
     assert cockpit.height_m == pytest.approx(6.0, abs=0.9)
 
 
-def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(cockpit: Any) -> None:
+def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(cockpit: Cockpit) -> None:
     circling(cockpit, seconds=2.0)
     assert cockpit.command(512, 436) == [0]
     mode = cockpit.received("CURRENT_MODE")[-1]
@@ -74,7 +82,7 @@ def test_the_mode_is_shown_as_orbit_and_cannot_be_armed_in(cockpit: Any) -> None
     assert (cockpit.heartbeat().custom_mode, cockpit.heartbeat().base_mode) == (0x01030000, 145)
 
 
-def test_disarmed_the_mode_is_taken_and_arming_is_refused(cockpit: Any) -> None:
+def test_disarmed_the_mode_is_taken_and_arming_is_refused(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert orbit(cockpit) == [0]
     assert cockpit.heartbeat().base_mode == 17
@@ -86,14 +94,14 @@ def test_disarmed_the_mode_is_taken_and_arming_is_refused(cockpit: Any) -> None:
     assert cockpit.height_m == 0.0  # an orbit takes nobody off the ground
 
 
-def test_set_mode_with_the_orbit_numbers_is_position_mode(cockpit: Any) -> None:
+def test_set_mode_with_the_orbit_numbers_is_position_mode(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     assert cockpit.set_mode(3, 1) == [0, 0]
     assert cockpit.heartbeat().custom_mode == 0x00030000
 
 
 @pytest.mark.parametrize("behaviour", [0, 1, 2, 3, 4])
-def test_each_heading_behaviour(cockpit: Any, behaviour: int) -> None:
+def test_each_heading_behaviour(cockpit: Cockpit, behaviour: int) -> None:
     cockpit.take_off(6.0)
     initial = cockpit.vehicle.airframe.yaw_rad
     assert orbit(cockpit, yaw_behaviour=behaviour) == [0]
@@ -110,23 +118,23 @@ def test_each_heading_behaviour(cockpit: Any, behaviour: int) -> None:
 
 
 def test_unchanged_keeps_the_heading_of_the_orbit_before_and_at_first_takes_the_parameter(
-    make_cockpit: Any,
+    make_cockpit: type[Cockpit],
 ) -> None:
     cockpit = make_cockpit(parameters={"MC_ORBIT_YAW_MOD": 3})
     circling(cockpit, seconds=1.0, yaw_behaviour=5)
-    task = cockpit.vehicle.autopilot.task
+    task = task_of(cockpit)
     assert task.yaw_behaviour == 3
     orbit(cockpit, yaw_behaviour=1)
     orbit(cockpit, yaw_behaviour=5, speed_mps=2.0)
     assert (task.yaw_behaviour, task.speed_mps) == (1, 2.0)
 
 
-def test_the_altitude_is_approached_with_the_circle(cockpit: Any) -> None:
+def test_the_altitude_is_approached_with_the_circle(cockpit: Cockpit) -> None:
     circling(cockpit, altitude_m=HOME_ALTITUDE_M + 10.0)
     assert cockpit.height_m == pytest.approx(10.0, abs=0.9)
 
 
-def test_without_a_centre_it_goes_round_where_it_was(cockpit: Any) -> None:
+def test_without_a_centre_it_goes_round_where_it_was(cockpit: Cockpit) -> None:
     cockpit.take_off(6.0)
     x, y, _ = cockpit.vehicle.airframe.position
     assert orbit(cockpit, radius_m=5.0, speed_mps=NAN, centre=None) == [0]
@@ -136,14 +144,14 @@ def test_without_a_centre_it_goes_round_where_it_was(cockpit: Any) -> None:
     assert math.hypot(*cockpit.vehicle.airframe.velocity) == pytest.approx(1.0, abs=0.3)
 
 
-def test_the_speed_is_limited_by_the_centripetal_acceleration(cockpit: Any) -> None:
+def test_the_speed_is_limited_by_the_centripetal_acceleration(cockpit: Cockpit) -> None:
     circling(cockpit, radius_m=4.5, speed_mps=9.0, seconds=1.0)
-    assert cockpit.vehicle.autopilot.task.speed_mps == pytest.approx(3.0)  # sqrt(2 m/s² * 4.5 m)
+    assert task_of(cockpit).speed_mps == pytest.approx(3.0)  # sqrt(2 m/s² * 4.5 m)
 
 
 @pytest.mark.parametrize("radius_m", [0.0, 0.5, -0.9, 1001.0])
 def test_a_radius_out_of_the_limits_is_accepted_and_told_and_the_vehicle_hovers(
-    cockpit: Any, radius_m: float
+    cockpit: Cockpit, radius_m: float
 ) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     circling(cockpit, seconds=0.1, radius_m=radius_m)
@@ -156,16 +164,16 @@ def test_a_radius_out_of_the_limits_is_accepted_and_told_and_the_vehicle_hovers(
     assert cockpit.received("ORBIT_EXECUTION_STATUS") == []
 
 
-def test_a_new_request_changes_the_orbit_that_is_flown(cockpit: Any) -> None:
+def test_a_new_request_changes_the_orbit_that_is_flown(cockpit: Cockpit) -> None:
     circling(cockpit, seconds=15.0)
     assert orbit(cockpit, radius_m=-15.0, speed_mps=NAN, centre=None) == [0]
     cockpit.fly(15.0)
     assert distance_m(cockpit) == pytest.approx(15.0, abs=0.8)
-    assert cockpit.vehicle.autopilot.task.speed_mps == -3.0
+    assert task_of(cockpit).speed_mps == -3.0
 
 
 @pytest.mark.hears("POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED")
-def test_the_execution_is_told_while_it_lasts(cockpit: Any) -> None:
+def test_the_execution_is_told_while_it_lasts(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     circling(cockpit, radius_m=-8.0, seconds=15.0)
     cockpit.forget()
@@ -188,13 +196,13 @@ def test_the_execution_is_told_while_it_lasts(cockpit: Any) -> None:
     assert cockpit.command(512, 360) == [2]
 
 
-def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Any) -> None:
+def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Cockpit) -> None:
     cockpit.take_off(6.0)
     assert cockpit.command(34, 8, 3, 0, NAN, 91.0, 8.0, NAN) == [0]
     assert cockpit.mode == "ORBIT"
 
 
-def test_turning_by_condition_yaw_is_unsupported(cockpit: Any) -> None:
+def test_turning_by_condition_yaw_is_unsupported(cockpit: Cockpit) -> None:
     assert cockpit.command(115, 90, 20, 1, 0) == [3]
 
 
@@ -203,7 +211,7 @@ numbers = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, 5.0, -20.0, 
 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=4))
-def test_no_request_makes_the_flight_absurd(make_cockpit: Any, requests: list[list[float]]) -> None:
+def test_no_request_makes_the_flight_absurd(make_cockpit: type[Cockpit], requests: list[list[float]]) -> None:
     cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     airframe = cockpit.vehicle.airframe
     airframe.position, airframe.on_ground = (0.0, 0.0, -5.0), False

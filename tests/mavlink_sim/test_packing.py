@@ -2,6 +2,7 @@
 
 import copy
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -39,7 +40,7 @@ def test_the_checksum_is_that_of_mavlink(data: bytes) -> None:
 
 
 @st.composite
-def values(draw: st.DrawFn, message_class: type) -> list[object]:
+def values(draw: st.DrawFn, message_class: Any) -> list[object]:
     lengths = dict(zip(message_class.ordered_fieldnames, message_class.array_lengths, strict=True))
     found: list[object] = []
     for name, kind in zip(message_class.fieldnames, message_class.fieldtypes, strict=True):
@@ -82,7 +83,7 @@ def test_it_reads_like_the_message_it_stands_for() -> None:
 
 def test_a_copy_can_be_changed_and_the_message_itself_cannot() -> None:
     made = packing.attitude(1200, 0.5, -0.25, 1.0, 0.0, 0.0, 0.0)
-    changed = copy.copy(made)
+    changed: Any = copy.copy(made)
     changed.roll = 2.0
     assert (changed.roll, made.roll) == (2.0, 0.5)
 

@@ -16,6 +16,7 @@ from mavlink_sim.px4.parameters import (
     decode_wire_value,
 )
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 
 def bytewise(value: int) -> float:
@@ -27,21 +28,21 @@ def name_of(message: Any) -> str:
     return (text.decode() if isinstance(text, bytes) else text).rstrip("\0")
 
 
-def read(cockpit: Any, name: str = "", index: int = -1) -> list[Any]:
+def read(cockpit: Cockpit, name: str = "", index: int = -1) -> list[Any]:
     cockpit.forget()
     cockpit.send(dialect.MAVLink_param_request_read_message(1, 1, name.encode(), index))
     cockpit.fly(0.05)
     return [*cockpit.received("PARAM_VALUE"), *cockpit.received("PARAM_ERROR")]
 
 
-def write(cockpit: Any, name: str, value: float, kind: int) -> list[Any]:
+def write(cockpit: Cockpit, name: str, value: float, kind: int) -> list[Any]:
     cockpit.forget()
     cockpit.send(dialect.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
     cockpit.fly(0.05)
     return [*cockpit.received("PARAM_VALUE"), *cockpit.received("PARAM_ERROR")]
 
 
-def test_the_list_is_alphabetical_and_begins_with_the_hash(cockpit: Any) -> None:
+def test_the_list_is_alphabetical_and_begins_with_the_hash(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.forget()
     cockpit.send(dialect.MAVLink_param_request_list_message(1, 1))
@@ -58,7 +59,7 @@ def test_the_list_is_alphabetical_and_begins_with_the_hash(cockpit: Any) -> None
     assert {message.param_type for message in rest} == {INT32, REAL32}
 
 
-def test_a_parameter_is_read_by_name_and_by_index(cockpit: Any) -> None:
+def test_a_parameter_is_read_by_name_and_by_index(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     by_name = read(cockpit, "COM_OF_LOSS_T")
     assert len(by_name) == 1
@@ -67,7 +68,7 @@ def test_a_parameter_is_read_by_name_and_by_index(cockpit: Any) -> None:
     assert name_of(by_index[0]) == "COM_OF_LOSS_T"
 
 
-def test_integers_travel_bytewise(cockpit: Any) -> None:
+def test_integers_travel_bytewise(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     assert read(cockpit, "NAV_RCL_ACT")[0].param_value == bytewise(2)
     sent = write(cockpit, "NAV_RCL_ACT", bytewise(3), INT32)
@@ -75,7 +76,7 @@ def test_integers_travel_bytewise(cockpit: Any) -> None:
     assert cockpit.vehicle.parameters.number("NAV_RCL_ACT") == 3
 
 
-def test_a_set_is_echoed_twice(cockpit: Any) -> None:
+def test_a_set_is_echoed_twice(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.forget()
     cockpit.send(dialect.MAVLink_param_set_message(1, 1, b"MIS_TAKEOFF_ALT", 4.0, REAL32))
@@ -85,13 +86,13 @@ def test_a_set_is_echoed_twice(cockpit: Any) -> None:
     assert [message.param_value for message in cockpit.received("PARAM_VALUE")] == [4.0, 4.0]
 
 
-def test_px4_checks_no_range(cockpit: Any) -> None:
+def test_px4_checks_no_range(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     write(cockpit, "COM_OF_LOSS_T", 1000.0, REAL32)
     assert cockpit.vehicle.parameters.number("COM_OF_LOSS_T") == 1000.0
 
 
-def test_an_unknown_parameter_is_answered_by_an_error(cockpit: Any) -> None:
+def test_an_unknown_parameter_is_answered_by_an_error(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     for answer in (
         read(cockpit, "NO_SUCH"),
@@ -101,20 +102,20 @@ def test_an_unknown_parameter_is_answered_by_an_error(cockpit: Any) -> None:
         assert [(message.get_type(), message.error) for message in answer] == [("PARAM_ERROR", 1)]
 
 
-def test_the_wrong_type_is_answered_by_an_error(cockpit: Any) -> None:
+def test_the_wrong_type_is_answered_by_an_error(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     answer = write(cockpit, "COM_OF_LOSS_T", 2.0, INT32)
     assert [(message.get_type(), message.error) for message in answer] == [("PARAM_ERROR", 7)]
     assert cockpit.vehicle.parameters.number("COM_OF_LOSS_T") == 1.0
 
 
-def test_what_is_no_number_is_refused_and_the_old_value_told(cockpit: Any) -> None:
+def test_what_is_no_number_is_refused_and_the_old_value_told(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     answer = write(cockpit, "COM_OF_LOSS_T", float("nan"), REAL32)
     assert [message.param_value for message in answer] == [1.0]
 
 
-def test_the_hash_changes_with_a_value_and_comes_back_with_it(cockpit: Any) -> None:
+def test_the_hash_changes_with_a_value_and_comes_back_with_it(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     before = read(cockpit, "_HASH_CHECK")[0].param_value
     write(cockpit, "MIS_TAKEOFF_ALT", 4.0, REAL32)
@@ -123,7 +124,7 @@ def test_the_hash_changes_with_a_value_and_comes_back_with_it(cockpit: Any) -> N
     assert read(cockpit, "_HASH_CHECK")[0].param_value == before
 
 
-def test_a_client_with_the_right_hash_stops_the_list(cockpit: Any) -> None:
+def test_a_client_with_the_right_hash_stops_the_list(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.send(dialect.MAVLink_param_request_list_message(1, 1))
     cockpit.fly(0.05)

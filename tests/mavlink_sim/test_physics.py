@@ -54,7 +54,7 @@ def test_a_ten_metre_step_is_flown_as_the_real_vehicle_flew_it() -> None:
 def test_a_velocity_over_the_limit_is_cut_where_it_does_not_lead_to_the_position() -> None:
     _, controller = hovering()
     setpoint = TrajectorySetpoint(position=(9.0 / 0.95, 0.0, -5.0), velocity=(0.0, 20.0, 0.0))
-    controller.update(STEP_S, setpoint, (0.0, 0.0, -5.0), (0.0,) * 3, (0.0,) * 3, 0.0)  # type: ignore[arg-type]
+    controller.update(STEP_S, setpoint, (0.0, 0.0, -5.0), (0.0,) * 3, (0.0,) * 3, 0.0)
     x, y, _ = controller.velocity
     assert x == pytest.approx(9.0)  # MPC_XY_P asks for 9 m/s, all of it is granted
     assert math.hypot(x, y) == pytest.approx(12.0)
@@ -65,7 +65,7 @@ def test_a_velocity_over_the_limit_is_cut_where_it_does_not_lead_to_the_position
 def test_no_velocity_setpoint_is_over_the_limit(values: list[float]) -> None:
     _, controller = hovering()
     setpoint = TrajectorySetpoint(position=(values[0], values[1], -5.0), velocity=(values[2], values[3], 0.0))
-    controller.update(STEP_S, setpoint, (0.0, 0.0, -5.0), (0.0,) * 3, (0.0,) * 3, 0.0)  # type: ignore[arg-type]
+    controller.update(STEP_S, setpoint, (0.0, 0.0, -5.0), (0.0,) * 3, (0.0,) * 3, 0.0)
     assert math.hypot(*controller.velocity[:2]) <= 12.0 + 1e-6
 
 

@@ -21,6 +21,7 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import event_identifier
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 JOYSTICK = {"COM_RC_IN_MODE": 1}
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4, "COM_FLTMODE6": 8}
@@ -166,7 +167,7 @@ def stick_message(pitch: int = 0, roll: int = 0, throttle: int = 500, yaw: int =
     return dialect.MAVLink_manual_control_message(target, pitch, roll, throttle, yaw, 0)
 
 
-def push(cockpit: Any, seconds: float, message: Any, until: Any = None) -> None:
+def push(cockpit: Cockpit, seconds: float, message: Any, until: Any = None) -> None:
     """A joystick's stream at 25 Hz."""
     end_s = cockpit.now_s + seconds
     while cockpit.now_s < end_s - 1e-9 and not (until is not None and until()):
@@ -174,18 +175,20 @@ def push(cockpit: Any, seconds: float, message: Any, until: Any = None) -> None:
         cockpit.fly(0.04)
 
 
-def events(cockpit: Any, name: str) -> list[Any]:
+def events(cockpit: Cockpit, name: str) -> list[Any]:
     return [message for message in cockpit.received("EVENT") if message.id == event_identifier(name)]
 
 
-def test_a_vehicle_as_delivered_ignores_sticks(cockpit: Any) -> None:
+def test_a_vehicle_as_delivered_ignores_sticks(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     push(cockpit, 0.5, stick_message())
     assert not cockpit.vehicle.autopilot.pilot_has_sticks
     assert cockpit.mode == "HOLD"
 
 
-def test_a_joystick_before_any_mode_was_asked_for_makes_position_the_first_mode(make_cockpit: Any) -> None:
+def test_a_joystick_before_any_mode_was_asked_for_makes_position_the_first_mode(
+    make_cockpit: type[Cockpit],
+) -> None:
     cockpit = make_cockpit(parameters=JOYSTICK)
     cockpit.wait_ready()
     push(cockpit, 0.2, stick_message(target=7))
@@ -195,7 +198,7 @@ def test_a_joystick_before_any_mode_was_asked_for_makes_position_the_first_mode(
     assert cockpit.vehicle.autopilot.can_arm
 
 
-def test_sticks_arm_fly_and_disarm(make_cockpit: Any) -> None:
+def test_sticks_arm_fly_and_disarm(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters=JOYSTICK)
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.wait_ready()
@@ -212,7 +215,7 @@ def test_sticks_arm_fly_and_disarm(make_cockpit: Any) -> None:
     assert "Disarmed by stick gesture\t" in cockpit.texts()
 
 
-def test_arming_is_denied_where_the_throttle_would_surprise(make_cockpit: Any) -> None:
+def test_arming_is_denied_where_the_throttle_would_surprise(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters=JOYSTICK)
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.wait_ready()
@@ -229,7 +232,7 @@ def test_arming_is_denied_where_the_throttle_would_surprise(make_cockpit: Any) -
     assert "Arming denied: switch to manual mode first\t" in cockpit.texts()
 
 
-def test_losing_and_regaining_the_joystick_is_an_event(make_cockpit: Any) -> None:
+def test_losing_and_regaining_the_joystick_is_an_event(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters=JOYSTICK)
     cockpit.wait_ready()
     push(cockpit, 0.2, stick_message())
@@ -241,14 +244,14 @@ def test_losing_and_regaining_the_joystick_is_an_event(make_cockpit: Any) -> Non
     assert any("manual control regained" in line for line in cockpit.events)
 
 
-def remote_cockpit(make_cockpit: Any, **values: float) -> Any:
+def remote_cockpit(make_cockpit: type[Cockpit], **values: float) -> Cockpit:
     cockpit = make_cockpit(parameters={**REMOTE_CONTROL, **values})
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.vehicle.transmitter.on = True
     return cockpit
 
 
-def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_cockpit: Any) -> None:
+def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters=REMOTE_CONTROL)
     cockpit.fly(1.0)
     assert cockpit.received("RC_CHANNELS") == []
@@ -271,7 +274,7 @@ def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_cockpit: Any) 
     assert not cockpit.received("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000
 
 
-def test_rc_channels_override_is_a_remote_control_like_any_other(make_cockpit: Any) -> None:
+def test_rc_channels_override_is_a_remote_control_like_any_other(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters=REMOTE_CONTROL)
     cockpit.wait_ready()
     widths = [1500, 1500, 1000, 1500, 1080, 1000, 1000, 65535]
@@ -284,7 +287,7 @@ def test_rc_channels_override_is_a_remote_control_like_any_other(make_cockpit: A
     assert cockpit.received("RC_CHANNELS")[-1].chancount == 7
 
 
-def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_cockpit: Any) -> None:
+def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_cockpit: type[Cockpit]) -> None:
     cockpit = remote_cockpit(make_cockpit, COM_FLTMODE5=3)
     transmitter = cockpit.vehicle.transmitter
     cockpit.take_off()
@@ -305,7 +308,7 @@ def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_cockpit: An
     assert "Switching to Mission is currently not available\t" in cockpit.texts()
 
 
-def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_cockpit: Any) -> None:
+def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_cockpit: type[Cockpit]) -> None:
     cockpit = remote_cockpit(make_cockpit, COM_DISARM_LAND=-1)
     cockpit.take_off(6.0)
     cockpit.vehicle.transmitter.kill = True
@@ -327,7 +330,7 @@ def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_co
     assert cockpit.vehicle.autopilot.can_arm
 
 
-def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(make_cockpit: Any) -> None:
+def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(make_cockpit: type[Cockpit]) -> None:
     cockpit = remote_cockpit(make_cockpit)
     cockpit.take_off(15.0)
     cockpit.vehicle.transmitter.kill = True

@@ -14,10 +14,10 @@ from mavsdk.asyncio.plugins.gimbal import ControlMode, GimbalAsync, GimbalMode, 
 from mavsdk.asyncio.plugins.manual_control import ManualControlAsync
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
-from mavsdk_client import MavsdkClient, mavsdk_client, meanwhile, wait_for
 
 from mavlink_sim.flight.transmitter import CALIBRATION
 from mavlink_sim.testing import RunningSimulator, running_simulator
+from tests.mavlink_sim.mavsdk_client import MavsdkClient, mavsdk_client, meanwhile, wait_for
 
 
 @asynccontextmanager

@@ -6,15 +6,16 @@ import math
 from typing import Any
 
 import pytest
-from plan_client import land, listen, takeoff, upload
 
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import land, listen, takeoff, upload
 
 TARGET = (2.0, -1.5)
 
 
 @pytest.fixture
-def cockpit(make_cockpit: Any) -> Any:
+def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
     """A vehicle that is ready at once."""
     return make_cockpit(ready_after_s=0.0)
 
@@ -25,16 +26,16 @@ def target(north: float, east: float, down: float = 0.0, frame: int = 1, valid: 
     )
 
 
-def off(cockpit: Any) -> float:
+def off(cockpit: Cockpit) -> float:
     return math.dist(cockpit.vehicle.airframe.position[:2], TARGET)
 
 
-def phases(cockpit: Any) -> list[str]:
+def phases(cockpit: Cockpit) -> list[str]:
     prefix = "precision landing: "
     return [event.removeprefix(prefix) for event in cockpit.events if event.startswith(prefix)]
 
 
-def test_the_vehicle_approaches_descends_and_lands_on_the_target(cockpit: Any) -> None:
+def test_the_vehicle_approaches_descends_and_lands_on_the_target(cockpit: Cockpit) -> None:
     cockpit.take_off(4.0)
     seen = target(*TARGET)
     cockpit.fly(0.2, seen)
@@ -50,7 +51,7 @@ def test_the_vehicle_approaches_descends_and_lands_on_the_target(cockpit: Any) -
     assert cockpit.mode == "HOLD"
 
 
-def test_a_moving_target_is_followed_down(cockpit: Any) -> None:
+def test_a_moving_target_is_followed_down(cockpit: Cockpit) -> None:
     cockpit.take_off(4.0)
     cockpit.set_mode(4, 9)
     cockpit.until(lambda: "descend" in phases(cockpit), 30.0, target(0.0, 0.0))
@@ -58,7 +59,7 @@ def test_a_moving_target_is_followed_down(cockpit: Any) -> None:
     assert cockpit.vehicle.airframe.position[0] == pytest.approx(0.6, abs=0.2)
 
 
-def test_a_target_lost_high_up_is_searched_for_and_then_given_up(make_cockpit: Any) -> None:
+def test_a_target_lost_high_up_is_searched_for_and_then_given_up(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(
         ready_after_s=0.0,
         parameters={"PLD_BTOUT": 1.0, "PLD_MAX_SRCH": 1, "PLD_SRCH_ALT": 7.0, "PLD_SRCH_TOUT": 4.0},
@@ -80,7 +81,7 @@ def test_a_target_lost_high_up_is_searched_for_and_then_given_up(make_cockpit: A
     assert phases(cockpit) == ["horizontal approach", "descend", "start", "search", "fallback"]
 
 
-def test_a_target_found_while_searching_is_landed_on(make_cockpit: Any) -> None:
+def test_a_target_found_while_searching_is_landed_on(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"PLD_SRCH_ALT": 6.0})
     cockpit.take_off(4.0)
     cockpit.set_mode(4, 9)
@@ -90,7 +91,7 @@ def test_a_target_found_while_searching_is_landed_on(make_cockpit: Any) -> None:
     assert phases(cockpit)[:3] == ["search", "horizontal approach", "descend"]
 
 
-def test_a_target_lost_low_down_is_landed_on_blindly(make_cockpit: Any) -> None:
+def test_a_target_lost_low_down_is_landed_on_blindly(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"PLD_FAPPR_ALT": 1.0})
     cockpit.take_off(3.0)
     cockpit.set_mode(4, 9)
@@ -100,7 +101,7 @@ def test_a_target_lost_low_down_is_landed_on_blindly(make_cockpit: Any) -> None:
 
 
 @pytest.mark.parametrize("precision", [1, 2], ids=["opportunistic", "required"])
-def test_a_mission_lands_on_the_target_it_sees(cockpit: Any, precision: int) -> None:
+def test_a_mission_lands_on_the_target_it_sees(cockpit: Cockpit, precision: int) -> None:
     upload(cockpit, [takeoff(3.0), land(1.0, 0.0, precision)])
     cockpit.command(300)
     cockpit.until(lambda: not cockpit.armed, 90.0, target(*TARGET))
@@ -108,14 +109,14 @@ def test_a_mission_lands_on_the_target_it_sees(cockpit: Any, precision: int) -> 
     assert cockpit.vehicle.autopilot.navigator.mission.finished
 
 
-def test_an_opportunistic_landing_without_a_target_lands_at_once(cockpit: Any) -> None:
+def test_an_opportunistic_landing_without_a_target_lands_at_once(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(3.0), land(1.0, 0.0, 1)])
     cockpit.command(300)
     cockpit.until(lambda: not cockpit.armed, 60.0)
     assert phases(cockpit) == ["fallback"]
 
 
-def test_rtl_lands_on_the_target_if_told_so(make_cockpit: Any) -> None:
+def test_rtl_lands_on_the_target_if_told_so(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(ready_after_s=0.0, parameters={"RTL_PLD_MD": 1})
     cockpit.take_off(4.0)
     seen = target(1.0, 1.0)
@@ -125,7 +126,7 @@ def test_rtl_lands_on_the_target_if_told_so(make_cockpit: Any) -> None:
     assert math.dist(cockpit.vehicle.airframe.position[:2], (1.0, 1.0)) < 0.25
 
 
-def test_a_target_in_another_frame_is_refused_and_one_given_as_angles_passed_over(cockpit: Any) -> None:
+def test_a_target_in_another_frame_is_refused_and_one_given_as_angles_passed_over(cockpit: Cockpit) -> None:
     listen(cockpit)
     cockpit.send(target(1, 1, frame=12))
     cockpit.send(target(1, 1, valid=0))

@@ -9,12 +9,15 @@ import pytest
 
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 PREARM_CHECK = 0x10000000
 NAN = float("nan")
 
 
-def test_an_answer_takes_at_most_fifteen_milliseconds_and_needs_no_heartbeat_of_ours(cockpit: Any) -> None:
+def test_an_answer_takes_at_most_fifteen_milliseconds_and_needs_no_heartbeat_of_ours(
+    cockpit: Cockpit,
+) -> None:
     cockpit.wait_ready()
     for number, *values in ((400, 1), (400, 0), (401,), (178, 1, 5), (512, 148), (60000,)):
         cockpit.forget()
@@ -23,7 +26,7 @@ def test_an_answer_takes_at_most_fifteen_milliseconds_and_needs_no_heartbeat_of_
         assert cockpit.until(lambda: bool(cockpit.received("COMMAND_ACK")), 0.1) <= 0.015
 
 
-def test_arming_in_offboard_without_a_stream_is_rejected_and_the_mode_stays(cockpit: Any) -> None:
+def test_arming_in_offboard_without_a_stream_is_rejected_and_the_mode_stays(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.set_mode(6) == [0, 0]
     beat = cockpit.heartbeat()
@@ -33,7 +36,7 @@ def test_arming_in_offboard_without_a_stream_is_rejected_and_the_mode_stays(cock
 
 
 def test_on_the_ground_the_loss_of_the_stream_only_drops_the_readiness(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     cockpit.wait_ready()
     cockpit.offboard(velocity_setpoint(0, 0, 0))
@@ -46,13 +49,13 @@ def test_on_the_ground_the_loss_of_the_stream_only_drops_the_readiness(
     assert cockpit.events == []
 
 
-def test_take_off_while_flying_is_accepted_and_shown(cockpit: Any) -> None:
+def test_take_off_while_flying_is_accepted_and_shown(cockpit: Cockpit) -> None:
     cockpit.take_off(8.0)
     assert cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, 489.4 + 20.0) == [0]
     assert cockpit.mode == "TAKEOFF"
 
 
-def test_take_off_to_an_altitude_above_the_sea_ends_within_the_acceptance_radius(cockpit: Any) -> None:
+def test_take_off_to_an_altitude_above_the_sea_ends_within_the_acceptance_radius(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.command(400, 1)
     cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, 489.4 + 5.0)
@@ -61,7 +64,7 @@ def test_take_off_to_an_altitude_above_the_sea_ends_within_the_acceptance_radius
 
 
 @pytest.mark.parametrize("flags", [0.0, 1.0])
-def test_reposition_by_command_long_needs_the_change_of_mode_too(cockpit: Any, flags: float) -> None:
+def test_reposition_by_command_long_needs_the_change_of_mode_too(cockpit: Cockpit, flags: float) -> None:
     cockpit.take_off()
     values = (-1, flags, 0, NAN, 47.39775, 8.54559, 494.0)
     assert cockpit.command(192, *values) == [0 if flags else 3]
@@ -69,7 +72,7 @@ def test_reposition_by_command_long_needs_the_change_of_mode_too(cockpit: Any, f
 
 @pytest.mark.hears("everything")
 def test_a_stream_that_stops_is_left_between_1_05_and_1_15_seconds_later(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     cockpit.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -95,7 +98,7 @@ def test_a_stream_that_stops_is_left_between_1_05_and_1_15_seconds_later(
 
 
 def test_a_heartbeat_shows_the_loss_1_4_to_2_seconds_after_the_last_setpoint_as_its_second_falls(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     """PX4's few losses were seen at 1.4 to 2.0 s. At any phase of the heartbeat, 1.05 to 2.15 s can be."""
     cockpit.take_off(4.0)
@@ -116,7 +119,7 @@ def test_a_heartbeat_shows_the_loss_1_4_to_2_seconds_after_the_last_setpoint_as_
 
 
 def test_a_stream_of_0_9_hertz_is_lost_for_some_fifty_milliseconds_at_a_time(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     cockpit.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -137,7 +140,7 @@ def test_a_stream_of_0_9_hertz_is_lost_for_some_fifty_milliseconds_at_a_time(
 
 @pytest.mark.parametrize(("action", "mode"), [(3, "RTL"), (4, "LAND"), (5, "HOLD")])
 def test_from_whatever_the_failsafe_does_offboard_resumes_with_the_setpoints(
-    make_cockpit: Any, velocity_setpoint: Any, action: int, mode: str
+    make_cockpit: type[Cockpit], velocity_setpoint: Any, action: int, mode: str
 ) -> None:
     cockpit = make_cockpit(parameters={"COM_OBL_RC_ACT": action})
     cockpit.take_off(6.0)
@@ -152,7 +155,7 @@ def test_from_whatever_the_failsafe_does_offboard_resumes_with_the_setpoints(
 
 @pytest.mark.parametrize(("hold_first", "shown"), [(False, 0x00060000), (True, 0x03040000)])
 def test_after_landing_from_offboard_the_mode_chosen_before_it_is_shown(
-    cockpit: Any, velocity_setpoint: Any, hold_first: bool, shown: int
+    cockpit: Cockpit, velocity_setpoint: Any, hold_first: bool, shown: int
 ) -> None:
     cockpit.take_off()
     cockpit.offboard(velocity_setpoint(0, 0, 0))
@@ -164,7 +167,7 @@ def test_after_landing_from_offboard_the_mode_chosen_before_it_is_shown(
 
 
 def test_the_failsafe_of_a_vehicle_far_from_home_climbs_to_thirty_metres_at_once(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     cockpit.take_off(4.0)
     cockpit.offboard(velocity_setpoint(0, 0, 0))
@@ -177,7 +180,7 @@ def test_the_failsafe_of_a_vehicle_far_from_home_climbs_to_thirty_metres_at_once
 
 
 @pytest.mark.parametrize("command", [20, 21])
-def test_a_gimbal_is_looked_after_at_a_landing_and_at_a_return(cockpit: Any, command: int) -> None:
+def test_a_gimbal_is_looked_after_at_a_landing_and_at_a_return(cockpit: Cockpit, command: int) -> None:
     cockpit.take_off(4.0)
     cockpit.forget()
     cockpit.command(command)
@@ -187,7 +190,7 @@ def test_a_gimbal_is_looked_after_at_a_landing_and_at_a_return(cockpit: Any, com
     assert [m.confirmation for m in sent if m.command == 1001] == [0, 0, 1, 2, 3]
 
 
-def test_returning_lands_with_the_state_landing_only_on_its_descent(make_cockpit: Any) -> None:
+def test_returning_lands_with_the_state_landing_only_on_its_descent(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(parameters={"RTL_RETURN_ALT": 8.0, "RTL_MIN_DIST": 1.0})
     cockpit.take_off(4.0)
     cockpit.command_int(192, (-1, 1, 0, NAN), 473978330, 85455942, 493.4)
@@ -202,7 +205,7 @@ def test_returning_lands_with_the_state_landing_only_on_its_descent(make_cockpit
     assert states == {2}
 
 
-def test_the_capabilities_are_those_measured(cockpit: Any) -> None:
+def test_the_capabilities_are_those_measured(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.command(512, 148)
     version = cockpit.received("AUTOPILOT_VERSION")[0]

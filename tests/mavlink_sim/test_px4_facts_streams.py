@@ -10,6 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import common
 
 from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.conftest import Cockpit
 
 pytestmark = pytest.mark.hears("everything")
 
@@ -20,11 +21,11 @@ UNKNOWN_TO_COMMON = {8, 300, 380, 395, 397, 410, 411, 435, 436}
 SIGNATURE_BYTES = 13  # the vehicle that was measured signed what it sent
 
 
-def names(cockpit: Any, link: str = "onboard") -> Counter[str]:
+def names(cockpit: Cockpit, link: str = "onboard") -> Counter[str]:
     return Counter(item.message.get_type() for _, item in cockpit.inbox[link])
 
 
-def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockpit: Any) -> None:
+def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockpit: type[Cockpit]) -> None:
     alone, heard = make_cockpit(["everything"]), make_cockpit(["everything"])
     heard.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
     for cockpit in (alone, heard):
@@ -35,7 +36,7 @@ def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockp
 
 
 @pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])
-def test_the_onboard_link_carries_29_kilobytes_a_second(make_cockpit: Any, flying: bool) -> None:
+def test_the_onboard_link_carries_29_kilobytes_a_second(make_cockpit: type[Cockpit], flying: bool) -> None:
     """Of whole frames with their signatures, as in the recorded flight: 28.7 kB/s before arming."""
     cockpit = make_cockpit(["everything"], noise=True, gusts_mps=None)
     if flying:
@@ -48,7 +49,7 @@ def test_the_onboard_link_carries_29_kilobytes_a_second(make_cockpit: Any, flyin
     assert size == pytest.approx(29_000, rel=0.05)
 
 
-def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(cockpit: Any) -> None:
+def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(cockpit: Cockpit) -> None:
     cockpit.take_off()
     cockpit.command(519, 1)
     codec, reader = parser(), common.MAVLink(None)
@@ -61,7 +62,7 @@ def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(c
 
 
 def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
-    cockpit: Any, velocity_setpoint: Any
+    cockpit: Cockpit, velocity_setpoint: Any
 ) -> None:
     cockpit.wait_ready()
     assert "POSITION_TARGET_GLOBAL_INT" not in names(cockpit)  # not on the ground
@@ -78,7 +79,7 @@ def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
         assert 9 <= names(cockpit)["POSITION_TARGET_GLOBAL_INT"] <= 10
 
 
-def test_a_heartbeat_comes_once_a_second_whatever_happens(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_a_heartbeat_comes_once_a_second_whatever_happens(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.wait_ready()
     cockpit.forget()
     started = cockpit.now_s
@@ -97,7 +98,7 @@ def test_a_heartbeat_comes_once_a_second_whatever_happens(cockpit: Any, velocity
     assert max(gaps) == pytest.approx(1.0, abs=0.01)
 
 
-def test_what_a_heartbeat_shows_lags_by_up_to_a_second(cockpit: Any) -> None:
+def test_what_a_heartbeat_shows_lags_by_up_to_a_second(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.heartbeat()
     cockpit.fly(0.02)
@@ -107,7 +108,7 @@ def test_what_a_heartbeat_shows_lags_by_up_to_a_second(cockpit: Any) -> None:
     assert 0.9 < cockpit.now_s - changed <= 1.0
 
 
-def test_the_old_request_for_a_data_stream_is_ignored(cockpit: Any) -> None:
+def test_the_old_request_for_a_data_stream_is_ignored(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.forget()
     for start in (0, 1):
@@ -118,7 +119,7 @@ def test_the_old_request_for_a_data_stream_is_ignored(cockpit: Any) -> None:
     assert "COMMAND_ACK" not in names(cockpit)
 
 
-def test_its_own_time_synchronisation_and_pings_are_requests_to_all(cockpit: Any) -> None:
+def test_its_own_time_synchronisation_and_pings_are_requests_to_all(cockpit: Cockpit) -> None:
     cockpit.fly(5.0)
     requests = cockpit.received("TIMESYNC")
     assert len(requests) == pytest.approx(49, abs=1)
@@ -129,7 +130,7 @@ def test_its_own_time_synchronisation_and_pings_are_requests_to_all(cockpit: Any
 
 
 def test_a_ground_stations_heartbeat_reaches_the_companion_under_the_ground_stations_name(
-    cockpit: Any,
+    cockpit: Cockpit,
 ) -> None:
     cockpit.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
     cockpit.fly(5.0)

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 INFO, CRITICAL = 6, 2
 GROUND_STATION = (245, 190)
 
 
-def said(cockpit: Any, link: str = "gcs") -> list[tuple[int, str]]:
+def said(cockpit: Cockpit, link: str = "gcs") -> list[tuple[int, str]]:
     """(severity, whole text) of every STATUSTEXT received."""
     severities = [
         message.severity for message in cockpit.received("STATUSTEXT", link) if not message.chunk_seq
@@ -21,14 +22,14 @@ def said(cockpit: Any, link: str = "gcs") -> list[tuple[int, str]]:
 
 
 @pytest.fixture
-def heard(make_cockpit: Any) -> Any:
+def heard(make_cockpit: type[Cockpit]) -> Cockpit:
     """A vehicle whose ground-station link has a ground station on it."""
     cockpit = make_cockpit()
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     return cockpit
 
 
-def test_a_flight_by_command_is_told_in_px4s_words(heard: Any) -> None:
+def test_a_flight_by_command_is_told_in_px4s_words(heard: Cockpit) -> None:
     heard.wait_ready()
     heard.command(400, 1)
     heard.command(22, *[float("nan")] * 7)
@@ -47,7 +48,7 @@ def test_a_flight_by_command_is_told_in_px4s_words(heard: Any) -> None:
     ]
 
 
-def test_a_return_is_told_in_px4s_words_all_as_information(heard: Any) -> None:
+def test_a_return_is_told_in_px4s_words_all_as_information(heard: Cockpit) -> None:
     heard.take_off(4.0)
     heard.fly(4.0)
     heard.forget()
@@ -63,7 +64,7 @@ def test_a_return_is_told_in_px4s_words_all_as_information(heard: Any) -> None:
     ]
 
 
-def test_disarming_is_told_with_its_reason(heard: Any) -> None:
+def test_disarming_is_told_with_its_reason(heard: Cockpit) -> None:
     heard.wait_ready()
     heard.command(400, 1)
     heard.command(400, 0)
@@ -76,7 +77,7 @@ def test_disarming_is_told_with_its_reason(heard: Any) -> None:
     ]
 
 
-def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(heard: Any) -> None:
+def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(heard: Cockpit) -> None:
     heard.fly(0.1)
     heard.command(400, 1)
     heard.set_mode(77)
@@ -102,7 +103,7 @@ def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 
-def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Any, velocity_setpoint: Any) -> None:
+def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Cockpit, velocity_setpoint: Any) -> None:
     heard.heartbeats.append(("onboard", (1, 191), 18))
     heard.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -123,7 +124,9 @@ def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Any, velocit
     ]
 
 
-def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(heard: Any) -> None:
+def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(
+    heard: Cockpit,
+) -> None:
     heard.wait_ready()
     heard.command(400, 1)
     assert heard.command(22, 0, 0, 0, float("nan"), float("nan"), float("nan"), 5.0) == [0]
@@ -134,7 +137,7 @@ def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and
     assert said(heard)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
 
 
-def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: Any) -> None:
+def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: Cockpit) -> None:
     heard.fly(0.1)
     heard.command(400, 1)
     heard.fly(0.05)
@@ -145,7 +148,9 @@ def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(he
     assert len(chunks[0].text) == 50
 
 
-def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_on(make_cockpit: Any) -> None:
+def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_on(
+    make_cockpit: type[Cockpit],
+) -> None:
     cockpit = make_cockpit()
     cockpit.heartbeats.append(("onboard", GROUND_STATION, 6))
     cockpit.wait_ready()
@@ -155,7 +160,7 @@ def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_
     assert cockpit.texts("gcs") == []
 
 
-def test_events_go_to_every_link_with_one_numbering(cockpit: Any) -> None:
+def test_events_go_to_every_link_with_one_numbering(cockpit: Cockpit) -> None:
     cockpit.take_off()
     numbers = {link: [m.sequence for m in cockpit.received("EVENT", link)] for link in ("onboard", "gcs")}
     assert numbers["onboard"] == numbers["gcs"] != []

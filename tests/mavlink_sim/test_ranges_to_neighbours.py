@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import assume, given
@@ -82,7 +83,13 @@ def test_a_level_cuts_those_at_its_height_wherever_their_frames_begin() -> None:
 
 def pair(**options: object) -> tuple[Flock, LockstepVehicle, LockstepVehicle]:
     """Two in one flock, the other 5 m north of the first."""
-    calm = {"scene": World(()), "gusts_mps": 0.0, "noise": False, "obstacle_sensor": True, **options}
+    calm: dict[str, Any] = {
+        "scene": World(()),
+        "gusts_mps": 0.0,
+        "noise": False,
+        "obstacle_sensor": True,
+        **options,
+    }
     one = LockstepVehicle(system_id=1, **calm)
     other = LockstepVehicle(system_id=2, start_ned_m=(5.0, 0.0), gusts_mps=0.0, noise=False)
     flock = Flock(2)

@@ -1,16 +1,17 @@
 """The behaviour of PX4's releases where they differ."""
 
-from typing import Any
-
 import pytest
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.releases import RELEASES, release_named
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 
 @pytest.mark.parametrize("release", ["1.14", "1.15"])
-def test_an_older_release_answers_a_mode_request_once_and_truly(make_cockpit: Any, release: str) -> None:
+def test_an_older_release_answers_a_mode_request_once_and_truly(
+    make_cockpit: type[Cockpit], release: str
+) -> None:
     cockpit = make_cockpit(px4=release)
     cockpit.take_off()
     assert cockpit.set_mode(6) == [1]
@@ -18,7 +19,7 @@ def test_an_older_release_answers_a_mode_request_once_and_truly(make_cockpit: An
 
 
 @pytest.mark.parametrize("release", ["1.16", "1.17"])
-def test_a_newer_release_answers_it_twice(make_cockpit: Any, release: str) -> None:
+def test_a_newer_release_answers_it_twice(make_cockpit: type[Cockpit], release: str) -> None:
     cockpit = make_cockpit(px4=release)
     cockpit.take_off()
     assert cockpit.set_mode(6) == [0, 1]
@@ -26,7 +27,7 @@ def test_a_newer_release_answers_it_twice(make_cockpit: Any, release: str) -> No
 
 @pytest.mark.parametrize(("release", "answers"), [("1.16", 0), ("1.17", 1)])
 def test_what_is_wrong_with_a_parameter_is_told_since_v1_17_alone(
-    make_cockpit: Any, release: str, answers: int
+    make_cockpit: type[Cockpit], release: str, answers: int
 ) -> None:
     cockpit = make_cockpit(px4=release)
     for request in (
@@ -41,7 +42,7 @@ def test_what_is_wrong_with_a_parameter_is_told_since_v1_17_alone(
 
 
 @pytest.mark.parametrize("release", RELEASES)
-def test_the_version_that_is_reported_is_the_releases(make_cockpit: Any, release: str) -> None:
+def test_the_version_that_is_reported_is_the_releases(make_cockpit: type[Cockpit], release: str) -> None:
     cockpit = make_cockpit(px4=release)
     cockpit.fly(0.1)
     cockpit.command(512, 148)

@@ -245,13 +245,12 @@ def test_what_a_renderer_drew_before_does_not_show() -> None:
 
 def test_what_moves_is_drawn_as_if_it_had_always_been_there() -> None:
     parked = thing(0, "truck", 14.0, 1.0)
-    upturned = {"roll_rad": 2.6, "pitch_rad": 0.2}
     ways = [(8.0, -1.0, 0.0, 0.4), (9.5, 0.5, 0.0, 0.4), (9.5, 0.5, -1.5, 0.4), (9.5, 0.5, 0.0, -1.0)]
     renderer = Renderer(world_of(parked, thing(1, "person", 7.0, 0.0, 0.4)), CAMERA, DEFAULT_MOUNT)
     renderer.render((0.0, 0.0, -3.0), LEVEL)
     for north, east, down, yaw in ways:
         person = WorldObject(1, "person", (north, east, down), yaw, 1.0, 0)
-        drone = WorldObject(2, "drone", (north - 3.0, east, down), yaw, 1.0, 0, **upturned)
+        drone = WorldObject(2, "drone", (north - 3.0, east, down), yaw, 1.0, 0, roll_rad=2.6, pitch_rad=0.2)
         objects = (parked, person, drone)
         renderer.place(objects)
         moved = renderer.render((0.0, 0.0, -3.0), LEVEL)

@@ -12,6 +12,7 @@ from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 NAN = math.nan
 CHANGE_MODE = 1.0
@@ -22,7 +23,7 @@ SLOW = pytest.approx(1.8, abs=0.4)
 
 
 def reposition(
-    cockpit: Any,
+    cockpit: Cockpit,
     place: tuple[float, float] | None,
     height_m: float = NAN,
     *,
@@ -41,7 +42,7 @@ def reposition(
     return results
 
 
-def top_speed_mps(cockpit: Any, seconds: float) -> float:
+def top_speed_mps(cockpit: Cockpit, seconds: float) -> float:
     fastest = 0.0
 
     def faster() -> bool:
@@ -58,7 +59,7 @@ def top_speed_mps(cockpit: Any, seconds: float) -> float:
 
 
 @pytest.mark.hears("POSITION_TARGET_GLOBAL_INT")
-def test_it_flies_there_nose_first_and_holds(cockpit: Any) -> None:
+def test_it_flies_there_nose_first_and_holds(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     assert reposition(cockpit, (15.0, 15.0), 8.0) == [0]
     cockpit.fly(3.0)
@@ -71,7 +72,7 @@ def test_it_flies_there_nose_first_and_holds(cockpit: Any) -> None:
     assert goal.alt == pytest.approx(HOME_ALTITUDE_M + 8.0, abs=0.01)
 
 
-def test_a_yaw_is_taken_in_radians(cockpit: Any) -> None:
+def test_a_yaw_is_taken_in_radians(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     assert reposition(cockpit, (6.0, 0.0), 5.0, yaw=-1.2) == [0]
     cockpit.fly(10.0)
@@ -82,7 +83,7 @@ def test_a_yaw_is_taken_in_radians(cockpit: Any) -> None:
     ("mode", "yaw_rad"), [(0, math.pi / 2), (1, -math.pi / 2), (2, math.pi / 2), (3, math.pi / 2), (5, 0.0)]
 )
 def test_without_a_yaw_the_parameter_decides_where_the_nose_points(
-    make_cockpit: Any, mode: int, yaw_rad: float
+    make_cockpit: type[Cockpit], mode: int, yaw_rad: float
 ) -> None:
     cockpit = make_cockpit(parameters={"MPC_YAW_MODE": mode})
     cockpit.take_off(5.0)
@@ -92,14 +93,14 @@ def test_without_a_yaw_the_parameter_decides_where_the_nose_points(
 
 
 @pytest.mark.parametrize("frame", [0, 3, 5, 6])
-def test_the_frame_is_not_looked_at_the_altitude_is_above_sea_level(cockpit: Any, frame: int) -> None:
+def test_the_frame_is_not_looked_at_the_altitude_is_above_sea_level(cockpit: Cockpit, frame: int) -> None:
     cockpit.take_off(5.0)
     assert reposition(cockpit, (2.0, 0.0), 7.0, frame=frame) == [0]
     cockpit.fly(8.0)
     assert cockpit.height_m == pytest.approx(7.0, abs=0.3)
 
 
-def test_an_altitude_alone_keeps_the_place_it_was_flying_to(cockpit: Any) -> None:
+def test_an_altitude_alone_keeps_the_place_it_was_flying_to(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     reposition(cockpit, (12.0, 0.0), 5.0)
     cockpit.fly(1.5)
@@ -108,7 +109,7 @@ def test_an_altitude_alone_keeps_the_place_it_was_flying_to(cockpit: Any) -> Non
     assert math.dist(cockpit.vehicle.airframe.position, (12.0, 0.0, -9.0)) < 0.4
 
 
-def test_with_nothing_given_it_stops(cockpit: Any) -> None:
+def test_with_nothing_given_it_stops(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     reposition(cockpit, (40.0, 0.0), 5.0)
     cockpit.fly(4.0)
@@ -122,7 +123,7 @@ def test_with_nothing_given_it_stops(cockpit: Any) -> None:
 
 @pytest.mark.parametrize("flags", [0.0, 2.0, 3.0, NAN])
 def test_without_the_mode_flag_or_with_others_it_is_unsupported_and_flown_in_hold(
-    cockpit: Any, flags: float
+    cockpit: Cockpit, flags: float
 ) -> None:
     """As a PX4 v1.17 in SIH did: its commander refuses, and its navigator flies."""
     cockpit.take_off(5.0)
@@ -132,7 +133,7 @@ def test_without_the_mode_flag_or_with_others_it_is_unsupported_and_flown_in_hol
     assert cockpit.vehicle.airframe.position[0] == pytest.approx(9.0, abs=0.3)
 
 
-def test_without_the_mode_flag_another_mode_flies_on(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_without_the_mode_flag_another_mode_flies_on(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off(5.0)
     stream = velocity_setpoint(0, 1, 0)
     cockpit.offboard(stream)
@@ -142,7 +143,7 @@ def test_without_the_mode_flag_another_mode_flies_on(cockpit: Any, velocity_setp
     assert abs(cockpit.vehicle.airframe.position[0]) < 0.5
 
 
-def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Any) -> None:
+def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     assert cockpit.command(192, -1, 1, 0, NAN, 91.0, 8.0, 500.0) == [0]
     cockpit.fly(5.0)
@@ -150,14 +151,14 @@ def test_a_place_that_is_not_on_earth_is_taken_as_px4_takes_it(cockpit: Any) -> 
     assert cockpit.command_int(192, (-1.0, 1.0, 0.0, NAN), NOT_GIVEN, 85_000_000, 500.0) == [0]
 
 
-def test_a_nan_put_into_integers_by_accident_is_denied_whatever_the_command(cockpit: Any) -> None:
+def test_a_nan_put_into_integers_by_accident_is_denied_whatever_the_command(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     for command in (192, 34, 22):
         assert cockpit.command_int(command, (-1.0, 1.0, 0.0, NAN), 0x7FF80000, 0x7FF80000, 500.0) == [2]
     assert cockpit.mode == "HOLD"
 
 
-def test_disarmed_the_mode_is_taken_and_the_goal_forgotten(cockpit: Any) -> None:
+def test_disarmed_the_mode_is_taken_and_the_goal_forgotten(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.set_mode(4, 2)
     assert reposition(cockpit, (20.0, 0.0), 10.0) == [0]
@@ -167,7 +168,7 @@ def test_disarmed_the_mode_is_taken_and_the_goal_forgotten(cockpit: Any) -> None
     assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 0.3
 
 
-def test_armed_on_the_ground_it_takes_off_to_the_goal(cockpit: Any) -> None:
+def test_armed_on_the_ground_it_takes_off_to_the_goal(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.command(400, 1) == [0]
     assert reposition(cockpit, (5.0, 0.0), 6.0) == [0]
@@ -176,7 +177,7 @@ def test_armed_on_the_ground_it_takes_off_to_the_goal(cockpit: Any) -> None:
     assert math.dist(cockpit.vehicle.airframe.position, (5.0, 0.0, -6.0)) < 0.4
 
 
-def test_it_ends_offboard_though_the_setpoints_go_on(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_it_ends_offboard_though_the_setpoints_go_on(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off(5.0)
     stream = velocity_setpoint(1, 0, 0)
     cockpit.offboard(stream)
@@ -186,7 +187,7 @@ def test_it_ends_offboard_though_the_setpoints_go_on(cockpit: Any, velocity_setp
     assert math.dist(cockpit.vehicle.airframe.position, (0.0, 6.0, -5.0)) < 0.3
 
 
-def test_the_altitude_can_be_changed_by_a_command_of_its_own(cockpit: Any) -> None:
+def test_the_altitude_can_be_changed_by_a_command_of_its_own(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     assert cockpit.command(186, HOME_ALTITUDE_M + 9.0, 0) == [0]
     cockpit.fly(8.0)
@@ -216,7 +217,7 @@ def test_the_goal_is_always_a_whole_place(x: float, y: float, z: float, yaw: flo
 # ---- how fast
 
 
-def test_the_cruise_speed_is_the_parameters_unless_the_command_has_one(cockpit: Any) -> None:
+def test_the_cruise_speed_is_the_parameters_unless_the_command_has_one(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     reposition(cockpit, (50.0, 0.0), 5.0)
     assert top_speed_mps(cockpit, 12.0) == FAST
@@ -225,7 +226,7 @@ def test_the_cruise_speed_is_the_parameters_unless_the_command_has_one(cockpit: 
     assert top_speed_mps(cockpit, 10.0) == SLOW
 
 
-def test_a_speed_change_acts_at_once_and_on_later_goals_until_the_mode_ends(cockpit: Any) -> None:
+def test_a_speed_change_acts_at_once_and_on_later_goals_until_the_mode_ends(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     reposition(cockpit, (60.0, 0.0), 5.0)
     cockpit.fly(5.0)
@@ -241,7 +242,7 @@ def test_a_speed_change_acts_at_once_and_on_later_goals_until_the_mode_ends(cock
     assert top_speed_mps(cockpit, 12.0) == FAST
 
 
-def test_a_speed_of_another_kind_waits_for_the_next_goal_and_zero_takes_it_back(cockpit: Any) -> None:
+def test_a_speed_of_another_kind_waits_for_the_next_goal_and_zero_takes_it_back(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     reposition(cockpit, (80.0, 0.0), 5.0)
     cockpit.fly(5.0)
@@ -256,7 +257,7 @@ def test_a_speed_of_another_kind_waits_for_the_next_goal_and_zero_takes_it_back(
 
 
 @pytest.mark.parametrize("values", [(1.0, 5.0, -1.0), (NAN, NAN, NAN), (1.0, -7.0, 50.0)])
-def test_a_speed_change_is_accepted_in_any_state(cockpit: Any, values: tuple[float, ...]) -> None:
+def test_a_speed_change_is_accepted_in_any_state(cockpit: Cockpit, values: tuple[float, ...]) -> None:
     cockpit.fly(0.1)
     assert cockpit.command(178, *values) == [0]
 
@@ -264,7 +265,7 @@ def test_a_speed_change_is_accepted_in_any_state(cockpit: Any, values: tuple[flo
 # ---- how many answers
 
 
-def test_the_older_behaviour_of_a_single_true_answer_to_set_mode(make_cockpit: Any) -> None:
+def test_the_older_behaviour_of_a_single_true_answer_to_set_mode(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(px4="1.15")
     cockpit.take_off()
     assert cockpit.set_mode(4, 4) == [1]

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
 
 from mavlink_sim.missions.items import item_of
 from mavlink_sim.missions.plan import Mission
 from mavlink_sim.missions.return_flight import Goal, destination, mission_route
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.parameters import Parameters
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
 
 HOME = (0.0, 0.0, 0.0)
 
@@ -88,19 +90,19 @@ def test_along_a_mission_it_goes_on_to_the_landing_or_back_home() -> None:
 
 
 @pytest.fixture
-def make(make_cockpit: Any) -> Any:
+def make(make_cockpit: type[Cockpit]) -> Callable[..., Cockpit]:
     """Makes vehicles that are ready at once and return low."""
     return lambda **values: make_cockpit(
         ready_after_s=0.0, parameters={"RTL_RETURN_ALT": 5.0, "RTL_DESCEND_ALT": 5.0, **values}
     )
 
 
-def lands_at(cockpit: Any, north: float, east: float) -> None:
+def lands_at(cockpit: Cockpit, north: float, east: float) -> None:
     cockpit.until(lambda: not cockpit.armed, 90.0)
     assert math.dist(cockpit.vehicle.airframe.position[:2], (north, east)) < 1.0
 
 
-def test_rtl_lands_at_the_nearer_rally_point(make: Any) -> None:
+def test_rtl_lands_at_the_nearer_rally_point(make: Callable[..., Cockpit]) -> None:
     cockpit = make()
     listen(cockpit)
     upload(cockpit, [rally(14, 0)], 2)
@@ -113,7 +115,7 @@ def test_rtl_lands_at_the_nearer_rally_point(make: Any) -> None:
 
 
 def test_a_pilot_who_returns_a_vehicle_that_started_elsewhere_lands_it_at_the_rally_point(
-    make_cockpit: Any,
+    make_cockpit: type[Cockpit],
 ) -> None:
     cockpit = make_cockpit(
         ready_after_s=0.0,
@@ -129,7 +131,7 @@ def test_a_pilot_who_returns_a_vehicle_that_started_elsewhere_lands_it_at_the_ra
     lands_at(cockpit, 14, 0)
 
 
-def test_rtl_goes_on_along_the_mission_to_its_landing(make: Any) -> None:
+def test_rtl_goes_on_along_the_mission_to_its_landing(make: Callable[..., Cockpit]) -> None:
     cockpit = make(RTL_TYPE=2)
     plan = [takeoff(4.0), waypoint(6, 0, 4, 60.0), waypoint(6, 8, 4), item(189), land(0, 12)]
     upload(cockpit, plan)
@@ -141,7 +143,7 @@ def test_rtl_goes_on_along_the_mission_to_its_landing(make: Any) -> None:
     lands_at(cockpit, 0, 12)
 
 
-def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: Any) -> None:
+def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: Callable[..., Cockpit]) -> None:
     cockpit = make(RTL_TYPE=3)
     upload(cockpit, [takeoff(4.0), waypoint(30, 0, 4), item(189), waypoint(20, 5, 4), land(20, 12)])
     cockpit.take_off(4.0)
@@ -152,7 +154,9 @@ def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: An
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_rtl_leads_to_where_home_was_set_before_arming_or_after(make: Any, before: bool) -> None:
+def test_rtl_leads_to_where_home_was_set_before_arming_or_after(
+    make: Callable[..., Cockpit], before: bool
+) -> None:
     cockpit = make()
     if not before:
         cockpit.take_off(4.0)

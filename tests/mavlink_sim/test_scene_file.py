@@ -89,6 +89,7 @@ def test_every_key_arrives_where_it_belongs() -> None:
     assert (camera.loss, camera.latency_s, camera.rate_hz) == (0.1, 0.04, 50.0)
     assert camera.depth is not None
     assert camera.depth.maximum_m == 12
+    assert camera.effects is not None
     assert camera.effects.noise_sigma == 4
 
 
@@ -203,10 +204,16 @@ def test_a_path_repeats_after_its_period_unless_it_ends(path: Path, time_s: floa
 
 def test_a_path_looks_where_it_goes_and_turns_round_on_its_way_back() -> None:
     path = Path(((0.0, 0.0, 0.0), (0.0, 10.0, 0.0)), 1.0, "back_and_forth")
-    assert path.pose_at(2.0) == ((0.0, 2.0, 0.0), pytest.approx(math.pi / 2))
-    assert path.pose_at(12.0) == ((0.0, 8.0, 0.0), pytest.approx(-math.pi / 2))
+    position, yaw_rad = path.pose_at(2.0)
+    assert position == (0.0, 2.0, 0.0)
+    assert yaw_rad == pytest.approx(math.pi / 2)
+    position, yaw_rad = path.pose_at(12.0)
+    assert position == (0.0, 8.0, 0.0)
+    assert yaw_rad == pytest.approx(-math.pi / 2)
     rising = Path(((0.0, 0.0, 0.0), (0.0, 5.0, 0.0), (0.0, 5.0, -5.0)), 1.0, "once")
-    assert rising.pose_at(8.0) == ((0.0, 5.0, -3.0), pytest.approx(math.pi / 2))
+    position, yaw_rad = rising.pose_at(8.0)
+    assert position == (0.0, 5.0, -3.0)
+    assert yaw_rad == pytest.approx(math.pi / 2)
     assert Path(rising.waypoints_ned_m, 1.0, fixed_yaw_rad=0.3).pose_at(3.0)[1] == 0.3
 
 

@@ -12,6 +12,7 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,8 +56,8 @@ def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -
     for option in ("onboard", "gcs"):
         command += [f"--{option}-bind", "0", f"--{option}-port", str(free_port(socket.SOCK_DGRAM))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as vehicle:
+        assert vehicle.stdout is not None
         try:
-            assert vehicle.stdout is not None
             raw = vehicle.stdout.read(160 * 120 * 3)  # standard output has pictures and nothing else
             piped = np.frombuffer(raw, np.uint8).reshape(120, 160, 3)
             with urllib.request.urlopen(
@@ -68,10 +69,11 @@ def test_a_scene_is_flown_in_and_its_camera_read_in_three_ways(tmp_path: Path) -
             assert frame is not None
             assert frame.depth_m is not None
             assert np.nanmax(frame.depth_m) <= 15.0
+            assert served is not None
             for picture in (piped, served):
                 assert np.abs(picture.astype(int) - frame.image).mean() < 12.0
             deadline = time.monotonic() + DEADLINE_S
-            lines: list[dict] = []
+            lines: list[dict[str, Any]] = []
             while len(lines) < 20:
                 assert time.monotonic() < deadline, "no truth of frames"
                 time.sleep(0.05)

@@ -67,7 +67,8 @@ def surface(thing: WorldObject) -> NDArray[np.float64]:
             sampled.append(corners[0] + a[inside][:, None] * ways[0] + b[inside][:, None] * ways[1])
     own = np.concatenate(sampled)
     c, s = math.cos(thing.yaw_rad), math.sin(thing.yaw_rad)
-    return own @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + thing.position_ned_m
+    turned: NDArray[np.float64] = own @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    return turned + thing.position_ned_m
 
 
 @settings(max_examples=30, deadline=None)

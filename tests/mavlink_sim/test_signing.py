@@ -15,6 +15,7 @@ from mavlink_sim.testing import running_simulator
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, component_metadata, dialect, parser
 from mavlink_sim.wire.signing import ALWAYS, EXCEPT_USB, OPTIONAL, Signing, key_of, timestamp_now
+from tests.mavlink_sim.conftest import Cockpit
 
 KEY = bytes(range(32))
 OTHER_KEY = bytes(32 * [7])
@@ -179,7 +180,7 @@ def test_any_bit_changed_makes_the_signature_wrong() -> None:
             assert not vehicle_signing().accepts(bytes(damaged))
 
 
-def test_setup_signing_is_taken_on_the_usb_link_alone(cockpit: Any) -> None:
+def test_setup_signing_is_taken_on_the_usb_link_alone(cockpit: Cockpit) -> None:
     message = dialect.MAVLink_setup_signing_message(1, 1, KEY, START)
     cockpit.send(message, "onboard")
     assert not any(link.signing.has_key for link in cockpit.vehicle.links.values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,6 +52,7 @@ def test_the_truth_of_a_frame_bears_its_stamp_and_names_what_is_seen() -> None:
     assert seen[0]["visible_fraction"] < 0.97 < seen[1]["visible_fraction"]
     left, top, right, bottom = seen[1]["xyxy"]
     assert left < 79.5 < right
+    assert captured.frame.depth_m is not None
     assert np.nanmin(captured.frame.depth_m[int(top) : int(bottom), int(left) : int(right)]) == pytest.approx(
         8.0, abs=0.5
     )
@@ -121,6 +123,8 @@ def test_the_same_calls_give_the_same_frames() -> None:
         assert first is not None
         assert again is not None
         assert np.array_equal(first.frame.image, again.frame.image)
+        assert first.frame.depth_m is not None
+        assert again.frame.depth_m is not None
         assert np.array_equal(first.frame.depth_m, again.frame.depth_m, equal_nan=True)
 
 
@@ -142,6 +146,6 @@ def test_motion_is_what_lies_between_two_poses() -> None:
         ({"rate_hz": 0.0}, "rate must be positive"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(changes: dict[str, float], says: str) -> None:
+def test_a_camera_that_cannot_be_is_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         CameraSettings(**changes)

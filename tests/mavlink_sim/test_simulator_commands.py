@@ -1,12 +1,11 @@
 """Commands that are not about flying: who is answered, and with which MAV_RESULT."""
 
-from typing import Any
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.wire.messages import dialect
+from tests.mavlink_sim.conftest import Cockpit
 
 pytestmark = pytest.mark.hears("everything")
 
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.hears("everything")
     ],
 )
 def test_the_result_of_a_command_is_as_measured(
-    cockpit: Any, command: int, values: tuple[float, ...], result: int
+    cockpit: Cockpit, command: int, values: tuple[float, ...], result: int
 ) -> None:
     cockpit.wait_ready()
     assert cockpit.command(command, *values) == [result]
@@ -41,31 +40,31 @@ def test_the_result_of_a_command_is_as_measured(
     ("target", "answers"), [((1, 1), 1), ((1, 0), 1), ((0, 0), 1), ((2, 1), 0), ((1, 100), 0)]
 )
 def test_only_what_is_addressed_to_the_autopilot_is_answered(
-    cockpit: Any, target: tuple[int, int], answers: int
+    cockpit: Cockpit, target: tuple[int, int], answers: int
 ) -> None:
     cockpit.fly(0.1)
     assert len(cockpit.command(401, target=target)) == answers
 
 
-def test_home_is_not_set_while_its_parameter_forbids_it(make_cockpit: Any) -> None:
+def test_home_is_not_set_while_its_parameter_forbids_it(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(["everything"], parameters={"COM_HOME_EN": 0})
     cockpit.wait_ready()
     assert cockpit.command(179, 1) == [2]
 
 
-def test_command_zero_is_not_answered(cockpit: Any) -> None:
+def test_command_zero_is_not_answered(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     assert cockpit.command(0) == []
 
 
-def test_the_protocol_version_is_sent_on_request(cockpit: Any) -> None:
+def test_the_protocol_version_is_sent_on_request(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     assert cockpit.command(519, 1) == [0]
     version = cockpit.received("PROTOCOL_VERSION")[0]
     assert (version.version, version.min_version, version.max_version) == (200, 100, 200)
 
 
-def test_another_system_id_is_answered_under_it(make_cockpit: Any) -> None:
+def test_another_system_id_is_answered_under_it(make_cockpit: type[Cockpit]) -> None:
     cockpit = make_cockpit(["everything"], system_id=7)
     cockpit.fly(0.1)
     assert cockpit.command(401, target=(1, 1)) == []
@@ -76,7 +75,7 @@ def test_another_system_id_is_answered_under_it(make_cockpit: Any) -> None:
 
 @pytest.mark.parametrize(("command", "values"), [(512, (148,)), (520, (1,))])
 def test_the_version_comes_before_the_acknowledgement(
-    cockpit: Any, command: int, values: tuple[float, ...]
+    cockpit: Cockpit, command: int, values: tuple[float, ...]
 ) -> None:
     cockpit.fly(0.1)
     cockpit.forget()
@@ -96,12 +95,12 @@ def test_the_version_comes_before_the_acknowledgement(
 
 
 @pytest.mark.parametrize("identifier", [259, 280, 60000, 27])
-def test_a_message_that_it_does_not_have_is_denied(cockpit: Any, identifier: int) -> None:
+def test_a_message_that_it_does_not_have_is_denied(cockpit: Cockpit, identifier: int) -> None:
     cockpit.fly(0.1)
     assert cockpit.command(512, identifier) == [2]
 
 
-def test_home_cannot_be_asked_for_before_it_is_known(cockpit: Any) -> None:
+def test_home_cannot_be_asked_for_before_it_is_known(cockpit: Cockpit) -> None:
     cockpit.fly(0.5)
     assert cockpit.command(512, 242) == [2]
     cockpit.wait_ready()
@@ -109,7 +108,7 @@ def test_home_cannot_be_asked_for_before_it_is_known(cockpit: Any) -> None:
     assert cockpit.received("HOME_POSITION")[-1].altitude == 489400
 
 
-def test_an_interval_is_honoured_switched_off_and_restored(cockpit: Any) -> None:
+def test_an_interval_is_honoured_switched_off_and_restored(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
 
     def count(seconds: float) -> int:
@@ -127,12 +126,12 @@ def test_an_interval_is_honoured_switched_off_and_restored(cockpit: Any) -> None
 
 
 @pytest.mark.parametrize("identifier", [27, 0, 60000])
-def test_the_interval_of_what_it_does_not_stream_cannot_be_set(cockpit: Any, identifier: int) -> None:
+def test_the_interval_of_what_it_does_not_stream_cannot_be_set(cockpit: Cockpit, identifier: int) -> None:
     cockpit.fly(0.1)
     assert cockpit.command(511, identifier, 100_000) == [4]
 
 
-def test_an_interval_set_on_one_link_leaves_the_other_alone(cockpit: Any) -> None:
+def test_an_interval_set_on_one_link_leaves_the_other_alone(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.command(511, 30, -1)
     cockpit.forget()
@@ -141,7 +140,7 @@ def test_an_interval_set_on_one_link_leaves_the_other_alone(cockpit: Any) -> Non
     assert len(cockpit.received("ATTITUDE", "gcs")) == 49
 
 
-def test_the_interval_can_be_read_back(cockpit: Any) -> None:
+def test_the_interval_can_be_read_back(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.command(511, 32, 250_000)
     for identifier, interval in ((32, 250_000), (30, 10_000), (27, -1)):
@@ -153,7 +152,7 @@ def test_the_interval_can_be_read_back(cockpit: Any) -> None:
     assert (answer.message_id, answer.interval_us) == (32, 250_000)
 
 
-def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(cockpit: Any) -> None:
+def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(cockpit: Cockpit) -> None:
     cockpit.fly(0.5)
     cockpit.forget()
     cockpit.send(dialect.MAVLink_timesync_message(0, 123456789))
@@ -164,12 +163,12 @@ def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(cockpit
     assert {message.tc1 for message in cockpit.received("TIMESYNC")} == {0}  # its own requests
 
 
-def test_a_timesync_answer_is_not_answered(cockpit: Any) -> None:
+def test_a_timesync_answer_is_not_answered(cockpit: Cockpit) -> None:
     cockpit.send(dialect.MAVLink_timesync_message(5, 123))
     assert cockpit.received("TIMESYNC") == []
 
 
-def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(cockpit: Any) -> None:
+def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(cockpit: Cockpit) -> None:
     cockpit.send(dialect.MAVLink_ping_message(77, 5, 0, 0))
     answer = cockpit.received("PING")[0]
     assert (answer.time_usec, answer.seq, answer.target_system, answer.target_component) == (77, 5, 1, 191)
@@ -178,7 +177,7 @@ def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(cockpit
     assert cockpit.received("PING") == []
 
 
-def test_there_is_no_mission_on_board(cockpit: Any) -> None:
+def test_there_is_no_mission_on_board(cockpit: Cockpit) -> None:
     cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 1))
     count = cockpit.received("MISSION_COUNT")[0]
     assert (count.count, count.mission_type, count.target_component) == (0, 1, 191)
@@ -201,7 +200,7 @@ COMMANDS = [16, 20, 21, 22, 176, 178, 179, 185, 192, 193, 245, 300, 400, 401, 51
     )
 )
 def test_no_command_with_any_values_can_stop_the_vehicle(
-    make_cockpit: Any, requests: list[tuple[int, list[float]]]
+    make_cockpit: type[Cockpit], requests: list[tuple[int, list[float]]]
 ) -> None:
     cockpit = make_cockpit(["everything"], ready_after_s=0.0)
     cockpit.command(400, 1)

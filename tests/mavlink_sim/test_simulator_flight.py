@@ -11,10 +11,10 @@ from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, ActionError
 from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync, MavlinkMessage
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
-from mavsdk_client import mavsdk_client, meanwhile, wait_for
 from pymavlink import mavutil
 
 from mavlink_sim.testing import running_simulator
+from tests.mavlink_sim.mavsdk_client import mavsdk_client, meanwhile, wait_for
 
 SPEED = 4.0  # simulated seconds a second; setpoints are sent by the simulated clock
 
@@ -106,7 +106,7 @@ AHEAD = {
     "type_mask": 1479,
     "vx": 1.5,
 }
-TO_OFFBOARD = {
+TO_OFFBOARD: dict[str, float] = {
     "command": 176,
     "confirmation": 0,
     "param1": 1,

@@ -10,6 +10,7 @@ import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink import mavutil
@@ -98,7 +99,7 @@ def test_the_version_is_told() -> None:
     assert (finished.returncode, finished.stdout) == (0, f"mavlink-sim {version('mavlink-companion')}\n")
 
 
-def wander_m(truth: Path, **options: float | str) -> float:
+def wander_m(truth: Path, **options: Any) -> float:
     """How far a vehicle that holds its position gets from where it began to, horizontally, within 10 s."""
     with running_simulator(truth=truth, speed=10.0, ready_after=0.0, **options) as simulator:
         link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=245)

@@ -9,11 +9,11 @@ from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.action import ActionAsync, OrbitYawBehavior
 from mavsdk.asyncio.plugins.offboard import Attitude, AttitudeRate, OffboardAsync, PositionGlobalYaw
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
-from mavsdk_client import mavsdk_client, wait_for
 
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic, local
 from mavlink_sim.testing import RunningSimulator
+from tests.mavlink_sim.mavsdk_client import mavsdk_client, wait_for
 
 SPEED = 3.0  # simulated seconds a second; MAVSDK repeats a setpoint 20 times a real second
 HOVER = GRAVITY_MPS2 / MAX_THRUST_MPS2

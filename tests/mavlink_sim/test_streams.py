@@ -11,6 +11,7 @@ from pymavlink import mavutil
 
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import Streams
+from tests.mavlink_sim.conftest import Cockpit
 
 pytestmark = pytest.mark.hears("everything")
 
@@ -19,7 +20,7 @@ RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"
 PARAMETERS = DATA / "px4" / "parameters.txt"
 
 
-def counts(cockpit: Any, link: str, seconds: float) -> Counter[str]:
+def counts(cockpit: Cockpit, link: str, seconds: float) -> Counter[str]:
     cockpit.forget()
     cockpit.fly(seconds)
     return Counter(item.message.get_type() for _, item in cockpit.inbox[link])
@@ -49,19 +50,21 @@ MEASURED_GCS_HZ = {
 
 
 @pytest.fixture
-def settled(cockpit: Any) -> Any:
+def settled(cockpit: Cockpit) -> Cockpit:
     cockpit.fly(6.0)  # what a start alone sends is over
     return cockpit
 
 
-def test_the_onboard_streams_have_the_measured_rates(settled: Any) -> None:
+def test_the_onboard_streams_have_the_measured_rates(settled: Cockpit) -> None:
     seen = counts(settled, "onboard", 20.0)
     assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, and no RC_CHANNELS above all
     for name, rate in MEASURED_ONBOARD_HZ.items():
         assert seen[name] / 20.0 == pytest.approx(rate, rel=0.01, abs=0.051), name
 
 
-def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_or_less(settled: Any) -> None:
+def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_or_less(
+    settled: Cockpit,
+) -> None:
     seen = counts(settled, "gcs", 20.0)
     assert set(seen) <= set(MEASURED_ONBOARD_HZ)
     for name, rate in MEASURED_GCS_HZ.items():
@@ -70,7 +73,7 @@ def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_o
     assert max(seen.values()) <= 21
 
 
-def test_a_mode_that_flies_to_a_place_tells_it(cockpit: Any) -> None:
+def test_a_mode_that_flies_to_a_place_tells_it(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     cockpit.forget()
     cockpit.fly(1.0)
@@ -79,14 +82,16 @@ def test_a_mode_that_flies_to_a_place_tells_it(cockpit: Any) -> None:
     assert goals[-1].alt == pytest.approx(494.4, abs=0.1)
 
 
-def test_the_origin_is_told_once_and_on_request(cockpit: Any) -> None:
+def test_the_origin_is_told_once_and_on_request(cockpit: Cockpit) -> None:
     cockpit.fly(10.0)
     assert len(cockpit.received("GPS_GLOBAL_ORIGIN")) == 1
     assert cockpit.command(512, 49) == [0]
     assert len(cockpit.received("GPS_GLOBAL_ORIGIN")) == 2
 
 
-def test_the_messages_agree_with_each_other_and_with_the_truth(cockpit: Any, position_setpoint: Any) -> None:
+def test_the_messages_agree_with_each_other_and_with_the_truth(
+    cockpit: Cockpit, position_setpoint: Any
+) -> None:
     cockpit.take_off(5.0)
     there = position_setpoint(4, -3, -6, 0.7)
     cockpit.offboard(there)
@@ -118,7 +123,7 @@ def test_a_stream_that_was_held_up_skips_instead_of_bursting() -> None:
     assert streams.due(1_010_000) == ["ATTITUDE"]
 
 
-def test_every_message_survives_the_wire(cockpit: Any) -> None:
+def test_every_message_survives_the_wire(cockpit: Cockpit) -> None:
     cockpit.take_off()
     codec = dialect.MAVLink(None, 1, 1)
     reader = dialect.MAVLink(None)
@@ -151,7 +156,7 @@ NAMES_OF_UNKNOWN = {
 
 
 def test_a_flight_yields_the_same_kinds_of_messages_as_the_real_one(
-    cockpit: Any, recorded: dict[str, list[Any]], velocity_setpoint: Any
+    cockpit: Cockpit, recorded: dict[str, list[Any]], velocity_setpoint: Any
 ) -> None:
     cockpit.take_off()
     stream = velocity_setpoint(1, 0, -0.5)
@@ -181,14 +186,14 @@ def test_a_flight_yields_the_same_kinds_of_messages_as_the_real_one(
     ],
 )
 def test_constant_fields_are_those_of_the_real_vehicle(
-    cockpit: Any, recorded: dict[str, list[Any]], kind: str, fields: tuple[str, ...]
+    cockpit: Cockpit, recorded: dict[str, list[Any]], kind: str, fields: tuple[str, ...]
 ) -> None:
     cockpit.take_off()
     ours, theirs = cockpit.received(kind)[-1], recorded[kind][-1]
     assert [getattr(ours, field) for field in fields] == [getattr(theirs, field) for field in fields]
 
 
-def test_events_are_those_of_the_real_flight(cockpit: Any, recorded: dict[str, list[Any]]) -> None:
+def test_events_are_those_of_the_real_flight(cockpit: Cockpit, recorded: dict[str, list[Any]]) -> None:
     cockpit.take_off()
     cockpit.command(21)
     cockpit.until(lambda: not cockpit.armed, 40.0)
@@ -198,7 +203,7 @@ def test_events_are_those_of_the_real_flight(cockpit: Any, recorded: dict[str, l
     assert [message.sequence for message in events] == list(range(1, len(events) + 1))
 
 
-def test_the_parameters_are_those_a_real_vehicle_reports(cockpit: Any) -> None:
+def test_the_parameters_are_those_a_real_vehicle_reports(cockpit: Cockpit) -> None:
     if not PARAMETERS.exists():
         pytest.skip(f"needs the recorded parameters {PARAMETERS}")
     recorded = {}

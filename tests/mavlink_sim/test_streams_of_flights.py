@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from plan_client import circle, land, rally, takeoff, upload, waypoint
 
 from mavlink_sim.wire.messages import dialect, parser
+from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.plan_client import circle, land, rally, takeoff, upload, waypoint
 
 NAN = math.nan
 HOLD = 0x03040000
@@ -21,19 +22,19 @@ NUMBERS = {
 }
 
 
-def mission(cockpit: Any) -> None:
+def mission(cockpit: Cockpit) -> None:
     assert upload(cockpit, [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]) == 0
     assert cockpit.set_mode(4, 4) == [0, 0]
     cockpit.fly(6.0)
 
 
-def return_to_a_rally_point(cockpit: Any) -> None:
+def return_to_a_rally_point(cockpit: Cockpit) -> None:
     assert upload(cockpit, [rally(6, 6)], 2) == 0
     assert cockpit.set_mode(4, 5) == [0, 0]
     cockpit.fly(6.0)
 
 
-def precision_landing(cockpit: Any) -> None:
+def precision_landing(cockpit: Cockpit) -> None:
     seen = dialect.MAVLink_landing_target_message(
         0, 0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 0.0, [1, 0, 0, 0], 2, 1
     )
@@ -42,7 +43,7 @@ def precision_landing(cockpit: Any) -> None:
     cockpit.fly(6.0, seen)
 
 
-def geofence(cockpit: Any) -> None:
+def geofence(cockpit: Cockpit) -> None:
     assert upload(cockpit, [circle(0, 0, 5.0)], 1) == 0
     forward = dialect.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, 1, 1479, 0, 0, 0, 3.0, 0, 0, 0, 0, 0, 0, 0.0
@@ -51,12 +52,12 @@ def geofence(cockpit: Any) -> None:
     cockpit.fly(6.0, forward)
 
 
-def orbit(cockpit: Any) -> None:
+def orbit(cockpit: Cockpit) -> None:
     assert cockpit.command(34, 5, 2, 0, NAN, NAN, NAN, NAN) == [0]
     cockpit.fly(6.0)
 
 
-def sticks(cockpit: Any) -> None:
+def sticks(cockpit: Cockpit) -> None:
     pushed = dialect.MAVLink_manual_control_message(1, 500, 0, 500, 0, 0)
     cockpit.fly(0.3, pushed)
     assert cockpit.set_mode(3) == [0, 0]
@@ -67,7 +68,7 @@ def sticks(cockpit: Any) -> None:
     "flight", [mission, return_to_a_rally_point, precision_landing, geofence, orbit, sticks]
 )
 def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
-    make_cockpit: Any, flight: Callable[[Any], None]
+    make_cockpit: type[Cockpit], flight: Callable[[Any], None]
 ) -> None:
     joystick = {"COM_RC_IN_MODE": 1} if flight is sticks else {}
     cockpit = make_cockpit(["everything"], parameters=joystick)

@@ -6,11 +6,12 @@ from typing import Any
 import pytest
 
 from mavlink_sim.physics.geography import geographic
+from tests.mavlink_sim.conftest import Cockpit
 
 NAN = math.nan
 
 
-def landed_states(cockpit: Any) -> list[int]:
+def landed_states(cockpit: Cockpit) -> list[int]:
     """The EXTENDED_SYS_STATE.landed_state received, without repetitions."""
     found: list[int] = []
     for message in cockpit.received("EXTENDED_SYS_STATE"):
@@ -19,7 +20,7 @@ def landed_states(cockpit: Any) -> list[int]:
     return found
 
 
-def test_take_off_climbs_to_two_and_a_half_metres_and_holds(cockpit: Any) -> None:
+def test_take_off_climbs_to_two_and_a_half_metres_and_holds(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.command(400, 1) == [0]
     cockpit.forget()
@@ -37,7 +38,9 @@ def test_take_off_climbs_to_two_and_a_half_metres_and_holds(cockpit: Any) -> Non
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_in_moving_air_too_hold_begins_after_6_5_to_9_s_at_1_8_to_2_2_m(make_cockpit: Any, seed: int) -> None:
+def test_in_moving_air_too_hold_begins_after_6_5_to_9_s_at_1_8_to_2_2_m(
+    make_cockpit: type[Cockpit], seed: int
+) -> None:
     cockpit = make_cockpit(noise=True, gusts_mps=None, seed=seed)
     cockpit.wait_ready()
     assert cockpit.command(400, 1) == [0]
@@ -48,7 +51,7 @@ def test_in_moving_air_too_hold_begins_after_6_5_to_9_s_at_1_8_to_2_2_m(make_coc
     assert 1.8 <= cockpit.height_m <= 2.2
 
 
-def test_it_is_in_air_as_hold_begins_and_not_before(cockpit: Any) -> None:
+def test_it_is_in_air_as_hold_begins_and_not_before(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.command(400, 1)
     cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN)
@@ -58,19 +61,19 @@ def test_it_is_in_air_as_hold_begins_and_not_before(cockpit: Any) -> None:
         state = (cockpit.mode, int(cockpit.vehicle.autopilot.landed_state))
         if states[-1:] != [state]:
             states.append(state)
-        return state[0] == "HOLD"
+        return bool(state[0] == "HOLD")
 
     cockpit.until(watch)
     assert states == [("TAKEOFF", 1), ("TAKEOFF", 3), ("HOLD", 2)]
 
 
-def test_take_off_to_a_given_altitude_above_sea(cockpit: Any) -> None:
+def test_take_off_to_a_given_altitude_above_sea(cockpit: Cockpit) -> None:
     cockpit.take_off(6.0)
     cockpit.fly(6.0)
     assert cockpit.height_m == pytest.approx(6.0, abs=0.3)
 
 
-def test_take_off_is_accepted_before_arming_and_waits_for_it(cockpit: Any) -> None:
+def test_take_off_is_accepted_before_arming_and_waits_for_it(cockpit: Cockpit) -> None:
     cockpit.fly(0.5)  # not even ready
     assert cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN) == [0]
     assert not cockpit.armed
@@ -80,7 +83,7 @@ def test_take_off_is_accepted_before_arming_and_waits_for_it(cockpit: Any) -> No
     assert cockpit.height_m > 1.5
 
 
-def test_the_mode_take_off_alone_takes_off_once_armed(cockpit: Any) -> None:
+def test_the_mode_take_off_alone_takes_off_once_armed(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     assert cockpit.set_mode(4, 2) == [0, 0]
     assert cockpit.command(400, 1) == [0]
@@ -88,7 +91,7 @@ def test_the_mode_take_off_alone_takes_off_once_armed(cockpit: Any) -> None:
     assert cockpit.height_m > 1.5
 
 
-def test_take_off_while_flying_is_accepted_and_does_not_descend(cockpit: Any) -> None:
+def test_take_off_while_flying_is_accepted_and_does_not_descend(cockpit: Cockpit) -> None:
     cockpit.take_off(6.0)
     cockpit.fly(5.0)
     assert cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, NAN) == [0]
@@ -97,7 +100,7 @@ def test_take_off_while_flying_is_accepted_and_does_not_descend(cockpit: Any) ->
     assert cockpit.mode == "HOLD"
 
 
-def test_landing_touches_down_softly_and_disarms_two_seconds_later(cockpit: Any) -> None:
+def test_landing_touches_down_softly_and_disarms_two_seconds_later(cockpit: Cockpit) -> None:
     cockpit.take_off(4.0)
     cockpit.fly(4.0)
     cockpit.forget()
@@ -111,7 +114,7 @@ def test_landing_touches_down_softly_and_disarms_two_seconds_later(cockpit: Any)
     assert landed_states(cockpit) == [4, 1]
 
 
-def test_after_a_landing_the_mode_chosen_before_it_comes_back(cockpit: Any) -> None:
+def test_after_a_landing_the_mode_chosen_before_it_comes_back(cockpit: Cockpit) -> None:
     cockpit.take_off()
     cockpit.command(21)
     cockpit.until(lambda: not cockpit.armed, 30.0)
@@ -119,7 +122,7 @@ def test_after_a_landing_the_mode_chosen_before_it_comes_back(cockpit: Any) -> N
     assert cockpit.heartbeat().system_status == 3
 
 
-def test_leaving_land_in_the_air_is_in_air_again(cockpit: Any) -> None:
+def test_leaving_land_in_the_air_is_in_air_again(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     cockpit.forget()
     cockpit.command(21)
@@ -129,7 +132,7 @@ def test_leaving_land_in_the_air_is_in_air_again(cockpit: Any) -> None:
     assert landed_states(cockpit)[-2:] == [4, 2]
 
 
-def test_return_close_to_home_stays_low_lands_and_disarms(cockpit: Any) -> None:
+def test_return_close_to_home_stays_low_lands_and_disarms(cockpit: Cockpit) -> None:
     cockpit.heartbeats.append(("gcs", (245, 190), 6))
     cockpit.take_off(4.0)
     cockpit.fly(4.0)
@@ -145,7 +148,9 @@ def test_return_close_to_home_stays_low_lands_and_disarms(cockpit: Any) -> None:
     assert said[-3:] == ["RTL: land at destination\t", "Landing detected\t", "Disarmed by landing\t"]
 
 
-def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(make_cockpit: Any) -> None:
+def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(
+    make_cockpit: type[Cockpit],
+) -> None:
     cockpit = make_cockpit(parameters={"RTL_RETURN_ALT": 12.0})
     cockpit.take_off(4.0)
     assert cockpit.command_int(192, (-1, 1, 0, NAN), 473980000, 85455942, 494.4) == [0]
@@ -173,7 +178,7 @@ def test_return_from_afar_climbs_to_the_return_altitude_and_lands_at_home(make_c
     [({}, 70.0, 70.0), ({"WV_EN": 1}, 70.0, 120.0), ({}, math.nan, 120.0)],
 )
 def test_close_to_home_a_return_turns_to_the_heading_of_home(
-    make_cockpit: Any, parameters: dict[str, float], heading_deg: float, landed_deg: float
+    make_cockpit: type[Cockpit], parameters: dict[str, float], heading_deg: float, landed_deg: float
 ) -> None:
     cockpit = make_cockpit(parameters=parameters)
     cockpit.take_off(5.0)
@@ -190,7 +195,7 @@ def test_close_to_home_a_return_turns_to_the_heading_of_home(
 
 @pytest.mark.parametrize(("seed", "wind_mps"), [(0, 0.0), (1, 0.0), (2, 5.0)])
 def test_return_in_moving_air_ends_at_home_too(
-    make_cockpit: Any, velocity_setpoint: Any, seed: int, wind_mps: float
+    make_cockpit: type[Cockpit], velocity_setpoint: Any, seed: int, wind_mps: float
 ) -> None:
     cockpit = make_cockpit(gusts_mps=None, seed=seed, wind_mps=wind_mps)
     cockpit.take_off(6.0)
@@ -202,7 +207,7 @@ def test_return_in_moving_air_ends_at_home_too(
     assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 3.5
 
 
-def test_reposition_flies_there_and_turns_to_the_given_heading(cockpit: Any) -> None:
+def test_reposition_flies_there_and_turns_to_the_given_heading(cockpit: Cockpit) -> None:
     cockpit.take_off(5.0)
     assert cockpit.command_int(192, (-1, 1, 0, math.pi / 2), 473978330, 85455942, 497.4) == [0]
     cockpit.fly(25.0)
@@ -214,12 +219,12 @@ def test_reposition_flies_there_and_turns_to_the_given_heading(cockpit: Any) -> 
     assert cockpit.mode == "HOLD"
 
 
-def test_reposition_without_the_change_of_mode_is_unsupported(cockpit: Any) -> None:
+def test_reposition_without_the_change_of_mode_is_unsupported(cockpit: Cockpit) -> None:
     cockpit.take_off()
     assert cockpit.command_int(192, (-1, 0, 0, NAN), 473978330, 85455942, 497.4) == [3]
 
 
-def test_hold_brakes_and_stays(cockpit: Any, velocity_setpoint: Any) -> None:
+def test_hold_brakes_and_stays(cockpit: Cockpit, velocity_setpoint: Any) -> None:
     cockpit.take_off(5.0)
     fast = velocity_setpoint(4, 0, 0)
     cockpit.offboard(fast)
@@ -231,7 +236,7 @@ def test_hold_brakes_and_stays(cockpit: Any, velocity_setpoint: Any) -> None:
     assert 1.0 < cockpit.vehicle.airframe.position[0] - before < 8.0
 
 
-def test_a_gimbal_is_looked_after_at_every_landing(cockpit: Any) -> None:
+def test_a_gimbal_is_looked_after_at_every_landing(cockpit: Cockpit) -> None:
     cockpit.take_off(4.0)
     cockpit.forget()
     cockpit.command(21)

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mavlink_sim.datasets.training_scenes import (
-    CLASS_NAMES,
     MIN_AREA_PX,
     MIN_SIDE_PX,
+    Boxes,
+    ClassIds,
     random_scene,
     render_dataset,
 )
+from mavlink_sim.world.shapes import CLASS_NAMES
+from mavlink_sim.world.textures import Image
+
+Scenes = list[tuple[Image, Boxes, ClassIds]]
 
 
 @pytest.fixture(scope="module")
-def scenes() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def scenes() -> Scenes:
     return list(render_dataset(24, 7, 256, 256))
 
 
@@ -23,7 +32,8 @@ def test_a_scene_follows_from_its_generator_alone() -> None:
     first = random_scene(np.random.default_rng(5), 192, 160)
     random_scene(np.random.default_rng(6), 256, 192)
     again = random_scene(np.random.default_rng(5), 192, 160)
-    for one, other in zip(first, again, strict=True):
+    both: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(first, again, strict=True)
+    for one, other in both:
         assert np.array_equal(one, other)
 
 
@@ -34,7 +44,7 @@ def test_picture_i_is_the_same_whatever_the_count() -> None:
     assert not np.array_equal(short[0][0], short[1][0])
 
 
-def test_scenes_have_the_size_and_types_they_promise(scenes: list) -> None:
+def test_scenes_have_the_size_and_types_they_promise(scenes: Scenes) -> None:
     for image, boxes, ids in scenes:
         assert image.shape == (256, 256, 3)
         assert image.dtype == np.uint8
@@ -44,7 +54,7 @@ def test_scenes_have_the_size_and_types_they_promise(scenes: list) -> None:
         assert ids.dtype == np.int64
 
 
-def test_every_label_is_inside_the_picture_and_large_enough(scenes: list) -> None:
+def test_every_label_is_inside_the_picture_and_large_enough(scenes: Scenes) -> None:
     for _, boxes, ids in scenes:
         sides = boxes[:, 2:] - boxes[:, :2]
         assert (boxes >= 0).all()
@@ -54,7 +64,7 @@ def test_every_label_is_inside_the_picture_and_large_enough(scenes: list) -> Non
         assert ((ids >= 0) & (ids < len(CLASS_NAMES))).all()
 
 
-def test_most_pictures_show_several_things_and_some_show_none(scenes: list) -> None:
+def test_most_pictures_show_several_things_and_some_show_none(scenes: Scenes) -> None:
     counts = np.array([len(ids) for _, _, ids in scenes])
     assert 3.0 < counts.mean() < 10.0
     assert counts.max() <= 14

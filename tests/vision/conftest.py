@@ -5,8 +5,9 @@ from __future__ import annotations
 from urllib.request import getproxies
 
 import pytest
-from foreign_checkpoints import FOREIGN, foreign_classes
 from torch import nn
+
+from tests.vision.foreign_checkpoints import FOREIGN, foreign_classes
 
 
 @pytest.fixture

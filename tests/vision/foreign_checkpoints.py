@@ -57,8 +57,8 @@ def foreign_classes(monkeypatch: pytest.MonkeyPatch, places: dict[str, str]) -> 
     return classes
 
 
-def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attributes: Any) -> nn.Module:
-    """Our network's modules, relabelled as the foreign library's."""
+def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attributes: Any) -> Any:
+    """Our network's modules, relabelled as the foreign library's: a module with attributes of any kind."""
 
     def relabelled(module: nn.Module) -> nn.Module:
         module = copy.copy(module)
@@ -75,7 +75,7 @@ def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attribut
 
     model = copy.deepcopy(model)
     table = model.description.to_plain()
-    whole = classes["DetectionModel"]()
+    whole: Any = classes["DetectionModel"]()
     whole.model = nn.Sequential(*[relabelled(layer) for layer in model.model])
     head = whole.model[-1]
     head.stride, head.reg_max = torch.tensor([8.0, 16.0, 32.0]), model.reg_max
@@ -126,9 +126,9 @@ class Mentioning(pickle._Pickler):
 
     def save(self, value: Any, save_persistent_id: bool = True) -> Any:
         if isinstance(value, Global):
-            self.write(b"c" + f"{value.module}\n{value.name}\n".encode())
+            self.write(b"c" + f"{value.module}\n{value.name}\n".encode())  # type: ignore[attr-defined]  # not in typeshed
             return None
-        return super().save(value, save_persistent_id)
+        return super().save(value, save_persistent_id)  # type: ignore[misc]  # not in typeshed
 
 
 def archive(path: Path, pickled: bytes, members: dict[str, bytes] | None = None) -> Path:

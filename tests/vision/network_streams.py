@@ -54,7 +54,8 @@ def rtp_packets(image: np.ndarray[Any, Any], sequence: int, timestamp: int) -> l
     position += 2 + int.from_bytes(jpeg_bytes[position + 2 : position + 4], "big")
     scan = jpeg_bytes[position:-2]
     height, width = image.shape[:2]
-    packets, offset = [], 0
+    packets: list[bytes] = []
+    offset = 0
     while offset < len(scan):
         chunk = scan[offset : offset + 1000]
         last = offset + len(chunk) == len(scan)

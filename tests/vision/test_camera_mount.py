@@ -20,7 +20,9 @@ headings = st.floats(-math.pi, math.pi)
 
 
 @given(roll=leans, pitch=leans, yaw=headings, down=st.floats(0.1, 1.4), aside=st.floats(-1.0, 1.0))
-def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(roll, pitch, yaw, down, aside):
+def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(
+    roll: float, pitch: float, yaw: float, down: float, aside: float
+) -> None:
     mount = CameraMount(pitch_rad=-down, yaw_rad=aside, levelled=True)
     body = matrix_from_euler(roll, pitch, yaw)
     north, east, below = Sightlines.of(CAMERA, mount, body, MIDDLE).directions[0]
@@ -32,14 +34,16 @@ def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(roll, pi
 
 
 @given(yaw=headings, roll=leans, pitch=st.floats(-1.2, 0.0))
-def test_on_a_level_body_both_are_one(yaw, roll, pitch):
+def test_on_a_level_body_both_are_one(yaw: float, roll: float, pitch: float) -> None:
     body = matrix_from_euler(0.0, 0.0, yaw)
     fixed, held = (CameraMount(0.1, 0.0, 0.05, roll, pitch, 0.2, levelled) for levelled in (False, True))
     assert np.allclose(fixed.ned_from_optical(body), held.ned_from_optical(body))
 
 
 @given(roll=leans, pitch=leans, yaw=headings, levelled=st.booleans())
-def test_the_ground_point_and_the_point_at_its_depth_are_one(roll, pitch, yaw, levelled):
+def test_the_ground_point_and_the_point_at_its_depth_are_one(
+    roll: float, pitch: float, yaw: float, levelled: bool
+) -> None:
     mount = CameraMount(0.2, -0.1, 0.05, pitch_rad=-0.9, levelled=levelled)
     body = matrix_from_euler(roll, pitch, yaw)
     pixels = np.array([[100.0, 80.0], [320.0, 240.0], [600.0, 470.0]])

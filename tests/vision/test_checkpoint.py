@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from foreign_checkpoints import (
+from torch import Tensor, nn
+
+from tests.vision.foreign_checkpoints import (
     NAMES,
     SMALL,
     as_foreign,
@@ -20,8 +22,6 @@ from foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
-from torch import Tensor, nn
-
 from vision.yolo import torch_archive
 from vision.yolo.architecture import ModelDescription, yolov8_description
 from vision.yolo.checkpoint import (
@@ -61,7 +61,7 @@ def test_a_loaded_model_can_be_trained_further(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
     model = load_checkpoint(tmp_path / "m.pt").model.train()
     sum(level.square().sum() for level in model(torch.rand(2, 3, 64, 64))).backward()
-    assert model.model[0].conv.weight.grad is not None
+    assert model.model[0].get_parameter("conv.weight").grad is not None
 
 
 def test_a_model_with_folded_normalisation_comes_back_folded(tmp_path: Path) -> None:
@@ -74,9 +74,9 @@ def test_a_model_with_folded_normalisation_comes_back_folded(tmp_path: Path) -> 
 
 def test_a_weight_beyond_float16_keeps_its_value(tmp_path: Path) -> None:
     model = trained_model()
-    model.model[0].bn.running_var[0] = 1e6
+    model.model[0].get_buffer("bn.running_var")[0] = 1e6
     save_checkpoint(tmp_path / "m.pt", model, metadata={})
-    assert load_checkpoint(tmp_path / "m.pt").model.model[0].bn.running_var[0] == 1e6
+    assert load_checkpoint(tmp_path / "m.pt").model.model[0].get_buffer("bn.running_var")[0] == 1e6
 
 
 def test_metadata_must_be_plain_values(tmp_path: Path) -> None:
@@ -180,10 +180,12 @@ def test_the_epsilon_of_each_normalisation_is_kept(
     tmp_path: Path, foreign: dict[str, type[nn.Module]]
 ) -> None:
     model = trained_model()
-    model.model[0].bn.eps = 0.02
+    norm = model.model[0].get_submodule("bn")
+    assert isinstance(norm, nn.BatchNorm2d)
+    norm.eps = 0.02
     path = save_foreign(tmp_path / "f.pt", as_foreign(model, foreign))
     loaded = load_checkpoint(path).model
-    assert loaded.model[0].bn.eps == 0.02
+    assert loaded.model[0].get_submodule("bn").eps == 0.02
     assert_same_maps(model, loaded)
 
 
@@ -262,7 +264,7 @@ def shrunk(generation: str, scale: str) -> ModelDescription:
     return dataclasses.replace(description, depth_multiple=0.34, width_multiple=0.25, max_channels=None)
 
 
-def terse(whole: nn.Module) -> None:
+def terse(whole: Any) -> None:
     """The table as it is published: what scale and layers imply is left unsaid."""
     for row in whole.yaml["backbone"] + whole.yaml["head"]:
         if row[2] == "C3k2" and len(row[3]) < 4:
@@ -306,8 +308,9 @@ def test_a_checkpoint_of_the_first_releases_is_read(
     model = trained_model(shrunk(generation, "n"))
     whole = as_foreign(model, early_foreign)
     del whole.model[-1].reg_max
-    settings = early_foreign["DictConfig"]()
-    settings._content = collections.defaultdict(dict, {"imgsz": 640})
+    settings: Any = early_foreign["DictConfig"]()
+    content: dict[str, object] = collections.defaultdict(dict, {"imgsz": 640})
+    settings._content = content
     whole.args = settings
     loaded = load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
     assert_same_maps(model, loaded.model)

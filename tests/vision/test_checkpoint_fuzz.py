@@ -19,10 +19,10 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from checkpoint_bombs import BOMBS, archive
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.vision.checkpoint_bombs import BOMBS, archive
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.architecture import build, yolov8_description
 from vision.yolo.checkpoint import CheckpointError, load_checkpoint, save_checkpoint

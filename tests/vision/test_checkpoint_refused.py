@@ -13,7 +13,11 @@ from typing import Any
 
 import pytest
 import torch
-from foreign_checkpoints import (
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from tests.vision.foreign_checkpoints import (
     FOREIGN,
     NAMES,
     Calls,
@@ -26,10 +30,6 @@ from foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from torch import nn
-
 from vision.yolo.architecture import yolov8_description
 from vision.yolo.checkpoint import (
     FORMAT,

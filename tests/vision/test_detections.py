@@ -38,11 +38,15 @@ def tracked() -> Detections:
 def test_a_part_keeps_everything_of_its_detections(index: Any) -> None:
     part = tracked()[index]
     assert part.names == ["car", "car"]
+    assert part.track_id is not None
     assert part.track_id.tolist() == [NO_TRACK, 9]
+    assert part.track_confirmed is not None
     assert part.track_confirmed.tolist() == [False, False]
     assert part.records() == tracked().records()[1:]
     untracked = three()[index]
-    assert untracked.track_id is untracked.track_score is untracked.track_confirmed is None
+    assert untracked.track_id is None
+    assert untracked.track_score is None
+    assert untracked.track_confirmed is None
 
 
 def test_records_tell_of_tracks_what_is_known() -> None:

@@ -30,13 +30,14 @@ def eager_model(class_id: int = 2) -> YoloModel:
     """A network that sees a box of 2 × 2 cells of class `class_id` in every cell of its coarsest level."""
     torch.manual_seed(0)
     model = build(yolov8_description((0.1, 0.01, 64), NAMES)).eval()
-    for level, (sides, classes) in enumerate(zip(model.detect.cv2, model.detect.cv3, strict=True)):
-        for last in (sides[-1], classes[-1]):
-            last.weight.data.zero_()
-            last.bias.data.fill_(-20.0)
-        sides[-1].bias.data.view(4, 16)[:, 1] = 20.0
+    for level, branches in enumerate(zip(model.detect.cv2, model.detect.cv3, strict=True)):
+        sides, classes = (list(branch.children())[-1] for branch in branches)
+        for last in (sides, classes):
+            last.get_parameter("weight").data.zero_()
+            last.get_parameter("bias").data.fill_(-20.0)
+        sides.get_parameter("bias").data.view(4, 16)[:, 1] = 20.0
         if level == 2:
-            classes[-1].bias.data[class_id] = 1.0
+            classes.get_parameter("bias").data[class_id] = 1.0
     return model
 
 
@@ -131,6 +132,7 @@ def test_a_detector_tells_what_it_was_made_from(model_path: Path) -> None:
     detector = detector_of(model_path, image_size=64)
     assert detector.class_names == NAMES
     assert detector.metadata == {"licence": "Apache-2.0"}
+    assert detector.description is not None
     assert detector.description.class_names == NAMES
 
 
@@ -227,7 +229,7 @@ def test_real_photographs_give_what_the_reference_gives(variant: str, arguments:
         assert image is not None
         if hashlib.sha256(image.tobytes()).hexdigest() != picture["pixels_bgr_sha256"]:
             pytest.skip("this machine's JPEG decoder gives other pixels than the reference's")
-        found = detector.detect(image)
+        found = detector.detect(np.asarray(image, np.uint8))
         unmatched = set(range(len(found)))
         for expected in picture[variant]:
             overlap, best = max(

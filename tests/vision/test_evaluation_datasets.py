@@ -37,7 +37,8 @@ def yolo(tmp_path: Path) -> Path:
 
 
 def pixels(dataset: Dataset, index: int) -> list[list[int]]:
-    return dataset.samples[index].boxes_in(200, 100).round().astype(int).tolist()
+    boxes: list[list[int]] = dataset.samples[index].boxes_in(200, 100).round().astype(int).tolist()
+    return boxes
 
 
 def test_images_and_labels_in_folders_of_their_own(yolo: Path) -> None:

@@ -20,7 +20,7 @@ def found(*boxes: tuple[float, float, float, float, float, int]) -> Detections:
 
 def add(
     misses: WorstMisses, detections: Detections, *true: tuple[float, float, float, float, int], **crowd: bool
-):
+) -> None:
     table = np.array(true, np.float32).reshape(-1, 5)
     ignored = np.full(len(table), crowd.get("ignored", False))
     misses.add(Path("a.jpg"), IMAGE, detections, table[:, :4], table[:, 4].astype(np.int64), ignored)

@@ -295,7 +295,7 @@ def test_no_box_above_the_confidence_is_an_empty_list() -> None:
     with torch.inference_mode():
         boxes = select_boxes(model, model(picture()), confidence=1.0)
     assert (len(boxes), boxes.xyxy.shape) == (0, (0, 4))
-    assert (boxes.confidence.dtype, boxes.class_id.dtype) == (np.float32, np.int64)
+    assert (boxes.confidence.dtype, boxes.class_id.dtype) == (np.dtype(np.float32), np.dtype(np.int64))
 
 
 def test_an_end_to_end_head_learns_with_one_branch_and_answers_with_the_other() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import pytest
 import torch
@@ -22,12 +23,16 @@ from vision.yolo.layers import (
     SCDown,
 )
 
+Layer = TypeVar("Layer", bound=nn.Module)
 
-def with_lively_statistics(module: nn.Module, seed: int = 0) -> nn.Module:
+
+def with_lively_statistics(module: Layer, seed: int = 0) -> Layer:
     """Batch normalisations as after training, so that folding them is not folding an identity."""
     generator = torch.Generator().manual_seed(seed)
     for norm in module.modules():
         if isinstance(norm, nn.BatchNorm2d):
+            assert norm.running_mean is not None
+            assert norm.running_var is not None
             for tensor, low, high in (
                 (norm.weight.data, 0.5, 2.0),
                 (norm.bias.data, -1.0, 1.0),
@@ -103,10 +108,12 @@ def test_the_head_starts_with_rare_objects() -> None:
     head = Detect(7, (16, 32, 64))
     head.initialise_biases((8, 16, 32))
     for level, stride in zip(head.cv3, (8, 16, 32), strict=True):
-        probability = level[-1].bias.sigmoid()
+        *_, last = level.children()
+        probability = last.get_parameter("bias").sigmoid()
         # 5 objects spread over the cells of a 640-pixel picture and over the classes.
         assert torch.all((probability - 5 / 7 / (640 / stride) ** 2).abs() < 1e-4)
-    assert all(math.isclose(value, 1.0) for value in head.cv2[0][-1].bias.tolist())
+    *_, last = head.cv2[0].children()
+    assert all(math.isclose(value, 1.0) for value in last.get_parameter("bias").tolist())
 
 
 def test_two_depthwise_convolutions_fold_into_one() -> None:

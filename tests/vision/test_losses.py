@@ -11,23 +11,24 @@ from hypothesis import strategies as st
 
 from vision.yolo.losses import BINS, Truth, cell_grid, ciou, detection_loss, distribution_focal_loss
 
+Box = tuple[float, float, float, float]
 side = st.floats(1, 100)
 box = st.tuples(st.floats(0, 100), st.floats(0, 100), side, side).map(
     lambda b: (b[0], b[1], b[0] + b[2], b[1] + b[3])
 )
 
 
-def test_ciou_of_equal_boxes_is_one():
+def test_ciou_of_equal_boxes_is_one() -> None:
     boxes = torch.tensor([[1.0, 2, 30, 40]])
     assert float(ciou(boxes, boxes)) == pytest.approx(1, abs=1e-5)
 
 
-def test_ciou_of_a_shifted_box_is_iou_less_the_centre_distance():
+def test_ciou_of_a_shifted_box_is_iou_less_the_centre_distance() -> None:
     value = float(ciou(torch.tensor([0.0, 0, 2, 2]), torch.tensor([1.0, 0, 3, 2])))
     assert value == pytest.approx(1 / 3 - 1 / (3**2 + 2**2), abs=1e-5)
 
 
-def test_ciou_weighs_the_aspect_ratio():
+def test_ciou_weighs_the_aspect_ratio() -> None:
     first, second = torch.tensor([-2.0, -1, 2, 1]), torch.tensor([-1.0, -2, 1, 2])
     iou, aspect = 4 / 12, 4 / math.pi**2 * (math.atan(2) - math.atan(0.5)) ** 2
     assert float(ciou(first, second)) == pytest.approx(iou - aspect**2 / (1 - iou + aspect), abs=1e-5)
@@ -35,20 +36,20 @@ def test_ciou_weighs_the_aspect_ratio():
 
 @settings(deadline=None)
 @given(first=box, second=box)
-def test_ciou_is_symmetric_and_bounded(first, second):
+def test_ciou_is_symmetric_and_bounded(first: Box, second: Box) -> None:
     a, b = torch.tensor(first, dtype=torch.float64), torch.tensor(second, dtype=torch.float64)
     assert float(ciou(a, b)) == pytest.approx(float(ciou(b, a)), abs=1e-9)
     assert -2 <= float(ciou(a, b)) <= 1 + 1e-9
 
 
-def test_ciou_draws_a_distant_box_nearer():
+def test_ciou_draws_a_distant_box_nearer() -> None:
     moving = torch.tensor([50.0, 50, 60, 60], requires_grad=True)
-    (1 - ciou(moving, torch.tensor([0.0, 0, 10, 10]))).backward()
+    (1 - ciou(moving, torch.tensor([0.0, 0, 10, 10]))).backward()  # type: ignore[no-untyped-call]  # not typed by torch
     assert moving.grad is not None
     assert (moving.grad > 0).sum() >= 2
 
 
-def test_a_distribution_at_the_two_right_bins_has_the_least_loss():
+def test_a_distribution_at_the_two_right_bins_has_the_least_loss() -> None:
     distance = torch.full((1, 4), 3.25)
     right = torch.full((1, 4, BINS), -30.0)
     right[..., 3], right[..., 4] = math.log(0.75), math.log(0.25)
@@ -57,18 +58,20 @@ def test_a_distribution_at_the_two_right_bins_has_the_least_loss():
     assert float(distribution_focal_loss(torch.zeros(1, 4, BINS), distance)) == pytest.approx(math.log(BINS))
 
 
-def test_distances_beyond_the_bins_are_clipped_not_lost():
+def test_distances_beyond_the_bins_are_clipped_not_lost() -> None:
     loss = distribution_focal_loss(torch.zeros(2, 4, BINS), torch.tensor([[40.0] * 4, [-3.0] * 4]))
     assert loss.tolist() == pytest.approx([math.log(BINS)] * 2)
 
 
-def test_cells_are_counted_level_by_level_and_row_by_row():
+def test_cells_are_counted_level_by_level_and_row_by_row() -> None:
     centres, strides = cell_grid([(1, 2), (1, 1)], [8, 16])
     assert centres.tolist() == [[4, 4], [12, 4], [8, 8]]
     assert strides.tolist() == [8, 8, 16]
 
 
-def head_maps(classes, sure_of=None):
+def head_maps(
+    classes: int, sure_of: tuple[int, float, float, float, float] | None = None
+) -> tuple[list[torch.Tensor], tuple[int, ...]]:
     """Maps of a 64 × 64 input; with `sure_of`, the head says exactly that class and box."""
     strides, maps = (8, 16, 32), []
     for stride in strides:
@@ -93,7 +96,7 @@ def head_maps(classes, sure_of=None):
     return maps, strides
 
 
-def one_object(class_id, *corners):
+def one_object(class_id: int, *corners: float) -> Truth:
     return Truth(
         torch.tensor([[corners]], dtype=torch.float32),
         torch.tensor([[class_id]]),
@@ -101,7 +104,7 @@ def one_object(class_id, *corners):
     )
 
 
-def test_a_head_that_is_right_has_next_to_no_loss():
+def test_a_head_that_is_right_has_next_to_no_loss() -> None:
     maps, strides = head_maps(3, sure_of=(1, 12, 12, 28, 28))
     loss = detection_loss(maps, strides, one_object(1, 12, 12, 28, 28))
     assert loss.box == pytest.approx(0, abs=1e-3)
@@ -109,14 +112,14 @@ def test_a_head_that_is_right_has_next_to_no_loss():
     assert loss.foreground > 0
 
 
-def test_the_wrong_class_costs_classification_and_no_box_loss():
+def test_the_wrong_class_costs_classification_and_no_box_loss() -> None:
     maps, strides = head_maps(3, sure_of=(1, 12, 12, 28, 28))
     loss = detection_loss(maps, strides, one_object(2, 12, 12, 28, 28))
     assert loss.classes > 5
     assert loss.box == pytest.approx(0, abs=1e-3)
 
 
-def test_an_empty_picture_teaches_background_alone():
+def test_an_empty_picture_teaches_background_alone() -> None:
     maps, strides = head_maps(3)
     loss = detection_loss(
         maps,
@@ -128,11 +131,11 @@ def test_an_empty_picture_teaches_background_alone():
     assert loss.box == 0
     assert loss.distribution == 0
     assert loss.classes > 0
-    loss.total.backward()
-    assert all(torch.isfinite(m.grad).all() for m in maps)
+    loss.total.backward()  # type: ignore[no-untyped-call]  # not typed by torch
+    assert all(m.grad is not None and torch.isfinite(m.grad).all() for m in maps)
 
 
-def test_following_the_gradient_lowers_the_loss():
+def test_following_the_gradient_lowers_the_loss() -> None:
     maps, strides = head_maps(3)
     truth = one_object(0, 10, 10, 40, 50)
     optimiser = torch.optim.Adam(maps, 0.3)
@@ -140,11 +143,11 @@ def test_following_the_gradient_lowers_the_loss():
     for _ in range(60):
         optimiser.zero_grad()
         loss = detection_loss(maps, strides, truth)
-        loss.total.backward()
+        loss.total.backward()  # type: ignore[no-untyped-call]  # not typed by torch
         optimiser.step()
     assert float(detection_loss(maps, strides, truth).total.detach()) < first / 3
 
 
-def test_maps_without_room_for_classes_are_refused():
+def test_maps_without_room_for_classes_are_refused() -> None:
     with pytest.raises(ValueError, match="64 \\+ classes channels, got 64"):
         detection_loss([torch.zeros(1, 64, 2, 2)], [8], one_object(0, 0, 0, 8, 8))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from vision.yolo.metrics import ImageResult, average_precision, box_iou, score_d
 NAMES = ("car", "boat")
 SQUARE = (0.0, 0.0, 10.0, 10.0)
 FAR = (50.0, 50.0, 60.0, 60.0)
+Box = tuple[float, float, float, float]
 
 
-def result(found=(), true=()):
+def result(found: Sequence[tuple[Box, float, int]] = (), true: Sequence[tuple[Box, int]] = ()) -> ImageResult:
     """found: (box, confidence, class); true: (box, class)."""
     return ImageResult(
         np.array([f[0] for f in found], np.float32).reshape(-1, 4),
@@ -27,7 +29,7 @@ def result(found=(), true=()):
     )
 
 
-def test_finding_everything_exactly_scores_one():
+def test_finding_everything_exactly_scores_one() -> None:
     score = score_detections([result([(SQUARE, 0.9, 0), (FAR, 0.8, 1)], [(SQUARE, 0), (FAR, 1)])], NAMES)
     assert score.map50 == pytest.approx(1)
     assert score.map50_95 == pytest.approx(1)
@@ -35,71 +37,71 @@ def test_finding_everything_exactly_scores_one():
     assert score.images == 1
 
 
-def test_a_missed_object_costs_the_recall_points_beyond():
+def test_a_missed_object_costs_the_recall_points_beyond() -> None:
     score = score_detections([result([(SQUARE, 0.9, 0)], [(SQUARE, 0), (FAR, 0)])], NAMES)
     assert score.map50 == pytest.approx(51 / 101)
 
 
-def test_a_more_confident_false_alarm_halves_the_precision():
+def test_a_more_confident_false_alarm_halves_the_precision() -> None:
     score = score_detections([result([(FAR, 0.9, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)])], NAMES)
     assert score.map50 == pytest.approx(0.5)
 
 
-def test_a_less_confident_false_alarm_costs_nothing():
+def test_a_less_confident_false_alarm_costs_nothing() -> None:
     score = score_detections([result([(FAR, 0.1, 0), (SQUARE, 0.8, 0)], [(SQUARE, 0)])], NAMES)
     assert score.map50 == pytest.approx(1)
 
 
-def test_the_second_box_on_one_object_is_a_false_alarm():
+def test_the_second_box_on_one_object_is_a_false_alarm() -> None:
     score = score_detections(
         [result([(SQUARE, 0.9, 0), (SQUARE, 0.8, 0), (FAR, 0.7, 0)], [(SQUARE, 0), (FAR, 0)])], NAMES
     )
     assert score.map50 == pytest.approx((51 + 50 * 2 / 3) / 101)
 
 
-def test_a_box_of_iou_0_72_counts_at_the_five_lower_thresholds():
+def test_a_box_of_iou_0_72_counts_at_the_five_lower_thresholds() -> None:
     loose = (0.0, 0.0, 10.0, 7.2)
     score = score_detections([result([(loose, 0.9, 0)], [(SQUARE, 0)])], NAMES)
     assert score.map50 == pytest.approx(1)
     assert score.map50_95 == pytest.approx(0.5)
 
 
-def test_classes_do_not_find_each_other_and_absent_classes_do_not_count():
+def test_classes_do_not_find_each_other_and_absent_classes_do_not_count() -> None:
     score = score_detections([result([(SQUARE, 0.9, 1)], [(SQUARE, 0)])], NAMES)
     assert score.map50 == 0
     assert math.isnan(score.per_class["boat"].ap50)
 
 
-def test_an_object_is_not_found_by_a_box_in_another_image():
+def test_an_object_is_not_found_by_a_box_in_another_image() -> None:
     score = score_detections([result([(SQUARE, 0.9, 0)]), result((), [(SQUARE, 0)])], NAMES)
     assert score.map50 == 0
 
 
-def test_only_the_hundred_most_confident_boxes_of_an_image_count():
+def test_only_the_hundred_most_confident_boxes_of_an_image_count() -> None:
     noise = [(FAR, 0.9, 0)] * 100
     assert score_detections([result([*noise, (SQUARE, 0.1, 0)], [(SQUARE, 0)])], NAMES).map50 == 0
 
 
-def test_no_images_give_no_score():
+def test_no_images_give_no_score() -> None:
     assert math.isnan(score_detections([], NAMES).map50)
 
 
-def test_a_class_id_the_model_does_not_know_is_refused():
+def test_a_class_id_the_model_does_not_know_is_refused() -> None:
     with pytest.raises(ValueError, match=r"class ids must be 0\.\.1, got 0\.\.7"):
         score_detections([result([(SQUARE, 0.5, 7)], [(SQUARE, 0)])], NAMES)
 
 
-def test_precision_without_true_objects_is_not_defined():
+def test_precision_without_true_objects_is_not_defined() -> None:
     with pytest.raises(ValueError, match="at least one true object"):
         average_precision(np.zeros(0, np.float32), np.zeros(0, bool), 0)
 
 
-def test_iou_of_half_overlapping_boxes_is_a_third():
+def test_iou_of_half_overlapping_boxes_is_a_third() -> None:
     iou = box_iou(np.array([[0, 0, 2, 2]], np.float32), np.array([[1, 0, 3, 2]], np.float32))
     assert iou.tolist() == [[pytest.approx(1 / 3)]]
 
 
-def plain_average_precision(confidences, right, objects):
+def plain_average_precision(confidences: list[float], right: list[bool], objects: int) -> float:
     """The definition, written out: at each recall the best precision at that recall or more."""
     order = sorted(range(len(right)), key=lambda i: -confidences[i])
     curve, found = [], 0
@@ -115,7 +117,7 @@ def plain_average_precision(confidences, right, objects):
     st.lists(st.tuples(st.integers(0, 10**6), st.booleans()), max_size=30, unique_by=lambda p: p[0]),
     st.integers(0, 5),
 )
-def test_average_precision_agrees_with_its_definition(pairs, missed):
+def test_average_precision_agrees_with_its_definition(pairs: list[tuple[int, bool]], missed: int) -> None:
     confidences = np.array([p[0] / 10**6 for p in pairs], np.float32)
     right = np.array([p[1] for p in pairs], bool)
     objects = int(right.sum()) + missed
@@ -126,7 +128,7 @@ def test_average_precision_agrees_with_its_definition(pairs, missed):
     )
 
 
-def test_an_ignored_region_makes_nothing_right_or_wrong():
+def test_an_ignored_region_makes_nothing_right_or_wrong() -> None:
     crowd = ImageResult(
         np.array([SQUARE, FAR], np.float32),
         np.array([0.9, 0.8], np.float32),
@@ -140,12 +142,13 @@ def test_an_ignored_region_makes_nothing_right_or_wrong():
     assert score.map50 == pytest.approx(1)
 
 
-def test_the_score_is_that_of_cocos_own_program():
+def test_the_score_is_that_of_cocos_own_program() -> None:
     """Random scenes with crowds, second boxes and false alarms, against pycocotools."""
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
     cocoeval = pytest.importorskip("pycocotools.cocoeval")
     rng = np.random.default_rng(3)
-    results, images, annotations, found = [], [], [], []
+    results, images, found = [], [], []
+    annotations: list[dict[str, object]] = []
     for image in range(40):
         true = rng.uniform(0, 80, (rng.integers(0, 6), 4)).astype(np.float32)
         true[:, 2:] = true[:, :2] + rng.uniform(8, 60, (len(true), 2))
@@ -157,7 +160,7 @@ def test_the_score_is_that_of_cocos_own_program():
         boxes[:, 2:] = np.maximum(boxes[:, 2:], boxes[:, :2] + 1)
         kinds = np.concatenate([np.repeat(classes, 2), rng.integers(0, 2, len(extra))])
         confidences = rng.permutation(len(boxes)).astype(np.float32) / len(boxes) + image * 1e-5
-        results.append(ImageResult(boxes, confidences, kinds, true, classes, ignored))
+        results.append(ImageResult(boxes, confidences.astype(np.float32), kinds, true, classes, ignored))
         images.append({"id": image + 1, "width": 200, "height": 200})
         for box, kind, crowd in zip(true.tolist(), classes.tolist(), ignored.tolist(), strict=True):
             left, top, right, bottom = box

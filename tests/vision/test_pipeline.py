@@ -207,7 +207,8 @@ def test_a_tracker_names_what_is_seen_and_keeps_the_weak_that_belong_to_it() -> 
     frames = [frame_of(number, spot_x=10 + 3 * number) for number in range(8)]
     frames = [replace(frame, captured_ns=frame.sequence * 100_000_000 + 1) for frame in frames]
     results = run(Pipeline(Frames(*frames), Flickering(), tracker=Tracker()))
-    assert [result.detections.track_id.tolist() for result in results] == [[1]] * 8
+    tracked = [result.detections.track_id for result in results]
+    assert [ids is not None and ids.tolist() for ids in tracked] == [[1]] * 8
     assert [round(float(result.detections.confidence[0]), 2) for result in results] == [
         0.9,
         0.9,

@@ -88,9 +88,10 @@ def frame(sequence: int, width: int = 16, height: int = 12, depth: bool = True) 
 
 
 def same(one: Frame, other: Frame) -> bool:
-    depth = (one.depth_m is None) == (other.depth_m is None) and (
-        one.depth_m is None or np.array_equal(one.depth_m, other.depth_m, equal_nan=True)
-    )
+    if one.depth_m is None or other.depth_m is None:
+        depth = one.depth_m is other.depth_m
+    else:
+        depth = np.array_equal(one.depth_m, other.depth_m, equal_nan=True)
     stamps = (one.sequence, one.captured_ns) == (other.sequence, other.captured_ns)
     return stamps and depth and np.array_equal(one.image, other.image)
 

@@ -12,9 +12,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import pytest
-from network_streams import QUICK, is_blue, jpeg, wait_for_frame
 
 from mavlink_sim.testing import free_port
+from tests.vision.network_streams import QUICK, is_blue, jpeg, wait_for_frame
 from vision.sources import SourceError, SourceSettings, open_source
 
 pytestmark = pytest.mark.usefixtures("no_proxy")

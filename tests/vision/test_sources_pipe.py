@@ -36,7 +36,7 @@ def fifo(tmp_path: Path) -> Path:
     return path
 
 
-def write_in_thread(path: Path, write: Callable[[int], None]) -> threading.Thread:
+def write_in_thread(path: Path, write: Callable[[int], object]) -> threading.Thread:
     def run() -> None:
         descriptor = os.open(path, os.O_WRONLY)
         try:

@@ -9,9 +9,9 @@ import time
 
 import numpy as np
 import pytest
-from network_streams import QUICK, is_blue, sending, wait_for_frame
 
 from mavlink_sim.testing import free_port
+from tests.vision.network_streams import QUICK, is_blue, sending, wait_for_frame
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import UdpStream
 

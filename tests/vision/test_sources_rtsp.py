@@ -8,8 +8,8 @@ import struct
 import threading
 
 import pytest
-from network_streams import QUICK, is_blue, sending, wait_for_frame
 
+from tests.vision.network_streams import QUICK, is_blue, sending, wait_for_frame
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import without_password
 

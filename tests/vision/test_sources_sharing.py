@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ def pictures(folder: Path, *sizes: tuple[int, int]) -> Path:
 
 
 @contextmanager
-def shared(folder: Path, name: str, **settings: object) -> Iterator[Source]:
+def shared(folder: Path, name: str, **settings: Any) -> Iterator[Source]:
     with (
         FrameSharing(name) as sharing,
         open_source(str(folder), SourceSettings(on_frame=sharing.write, **settings)) as source,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 
 from vision.detections import Detections
 from vision.pipeline import FrameDetector
-from vision.tiling import TiledDetector, TiledTiming, merge_passes, tiles_of
+from vision.tiling import Tile, TiledDetector, TiledTiming, merge_passes, tiles_of
 
 NAMES = ("car", "dog")
+Edge = Callable[[Tile], int]
 
 
 @dataclass
@@ -58,10 +60,11 @@ def test_tiles_cover_the_frame_and_overlap_as_asked(
     width: int, height: int, size: int, overlap: float
 ) -> None:
     tiles = tiles_of(width, height, size, overlap)
-    for start, end, length in (
+    axes: tuple[tuple[Edge, Edge, int], ...] = (
         (lambda tile: tile.left, lambda tile: tile.right, width),
         (lambda tile: tile.top, lambda tile: tile.bottom, height),
-    ):
+    )
+    for start, end, length in axes:
         spans = sorted({(start(tile), end(tile)) for tile in tiles})
         assert spans[0][0] == 0
         assert spans[-1][1] == length

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,16 +14,17 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from vision.yolo.augmentation import NO_AUGMENTATION, Augmentation, augment
+from vision.yolo.augmentation import NO_AUGMENTATION, Augmentation, LabelledImage, augment
 from vision.yolo.evaluation import evaluate
-from vision.yolo.scene_batches import SceneKey, collate, draw_scene, scene_batches
-from vision.yolo.training import Progress, Stage, TrainingSettings, load_average, train
+from vision.yolo.scene_batches import SceneKey, SceneSource, collate, draw_scene, scene_batches
+from vision.yolo.training import Progress, Stage, TrainedModel, TrainingSettings, load_average, train
 
 COLOURS = ((40, 40, 220), (60, 200, 60))
 
 
-def rectangles(rng, width, height):
+def rectangles(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
     """Two rectangles of two classes on noise, in their own halves so that none hides another."""
     image = rng.integers(90, 130, (height, width, 3), dtype=np.uint8)
     boxes, ids = [], []
@@ -37,12 +40,12 @@ def rectangles(rng, width, height):
     return image, np.array(boxes, np.float32), np.array(ids, np.int64)
 
 
-def one_of_eight(rng, width, height):
+def one_of_eight(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
     """One of eight fixed pictures."""
     return rectangles(np.random.default_rng(int(rng.integers(8))), width, height)
 
 
-def nothing(_rng, width, height):
+def nothing(_rng: np.random.Generator | None, width: int, height: int) -> LabelledImage:
     return np.zeros((height, width, 3), np.uint8), np.zeros((0, 4), np.float32), np.zeros(0, np.int64)
 
 
@@ -57,15 +60,15 @@ SMALL = TrainingSettings(
 )
 
 
-def weights(trained):
+def weights(trained: TrainedModel) -> torch.Tensor:
     return torch.cat([value.flatten().float() for value in trained.model.state_dict().values()])
 
 
-def silent(_progress):
+def silent(_progress: Progress) -> None:
     pass
 
 
-def test_a_tiny_model_overfits_eight_pictures():
+def test_a_tiny_model_overfits_eight_pictures() -> None:
     settings = replace(
         SMALL, stages=(Stage(96, 96, 8, 110),), warmup_steps=10, learning_rate=6e-3, average_decay=0.95
     )
@@ -78,20 +81,22 @@ def test_a_tiny_model_overfits_eight_pictures():
     assert seen[-1].remaining_s == 0
 
 
-def test_the_same_seed_gives_the_same_weights_whatever_the_number_of_workers():
+def test_the_same_seed_gives_the_same_weights_whatever_the_number_of_workers() -> None:
     assert torch.equal(
         weights(train(SMALL, rectangles, silent)),
         weights(train(replace(SMALL, workers=2), rectangles, silent)),
     )
 
 
-def test_another_seed_gives_other_weights():
+def test_another_seed_gives_other_weights() -> None:
     assert not torch.equal(
         weights(train(SMALL, rectangles, silent)), weights(train(replace(SMALL, seed=1), rectangles, silent))
     )
 
 
-def test_training_resumed_from_a_checkpoint_ends_with_the_weights_of_an_uninterrupted_run(tmp_path: Path):
+def test_training_resumed_from_a_checkpoint_ends_with_the_weights_of_an_uninterrupted_run(
+    tmp_path: Path,
+) -> None:
     whole = train(SMALL, rectangles, silent)
     kept = tmp_path / "state.pt"
     cut = train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
@@ -102,31 +107,31 @@ def test_training_resumed_from_a_checkpoint_ends_with_the_weights_of_an_uninterr
     assert torch.equal(weights(load_average(kept, SMALL)), weights(resumed))
 
 
-def test_resuming_another_network_is_refused(tmp_path: Path):
+def test_resuming_another_network_is_refused(tmp_path: Path) -> None:
     kept = tmp_path / "state.pt"
     train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
     with pytest.raises(ValueError, match=r"is of the network .* the settings ask for"):
         train(replace(SMALL, width_multiple=0.125), rectangles, silent, checkpoint=kept, resume=True)
 
 
-def test_resuming_without_a_checkpoint_says_which_file_is_missing(tmp_path: Path):
+def test_resuming_without_a_checkpoint_says_which_file_is_missing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"missing\.pt"):
         train(SMALL, rectangles, silent, checkpoint=tmp_path / "missing.pt", resume=True)
 
 
-def test_pictures_without_any_object_can_be_trained_on():
+def test_pictures_without_any_object_can_be_trained_on() -> None:
     assert torch.isfinite(
         weights(train(replace(SMALL, stages=(Stage(64, 64, 2, 2),)), nothing, silent))
     ).all()
 
 
-def test_stages_of_different_sizes_follow_each_other():
+def test_stages_of_different_sizes_follow_each_other() -> None:
     seen: list[Progress] = []
     train(replace(SMALL, stages=(Stage(64, 64, 2, 2), Stage(96, 64, 1, 1))), rectangles, seen.append)
     assert [(p.step, p.steps) for p in seen] == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_the_rate_warms_up_stays_and_falls():
+def test_the_rate_warms_up_stays_and_falls() -> None:
     settings = replace(
         SMALL, stages=(Stage(64, 64, 1, 100, decay_steps=20),), warmup_steps=10, final_rate=0.1
     )
@@ -137,13 +142,13 @@ def test_the_rate_warms_up_stays_and_falls():
     assert rates[100] == pytest.approx(0.1)
 
 
-def test_prolonging_the_constant_stretch_leaves_the_earlier_rates_alone():
+def test_prolonging_the_constant_stretch_leaves_the_earlier_rates_alone() -> None:
     settings = replace(SMALL, stages=(Stage(64, 64, 1, 100, decay_steps=20),), warmup_steps=10)
     longer = replace(settings, stages=(Stage(64, 64, 1, 300, decay_steps=20),))
     assert [settings.rate_at(step) for step in range(80)] == [longer.rate_at(step) for step in range(80)]
 
 
-def test_a_compressed_course_keeps_its_stages():
+def test_a_compressed_course_keeps_its_stages() -> None:
     settings = replace(SMALL, stages=(Stage(64, 64, 1, 90, decay_steps=20), Stage(96, 96, 1, 10)))
     short = settings.with_steps(10)
     assert [(stage.steps, stage.decay_steps) for stage in short.stages] == [(9, 2), (1, 0)]
@@ -151,7 +156,7 @@ def test_a_compressed_course_keeps_its_stages():
     assert [(stage.steps, stage.decay_steps) for stage in one.stages] == [(1, 1), (1, 0)]
 
 
-def test_each_stage_has_its_own_fall_of_the_rate():
+def test_each_stage_has_its_own_fall_of_the_rate() -> None:
     stages = (
         Stage(64, 64, 1, 50, decay_steps=10),
         Stage(96, 96, 1, 30),
@@ -167,13 +172,13 @@ def test_each_stage_has_its_own_fall_of_the_rate():
     assert rates[100] == pytest.approx(0.1)
 
 
-def test_a_stage_has_a_rate():
+def test_a_stage_has_a_rate() -> None:
     with pytest.raises(ValueError, match="rate of a stage must be above 0"):
         Stage(64, 64, 1, 100, rate=0.0)
 
 
 @pytest.mark.parametrize("decay_steps", [-1, 101])
-def test_a_stage_cannot_fall_for_longer_than_it_lasts(decay_steps: int):
+def test_a_stage_cannot_fall_for_longer_than_it_lasts(decay_steps: int) -> None:
     with pytest.raises(ValueError, match="decay_steps of a stage must be from 0 to its steps"):
         Stage(64, 64, 1, 100, decay_steps=decay_steps)
 
@@ -186,26 +191,26 @@ def test_a_stage_cannot_fall_for_longer_than_it_lasts(decay_steps: int):
         pytest.param({"average_decay": 1.0}, "average_decay must be in", id="an average that never moves"),
     ],
 )
-def test_impossible_settings_are_refused(change, message):
+def test_impossible_settings_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(SMALL, **change)
 
 
-def test_a_picture_size_the_network_cannot_halve_five_times_is_refused():
+def test_a_picture_size_the_network_cannot_halve_five_times_is_refused() -> None:
     with pytest.raises(ValueError, match="multiples of 32 pixels, got 100x64"):
         Stage(100, 64, 1, 1)
 
 
-def wrong_size(rng, width, height):
+def wrong_size(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
     return rectangles(rng, width + 1, height)
 
 
-def unknown_class(rng, width, height):
+def unknown_class(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
     image, boxes, ids = rectangles(rng, width, height)
     return image, boxes, ids + 5
 
 
-def label_short(rng, width, height):
+def label_short(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
     image, boxes, ids = rectangles(rng, width, height)
     return image, boxes, ids[:1]
 
@@ -218,13 +223,13 @@ def label_short(rng, width, height):
         pytest.param(label_short, "2 boxes but 1 class ids", id="labels"),
     ],
 )
-def test_a_source_that_gives_no_proper_scene_is_named(source, message):
+def test_a_source_that_gives_no_proper_scene_is_named(source: SceneSource, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         train(SMALL, source, silent)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_augmented_boxes_still_hold_their_objects(seed):
+def test_augmented_boxes_still_hold_their_objects(seed: int) -> None:
     limits = Augmentation(mirror=0.5, zoom_probability=1.0, hue=0, saturation=0, brightness=0)
     image = np.full((96, 128, 3), 114, np.uint8)
     image[30:60, 40:90] = (0, 0, 255)
@@ -238,18 +243,19 @@ def test_augmented_boxes_still_hold_their_objects(seed):
         )
 
 
-def test_the_same_key_draws_the_same_picture():
+def test_the_same_key_draws_the_same_picture() -> None:
     key = SceneKey(3, 4, 96, 64)
     first, second = (draw_scene(rectangles, key, 2) for _ in range(2))
-    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    both: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(first, second, strict=True)
+    assert all(np.array_equal(a, b) for a, b in both)
     assert not np.array_equal(first[0], draw_scene(rectangles, replace(key, scene=5), 2)[0])
 
 
-def test_returning_scenes_are_drawn_once_and_seen_differently_each_time(tmp_path: Path):
+def test_returning_scenes_are_drawn_once_and_seen_differently_each_time(tmp_path: Path) -> None:
     plan = [[SceneKey(0, scene, 64, 64, view) for scene in range(2)] for view in range(3)]
     calls = []
 
-    def counted(rng, width, height):
+    def counted(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
         calls.append(1)
         return rectangles(rng, width, height)
 
@@ -260,7 +266,7 @@ def test_returning_scenes_are_drawn_once_and_seen_differently_each_time(tmp_path
     assert torch.equal(batches[2][0], alone[0][0])
 
 
-def test_a_longer_stage_begins_like_a_shorter_one():
+def test_a_longer_stage_begins_like_a_shorter_one() -> None:
     settings = replace(SMALL, stages=(Stage(64, 64, 2, 3, scenes=4),))
     seen: list[float] = []
     train(settings, rectangles, lambda progress: seen.append(progress.box_loss))
@@ -273,7 +279,7 @@ def test_a_longer_stage_begins_like_a_shorter_one():
     assert longer[:2] == seen[:2]
 
 
-def test_a_batch_pads_its_labels_and_turns_colours_to_rgb():
+def test_a_batch_pads_its_labels_and_turns_colours_to_rgb() -> None:
     full = draw_scene(rectangles, SceneKey(0, 0, 64, 64), 2)
     empty = nothing(None, 64, 64)
     images, truth = collate([full, empty])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ def result(detections: Detections) -> PerceptionResult:
     return PerceptionResult(7, 1_000, 2_000, 640, 480, detections, {"inference": 20.123}, 3)
 
 
-def strictly(value: object) -> object:
+def strictly(value: object) -> Any:
     """Through JSON as a strict reader sees it."""
     return json.loads(json.dumps(value, allow_nan=False))
 
@@ -89,8 +90,7 @@ def test_a_tracked_detection_bears_its_identity_its_median_and_whether_it_counts
     )
     message = strictly(detections_message(result(cars), "alpha", 3_000))
     tracks = [
-        (record["track_id"], record["track_score"], record["track_state"])
-        for record in message["detections"]  # type: ignore[index]
+        (record["track_id"], record["track_score"], record["track_state"]) for record in message["detections"]
     ]
     assert tracks == [(7, 0.81, "confirmed"), (8, 0.4, "tentative"), (None, None, "none")]
 
@@ -136,7 +136,7 @@ def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> Non
 
 def test_an_unknown_range_is_null() -> None:
     message = strictly(detections_message(result(one_car(math.nan)), "alpha", 3_000))
-    (car,) = message["detections"]  # type: ignore[index]
+    (car,) = message["detections"]
     assert car["depth_m"] is None
     assert car["nearest_camera_m"] is None
 
@@ -148,9 +148,9 @@ def test_labels_are_names_in_order_or_say_that_there_is_nothing() -> None:
 
 def test_a_vehicle_of_which_nothing_is_known_yet_is_valid_json() -> None:
     message = strictly(vehicle_message(VehicleState(), 5_000_000_000))
-    assert message["connected"] is False  # type: ignore[index]
-    assert message["position_ned_m"] is None  # type: ignore[index]
-    assert message["heartbeat_age_s"] is None  # type: ignore[index]
+    assert message["connected"] is False
+    assert message["position_ned_m"] is None
+    assert message["heartbeat_age_s"] is None
 
 
 def test_a_flying_vehicle_is_told_with_height_above_home_and_ages() -> None:
@@ -173,6 +173,6 @@ def test_a_flying_vehicle_is_told_with_height_above_home_and_ages() -> None:
 
 def test_a_setpoint_tells_what_it_does_not_control_as_null() -> None:
     message = strictly(setpoint_message(Setpoint.velocity((1.0, 0.0, 0.0), 0)))
-    assert message["position_ned_m"] is None  # type: ignore[index]
-    assert message["velocity_ned_mps"] == [1.0, 0.0, 0.0]  # type: ignore[index]
+    assert message["position_ned_m"] is None
+    assert message["velocity_ned_mps"] == [1.0, 0.0, 0.0]
     assert setpoint_message(None) is None

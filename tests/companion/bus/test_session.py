@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import zenoh
@@ -168,7 +168,7 @@ async def test_a_command_is_sent_once_whatever_becomes_of_it() -> None:
 
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
-async def test_a_router_that_is_killed_is_missed_and_found_again(mode: str) -> None:
+async def test_a_router_that_is_killed_is_missed_and_found_again(mode: Literal["peer", "client"]) -> None:
     port = free_port(socket.SOCK_STREAM)
     events = Events()
     settings = ZenohSection(mode=mode, connect=(f"tcp/127.0.0.1:{port}",), listen=())

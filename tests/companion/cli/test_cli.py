@@ -15,11 +15,11 @@ from pathlib import Path
 import cv2
 import pytest
 import typer
-from command_line import companion
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from mavlink_sim.testing import free_port
+from tests.companion.command_line import companion
 
 ONNX = ("--runtime", "onnxruntime")
 
@@ -56,7 +56,9 @@ def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path
     saved = sorted(path.name for path in (tmp_path / "saved").iterdir())
     assert saved[:2] == ["000000.jpg", "000000_detections.jpg"]
     assert len(saved) == 8
-    assert cv2.imread(str(tmp_path / "saved" / "000000_detections.jpg")).shape == (120, 160, 3)
+    drawn = cv2.imread(str(tmp_path / "saved" / "000000_detections.jpg"))
+    assert drawn is not None
+    assert drawn.shape == (120, 160, 3)
 
 
 def test_detect_tells_tracks_when_asked(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
@@ -94,7 +96,7 @@ def test_detect_without_json_writes_a_readable_line_a_frame(
 
 
 def test_detect_sees_only_the_classes_asked_for(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
-    common = [
+    common: list[str | Path] = [
         "detect",
         pictures,
         "--model",
@@ -152,7 +154,7 @@ def test_a_checkpoint_that_calls_the_system_is_refused_by_name_and_not_run(
 def test_an_unknown_class_is_one_line_with_the_nearest_names(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
-    arguments = ["detect", pictures, "--model", exported_model, *ONNX, "--classes", "persn"]
+    arguments: list[str | Path] = ["detect", pictures, "--model", exported_model, *ONNX, "--classes", "persn"]
     line = one_line_of_bad_input(companion(*arguments, cwd=tmp_path))
     assert "'persn'" in line
     assert "person" in line
@@ -218,7 +220,7 @@ def test_the_version_is_told(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, f"companion {version('mavlink-companion')}\n")
 
 
-@pytest.mark.parametrize("command", sorted(typer.main.get_command(app).commands))
+@pytest.mark.parametrize("command", sorted(typer.main.get_group(app).commands))
 def test_every_command_tells_what_it_does(command: str) -> None:
     done = CliRunner().invoke(app, [command, "--help"])
     assert done.exit_code == 0

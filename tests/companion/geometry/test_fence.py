@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from companion.geometry.fence import Fence
+from companion.geometry.fence import Fence, Place, Polygon
 from companion.settings.reading import load_settings
 
 SQUARE = ((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))
@@ -45,7 +46,7 @@ def test_inside_and_outside() -> None:
 
 
 @given(stars(), place)
-def test_inside_agrees_with_the_winding_number(polygon, here) -> None:
+def test_inside_agrees_with_the_winding_number(polygon: Polygon, here: Place) -> None:
     angles = [math.atan2(e - here[1], n - here[0]) for n, e in polygon]
     winding = sum(
         math.remainder(b - a, math.tau) for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
@@ -60,7 +61,9 @@ def test_inside_agrees_with_the_winding_number(polygon, here) -> None:
 
 
 @given(stars(), place, speed, st.booleans())
-def test_a_velocity_only_ever_gets_less_and_passes_again_unchanged(polygon, here, velocity, inside) -> None:
+def test_a_velocity_only_ever_gets_less_and_passes_again_unchanged(
+    polygon: Polygon, here: Place, velocity: Place, inside: bool
+) -> None:
     fence = Fence(polygon) if inside else Fence(exclude=(polygon,))
     slowed = fence.slowed(velocity, here, braking)
     assert math.hypot(*slowed) <= math.hypot(*velocity) + 1e-9
@@ -69,7 +72,9 @@ def test_a_velocity_only_ever_gets_less_and_passes_again_unchanged(polygon, here
 
 @given(stars(), speed, st.booleans(), st.floats(0, math.tau))
 @settings(max_examples=60, deadline=None)
-def test_whoever_flies_what_is_left_never_gets_over_it(polygon, velocity, inside, turn) -> None:
+def test_whoever_flies_what_is_left_never_gets_over_it(
+    polygon: Polygon, velocity: Place, inside: bool, turn: float
+) -> None:
     fence = Fence(polygon) if inside else Fence(exclude=(polygon,))
     here = (0.0, 0.0) if inside else (40.0 * math.cos(turn), 40.0 * math.sin(turn))
     assume(fence.holds(here))
@@ -85,7 +90,7 @@ def test_whoever_flies_what_is_left_never_gets_over_it(polygon, velocity, inside
         assert fence.holds(here)
 
 
-def edge_m(polygon, here) -> float:
+def edge_m(polygon: Polygon, here: Place) -> float:
     from companion.geometry.fence import _edges, _nearest
 
     return min(math.dist(_nearest(a, b, here), here) for a, b in _edges(polygon))
@@ -164,7 +169,7 @@ def test_a_place_beyond_an_edge_is_cut_off_before_it() -> None:
         ("0,0 10,x 10,10", "'10,x'"),
     ],
 )
-def test_what_is_no_area_is_told_with_its_key(corners, words, tmp_path) -> None:
+def test_what_is_no_area_is_told_with_its_key(corners: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
     for line in (f'fence_include = "{corners}"', f'fence_exclude = "{corners}"'):
         path.write_text(f"[guidance]\n{line}\n")

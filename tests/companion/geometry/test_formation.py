@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import itertools
 import math
+from random import Random
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.geometry.formation import SHAPES, assign, least_cost, radius_m, slot_motion, slots, turned
+from companion.geometry.formation import (
+    SHAPES,
+    Vector3,
+    assign,
+    least_cost,
+    radius_m,
+    slot_motion,
+    slots,
+    turned,
+)
 
 coordinate = st.floats(-100, 100)
 place = st.tuples(coordinate, coordinate, st.floats(-5, 5))
 
 
 @given(st.sampled_from(SHAPES), st.integers(0, 60), st.floats(0.5, 50), st.booleans())
-def test_no_two_slots_are_nearer_than_the_spacing_nor_one_to_the_leader(shape, count, spacing, taken):
+def test_no_two_slots_are_nearer_than_the_spacing_nor_one_to_the_leader(
+    shape: str, count: int, spacing: float, taken: bool
+) -> None:
     offsets = slots(shape, count, spacing, centre_taken=taken)
     assert len(offsets) == count
     occupied = [*offsets, (0.0, 0.0, 0.0)] if taken else offsets
@@ -25,7 +37,7 @@ def test_no_two_slots_are_nearer_than_the_spacing_nor_one_to_the_leader(shape, c
         assert math.dist(a, b) >= spacing * (1 - 1e-9)
 
 
-def test_the_shapes_look_as_they_are_called():
+def test_the_shapes_look_as_they_are_called() -> None:
     assert slots("line", 3, 5.0) == [(0, 5, 0), (0, -5, 0), (0, 10, 0)]
     assert slots("column", 2, 4.0) == [(-4, 0, 0), (-8, 0, 0)]
     right, left = slots("wedge", 2, math.sqrt(8.0))
@@ -45,14 +57,14 @@ def test_the_shapes_look_as_they_are_called():
         (("line", 3, math.nan), "spacing_m must be finite"),
     ],
 )
-def test_what_is_no_formation_is_refused(arguments, words):
+def test_what_is_no_formation_is_refused(arguments: tuple[str, int, float], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         slots(*arguments)
 
 
 @settings(max_examples=150)
 @given(st.integers(1, 5).flatmap(lambda n: st.tuples(st.just(n), st.integers(n, 6))), st.randoms())
-def test_the_assignment_costs_least_of_all(size, random):
+def test_the_assignment_costs_least_of_all(size: tuple[int, int], random: Random) -> None:
     rows, columns = size
     cost = np.array(
         [[random.choice((0.0, 1.0, random.uniform(0, 9))) for _ in range(columns)] for _ in range(rows)]
@@ -68,7 +80,9 @@ def test_the_assignment_costs_least_of_all(size, random):
 
 @settings(max_examples=60)
 @given(st.lists(place, min_size=2, max_size=12, unique=True), st.sampled_from(SHAPES), st.floats(3, 10))
-def test_on_the_way_to_their_slots_vehicles_stay_apart(places, shape, spacing):
+def test_on_the_way_to_their_slots_vehicles_stay_apart(
+    places: list[Vector3], shape: str, spacing: float
+) -> None:
     """At the same share of their ways, never nearer than 0.7 of the nearest two at either end."""
     offsets = slots(shape, len(places), spacing)
     taken = assign(places, offsets)
@@ -83,13 +97,13 @@ def test_on_the_way_to_their_slots_vehicles_stay_apart(places, shape, spacing):
             assert math.dist(here, there) >= least - 1e-6
 
 
-def test_who_is_in_a_slot_keeps_it_when_one_more_comes():
+def test_who_is_in_a_slot_keeps_it_when_one_more_comes() -> None:
     offsets = slots("wedge", 4, 5.0)
     taken = assign([*offsets[:3], (-30.0, 2.0, 0.0)], offsets)
     assert taken == [0, 1, 2, 3]
 
 
-def test_fewer_slots_than_vehicles_and_places_that_are_none_are_refused():
+def test_fewer_slots_than_vehicles_and_places_that_are_none_are_refused() -> None:
     with pytest.raises(ValueError, match="2 vehicles need as many slots, got 1"):
         assign([(0, 0, 0), (1, 0, 0)], [(0, 0, 0)])
     with pytest.raises(ValueError, match="finite"):
@@ -98,16 +112,18 @@ def test_fewer_slots_than_vehicles_and_places_that_are_none_are_refused():
 
 
 @given(place, st.floats(-3, 3), st.floats(-1, 1), place)
-def test_the_velocity_of_a_slot_is_the_change_of_its_place(velocity, heading, rate, offset):
+def test_the_velocity_of_a_slot_is_the_change_of_its_place(
+    velocity: Vector3, heading: float, rate: float, offset: Vector3
+) -> None:
     dt = 1e-5
     leader = (1.0, 2.0, -5.0)
     start, moving = slot_motion(leader, velocity, heading, rate, offset)
-    later = tuple(p + dt * v for p, v in zip(leader, velocity, strict=True))
-    end, _ = slot_motion(later, velocity, heading + rate * dt, rate, offset)
+    north, east, down = (p + dt * v for p, v in zip(leader, velocity, strict=True))
+    end, _ = slot_motion((north, east, down), velocity, heading + rate * dt, rate, offset)
     for a, b, v in zip(start, end, moving, strict=True):
         assert (b - a) / dt == pytest.approx(v, abs=1e-2)
 
 
-def test_offsets_turn_with_the_heading():
+def test_offsets_turn_with_the_heading() -> None:
     assert turned((1.0, 0.0, 2.0), math.pi / 2) == pytest.approx((0.0, 1.0, 2.0))
     assert turned((0.0, 1.0, 0.0), math.pi / 2) == pytest.approx((-1.0, 0.0, 0.0))

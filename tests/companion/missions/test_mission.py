@@ -6,10 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
-from command_line import companion
 from hypothesis import given
 from hypothesis import strategies as st
-from service_process import running_service
 
 from companion.guidance.sequence import ABORT, END, LAND, RTL
 from companion.missions.mission_file import (
@@ -21,6 +19,8 @@ from companion.missions.mission_file import (
     read_mission,
 )
 from mavlink_sim.testing import running_simulator
+from tests.companion.command_line import companion
+from tests.companion.service_process import running_service
 
 NAMES = ("person", "car", "traffic light")
 DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"

@@ -8,10 +8,10 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from service_process import running_service
 
 from companion.operator.metrics import MetricsError, MetricsServer
 from mavlink_sim.testing import free_port, running_simulator
+from tests.companion.service_process import running_service
 
 
 def fetch(port: int) -> dict[str, float]:

@@ -67,7 +67,7 @@ async def until(condition: Callable[[], object]) -> None:
         await asyncio.sleep(0.01)
 
 
-def settings_of(source: Path | str, model: Path | None = None, **overrides: str) -> Settings:
+def settings_of(source: Path | str, model: Path | None = None, /, **overrides: str) -> Settings:
     values = {
         "source.uri": str(source),
         "source.loop": "true",

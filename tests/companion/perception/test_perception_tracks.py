@@ -55,6 +55,12 @@ def result(sequence: int, *events: TrackEvent, ids: tuple[int, ...] = ()) -> Per
     return PerceptionResult(sequence, sequence * 1000, 0, 64, 48, detections, {}, 0, events)
 
 
+def ids_in(taken: PerceptionResult) -> list[int]:
+    assert taken.detections.track_id is not None
+    ids: list[int] = taken.detections.track_id.tolist()
+    return ids
+
+
 def kinds(taken: PerceptionResult) -> list[tuple[TrackEventKind, int]]:
     return [(event.kind, event.track.track_id) for event in taken.track_events]
 
@@ -201,7 +207,7 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         assert told(END) == []
         assert keeper.status.tracks == len(told(NEW))
         assert results[-1].timing_ms["track"] > 0
-        assert set(results[-1].detections.track_id.tolist()) >= set(told(NEW))
+        assert set(ids_in(results[-1])) >= set(told(NEW))
 
         await until(spun)
 
@@ -214,8 +220,8 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         after = results[before:]
         ends = [e.track.track_id for e in after[0].track_events if e.kind is END]
         assert sorted(ends) == sorted(live)
-        newer = [number for r in after for number in r.detections.track_id.tolist() if number != NO_TRACK]
-        assert min(newer) > max(number for r in results[:before] for number in r.detections.track_id)
+        newer = [number for r in after for number in ids_in(r) if number != NO_TRACK]
+        assert min(newer) > max(number for r in results[:before] for number in ids_in(r))
     finally:
         await keeper.stop()
 

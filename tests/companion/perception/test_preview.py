@@ -11,13 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import zenoh
-from service_process import running_service
 
 from companion.bus.client import listen
 from companion.perception.messages import Preview
 from companion.perception.preview import PreviewEncoder
 from companion.settings import PreviewSection
 from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import running_service
 from vision.detections import Detections
 from vision.frame import Frame
 
@@ -50,6 +50,8 @@ def test_a_picture_shows_what_was_detected_and_says_which_frame_it_is() -> None:
     plain, drawn = (pictures_of(PreviewSection(annotate=annotate), [5_000])[0] for annotate in (False, True))
     assert (drawn.sequence, drawn.captured_ns) == (0, 5_000)
     images = [cv2.imdecode(np.frombuffer(p.jpeg, np.uint8), cv2.IMREAD_COLOR) for p in (plain, drawn)]
+    assert images[0] is not None
+    assert images[1] is not None
     assert images[0].shape == images[1].shape == (120, 160, 3)
     assert np.abs(images[0].astype(int) - 90).max() < 10
     assert np.abs(images[1].astype(int) - 90).max() > 60
@@ -80,6 +82,7 @@ def test_a_subscriber_gets_pictures_and_without_one_none_are_made(seeing: list[s
         with session.declare_subscriber("companion/*/image", pictures.put):
             sample = pictures.get(timeout=30)
         image = cv2.imdecode(np.frombuffer(sample.payload.to_bytes(), np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
         assert image.shape == (120, 160, 3)
         assert sample.encoding == zenoh.Encoding.IMAGE_JPEG
         assert sample.attachment is not None

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from service_process import running_service
 
 from companion.bus.client import listen
 from companion.perception.views import threads_each
 from companion.settings import DetectorSection
 from companion.settings.reading import ConfigurationError, load_settings, to_toml
 from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import running_service
 
 
 def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alone(

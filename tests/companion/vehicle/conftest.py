@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
-from fake_autopilot import FakeAutopilot
 
 from companion.vehicle import stream_requests
 from companion.vehicle.driver import Driver
-from companion.vehicle.drivers import open_driver
+from companion.vehicle.drivers import DriverKind, open_driver
 from mavlink_sim.testing import free_port
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot
 
 
 @pytest.fixture(params=["mavsdk", "pymavlink"])
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+def kind(request: pytest.FixtureRequest) -> DriverKind:
+    kind: DriverKind = request.param
+    return kind
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ async def autopilot(port: int) -> AsyncIterator[FakeAutopilot]:
 
 
 @pytest.fixture
-async def driver(kind: str, port: int, autopilot: FakeAutopilot) -> AsyncIterator[Driver]:
+async def driver(kind: DriverKind, port: int, autopilot: FakeAutopilot) -> AsyncIterator[Driver]:
     """Connected to the fake autopilot."""
     opened = open_driver(kind, f"udpin://127.0.0.1:{port}")
     await opened.connect(10.0)

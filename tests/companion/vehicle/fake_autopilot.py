@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import Driver
 from companion.vehicle.framing import frames_of
+from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.state import VehicleState
 
 HOLD, OFFBOARD, MISSION = 0x03040000, 0x00060000, 0x04040000
@@ -120,6 +121,11 @@ async def wait_until(
         if time.monotonic() > deadline:
             raise TimeoutError(f"waited {timeout_s} s for {wanted()}")
         await asyncio.sleep(0.01)
+
+
+def gimbal_of(state: VehicleState) -> GimbalState:
+    assert state.gimbal is not None
+    return state.gimbal
 
 
 async def state_shows(

@@ -9,7 +9,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
-from fake_autopilot import SETPOINT, FakeAutopilot, state_shows, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.ardupilot_manners import ArduPilotManners
@@ -19,6 +18,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from mavlink_sim.testing import RunningSimulator, free_port, running_simulator
+from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, state_shows, wait_until
 
 
 @asynccontextmanager
@@ -86,8 +86,8 @@ async def test_a_flight_by_setpoints_brakes_on_silence_but_stays_in_guided() -> 
         await state_shows(driver, lambda s: (s.velocity_ned_mps or (0.0,))[0] > 1.5)
         sending.cancel()
         # GUID_TIMEOUT's 3 s of simulated time, and the braking
-        await state_shows(driver, lambda s: math.hypot(*(s.velocity_ned_mps or (9.0,))) < 0.7)
-        assert driver.state.mode is FlightMode.OFFBOARD
+        state = await state_shows(driver, lambda s: math.hypot(*(s.velocity_ned_mps or (9.0,))) < 0.7)
+        assert state.mode is FlightMode.OFFBOARD
         assert abs(driver.state.yaw_rad or 0.0) < 0.3  # without a yaw asked for it keeps its heading
 
         await driver.set_mode(FlightMode.HOLD)

@@ -8,14 +8,15 @@ import logging
 import os
 import pty
 import socket
+from typing import Any
 
 import pytest
-from fake_autopilot import wait_until
 
-from companion.vehicle.byte_link import open_link
+from companion.vehicle.byte_link import Source, _StreamLink, open_link
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import parse_link_url
 from mavlink_sim.testing import free_port
+from tests.companion.vehicle.fake_autopilot import wait_until
 
 
 class Ear:
@@ -25,7 +26,7 @@ class Ear:
         self.data = b""
         self.source = None
 
-    def __call__(self, data: bytes, source) -> None:
+    def __call__(self, data: bytes, source: Source) -> None:
         self.data += data
         self.source = source
 
@@ -37,7 +38,7 @@ def udp_peer() -> socket.socket:
     return peer
 
 
-async def test_a_listening_udp_link_answers_whom_it_is_told_to(port) -> None:
+async def test_a_listening_udp_link_answers_whom_it_is_told_to(port: int) -> None:
     ear = Ear()
     link = await open_link(parse_link_url(f"udpin://127.0.0.1:{port}"), ear)
     with udp_peer() as first, udp_peer() as second:
@@ -45,7 +46,7 @@ async def test_a_listening_udp_link_answers_whom_it_is_told_to(port) -> None:
         assert link.dropped_count == 1
         for peer, text in ((first, b"one"), (second, b"two")):
             peer.sendto(text, ("127.0.0.1", port))
-            await wait_until(lambda text=text: ear.data.endswith(text), 5.0)
+            await wait_until(lambda text=text: ear.data.endswith(text), 5.0)  # type: ignore[misc]  # a lambda with a default
             link.answer_to(ear.source)
             link.send(b"answer to " + text)
             assert await asyncio.get_running_loop().sock_recv(peer, 100) == b"answer to " + text
@@ -55,7 +56,7 @@ async def test_a_listening_udp_link_answers_whom_it_is_told_to(port) -> None:
     assert link.dropped_count == 2
 
 
-async def test_an_outgoing_udp_link_keeps_its_address_and_outlives_an_absent_listener(port) -> None:
+async def test_an_outgoing_udp_link_keeps_its_address_and_outlives_an_absent_listener(port: int) -> None:
     ear = Ear()
     link = await open_link(parse_link_url(f"udpout://localhost:{port}"), ear)
     for _ in range(3):
@@ -73,14 +74,17 @@ async def test_an_outgoing_udp_link_keeps_its_address_and_outlives_an_absent_lis
     await link.close()
 
 
-async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog) -> None:
+async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    ear, arrived, writers, served = Ear(), bytearray(), [], []
+    ear, arrived, writers = Ear(), bytearray(), []
+    served: list[asyncio.Task[Any]] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writers.append(writer)
         writer.write(b"welcome %d" % len(writers))
-        served.append(asyncio.current_task())
+        task = asyncio.current_task()
+        assert task is not None
+        served.append(task)
         with contextlib.suppress(ConnectionError):
             while data := await reader.read(100):
                 arrived.extend(data)
@@ -105,7 +109,9 @@ async def test_a_tcp_link_reads_writes_and_comes_back_after_a_loss(caplog) -> No
     await server.wait_closed()
 
 
-async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(monkeypatch, caplog) -> None:
+async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """As after SIGSTOP in the middle of a setpoint, on a line that was full."""
     monkeypatch.setattr("companion.vehicle.byte_link._REST_S", -1.0)
     listener = socket.socket()
@@ -116,6 +122,7 @@ async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(monkey
     peer, _ = listener.accept()
     peer.setblocking(False)
     size = 1_000_003
+    assert isinstance(link, _StreamLink)
     while not link._unsent:
         link.send(bytes(size))
     arrived = 0
@@ -136,7 +143,9 @@ async def test_the_rest_of_a_frame_that_waited_too_long_is_not_sent_later(monkey
     listener.close()
 
 
-async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_one(monkeypatch) -> None:
+async def test_a_tcp_link_that_is_full_drops_whole_messages_and_never_half_of_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("companion.vehicle.byte_link._REST_S", 60.0)
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -196,7 +205,7 @@ async def test_a_serial_line_is_raw_both_ways() -> None:
     os.close(master)
 
 
-async def test_a_serial_line_that_hangs_up_is_said_and_tried_again(caplog) -> None:
+async def test_a_serial_line_that_hangs_up_is_said_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:
     master, slave = pty.openpty()
     name = os.ttyname(slave)
     os.close(slave)
@@ -218,7 +227,7 @@ async def test_a_serial_line_that_hangs_up_is_said_and_tried_again(caplog) -> No
         ("udpin://host.invalid:14540", "the host cannot be resolved"),
     ],
 )
-async def test_an_endpoint_that_cannot_be_opened_is_said_in_one_line(url, message) -> None:
+async def test_an_endpoint_that_cannot_be_opened_is_said_in_one_line(url: str, message: str) -> None:
     with pytest.raises(LinkError, match=message) as caught:
         await open_link(parse_link_url(url), Ear())
     assert str(caught.value).startswith(url)

@@ -22,7 +22,9 @@ def asked(sync: ClockSync, at_ns: int, there_ns: int, back_ns: int, offset_ns: i
     st.lists(st.tuples(st.integers(0, 45 * MS), st.integers(0, 45 * MS)), min_size=1, max_size=18),
     st.floats(-50e-6, 50e-6),
 )
-def test_the_truth_lies_within_the_error_that_is_told(offset_ns, trips, drift):
+def test_the_truth_lies_within_the_error_that_is_told(
+    offset_ns: int, trips: list[tuple[int, int]], drift: float
+) -> None:
     sync, at_ns = ClockSync(), SECOND
     for there_ns, back_ns in trips:
         true_ns = offset_ns + round(at_ns * drift)
@@ -34,7 +36,7 @@ def test_the_truth_lies_within_the_error_that_is_told(offset_ns, trips, drift):
     assert known.error_ns <= min(sum(trip) for trip in trips) / 2 + KEPT_S * 1e9 * 100e-6 + 1
 
 
-def test_the_shortest_trip_is_believed_and_the_long_ones_are_not():
+def test_the_shortest_trip_is_believed_and_the_long_ones_are_not() -> None:
     sync = ClockSync()
     asked(sync, SECOND, 200_000, 200_000, 7 * SECOND)
     asked(sync, 2 * SECOND, 1 * MS, 80 * MS, 7 * SECOND)
@@ -45,7 +47,7 @@ def test_the_shortest_trip_is_believed_and_the_long_ones_are_not():
     assert not sync.answer(5 * SECOND, 1, 4 * SECOND)
 
 
-def test_what_was_learnt_grows_old():
+def test_what_was_learnt_grows_old() -> None:
     sync = ClockSync()
     assert sync.offset(SECOND) is None
     asked(sync, SECOND, MS, MS, 5)
@@ -57,7 +59,7 @@ def test_what_was_learnt_grows_old():
 
 
 @pytest.mark.parametrize("jump_ns", [-3600 * SECOND, -200 * MS, 200 * MS, 3600 * SECOND])
-def test_a_jump_of_the_clock_is_believed_at_the_next_answer(jump_ns):
+def test_a_jump_of_the_clock_is_believed_at_the_next_answer(jump_ns: int) -> None:
     sync, at_ns = ClockSync(), 10_000 * SECOND
     for step in range(5):
         asked(sync, at_ns + step * SECOND, 2 * MS, 3 * MS, 4 * SECOND)
@@ -67,7 +69,7 @@ def test_a_jump_of_the_clock_is_believed_at_the_next_answer(jump_ns):
     assert abs(known.offset_ns - 4 * SECOND - jump_ns) <= known.error_ns
 
 
-def test_a_stamp_is_that_of_the_measurement_and_without_a_clock_that_of_the_arrival():
+def test_a_stamp_is_that_of_the_measurement_and_without_a_clock_that_of_the_arrival() -> None:
     sync, now_ns = ClockSync(), 50 * SECOND
     assert sync.stamp(1_000, now_ns) == now_ns
     asked(sync, now_ns, MS, MS, -40 * SECOND)  # booted at 40 s
@@ -80,7 +82,7 @@ def test_a_stamp_is_that_of_the_measurement_and_without_a_clock_that_of_the_arri
     assert sync.offset(now_ns) is None
 
 
-def test_messages_jittered_on_their_way_get_their_own_times_back():
+def test_messages_jittered_on_their_way_get_their_own_times_back() -> None:
     rng, sync = random.Random(4), ClockSync()
     offset_ns, worst_ns = -123 * SECOND - 456_789, 0
     for step in range(400):

@@ -6,22 +6,25 @@ import asyncio
 import math
 import struct
 import weakref
+from collections.abc import Callable
+from typing import Any
 
 import mavsdk
 import pytest
-from fake_autopilot import FakeAutopilot, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle import flight_commands
-from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
+from companion.vehicle.mavsdk_driver import MavsdkDriver
 from companion.vehicle.state import FlightMode
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_until
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 
 
-async def test_arming_returns_when_the_vehicle_shows_it(driver, autopilot) -> None:
+async def test_arming_returns_when_the_vehicle_shows_it(driver: Driver, autopilot: FakeAutopilot) -> None:
     asyncio.get_running_loop().call_later(0.5, setattr, autopilot, "base_mode", 157)
     await driver.arm()
     assert driver.state.armed
@@ -29,7 +32,7 @@ async def test_arming_returns_when_the_vehicle_shows_it(driver, autopilot) -> No
     assert (arm.param1, arm.param2) == (1.0, 0.0)
 
 
-async def test_a_refused_arming_says_why(driver, autopilot) -> None:
+async def test_a_refused_arming_says_why(driver: Driver, autopilot: FakeAutopilot) -> None:
     autopilot.answers["COMMAND_LONG"] = lambda m: autopilot.acknowledge(m.command, 1)
     with pytest.raises(
         CommandRefusedError, match=r"refused to arm \(temporarily rejected\): its pre-arm checks fail"
@@ -37,13 +40,15 @@ async def test_a_refused_arming_says_why(driver, autopilot) -> None:
         await driver.arm()
 
 
-async def test_a_mode_is_believed_when_shown_and_not_when_acknowledged(driver, autopilot) -> None:
+async def test_a_mode_is_believed_when_shown_and_not_when_acknowledged(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     with pytest.raises(CommandRefusedError, match=r"did not enter mode mission within 0\.5 s: it shows hold"):
         await driver.set_mode(FlightMode.MISSION, timeout_s=0.5)
 
 
-async def test_the_second_acknowledgement_refuses_at_once(driver, autopilot) -> None:
-    def twice(message) -> None:
+async def test_the_second_acknowledgement_refuses_at_once(driver: Driver, autopilot: FakeAutopilot) -> None:
+    def twice(message: Any) -> None:
         autopilot.acknowledge(message.command, 0)
         if message.command == 176:
             autopilot.acknowledge(176, 1)
@@ -53,8 +58,10 @@ async def test_the_second_acknowledgement_refuses_at_once(driver, autopilot) -> 
         await driver.set_mode(FlightMode.OFFBOARD, timeout_s=60.0)
 
 
-async def test_a_mode_asked_for_goes_out_as_main_and_sub_mode(driver, autopilot) -> None:
-    def obey(message) -> None:
+async def test_a_mode_asked_for_goes_out_as_main_and_sub_mode(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
+    def obey(message: Any) -> None:
         autopilot.acknowledge(message.command)
         if message.command == 176:
             autopilot.custom_mode = int(message.param2) << 16 | int(message.param3) << 24
@@ -71,7 +78,7 @@ async def test_a_mode_asked_for_goes_out_as_main_and_sub_mode(driver, autopilot)
         await driver.set_mode(FlightMode.UNKNOWN)
 
 
-async def test_takeoff_goes_to_a_height_above_home(driver, autopilot) -> None:
+async def test_takeoff_goes_to_a_height_above_home(driver: Driver, autopilot: FakeAutopilot) -> None:
     asyncio.get_running_loop().call_later(0.3, autopilot.home, 488.5)
     await driver.takeoff(4.0)
     (message,) = [m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 22]
@@ -79,7 +86,9 @@ async def test_takeoff_goes_to_a_height_above_home(driver, autopilot) -> None:
     assert all(math.isnan(getattr(message, f"param{number}")) for number in range(1, 7))
 
 
-async def test_takeoff_without_a_known_home_is_refused_here(driver, autopilot, monkeypatch) -> None:
+async def test_takeoff_without_a_known_home_is_refused_here(
+    driver: Driver, autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(flight_commands, "_SHOWN_TIMEOUT_S", 0.2)
     with pytest.raises(CommandRefusedError, match="needs home's altitude"):
         await driver.takeoff(4.0)
@@ -88,7 +97,9 @@ async def test_takeoff_without_a_known_home_is_refused_here(driver, autopilot, m
     assert not [m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 22]
 
 
-async def test_an_unanswered_command_is_sent_again_and_then_given_up(driver, autopilot) -> None:
+async def test_an_unanswered_command_is_sent_again_and_then_given_up(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     autopilot.answers.clear()
     with pytest.raises(CommandRefusedError, match="does not answer command 400"):
         await driver.arm()
@@ -96,8 +107,8 @@ async def test_an_unanswered_command_is_sent_again_and_then_given_up(driver, aut
     assert len(attempts) >= 3
 
 
-async def test_a_command_in_progress_is_waited_for(driver, autopilot) -> None:
-    def slowly(message) -> None:
+async def test_a_command_in_progress_is_waited_for(driver: Driver, autopilot: FakeAutopilot) -> None:
+    def slowly(message: Any) -> None:
         autopilot.acknowledge(message.command, 5)
         asyncio.get_running_loop().call_later(1.1, autopilot.acknowledge, message.command, 0)
 
@@ -107,8 +118,10 @@ async def test_a_command_in_progress_is_waited_for(driver, autopilot) -> None:
     assert len([m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 400]) == 1
 
 
-async def test_acknowledgements_for_another_component_are_not_ours(driver, autopilot) -> None:
-    def to_another(message) -> None:
+async def test_acknowledgements_for_another_component_are_not_ours(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
+    def to_another(message: Any) -> None:
         autopilot.say(mavlink.MAVLink_command_ack_message(message.command, 2, 0, 0, 255, 190))
         autopilot.acknowledge(message.command, 0)
 
@@ -117,7 +130,7 @@ async def test_acknowledgements_for_another_component_are_not_ours(driver, autop
     await driver.arm()
 
 
-async def test_streams_that_come_too_slowly_are_asked_for(driver, autopilot) -> None:
+async def test_streams_that_come_too_slowly_are_asked_for(driver: Driver, autopilot: FakeAutopilot) -> None:
     def intervals() -> dict[float, float]:
         return {m.param1: m.param2 for m in autopilot.heard_named("COMMAND_LONG") if m.command == 511}
 
@@ -126,7 +139,9 @@ async def test_streams_that_come_too_slowly_are_asked_for(driver, autopilot) -> 
     assert intervals()[CURRENT_MODE_ID] == 100000
 
 
-async def test_commands_under_way_fail_when_the_driver_is_closed(driver, autopilot) -> None:
+async def test_commands_under_way_fail_when_the_driver_is_closed(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     autopilot.answers.clear()
     arming = asyncio.create_task(driver.arm())
     await wait_until(lambda: any(m.command == 400 for m in autopilot.heard_named("COMMAND_LONG")), 5.0)
@@ -136,7 +151,7 @@ async def test_commands_under_way_fail_when_the_driver_is_closed(driver, autopil
 
 
 @pytest.fixture
-def parameters(autopilot) -> dict[str, tuple[int, bytes]]:
+def parameters(autopilot: FakeAutopilot) -> dict[str, tuple[int, bytes]]:
     """name → (MAV_PARAM_TYPE, the four bytes): PX4's bytewise encoding."""
     stored = {"COM_OF_LOSS_T": (9, struct.pack("<f", 1.0)), "COM_OBL_RC_ACT": (6, struct.pack("<i", 0))}
 
@@ -148,7 +163,7 @@ def parameters(autopilot) -> dict[str, tuple[int, bytes]]:
         payload = value + struct.pack("<HH16sB", len(stored), 0, name.encode(), kind)
         autopilot.say_bytes(pack_frame(22, payload, system_id=1, component_id=1, sequence=0))
 
-    def take(message) -> None:
+    def take(message: Any) -> None:
         frame = next(raw for heard, raw in reversed(autopilot.heard) if heard is message)
         stored[message.param_id] = (message.param_type, frame[10:14].ljust(4, b"\0"))
         tell(message.param_id)
@@ -158,7 +173,7 @@ def parameters(autopilot) -> dict[str, tuple[int, bytes]]:
     return stored
 
 
-async def test_parameters_keep_their_type(driver, parameters) -> None:
+async def test_parameters_keep_their_type(driver: Driver, parameters: dict[str, tuple[int, bytes]]) -> None:
     assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
     await driver.set_parameter("COM_OF_LOSS_T", 0.5)
     await driver.set_parameter("COM_OBL_RC_ACT", 4.0)
@@ -168,13 +183,17 @@ async def test_parameters_keep_their_type(driver, parameters) -> None:
 
 
 @pytest.mark.parametrize("value", [-1, -5_000_000, 2**31 - 1])
-async def test_integers_travel_as_bytes_whatever_float_they_look_like(driver, parameters, value) -> None:
+async def test_integers_travel_as_bytes_whatever_float_they_look_like(
+    driver: Driver, parameters: dict[str, tuple[int, bytes]], value: int
+) -> None:
     await driver.set_parameter("COM_OBL_RC_ACT", value)
     assert parameters["COM_OBL_RC_ACT"] == (6, struct.pack("<i", value))
     assert await driver.get_parameter("COM_OBL_RC_ACT") == value
 
 
-async def test_a_parameter_that_is_not_there_is_refused_by_name(driver, parameters) -> None:
+async def test_a_parameter_that_is_not_there_is_refused_by_name(
+    driver: Driver, parameters: dict[str, tuple[int, bytes]]
+) -> None:
     with pytest.raises(CommandRefusedError, match="COM_NOT_THERE: there is no such parameter"):
         await driver.get_parameter("COM_NOT_THERE")
     with pytest.raises(CommandRefusedError, match="16 characters"):
@@ -183,7 +202,9 @@ async def test_a_parameter_that_is_not_there_is_refused_by_name(driver, paramete
         await driver.set_parameter("COM_OBL_RC_ACT", 0.5)
 
 
-async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(autopilot, port, monkeypatch) -> None:
+async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(
+    autopilot: FakeAutopilot, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """MAVSDK calls it from C++: had it been freed before, an answer in that moment ended the process."""
     autopilot.answers["COMMAND_LONG"] = lambda _: None
     driver = open_driver("mavsdk", f"udpin://127.0.0.1:{port}")
@@ -200,6 +221,8 @@ async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(autopilot, 
     monkeypatch.setattr(mavsdk.Mavsdk, "destroy", destroy_and_look)
     try:
         await autopilot.hears_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM)  # others ask for streams
+        assert isinstance(driver, MavsdkDriver)
+        assert driver._direct is not None
         subscribed = [trampoline for trampoline, _ in driver._direct._subscriptions.values()]
         called_back += [weakref.ref(one) for one in [*driver._direct._callbacks, *subscribed]]
         assert len(called_back) > len(subscribed) > 5
@@ -211,7 +234,9 @@ async def test_what_answers_a_command_lives_until_mavsdk_has_stopped(autopilot, 
     assert lived == [True] * len(called_back)
 
 
-async def test_mavsdk_looks_for_no_vehicle_any_more_before_it_is_destroyed(port, monkeypatch) -> None:
+async def test_mavsdk_looks_for_no_vehicle_any_more_before_it_is_destroyed(
+    port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One that it found while it was being destroyed would outlive it."""
     vehicle = FakeAutopilot(port)
     vehicle.start()
@@ -219,7 +244,7 @@ async def test_mavsdk_looks_for_no_vehicle_any_more_before_it_is_destroyed(port,
     for name in ("cancel_first_autopilot", "destroy"):
         method = getattr(mavsdk.Mavsdk, name)
 
-        def noted(*arguments, name=name, method=method):
+        def noted(*arguments: Any, name: str = name, method: Callable[..., Any] = method) -> Any:
             order.append(name)
             return method(*arguments)
 
@@ -228,6 +253,7 @@ async def test_mavsdk_looks_for_no_vehicle_any_more_before_it_is_destroyed(port,
     monkeypatch.setattr(mavsdk.Mavsdk, "pass_received_raw_bytes", lambda *_: None)
     driver = open_driver("mavsdk", f"udpin://127.0.0.1:{port}")
     connecting = asyncio.create_task(driver.connect(30.0))
+    assert isinstance(driver, MavsdkDriver)
     await wait_until(lambda: driver._search is not None, 10.0)
     connecting.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -236,7 +262,9 @@ async def test_mavsdk_looks_for_no_vehicle_any_more_before_it_is_destroyed(port,
     await vehicle.stop()
 
 
-async def test_what_waits_for_its_turn_when_the_link_is_closed_is_refused(driver, autopilot) -> None:
+async def test_what_waits_for_its_turn_when_the_link_is_closed_is_refused(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     autopilot.answers["COMMAND_LONG"] = lambda _: None
     arming = [asyncio.create_task(driver.arm()) for _ in range(2)]
     reading = asyncio.create_task(driver.set_parameter("COM_OF_LOSS_T", 1.0))

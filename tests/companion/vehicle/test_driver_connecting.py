@@ -6,20 +6,20 @@ import asyncio
 import time
 
 import pytest
-from fake_autopilot import SETPOINT, FakeAutopilot, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
-from companion.vehicle.drivers import open_driver
+from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, SystemStatus
+from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
 from mavlink_sim.testing import free_port
+from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_until
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 
 
-async def test_no_autopilot_is_said_in_one_line(kind, port) -> None:
+async def test_no_autopilot_is_said_in_one_line(kind: DriverKind, port: int) -> None:
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     with pytest.raises(LinkError) as caught:
         await driver.connect(0.3)
@@ -29,7 +29,7 @@ async def test_no_autopilot_is_said_in_one_line(kind, port) -> None:
     await driver.close()
 
 
-async def test_heartbeats_of_others_are_no_autopilot_but_are_named(kind, port) -> None:
+async def test_heartbeats_of_others_are_no_autopilot_but_are_named(kind: DriverKind, port: int) -> None:
     station = FakeAutopilot(port, system_id=255, component_id=190, autopilot=8)
     station.start()
     try:
@@ -39,7 +39,7 @@ async def test_heartbeats_of_others_are_no_autopilot_but_are_named(kind, port) -
         await station.stop()
 
 
-async def test_the_wanted_system_is_waited_for(kind, port, autopilot) -> None:
+async def test_the_wanted_system_is_waited_for(kind: DriverKind, port: int, autopilot: FakeAutopilot) -> None:
     second = FakeAutopilot(port, system_id=7)
     second.start()
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}", system_id=7)
@@ -67,7 +67,7 @@ async def test_the_wanted_system_is_waited_for(kind, port, autopilot) -> None:
     ],
 )
 async def test_an_autopilot_that_a_driver_cannot_fly_is_refused_in_one_line(
-    kind, autopilot_kind, reason, port
+    kind: DriverKind, autopilot_kind: int, reason: str, port: int
 ) -> None:
     other = FakeAutopilot(port, autopilot=autopilot_kind)
     other.start()
@@ -78,12 +78,16 @@ async def test_an_autopilot_that_a_driver_cannot_fly_is_refused_in_one_line(
         await other.stop()
 
 
-async def test_a_busy_port_is_named_with_its_likely_holder(kind, driver, port) -> None:
+async def test_a_busy_port_is_named_with_its_likely_holder(
+    kind: DriverKind, driver: Driver, port: int
+) -> None:
     with pytest.raises(LinkError, match=rf"UDP port {port} is in use: another program .*QGroundControl"):
         await open_driver(kind, f"udpin://127.0.0.1:{port}").connect(5.0)
 
 
-async def test_closing_twice_frees_the_port_and_the_driver_can_connect_again(kind, port, autopilot) -> None:
+async def test_closing_twice_frees_the_port_and_the_driver_can_connect_again(
+    kind: DriverKind, port: int, autopilot: FakeAutopilot
+) -> None:
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     await driver.close()
     for _ in range(3):
@@ -99,7 +103,7 @@ async def test_closing_twice_frees_the_port_and_the_driver_can_connect_again(kin
         await driver.get_parameter("COM_OF_LOSS_T")
 
 
-async def test_connecting_can_be_cancelled(kind, port) -> None:
+async def test_connecting_can_be_cancelled(kind: DriverKind, port: int) -> None:
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     connecting = asyncio.create_task(driver.connect(60.0))
     await asyncio.sleep(0)
@@ -109,7 +113,9 @@ async def test_connecting_can_be_cancelled(kind, port) -> None:
     await driver.close()
 
 
-async def test_an_autopilot_that_restarted_is_asked_for_its_streams_anew(driver, autopilot) -> None:
+async def test_an_autopilot_that_restarted_is_asked_for_its_streams_anew(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     def asked() -> int:
         return sum(
             m.command == 511 and m.param1 == CURRENT_MODE_ID for m in autopilot.heard_named("COMMAND_LONG")
@@ -121,7 +127,9 @@ async def test_an_autopilot_that_restarted_is_asked_for_its_streams_anew(driver,
     await wait_until(lambda: asked() == 2, 10.0)
 
 
-async def test_two_drivers_fly_two_vehicles_at_once(kind, driver, autopilot) -> None:
+async def test_two_drivers_fly_two_vehicles_at_once(
+    kind: DriverKind, driver: Driver, autopilot: FakeAutopilot
+) -> None:
     port = free_port()
     other = FakeAutopilot(port, system_id=2)
     other.start()
@@ -139,7 +147,7 @@ async def test_two_drivers_fly_two_vehicles_at_once(kind, driver, autopilot) -> 
         await other.stop()
 
 
-async def test_a_vehicle_that_waits_to_be_spoken_to_is_spoken_to(kind, port) -> None:
+async def test_a_vehicle_that_waits_to_be_spoken_to_is_spoken_to(kind: DriverKind, port: int) -> None:
     """udpout: the vehicle listens, and answers whoever sent to it."""
     vehicle = FakeAutopilot(port)
     vehicle.beating = False
@@ -157,7 +165,7 @@ async def test_a_vehicle_that_waits_to_be_spoken_to_is_spoken_to(kind, port) -> 
 
 def test_a_driver_that_does_not_exist_and_bad_urls_and_ids_are_refused_when_opened() -> None:
     with pytest.raises(ValueError, match="there is no driver 'dronekit'; there are: mavsdk, pymavlink"):
-        open_driver("dronekit", "udpin://0.0.0.0:14540")
+        open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # what is refused
     with pytest.raises(ValueError, match="is not a link url"):
         open_driver("mavsdk", "14540")
     with pytest.raises(ValueError, match=r"system_id must be 1\.\.255, got 0"):

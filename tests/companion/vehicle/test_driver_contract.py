@@ -10,22 +10,24 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 import pytest
-from fake_autopilot import state_shows, wait_until
 
 from companion.vehicle.driver import CommandRefusedError, Driver
-from companion.vehicle.drivers import open_driver
+from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import RunningSimulator, running_simulator
+from tests.companion.vehicle.fake_autopilot import state_shows, wait_until
 
 # Simulated seconds are short; the loss timeout is long enough in them for a busy test machine.
 FLIGHT = {"COM_OF_LOSS_T": 4.0, "COM_OBL_RC_ACT": 4.0}
 
 
 @asynccontextmanager
-async def connected(kind: str, simulator: RunningSimulator, **options: int) -> AsyncIterator[Driver]:
-    driver = open_driver(kind, f"udpin://127.0.0.1:{simulator.onboard_port}", **options)
+async def connected(
+    kind: DriverKind, simulator: RunningSimulator, *, system_id: int | None = None
+) -> AsyncIterator[Driver]:
+    driver = open_driver(kind, f"udpin://127.0.0.1:{simulator.onboard_port}", system_id=system_id)
     await driver.connect(20.0)
     try:
         yield driver
@@ -66,13 +68,15 @@ async def streaming(
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_on_the_ground_state_parameters_modes_and_arming_work(kind: str) -> None:
+async def test_on_the_ground_state_parameters_modes_and_arming_work(kind: DriverKind) -> None:
     with running_simulator(speed=4.0) as simulator:
         async with connected(kind, simulator) as driver:
             state = await state_shows(driver, complete)
             assert state.mode is FlightMode.HOLD
             assert state.landed is LandedState.ON_GROUND
             assert state.altitude_m == pytest.approx(0.0, abs=0.5)
+            assert state.altitude_amsl_m is not None
+            assert state.home_altitude_amsl_m is not None
             assert abs(state.altitude_amsl_m - state.home_altitude_amsl_m) < 1.0
 
             assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
@@ -99,7 +103,7 @@ async def test_on_the_ground_state_parameters_modes_and_arming_work(kind: str) -
             assert not driver.state.armed
 
 
-async def test_a_flight_by_setpoints_ends_in_the_failsafe_when_they_end(kind: str) -> None:
+async def test_a_flight_by_setpoints_ends_in_the_failsafe_when_they_end(kind: DriverKind) -> None:
     with running_simulator(speed=6.0, parameters=FLIGHT) as simulator:
         async with connected(kind, simulator) as driver:
             await state_shows(driver, complete)
@@ -121,13 +125,15 @@ async def test_a_flight_by_setpoints_ends_in_the_failsafe_when_they_end(kind: st
             async with streaming(driver, lambda: (1.5, 0.0, 0.0)) as streamer:
                 await wait_until(lambda: streamer.sent_count > 0, 5.0)
                 await driver.set_mode(FlightMode.OFFBOARD)
-                await state_shows(driver, lambda s: abs(s.velocity_ned_mps[0] - 1.5) < 0.3)
+                await state_shows(driver, lambda s: abs((s.velocity_ned_mps or (0.0,))[0] - 1.5) < 0.3)
                 assert driver.state.mode is FlightMode.OFFBOARD
             await state_shows(driver, lambda s: s.failsafe and s.mode is FlightMode.LAND)
             await state_shows(driver, lambda s: not s.armed and s.landed is LandedState.ON_GROUND, 30.0)
 
 
-async def test_a_vehicle_that_restarts_is_flown_on_without_a_new_driver(kind: str, caplog) -> None:
+async def test_a_vehicle_that_restarts_is_flown_on_without_a_new_driver(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     with running_simulator(speed=4.0) as first:
         async with connected(kind, first) as driver:
@@ -146,12 +152,13 @@ async def test_a_vehicle_that_restarts_is_flown_on_without_a_new_driver(kind: st
     assert len(lines) == 2
 
 
-async def test_two_vehicles_are_flown_side_by_side(kind: str) -> None:
+async def test_two_vehicles_are_flown_side_by_side(kind: DriverKind) -> None:
     with running_simulator(speed=4.0) as one, running_simulator(speed=4.0, system_id=2) as two:
         async with connected(kind, one) as first, connected(kind, two, system_id=2) as second:
             await asyncio.gather(state_shows(first, complete), state_shows(second, complete))
             await asyncio.gather(second.takeoff(3.0), second.arm())
-            await state_shows(second, lambda s: s.altitude_m > 1.0)
+            await state_shows(second, lambda s: (s.altitude_m or 0.0) > 1.0)
             assert not first.state.armed
+            assert first.state.altitude_m is not None
             assert first.state.altitude_m < 0.5
             await second.set_mode(FlightMode.LAND)

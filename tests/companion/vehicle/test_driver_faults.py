@@ -10,14 +10,15 @@ from contextlib import AbstractContextManager, asynccontextmanager
 from typing import Any
 
 import pytest
-from fake_autopilot import state_shows, wait_until
 
+from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver
-from companion.vehicle.drivers import open_driver
+from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
 from mavlink_sim.testing import RunningSimulator, running_simulator
+from tests.companion.vehicle.fake_autopilot import state_shows, wait_until
 
 PARAMETERS = {"COM_OF_LOSS_T": 2.0, "COM_OBL_RC_ACT": 4.0}
 
@@ -28,8 +29,9 @@ def simulated(**options: Any) -> AbstractContextManager[RunningSimulator]:
 
 
 @asynccontextmanager
-async def connected(kind: str, simulator: RunningSimulator) -> AsyncIterator[Driver]:
+async def connected(kind: DriverKind, simulator: RunningSimulator) -> AsyncIterator[AutopilotDriver]:
     driver = open_driver(kind, f"udpin://127.0.0.1:{simulator.onboard_port}")
+    assert isinstance(driver, AutopilotDriver)
     await driver.connect(20.0)
     try:
         yield driver
@@ -71,7 +73,9 @@ async def hovering(driver: Driver) -> AsyncIterator[Streamer]:
         pytest.param(["corrupt 0.05"], id="corrupting"),
     ],
 )
-async def test_on_a_bad_link_commands_and_parameters_still_come_through(kind: str, faults: list[str]) -> None:
+async def test_on_a_bad_link_commands_and_parameters_still_come_through(
+    kind: DriverKind, faults: list[str]
+) -> None:
     with simulated(faults=faults, seed=2) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
@@ -84,11 +88,11 @@ async def test_on_a_bad_link_commands_and_parameters_still_come_through(kind: st
             assert not driver.state.armed
 
 
-async def test_what_corruption_lets_through_is_true(kind: str) -> None:
+async def test_what_corruption_lets_through_is_true(kind: DriverKind) -> None:
     """No damaged message may reach the state: heights stay near the ground and the mode a mode."""
     with simulated(faults=["corrupt 0.5 way=out"], seed=3) as simulator:
         async with connected(kind, simulator) as driver:
-            seen = []
+            seen: list[VehicleState] = []
             driver.subscribe(seen.append)
             await wait_until(lambda: len(seen) > 200, 20.0)
             for state in seen:
@@ -98,7 +102,7 @@ async def test_what_corruption_lets_through_is_true(kind: str) -> None:
                 assert state.battery_fraction is None or state.battery_fraction > 0.5
 
 
-async def test_a_lost_acknowledgement_costs_a_repetition_and_all_of_them_an_answer(kind: str) -> None:
+async def test_a_lost_acknowledgement_costs_a_repetition_and_all_of_them_an_answer(kind: DriverKind) -> None:
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
@@ -113,7 +117,7 @@ async def test_a_lost_acknowledgement_costs_a_repetition_and_all_of_them_an_answ
                 await driver.arm()
 
 
-async def test_a_refused_mode_is_told_of_at_once(kind: str) -> None:
+async def test_a_refused_mode_is_told_of_at_once(kind: DriverKind) -> None:
     with simulated(faults=["refuse_mode LAND"]) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
@@ -123,7 +127,9 @@ async def test_a_refused_mode_is_told_of_at_once(kind: str) -> None:
             assert time.monotonic() - asked_s < 2.5  # not by the timeout of 3 s
 
 
-async def test_a_dead_link_is_told_of_and_its_return_too(kind: str, caplog) -> None:
+async def test_a_dead_link_is_told_of_and_its_return_too(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
@@ -137,7 +143,7 @@ async def test_a_dead_link_is_told_of_and_its_return_too(kind: str, caplog) -> N
 
 
 async def test_late_telemetry_bears_the_time_when_it_was_true(
-    kind: str,
+    kind: DriverKind,
 ) -> None:
     with simulated(speed=1.0) as simulator:
         async with connected(kind, simulator) as driver:
@@ -153,7 +159,9 @@ async def test_late_telemetry_bears_the_time_when_it_was_true(
             await wait_until(lambda: bool(late) and late[-1] > 200_000_000, 5.0)
 
 
-async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_is_stale(kind: str) -> None:
+async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_is_stale(
+    kind: DriverKind,
+) -> None:
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
@@ -164,7 +172,9 @@ async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_i
             assert driver.state.connected(time.monotonic_ns())
 
 
-async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(kind: str, caplog) -> None:
+async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
@@ -183,7 +193,9 @@ async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(kind: str, 
             assert driver.state.home_altitude_amsl_m == pytest.approx(before, abs=0.5)
 
 
-async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(kind: str, caplog) -> None:
+async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
@@ -200,12 +212,14 @@ async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(kind: str, 
             assert "is silent" not in caplog.text
 
 
-async def test_a_second_autopilot_with_its_own_system_id_changes_nothing(kind: str, caplog) -> None:
+async def test_a_second_autopilot_with_its_own_system_id_changes_nothing(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     with simulated() as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)
-            seen = []
+            seen: list[VehicleState] = []
             driver.subscribe(seen.append)
             simulator.fault("second_autopilot 9")
             await wait_until(lambda: "9/1" in caplog.text, 10.0)
@@ -213,7 +227,9 @@ async def test_a_second_autopilot_with_its_own_system_id_changes_nothing(kind: s
             assert all(abs(state.position_ned_m[1]) < 5.0 for state in seen if state.position_ned_m)
 
 
-async def test_a_second_autopilot_of_the_same_id_is_named(kind: str, caplog) -> None:
+async def test_a_second_autopilot_of_the_same_id_is_named(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     """From the same address the two cannot be told apart; what can be done is to say it, and not fly."""
     caplog.set_level(logging.WARNING)
     with simulated() as simulator:
@@ -232,7 +248,7 @@ async def test_a_second_autopilot_of_the_same_id_is_named(kind: str, caplog) -> 
             await driver.arm()
 
 
-async def test_setpoints_that_come_late_and_with_gaps_keep_the_vehicle_in_offboard(kind: str) -> None:
+async def test_setpoints_that_come_late_and_with_gaps_keep_the_vehicle_in_offboard(kind: DriverKind) -> None:
     with simulated(parameters=PARAMETERS, seed=4) as simulator:
         async with connected(kind, simulator) as driver:
             await ready(driver)

@@ -10,14 +10,15 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from fake_autopilot import FakeAutopilot, state_shows, wait_until
-from live_flight import ground_station
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import CommandRefusedError, Driver
-from companion.vehicle.drivers import open_driver
+from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.gimbal import NOBODY, GimbalAim, YawFrame
+from companion.vehicle.state import VehicleState
 from mavlink_sim.testing import running_simulator
+from tests.companion.live_flight import ground_station
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot, gimbal_of, state_shows, wait_until
 from vision.attitude import quaternion_from_euler
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
@@ -25,7 +26,7 @@ OURS = (1, 191)
 
 
 @contextlib.asynccontextmanager
-async def connected(kind: str, port: int) -> AsyncIterator[Driver]:
+async def connected(kind: DriverKind, port: int) -> AsyncIterator[Driver]:
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     await driver.connect(20.0)
     try:
@@ -34,7 +35,7 @@ async def connected(kind: str, port: int) -> AsyncIterator[Driver]:
         await driver.close()
 
 
-async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_for(kind: str) -> None:
+async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_for(kind: DriverKind) -> None:
     with (
         running_simulator(speed=2.0, gimbal=True) as simulator,
         ground_station(simulator.gcs_port) as station,
@@ -46,12 +47,15 @@ async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_f
             assert math.degrees(state.gimbal.highest_pitch_rad) == pytest.approx(45.0)
             state = await state_shows(
                 driver,
-                lambda s: s.gimbal.attitude_fresh(time.monotonic_ns()) and s.gimbal.primary_control == NOBODY,
+                lambda s: (
+                    gimbal_of(s).attitude_fresh(time.monotonic_ns())
+                    and gimbal_of(s).primary_control == NOBODY
+                ),
             )
-            assert state.gimbal.yaw_frame is YawFrame.NORTH
+            assert gimbal_of(state).yaw_frame is YawFrame.NORTH
             # Unasked it comes 5 times a second, of a clock that is twice as fast here: 10 take 0.9 s.
             stamps: list[int] = []
-            unsubscribe = driver.subscribe(lambda s: stamps.append(s.gimbal.attitude_ns))
+            unsubscribe = driver.subscribe(lambda s: stamps.append(gimbal_of(s).attitude_ns))
             await wait_until(
                 lambda: len(ten := sorted(set(stamps))[-10:]) == 10 and ten[-1] - ten[0] < 0.5e9, 10.0
             )
@@ -60,29 +64,39 @@ async def test_a_gimbal_is_heard_taken_pointed_and_given_back_and_never_fought_f
             with pytest.raises(CommandRefusedError, match=r"refused to point the gimbal \(denied\)"):
                 await driver.point_gimbal(GimbalAim(-0.5))
             await driver.take_gimbal()
-            await state_shows(driver, lambda s: s.gimbal.primary_control == OURS)
+            await state_shows(driver, lambda s: gimbal_of(s).primary_control == OURS)
             aim = GimbalAim(math.radians(-40.0), math.radians(25.0))
             await driver.point_gimbal(aim)
-            state = await state_shows(driver, lambda s: s.gimbal.off_rad(aim, s.yaw_rad) < math.radians(1.0))
-            assert math.degrees(state.gimbal.pitch_rad) == pytest.approx(-40.0, abs=1.0)
+
+            def aimed(s: VehicleState) -> bool:
+                assert s.yaw_rad is not None
+                off_rad = gimbal_of(s).off_rad(aim, s.yaw_rad)
+                assert off_rad is not None
+                return off_rad < math.radians(1.0)
+
+            pitch_rad = gimbal_of(await state_shows(driver, aimed)).pitch_rad
+            assert pitch_rad is not None
+            assert math.degrees(pitch_rad) == pytest.approx(-40.0, abs=1.0)
 
             # The station takes it: what is shown says so, and what we ask is denied.
             assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)
             station.mav.command_long_send(1, 1, 1001, 0, 245, 190, -1, -1, 0, 0, 0)
-            await state_shows(driver, lambda s: s.gimbal.primary_control == (245, 190))
+            await state_shows(driver, lambda s: gimbal_of(s).primary_control == (245, 190))
             with pytest.raises(CommandRefusedError, match="denied"):
                 await driver.point_gimbal(GimbalAim(0.0))
             await driver.give_gimbal_back()  # it is not ours: nothing changes
-            since_ns = driver.state.gimbal.status_ns
-            state = await state_shows(driver, lambda s: s.gimbal.status_ns > since_ns)
-            assert state.gimbal.primary_control == (245, 190)
+            since_ns = gimbal_of(driver.state).status_ns
+            state = await state_shows(driver, lambda s: gimbal_of(s).status_ns > since_ns)
+            assert gimbal_of(state).primary_control == (245, 190)
 
             await driver.take_gimbal()
             await driver.give_gimbal_back()
-            await state_shows(driver, lambda s: s.gimbal.primary_control == NOBODY)
+            await state_shows(driver, lambda s: gimbal_of(s).primary_control == NOBODY)
 
 
-async def test_without_a_gimbal_none_is_found_and_nothing_is_said(kind: str, caplog) -> None:
+async def test_without_a_gimbal_none_is_found_and_nothing_is_said(
+    kind: DriverKind, caplog: pytest.LogCaptureFixture
+) -> None:
     with running_simulator(speed=4.0) as simulator:
         async with connected(kind, simulator.onboard_port) as driver:
             assert not await driver.find_gimbal()
@@ -104,7 +118,9 @@ def attitude(flags: int, pitch_rad: float, yaw_rad: float, device: int = 0) -> A
     )
 
 
-async def test_a_gimbal_that_appears_later_is_asked_what_it_can_do(driver, autopilot) -> None:
+async def test_a_gimbal_that_appears_later_is_asked_what_it_can_do(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     def answer(message: Any) -> None:
         autopilot.acknowledge(message.command)
         if (message.command, message.param1) == (512, 280):
@@ -115,7 +131,7 @@ async def test_a_gimbal_that_appears_later_is_asked_what_it_can_do(driver, autop
     autopilot.answers["COMMAND_LONG"] = answer
     autopilot.say(mavlink.MAVLink_gimbal_manager_status_message(9, 0, 1, 0, 0, 0, 0))
     state = await state_shows(driver, lambda s: s.gimbal is not None and s.gimbal.information_ns > 0)
-    assert (state.gimbal.device, state.gimbal.lowest_pitch_rad) == (1, -1.5)
+    assert (gimbal_of(state).device, gimbal_of(state).lowest_pitch_rad) == (1, -1.5)
 
     def asked() -> set[tuple[float, float]]:
         return {(m.param1, m.param2) for m in autopilot.heard_named("COMMAND_LONG") if m.command == 511}
@@ -124,7 +140,7 @@ async def test_a_gimbal_that_appears_later_is_asked_what_it_can_do(driver, autop
 
 
 async def test_a_gimbal_in_a_component_of_its_own_is_heard_and_its_clock_is_not_believed(
-    driver, autopilot, port
+    driver: Driver, autopilot: FakeAutopilot, port: int
 ) -> None:
     other, gimbal = (FakeAutopilot(port, component_id=component) for component in (171, 154))
     autopilot.say(information(154))
@@ -136,13 +152,15 @@ async def test_a_gimbal_in_a_component_of_its_own_is_heard_and_its_clock_is_not_
     before_ns = time.monotonic_ns()
     other.say(attitude(16, 0.3, 0.0))
     gimbal.say(attitude(32, -0.7, 0.2))
-    state = await state_shows(driver, lambda s: s.gimbal.attitude is not None)
-    assert state.gimbal.pitch_rad == pytest.approx(-0.7, abs=1e-6)
-    assert state.gimbal.yaw_frame is YawFrame.NOSE
-    assert before_ns <= state.gimbal.attitude_ns <= time.monotonic_ns()
+    state = await state_shows(driver, lambda s: gimbal_of(s).attitude is not None)
+    assert gimbal_of(state).pitch_rad == pytest.approx(-0.7, abs=1e-6)
+    assert gimbal_of(state).yaw_frame is YawFrame.NOSE
+    assert before_ns <= gimbal_of(state).attitude_ns <= time.monotonic_ns()
 
 
-async def test_the_commands_to_a_gimbal_at_a_landing_are_not_ours_to_answer(driver, autopilot) -> None:
+async def test_the_commands_to_a_gimbal_at_a_landing_are_not_ours_to_answer(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     for command, values in (
         (1001, (1.0, 1.0, -1.0, -1.0, 0.0, 0.0, 0.0)),
         (1000, (math.nan, math.nan, math.nan, math.nan, 2.0, 0.0, 0.0)),

@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 
 import pytest
-from fake_autopilot import state_shows
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
@@ -16,9 +15,10 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.settings.reading import load_settings, to_toml
 from companion.vehicle.driver import CommandRefusedError, LinkError
 from companion.vehicle.drivers import open_driver
-from companion.vehicle.framing import Framer
+from companion.vehicle.framing import Frame, Framer
 from companion.vehicle.signing import FrameSigner, SigningKeyError, read_key
 from mavlink_sim.testing import running_simulator
+from tests.companion.vehicle.fake_autopilot import state_shows
 
 KEY = bytes(range(32))
 
@@ -30,7 +30,7 @@ def key_file(folder: Path, content: bytes, mode: int = 0o600) -> Path:
     return path
 
 
-def frames(data: bytes) -> list:
+def frames(data: bytes) -> list[Frame]:
     return Framer().feed(data, datagram=True)
 
 

@@ -9,19 +9,28 @@ import struct
 import time
 
 import pytest
-from fake_autopilot import MISSION, OFFBOARD, SETPOINT, FakeAutopilot, state_shows, wait_until
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from tests.companion.vehicle.fake_autopilot import (
+    MISSION,
+    OFFBOARD,
+    SETPOINT,
+    FakeAutopilot,
+    state_shows,
+    wait_until,
+)
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 
 
-async def test_a_velocity_setpoint_is_one_message_with_px4s_type_mask(driver, autopilot) -> None:
+async def test_a_velocity_setpoint_is_one_message_with_px4s_type_mask(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     now_ns = time.monotonic_ns()
     driver.send_setpoint(Setpoint.velocity((1.5, -2.0, 0.25), now_ns, yaw_rate_radps=0.5))
     (message,) = await autopilot.hears(SETPOINT)
@@ -32,14 +41,18 @@ async def test_a_velocity_setpoint_is_one_message_with_px4s_type_mask(driver, au
     assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
 
 
-async def test_a_position_setpoint_keeps_its_yaw_and_ignores_velocity(driver, autopilot) -> None:
+async def test_a_position_setpoint_keeps_its_yaw_and_ignores_velocity(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     driver.send_setpoint(Setpoint.position((10.0, 20.0, -5.0), time.monotonic_ns(), yaw_rad=1.25))
     (message,) = await autopilot.hears(SETPOINT)
     assert (message.x, message.y, message.z, message.yaw) == (10.0, 20.0, -5.0, 1.25)
     assert message.type_mask == 0b1001_1111_1000
 
 
-async def test_every_setpoint_leaves_exactly_once_and_nothing_is_repeated(driver, autopilot) -> None:
+async def test_every_setpoint_leaves_exactly_once_and_nothing_is_repeated(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     for north in range(5):
         driver.send_setpoint(Setpoint.velocity((float(north), 0.0, 0.0), time.monotonic_ns()))
     await autopilot.hears(SETPOINT, 5)
@@ -52,7 +65,7 @@ async def test_every_setpoint_leaves_exactly_once_and_nothing_is_repeated(driver
 
 
 async def test_the_only_heartbeats_on_the_wire_are_ours_and_no_sequence_number_is_missing(
-    driver, autopilot
+    driver: Driver, autopilot: FakeAutopilot
 ) -> None:
     driver.send_heartbeat(SystemStatus.CRITICAL)
     # Long enough for MAVSDK's own heartbeat, which comes every second, to have come.
@@ -65,7 +78,7 @@ async def test_the_only_heartbeats_on_the_wire_are_ours_and_no_sequence_number_i
     assert sequences == [number % 256 for number in range(len(sequences))]
 
 
-async def test_a_loop_that_hangs_sends_nothing(driver, autopilot) -> None:
+async def test_a_loop_that_hangs_sends_nothing(driver: Driver, autopilot: FakeAutopilot) -> None:
     driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), time.monotonic_ns()))
     driver.send_heartbeat(SystemStatus.ACTIVE)
     await autopilot.hears(SETPOINT)
@@ -87,7 +100,9 @@ async def heard_of_a_stream(driver: Driver, autopilot: FakeAutopilot, speed_mps:
     return {message.vx for message in autopilot.heard_named(SETPOINT)}
 
 
-async def test_what_waited_for_a_hung_loop_does_not_arrive_late(port, autopilot, caplog) -> None:
+async def test_what_waited_for_a_hung_loop_does_not_arrive_late(
+    port: int, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
+) -> None:
     """MAVSDK hands its messages over from a thread of its own, which goes on while the loop hangs."""
     driver = open_driver("mavsdk", f"udpin://127.0.0.1:{port}")
     await driver.connect(10.0)
@@ -100,7 +115,9 @@ async def test_what_waited_for_a_hung_loop_does_not_arrive_late(port, autopilot,
         await driver.close()
 
 
-async def test_a_setpoint_whose_time_is_over_when_it_would_leave_does_not(driver, autopilot, caplog) -> None:
+async def test_a_setpoint_whose_time_is_over_when_it_would_leave_does_not(
+    driver: Driver, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
+) -> None:
     """As after SIGCONT: the streamer had found it fresh, then the process was stopped."""
     now_ns = time.monotonic_ns()
     driver.send_setpoint(Setpoint.velocity((1.0, 0.0, 0.0), now_ns - 1_000_000_000))
@@ -109,7 +126,10 @@ async def test_a_setpoint_whose_time_is_over_when_it_would_leave_does_not(driver
 
 
 async def test_a_setpoint_that_was_held_up_on_its_way_to_the_wire_does_not_leave(
-    driver, autopilot, caplog, monkeypatch
+    driver: Driver,
+    autopilot: FakeAutopilot,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_ms = iter([1000, 1400, 2000, 2010])
     monkeypatch.setattr(driver, "_boot_ms", lambda: next(now_ms))
@@ -120,8 +140,8 @@ async def test_a_setpoint_that_was_held_up_on_its_way_to_the_wire_does_not_leave
     assert message.vx == 2.0
 
 
-async def test_the_state_follows_every_kind_of_message(driver, autopilot) -> None:
-    snapshots = []
+async def test_the_state_follows_every_kind_of_message(driver: Driver, autopilot: FakeAutopilot) -> None:
+    snapshots: list[VehicleState] = []
     unsubscribe = driver.subscribe(snapshots.append)
     half = math.sqrt(0.5)
     autopilot.say(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125))
@@ -154,11 +174,13 @@ async def test_the_state_follows_every_kind_of_message(driver, autopilot) -> Non
     assert len(snapshots) == count
 
 
-async def test_a_subscriber_that_fails_harms_nobody_else(driver, autopilot, caplog) -> None:
+async def test_a_subscriber_that_fails_harms_nobody_else(
+    driver: Driver, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
+) -> None:
     def fails(_state: object) -> None:
         raise ZeroDivisionError
 
-    seen = []
+    seen: list[VehicleState] = []
     driver.subscribe(fails)
     driver.subscribe(seen.append)
     autopilot.custom_mode = OFFBOARD
@@ -167,14 +189,18 @@ async def test_a_subscriber_that_fails_harms_nobody_else(driver, autopilot, capl
     assert "a subscriber of the state failed" in caplog.text
 
 
-async def test_current_mode_shows_a_mode_before_the_heartbeat_does(driver, autopilot) -> None:
+async def test_current_mode_shows_a_mode_before_the_heartbeat_does(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     autopilot.beating = False
     payload = struct.pack("<IIB", OFFBOARD, OFFBOARD, 0)
     autopilot.say_bytes(pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9))
     await state_shows(driver, lambda s: s.mode is FlightMode.OFFBOARD)
 
 
-async def test_messages_of_other_systems_and_components_change_nothing(driver, autopilot, port) -> None:
+async def test_messages_of_other_systems_and_components_change_nothing(
+    driver: Driver, autopilot: FakeAutopilot, port: int
+) -> None:
     stranger = FakeAutopilot(port, system_id=2)
     gimbal = FakeAutopilot(port, component_id=154)
     try:
@@ -192,7 +218,7 @@ async def test_messages_of_other_systems_and_components_change_nothing(driver, a
 
 
 async def test_a_second_autopilot_of_the_same_id_is_ignored_and_named(
-    driver, autopilot, port, caplog
+    driver: Driver, autopilot: FakeAutopilot, port: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     double = FakeAutopilot(port)
@@ -211,7 +237,9 @@ async def test_a_second_autopilot_of_the_same_id_is_ignored_and_named(
         await double.stop()
 
 
-async def test_an_estimate_that_is_not_a_number_is_no_estimate(driver, autopilot) -> None:
+async def test_an_estimate_that_is_not_a_number_is_no_estimate(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
     nan = math.nan
     autopilot.say(mavlink.MAVLink_local_position_ned_message(5, nan, nan, nan, nan, nan, nan))
     autopilot.say(mavlink.MAVLink_attitude_quaternion_message(5, nan, nan, nan, nan, 0.0, 0.0, 0.0))
@@ -222,7 +250,7 @@ async def test_an_estimate_that_is_not_a_number_is_no_estimate(driver, autopilot
     assert state.home_position_ned_m is None
 
 
-async def test_noise_between_the_messages_costs_no_message(driver, autopilot) -> None:
+async def test_noise_between_the_messages_costs_no_message(driver: Driver, autopilot: FakeAutopilot) -> None:
     autopilot.say_bytes(b"\xfd\xff\x00 no frame at all \xfe\x09")
     autopilot.say_bytes(bytes(range(256)) * 8)
     autopilot.say_bytes(b"")

@@ -3,13 +3,22 @@ from __future__ import annotations
 import os
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.framing import CRC_EXTRA, CURRENT_MODE_ID, Framer, frames_of, pack_frame, with_sequence
+from companion.vehicle.framing import (
+    CRC_EXTRA,
+    CURRENT_MODE_ID,
+    Frame,
+    Framer,
+    frames_of,
+    pack_frame,
+    with_sequence,
+)
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
 
@@ -29,7 +38,9 @@ noise = st.binary(max_size=40).map(lambda data: data.replace(b"\xfd", b"\0").rep
 @given(
     parts=st.lists(st.tuples(noise, good_frames), max_size=8), cuts=st.lists(st.integers(0, 400), max_size=12)
 )
-def test_a_stream_gives_its_frames_however_it_is_cut(parts, cuts) -> None:
+def test_a_stream_gives_its_frames_however_it_is_cut(
+    parts: list[tuple[bytes, bytes]], cuts: list[int]
+) -> None:
     stream = b"".join(junk + frame for junk, frame in parts)
     framer = Framer()
     found = []
@@ -42,7 +53,7 @@ def test_a_stream_gives_its_frames_however_it_is_cut(parts, cuts) -> None:
 
 
 @given(st.binary(max_size=700), st.booleans())
-def test_any_bytes_are_survived_and_the_next_frame_is_found(data, datagram) -> None:
+def test_any_bytes_are_survived_and_the_next_frame_is_found(data: bytes, datagram: bool) -> None:
     framer = Framer()
     framer.feed(data, datagram=datagram)
     # On a stream a false header may announce as much as the longest frame.
@@ -51,7 +62,7 @@ def test_any_bytes_are_survived_and_the_next_frame_is_found(data, datagram) -> N
 
 
 @given(st.integers(1, len(POSITION) - 1), st.integers(1, 255))
-def test_a_broken_byte_costs_its_frame_and_not_the_next(at, flip) -> None:
+def test_a_broken_byte_costs_its_frame_and_not_the_next(at: int, flip: int) -> None:
     broken = bytearray(POSITION)
     broken[at] ^= flip
     found = [frame.raw for frame in frames_of(bytes(broken) + HEARTBEAT)]
@@ -79,7 +90,9 @@ def test_a_message_without_a_definition_is_cut_out_unchecked() -> None:
 
 
 @given(payload=st.binary(min_size=28, max_size=28), sequence=st.integers(0, 255), again=st.integers(0, 255))
-def test_what_we_pack_pymavlink_reads_also_with_another_sequence_number(payload, sequence, again) -> None:
+def test_what_we_pack_pymavlink_reads_also_with_another_sequence_number(
+    payload: bytes, sequence: int, again: int
+) -> None:
     raw = pack_frame(32, payload, system_id=9, component_id=8, sequence=sequence)
     (frame,) = frames_of(raw)
     assert (frame.system_id, frame.component_id, frame.sequence) == (9, 8, sequence)
@@ -132,12 +145,15 @@ def flight_log() -> Path:
     return log
 
 
-def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log) -> None:
+def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log: Path) -> None:
     """The log is a stamp of 8 bytes and a frame, again and again."""
     folded_ids = {number for number, m in mavlink.mavlink_map.items() if m.msgname in FOLDED_MESSAGES}
     folded_ids.add(CURRENT_MODE_ID)
     data = flight_log.read_bytes()
-    state, modes, landed, armed = VehicleState(), [], [], []
+    state = VehicleState()
+    modes: list[object] = []
+    landed: list[object] = []
+    armed: list[object] = []
     position = count = 0
     while position < len(data):
         header = data[position + 8 : position + 11]
@@ -159,10 +175,12 @@ def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log) -> None:
     assert armed[:2] == [False, True]
     assert state.home_altitude_amsl_m is not None
     assert state.position_ned_m is not None
+    assert state.altitude_amsl_m is not None
+    assert state.altitude_m is not None
     assert abs(state.altitude_amsl_m - state.home_altitude_amsl_m - state.altitude_m) < 2.0
 
 
-def _decoded(frame) -> tuple[str, dict]:
+def _decoded(frame: Frame) -> tuple[str, dict[str, Any]]:
     if frame.message_id == CURRENT_MODE_ID:
         return "CURRENT_MODE", {"custom_mode": struct.unpack("<I", frame.padded(4))[0]}
     message = CODEC.decode(bytearray(frame.raw))

@@ -30,7 +30,7 @@ def payload(target: LandingTarget, autopilot: int) -> tuple[float, ...]:
     return LAYOUT.unpack(packed[10 : 10 + length].ljust(LAYOUT.size, b"\0"))
 
 
-def test_px4_is_told_a_valid_place_in_local_ned():
+def test_px4_is_told_a_valid_place_in_local_ned() -> None:
     time_us, *_, distance, _, _, number, frame, x, y, z, q0, q1, q2, q3, kind, valid = payload(TARGET, PX4)
     assert time_us == 5_000_123
     assert (number, frame, kind, valid) == (7, common.MAV_FRAME_LOCAL_NED, 2, 1)
@@ -39,7 +39,7 @@ def test_px4_is_told_a_valid_place_in_local_ned():
     assert distance == pytest.approx(math.hypot(0.5, 0.25, 4.0))
 
 
-def test_ardupilot_is_told_a_vector_about_its_body_with_the_distance():
+def test_ardupilot_is_told_a_vector_about_its_body_with_the_distance() -> None:
     _, angle_x, angle_y, distance, size_x, size_y, _, frame, x, y, z, *_, valid = payload(TARGET, ARDUPILOT)
     assert (frame, valid) == (common.MAV_FRAME_BODY_FRD, 1)
     assert (x, y, z) == pytest.approx((0.5, -0.25, 4.0))
@@ -55,7 +55,9 @@ place = st.floats(-50.0, 50.0)
 @given(
     position=st.tuples(place, place, place), offset=st.tuples(place, place, place), size=st.floats(0.01, 5)
 )
-def test_any_target_can_be_packed_and_says_where_it_is(position, offset, size):
+def test_any_target_can_be_packed_and_says_where_it_is(
+    position: tuple[float, float, float], offset: tuple[float, float, float], size: float
+) -> None:
     target = LandingTarget(1_000_000, 300, position, offset, size)
     px4, ardupilot = payload(target, PX4), payload(target, ARDUPILOT)
     assert px4[8:11] == pytest.approx(position, rel=1e-5, abs=1e-5)
@@ -64,6 +66,6 @@ def test_any_target_can_be_packed_and_says_where_it_is(position, offset, size):
     assert all(math.isfinite(value) for value in (*px4, *ardupilot))
 
 
-def test_what_is_not_finite_is_no_target():
+def test_what_is_not_finite_is_no_target() -> None:
     with pytest.raises(ValueError, match="must be finite"):
         LandingTarget(0, 1, (math.nan, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)

@@ -24,7 +24,9 @@ from companion.vehicle.link_url import LinkScheme, LinkUrl, LinkUrlError, parse_
         ),
     ],
 )
-def test_every_shape_is_read_and_written_back(text, scheme, address) -> None:
+def test_every_shape_is_read_and_written_back(
+    text: str, scheme: LinkScheme, address: tuple[str, int]
+) -> None:
     url = parse_link_url(text)
     assert url == LinkUrl(scheme, address)
     assert parse_link_url(str(url)) == url
@@ -50,7 +52,7 @@ def test_every_shape_is_read_and_written_back(text, scheme, address) -> None:
         ("http://127.0.0.1:80", "is not a link url"),
     ],
 )
-def test_anything_else_is_refused_in_one_line_with_examples(text, message) -> None:
+def test_anything_else_is_refused_in_one_line_with_examples(text: str, message: str) -> None:
     with pytest.raises(LinkUrlError, match=message) as caught:
         parse_link_url(text)
     assert isinstance(caught.value, ValueError)
@@ -59,7 +61,7 @@ def test_anything_else_is_refused_in_one_line_with_examples(text, message) -> No
 
 
 @given(st.text())
-def test_no_text_breaks_the_reader(text) -> None:
+def test_no_text_breaks_the_reader(text: str) -> None:
     try:
         url = parse_link_url(text)
     except LinkUrlError:

@@ -34,7 +34,7 @@ async def test_others_run_meanwhile_and_a_hang_does_not_cost_the_next_one() -> N
     async with precise_sleep() as sleep, asyncio.timeout(20):
         await sleep(0.02)
         assert turns > 1
-        waiting = asyncio.create_task(sleep(0.01))
+        waiting = asyncio.ensure_future(sleep(0.01))
         await asyncio.sleep(0)
         time.sleep(0.05)  # noqa: ASYNC251  (the loop hangs while the timer rings)
         await waiting

@@ -27,12 +27,12 @@ SHOWN = {
 
 
 @pytest.mark.parametrize(("custom_mode", "mode"), SHOWN.items())
-def test_what_px4_shows_is_named(custom_mode, mode) -> None:
+def test_what_px4_shows_is_named(custom_mode: int, mode: FlightMode) -> None:
     assert mode_of_custom_mode(custom_mode) is mode
 
 
 @pytest.mark.parametrize("mode", sorted(set(FlightMode) - {FlightMode.UNKNOWN}))
-def test_what_is_asked_for_is_what_will_be_shown(mode) -> None:
+def test_what_is_asked_for_is_what_will_be_shown(mode: FlightMode) -> None:
     main, sub = request_of_mode(mode)
     assert mode_of_custom_mode(main << 16 | sub << 24) is mode
     assert mode_of_custom_mode(custom_mode_of_mode(mode)) is mode
@@ -43,7 +43,7 @@ def test_position_is_asked_for_in_its_plain_shape() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_no_number_is_too_strange_for_a_mode(custom_mode) -> None:
+def test_no_number_is_too_strange_for_a_mode(custom_mode: int) -> None:
     mode = mode_of_custom_mode(custom_mode)
     assert mode is FlightMode.UNKNOWN or custom_mode & 0xFFFF0000 in SHOWN or mode is FlightMode.READY
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -32,7 +33,7 @@ vectors = st.tuples(finite, finite, finite)
         ),
     ],
 )
-def test_a_shape_px4_does_not_take_is_refused(values, message) -> None:
+def test_a_shape_px4_does_not_take_is_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Setpoint(0, **values)
 
@@ -54,7 +55,9 @@ _IGNORE = {
 
 
 @given(vector=vectors, is_position=st.booleans(), turn=st.sampled_from([None, "yaw", "rate"]), angle=finite)
-def test_the_type_mask_ignores_exactly_what_is_not_given(vector, is_position, turn, angle) -> None:
+def test_the_type_mask_ignores_exactly_what_is_not_given(
+    vector: tuple[float, float, float], is_position: bool, turn: str | None, angle: float
+) -> None:
     setpoint = Setpoint(
         0,
         position_ned_m=vector if is_position else None,
@@ -73,7 +76,9 @@ def test_the_type_mask_ignores_exactly_what_is_not_given(vector, is_position, tu
 
 
 @given(now_ns=st.integers(0, 2**62), lifetime_s=st.floats(0.001, 1000.0), vector=vectors)
-def test_a_setpoint_lives_as_long_as_it_was_given(now_ns, lifetime_s, vector) -> None:
+def test_a_setpoint_lives_as_long_as_it_was_given(
+    now_ns: int, lifetime_s: float, vector: tuple[float, float, float]
+) -> None:
     for make in (Setpoint.velocity, Setpoint.position):
         setpoint = make(vector, now_ns, lifetime_s=lifetime_s)
         assert not setpoint.expired(now_ns)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,7 +13,7 @@ S = 1_000_000_000
 
 
 @given(yaw=st.floats(-3.14, 3.14), pitch=st.floats(-1.2, 1.2), roll=st.floats(-3.0, 3.0))
-def test_yaw_is_the_heading_at_any_tilt(yaw, pitch, roll) -> None:
+def test_yaw_is_the_heading_at_any_tilt(yaw: float, pitch: float, roll: float) -> None:
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
@@ -48,9 +49,9 @@ def test_a_link_counts_until_three_heartbeats_are_missing() -> None:
 
 
 @pytest.mark.parametrize("late", ["position_ns", "attitude_ns"])
-def test_a_position_is_fresh_only_with_position_and_attitude(late) -> None:
-    stamps = {"position_ns": 10 * S, "attitude_ns": 10 * S}
-    known = {"position_ned_m": (0.0, 0.0, 0.0), "attitude": (1.0, 0.0, 0.0, 0.0)}
+def test_a_position_is_fresh_only_with_position_and_attitude(late: str) -> None:
+    stamps: dict[str, Any] = {"position_ns": 10 * S, "attitude_ns": 10 * S}
+    known: dict[str, Any] = {"position_ned_m": (0.0, 0.0, 0.0), "attitude": (1.0, 0.0, 0.0, 0.0)}
     now_ns = 10 * S + round(TELEMETRY_MAX_AGE_S * S)
     assert VehicleState(**stamps, **known).position_fresh(now_ns)
     assert not VehicleState(**stamps | {late: 10 * S - 1}, **known).position_fresh(now_ns)

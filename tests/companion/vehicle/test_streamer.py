@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import logging
 import time
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 
@@ -82,12 +83,13 @@ def test_haste_begins_no_stream_and_takes_none_up_again() -> None:
     assert bench.streamer.sent_count == count
 
 
-def test_an_expired_setpoint_brakes_and_then_falls_silent_for_good(caplog) -> None:
+def test_an_expired_setpoint_brakes_and_then_falls_silent_for_good(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench(brake_ms=500)
     bench.submit(300)
     bench.run(800)
     assert [is_brake(sent) for _, sent in bench.sent] == [False] * 15 + [True] * 25
-    assert bench.streamer.state is StreamState.BRAKING
+    before = bench.streamer.state
+    assert before is StreamState.BRAKING
     bench.run(200)
     assert bench.streamer.state is StreamState.EXPIRED
     count = bench.streamer.sent_count
@@ -113,7 +115,8 @@ def test_braking_ends_when_a_fresh_setpoint_comes() -> None:
     bench = Bench()
     bench.submit(100)
     bench.run(300)
-    assert bench.streamer.state is StreamState.BRAKING
+    before = bench.streamer.state
+    assert before is StreamState.BRAKING
     fresh = bench.submit(300, north_mps=2.0)
     bench.run(20)
     assert bench.sent[-1][1] is fresh
@@ -163,7 +166,9 @@ STEPS = st.lists(
 
 
 @given(steps=STEPS, brake_ms=st.integers(0, 600))
-def test_whatever_happens_nothing_expired_leaves_and_silence_is_final(steps, brake_ms) -> None:
+def test_whatever_happens_nothing_expired_leaves_and_silence_is_final(
+    steps: list[tuple[str, int]], brake_ms: int
+) -> None:
     bench = Bench(brake_ms=brake_ms)
     newest: Setpoint | None = None
     silent = False  # a silence began and stop() has not been called since
@@ -201,7 +206,7 @@ class TurnedClock:
         self.turns = turns
 
     @asynccontextmanager
-    async def sleeper(self):
+    async def sleeper(self) -> AsyncIterator[Callable[[float], Awaitable[None]]]:
         yield self.sleep
 
     async def sleep(self, delay_s: float) -> None:
@@ -212,7 +217,7 @@ class TurnedClock:
         self.now_ns += round(delay_s * 1e9)
 
 
-async def run_streamer(clock: TurnedClock, send, **options) -> Streamer:
+async def run_streamer(clock: TurnedClock, send: Callable[[Setpoint], None], **options: float) -> Streamer:
     streamer = Streamer(send, clock_ns=lambda: clock.now_ns, sleeper=clock.sleeper, **options)
     streamer.submit(Setpoint.velocity((1.0, 0.0, 0.0), 0, lifetime_s=60.0))
     with pytest.raises(asyncio.CancelledError):

@@ -24,7 +24,9 @@ HEARTBEAT = {"custom_mode": 0x03040000, "base_mode": 29, "system_status": 3}
         pytest.param(1, 0, False, False, id="uninitialised"),
     ],
 )
-def test_the_heartbeat_tells_armed_and_failsafe(base_mode, system_status, armed, failsafe) -> None:
+def test_the_heartbeat_tells_armed_and_failsafe(
+    base_mode: int, system_status: int, armed: bool, failsafe: bool
+) -> None:
     fields = {"custom_mode": 0x00060000, "base_mode": base_mode, "system_status": system_status}
     state = fold(VehicleState(), "HEARTBEAT", fields, 77)
     assert (state.armed, state.failsafe, state.heartbeat_ns) == (armed, failsafe, 77)
@@ -57,14 +59,14 @@ def test_current_mode_leads_and_a_mode_without_a_name_does_not() -> None:
         (99, LandedState.UNKNOWN),
     ],
 )
-def test_the_landed_state_is_named(number, landed) -> None:
+def test_the_landed_state_is_named(number: int, landed: LandedState) -> None:
     state = fold(VehicleState(), "EXTENDED_SYS_STATE", {"landed_state": number}, 5)
     assert (state.landed, state.landed_ns) == (landed, 5)
 
 
 @pytest.mark.parametrize("bad", [None, math.nan, math.inf])
 @pytest.mark.parametrize("field", ["x", "y", "z", "vx", "vy", "vz"])
-def test_a_position_with_a_hole_is_not_taken_and_does_not_look_fresh(field, bad) -> None:
+def test_a_position_with_a_hole_is_not_taken_and_does_not_look_fresh(field: str, bad: float | None) -> None:
     """NaN by pymavlink; null in MAVSDK's JSON."""
     whole = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 1.0)
     before = fold(VehicleState(), "LOCAL_POSITION_NED", whole, 5)
@@ -93,14 +95,16 @@ def test_home_is_known_by_its_altitude_even_without_a_local_position() -> None:
     ("health", "remaining", "ready", "fraction"),
     [(0x1000_0000, 80, True, 0.8), (0x0FFF_FFFF, 0, False, 0.0), (0, -1, False, None), (0, 120, False, 1.0)],
 )
-def test_sys_status_tells_readiness_and_battery(health, remaining, ready, fraction) -> None:
+def test_sys_status_tells_readiness_and_battery(
+    health: int, remaining: int, ready: bool, fraction: float | None
+) -> None:
     fields = {"onboard_control_sensors_health": health, "battery_remaining": remaining}
     state = fold(VehicleState(), "SYS_STATUS", fields, 5)
     assert (state.ready_to_arm, state.battery_fraction) == (ready, fraction)
 
 
 @given(name=st.sampled_from(sorted(FOLDED_MESSAGES - {"CURRENT_MODE"})), payload=st.binary(max_size=60))
-def test_no_content_of_a_message_breaks_the_fold(name, payload) -> None:
+def test_no_content_of_a_message_breaks_the_fold(name: str, payload: bytes) -> None:
     definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
     size = definition.unpacker.size
     values = definition.unpacker.unpack(payload[:size].ljust(size, b"\0"))

@@ -25,11 +25,14 @@ def lively_model(seed: int = 0) -> YoloModel:
             # The gain of SiLU is about 1.7 for signals of this size.
             nn.init.normal_(module.weight, 0, 1.8 / (module.weight[0].numel() ** 0.5))
         elif isinstance(module, nn.BatchNorm2d):
+            assert module.running_mean is not None
+            assert module.running_var is not None
             module.running_mean.normal_(0, 0.1)
             module.running_var.uniform_(0.8, 1.2)
     for branch in model.detect.class_branches:
-        branch[-1].weight.data.mul_(4)
-        branch[-1].bias.data.fill_(-1.0)
+        *_, last = branch.children()
+        last.get_parameter("weight").data.mul_(4)
+        last.get_parameter("bias").data.fill_(-1.0)
     return model
 
 

@@ -68,6 +68,8 @@ def test_an_exported_network_says_what_torch_says_at_every_size(
     for size in ((96, 96), (64, 160), (96, 96), (32, 32)):
         image = picture(*size)
         for a, b in zip(found.infer(image), reference.infer(image), strict=True):
+            assert a.sides is not None
+            assert b.sides is not None
             np.testing.assert_allclose(a.sides, b.sides, atol=0.1)
             np.testing.assert_allclose(a.classes, b.classes, atol=0.1)
     assert found.name == runtime

@@ -18,7 +18,8 @@ def whole_maps(image: np.ndarray) -> list[Tensor]:
     """What the untouched model says of a BGR picture."""
     rgb = torch.from_numpy(image[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
     with torch.inference_mode():
-        return lively_model()(rgb)
+        maps: list[Tensor] = lively_model()(rgb)
+    return maps
 
 
 def run(network: Network, image: np.ndarray) -> list[LevelMaps]:
@@ -31,6 +32,7 @@ def test_bytes_of_a_bgr_picture_give_what_rgb_in_0_to_1_gives() -> None:
     image = picture(64, 96)
     levels = run(Network(lively_model()), image)
     for expected, level in zip(whole_maps(image), levels, strict=True):
+        assert level.sides is not None
         np.testing.assert_allclose(level.sides, expected[0, :64], atol=1e-3)
         np.testing.assert_allclose(level.classes, expected[0, 64:], atol=1e-3)
 
@@ -39,8 +41,8 @@ def test_a_description_that_reads_the_picture_twice_is_not_folded_and_right() ->
     image = picture(64, 64)
     network = Network(lively_model())
     unfolded = Network(lively_model())
-    first = unfolded.body.model[0].conv
-    first.weight.data = first.weight.data.flip(1) * 255
+    first = unfolded.body.model[0].get_parameter("conv.weight")
+    first.data = first.data.flip(1) * 255
     unfolded._folded = False
     for a, b in zip(run(network, image), run(unfolded, image), strict=True):
         np.testing.assert_allclose(a.classes, b.classes, atol=1e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
 import json
 import logging
 from pathlib import Path
@@ -20,11 +22,9 @@ from vision.runtimes.source import read_source
 
 def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     """As if these runtimes alone were installed."""
-    real = contract.importlib.util.find_spec
+    real = importlib.util.find_spec
     absent = set(contract.RUNTIMES) - set(names)
-    monkeypatch.setattr(
-        contract.importlib.util, "find_spec", lambda name: None if name in absent else real(name)
-    )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
 
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "openvino", "tensorrt"])
@@ -42,8 +42,8 @@ def test_a_runtime_that_is_installed_and_broken_says_so(monkeypatch: pytest.Monk
     def broken(name: str) -> Any:
         raise ImportError("libsomething.so.1: cannot open shared object file")
 
-    monkeypatch.setattr(contract.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(contract.importlib, "import_module", broken)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(importlib, "import_module", broken)
     with pytest.raises(RuntimeMissingError, match=r"cannot be loaded: libsomething"):
         contract.required("openvino")
 
@@ -95,12 +95,14 @@ def test_with_torch_alone_auto_is_torch_without_a_trial(
 class Trial:
     """Stands for the measuring processes: answers by a table, and counts how often it is asked."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: dict[str, float | str]) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: dict[RuntimeName, float | str]) -> None:
         self.answer, self.asked = answer, 0
         monkeypatch.setattr(trial, "_measured", self._measured)
         monkeypatch.setattr(trial, "version", lambda name: "1.0")
 
-    def _measured(self, source: Any, candidates: list[str], *_: Any) -> dict[str, float | str]:
+    def _measured(
+        self, source: Any, candidates: list[RuntimeName], *_: Any
+    ) -> dict[RuntimeName, float | str]:
         self.asked += 1
         return {name: self.answer[name] for name in candidates}
 
@@ -121,7 +123,7 @@ def test_auto_takes_the_fastest_and_says_why(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-    answer: dict[str, Any],
+    answer: dict[RuntimeName, Any],
     best: str,
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -193,13 +195,13 @@ def test_a_trial_is_a_real_measurement_in_a_process_of_its_own(checkpoint: Path)
 def test_a_runtime_that_another_package_brings_has_that_ones_version(monkeypatch: pytest.MonkeyPatch) -> None:
     def of_package(name: str) -> str:
         if name == "onnxruntime":
-            raise contract.importlib.metadata.PackageNotFoundError(name)
+            raise importlib.metadata.PackageNotFoundError(name)
         return "1.2.3"
 
-    monkeypatch.setattr(contract.importlib.metadata, "version", of_package)
+    monkeypatch.setattr(importlib.metadata, "version", of_package)
     monkeypatch.setattr(
-        contract.importlib.metadata, "packages_distributions", lambda: {"onnxruntime": ["onnxruntime-gpu"]}
+        importlib.metadata, "packages_distributions", lambda: {"onnxruntime": ["onnxruntime-gpu"]}
     )
     assert contract.version("onnxruntime") == "1.2.3"
-    monkeypatch.setattr(contract.importlib.metadata, "packages_distributions", dict)
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", dict)
     assert contract.version("onnxruntime") == "unknown"

@@ -37,6 +37,7 @@ def test_one_graph_serves_every_size() -> None:
         image = picture(*size)
         found = [maps for level in runtime.infer(image) for maps in (level.sides, level.classes)]
         for a, b in zip(found, expected(image), strict=True):
+            assert a is not None
             np.testing.assert_allclose(a, b, atol=1e-3)
     assert not runtime._graphs
 

@@ -29,10 +29,11 @@ boxes = arrays.arrays(np.float64, st.tuples(st.integers(0, 4), st.just(4)), elem
 def cheapest(cost: np.ndarray) -> float:
     wide = cost if cost.shape[0] <= cost.shape[1] else cost.T
     rows = range(wide.shape[0])
-    return min(
+    cost_of_best: float = min(
         sum(wide[row, column] for row, column in zip(rows, columns, strict=True))
         for columns in itertools.permutations(range(wide.shape[1]), wide.shape[0])
     )
+    return cost_of_best
 
 
 @settings(max_examples=150)
@@ -68,7 +69,7 @@ def best_gain(gain: np.ndarray) -> float:
     with_one = [
         gain[0, column] + best_gain(np.delete(gain[1:], column, axis=1)) for column in range(gain.shape[1])
     ]
-    return max(alone, *with_one)
+    return float(max(alone, *with_one))
 
 
 @settings(max_examples=150)
@@ -95,7 +96,7 @@ def test_far_apart_groups_do_not_touch_each_other() -> None:
 def test_overlap_is_of_areas() -> None:
     first = np.array([[0, 0, 10, 10], [0, 0, 0, 0]])
     second = np.array([[5, 0, 15, 10], [20, 20, 30, 30], [0, 0, 10, 10]])
-    np.testing.assert_allclose(overlaps(first, second), [[1 / 3, 0, 1], [0, 0, 0]])
+    np.testing.assert_allclose(overlaps(first, second), [[1 / 3, 0.0, 1.0], [0.0, 0.0, 0.0]])
 
 
 @given(boxes, boxes)

@@ -60,7 +60,8 @@ class Film:
 
 def ids(frame: TrackedFrame) -> list[int]:
     assert frame.detections.track_id is not None
-    return frame.detections.track_id.tolist()
+    found: list[int] = frame.detections.track_id.tolist()
+    return found
 
 
 def test_an_object_keeps_its_identity_while_it_moves() -> None:
@@ -122,6 +123,7 @@ def test_a_track_counts_as_true_past_the_second_threshold_of_its_median() -> Non
     for confidence in (0.36, 0.9, 0.4, 0.45, 0.6, 0.6, 0.6, 0.6, 0.6):
         frame = film.show((100, 100, confidence))
         (record,) = frame.detections.records()
+        assert record["track_score"] is not None
         states.append((record["track_state"], round(record["track_score"], 3)))
     assert states == [
         ("tentative", 0.36),
@@ -381,7 +383,8 @@ def called(*names: tuple[int, float], x: float = 100.0) -> Detections:
 
 def confirmed(frame: TrackedFrame, class_id: int) -> list[bool]:
     assert frame.detections.track_confirmed is not None
-    return frame.detections.track_confirmed[frame.detections.class_id == class_id].tolist()
+    chosen = frame.detections.track_confirmed[frame.detections.class_id == class_id]
+    return [bool(value) for value in chosen]
 
 
 def show(film: Film, frame: Detections, times: int) -> TrackedFrame:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.bench.scenes import MOTIONS, DrawnDetector, Motion, scene_frames, without_image
+from companion.bench.scenes import MOTIONS, Motion, SyntheticDetector, scene_frames, without_image
 from companion.bench.tracking import Seen, attitudes_of, no_tracking, tracked
 from vision.tracking import TrackerSettings
 from vision.tracking.clear_mot import MotScore, clear_mot
@@ -15,7 +15,7 @@ Scores = dict[str, dict[str, MotScore]]
 
 
 def scores_of(motion: Motion) -> dict[str, MotScore]:
-    detector = DrawnDetector(seed=1)
+    detector = SyntheticDetector(seed=1)
     sequence = [
         Seen(without_image(frame), detector.detect(frame))
         for frame in scene_frames(motion, seconds=SECONDS, rate_hz=RATE_HZ, seed=1, drop=0.1)
