@@ -25,13 +25,12 @@ from companion.guidance.motion import position_and_yaw
 from companion.guidance.obstacles import ObstacleRules
 from companion.guidance.targets import StateHistory
 from companion.perception.views import View
-from companion.service.factory import guidance_options
+from companion.service.factory import guidance_options, streamer_of
 from companion.service.inputs import InputAssembler
 from companion.settings import Settings
 from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
-from companion.vehicle.streamer import Streamer
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle, Truth
 from vision.camera_model import CameraModel, CameraMount
 from vision.pipeline import PerceptionResult
@@ -114,12 +113,7 @@ class LockstepFlight:
         views = [camera.view for camera in cameras] or [View(settings.of_view(None))]
         self.inputs = InputAssembler(settings, views, lambda level, text: self.notes.append((level, text)))
         self.guidance = Guidance(options or guidance_options(settings, COMPANION))
-        self.streamer = Streamer(
-            driver.send_setpoint,
-            rate_hz=settings.guidance.setpoint_rate_hz,
-            brake_s=settings.guidance.brake_s,
-            clock_ns=lambda: driver.now_ns,
-        )
+        self.streamer = streamer_of(settings, driver.send_setpoint, lambda: driver.now_ns)
         self.events: list[GuidanceEvent] = []
         self.state_words: list[str] = []
         self.begun_ns = driver.now_ns

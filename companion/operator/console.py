@@ -16,9 +16,25 @@ _BANNER = "type a command (help, quit): takeoff 5, seek car, approach car distan
 
 
 async def run_console(
+    command: Callable[[str], Awaitable[dict[str, Any]]],
+    quit_service: Callable[[], None],
+    help_text: str,
+    on_event: Callable[[str, str], None],
+) -> None:
+    """Read commands until end of file or `quit`. A command runs while the next is typed.
+
+    Never raises: the terminal is a convenience, and whatever goes wrong there, the flight goes on.
+    """
+    try:
+        await _read_commands(command, quit_service, help_text)
+    except Exception as error:
+        logger.exception("the console failed")
+        on_event("warning", f"the console has ended: {type(error).__name__}: {error}")
+
+
+async def _read_commands(
     command: Callable[[str], Awaitable[dict[str, Any]]], quit_service: Callable[[], None], help_text: str
 ) -> None:
-    """Read commands until end of file or `quit`. A command runs while the next is typed."""
     await aioconsole.aprint(_BANNER, use_stderr=True)
     running: set[asyncio.Task[None]] = set()
 

@@ -17,7 +17,7 @@ import numpy as np
 from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.target import Target
 from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
-from companion.perception.keeper import PerceptionKeeper, PerceptionState
+from companion.perception.keeper import PerceptionKeeper, PerceptionStartError, PerceptionState
 from companion.perception.messages import Preview
 from companion.perception.pulse import START_S
 from companion.settings import DetectorSection, Section, Settings
@@ -139,6 +139,15 @@ class WorkerView(View):
 
     def seeing(self, now_ns: int) -> bool:
         return self.keeper.state is PerceptionState.FINISHED or super().seeing(now_ns)
+
+    async def start(self) -> None:
+        """Start the worker. Raises PerceptionStartError; the view's name is in its message."""
+        try:
+            await self.keeper.start()
+        except PerceptionStartError as error:
+            if self.name is None:
+                raise
+            raise PerceptionStartError(f"view {self.name}: {error}") from error
 
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
         """The worker's tracker needs to know where its camera looked."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 from companion.guidance.battery import BatteryMinimum
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.envelope import Limits
@@ -11,7 +14,9 @@ from companion.settings import Settings
 from companion.vehicle.driver import Driver
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.gimbal import Address
+from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.signing import read_key
+from companion.vehicle.streamer import Streamer
 
 
 def driver_of(settings: Settings) -> Driver:
@@ -45,6 +50,14 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
             camera_pitch_rad=steering.mount().pitch_rad,
         ),
     )
+
+
+def streamer_of(
+    settings: Settings, send: Callable[[Setpoint], None], clock_ns: Callable[[], int] = time.monotonic_ns
+) -> Streamer:
+    """The streamer. `send` puts a setpoint on the wire."""
+    guidance = settings.guidance
+    return Streamer(send, rate_hz=guidance.setpoint_rate_hz, brake_s=guidance.brake_s, clock_ns=clock_ns)
 
 
 def limits_of(settings: Settings) -> Limits:

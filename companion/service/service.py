@@ -19,10 +19,10 @@ from companion.guidance import grammar
 from companion.guidance.core import Guidance
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
-from companion.perception.keeper import PerceptionKeeper, PerceptionStartError
+from companion.perception.keeper import PerceptionKeeper
 from companion.perception.views import WorkerView, open_views
 from companion.service.event import Event
-from companion.service.factory import driver_of, guidance_options
+from companion.service.factory import driver_of, guidance_options, streamer_of
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
@@ -32,7 +32,7 @@ from companion.service.systemd_notify import SystemdNotifier
 from companion.settings import Settings
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import FlightMode, VehicleState
-from companion.vehicle.streamer import Streamer, StreamState
+from companion.vehicle.streamer import StreamState
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__package__)
@@ -61,11 +61,7 @@ class Service:
         self._console = console
         self.events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
         self.driver: Driver = driver_of(settings)
-        self.streamer = Streamer(
-            self.driver.send_setpoint,
-            rate_hz=settings.guidance.setpoint_rate_hz,
-            brake_s=settings.guidance.brake_s,
-        )
+        self.streamer = streamer_of(settings, self.driver.send_setpoint)
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
         self.views = open_views(
             settings,
@@ -118,7 +114,7 @@ class Service:
             vehicle = self._publisher.publish_vehicle(self.guidance, self.streamer, self.views)
             loops = [self._loop.run(), self.streamer.run(), vehicle, self._publish_status()]
             if self._console and all(terminal_is_free(view.settings.source.uri) for view in self.views):
-                loops.append(self._take_console())
+                loops.append(run_console(self.command, self.stop, grammar.describe(), self._event))
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("flying" if self.driver.state.armed else "ready")
             self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")
@@ -180,7 +176,7 @@ class Service:
         starts = [
             asyncio.create_task(self.bus.start()),
             asyncio.create_task(self.driver.connect(self.settings.vehicle.connect_timeout_s)),
-            *(asyncio.create_task(_start(view)) for view in self.views),
+            *(asyncio.create_task(view.start()) for view in self.views),
         ]
         try:
             done, _ = await asyncio.wait(starts, return_when=asyncio.FIRST_EXCEPTION)
@@ -215,17 +211,8 @@ class Service:
                 try:
                     await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
                 except CommandRefusedError as error:
-                    text = f"leaving: {error}; the autopilot's offboard-loss failsafe takes over"
-                    self._event("error", text)
+                    self._event("error", f"leaving: {error}; the autopilot's offboard-loss failsafe acts")
         await self._loop.until_released()
-
-    async def _take_console(self) -> None:
-        """The terminal is a convenience: whatever goes wrong there, the flight goes on."""
-        try:
-            await run_console(self.command, self.stop, grammar.describe())
-        except Exception as error:
-            logger.exception("the console failed")
-            self._event("warning", f"the console has ended: {type(error).__name__}: {error}")
 
     async def _publish_status(self) -> None:
         while True:
@@ -248,8 +235,8 @@ class Service:
                 self._loop.on_seen()
         finally:
             # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
-            loop = asyncio.get_running_loop()
-            loop.call_soon(self._publisher.publish_result, view, result, markers)
+            publish = self._publisher.publish_result
+            asyncio.get_running_loop().call_soon(publish, view, result, markers)
 
     def _event(self, level: str, text: str) -> None:
         event = Event(time.monotonic_ns(), level, text)
@@ -262,13 +249,3 @@ class Service:
             except Exception:
                 # A listener must not be able to bring the vehicle down.
                 logger.exception("an event listener failed")
-
-
-async def _start(view: WorkerView) -> None:
-    """Start a view; its name goes into what it says when it cannot."""
-    try:
-        await view.keeper.start()
-    except PerceptionStartError as error:
-        if view.name is None:
-            raise
-        raise PerceptionStartError(f"view {view.name}: {error}") from error
