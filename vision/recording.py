@@ -22,8 +22,9 @@ from vision.video_writer import VideoWriter, VideoWriterError
 
 logger = logging.getLogger(__name__)
 
-# Frames that wait for the encoder. More would only be memory: an encoder that is too slow stays too slow.
-_QUEUED_FRAMES = 4
+# Frames that wait for the encoder: two seconds of them, so that a busy moment of the computer leaves no gap,
+# but not more than this memory, and a few in any case. An encoder that is too slow stays too slow.
+_QUEUED_S, _QUEUED_BYTES, _LEAST_QUEUED = 2.0, 48_000_000, 4
 # Whoever ends the program is not kept waiting: what still waits then is given up, and that is said.
 _FINISHING_S = 2.0
 # The network, in the same process, comes first.
@@ -67,7 +68,7 @@ class Recording:
         self._first_ns: int | None = None
         self._next_slot = 0
         self._refused_slot: int | None = None
-        self._queue: queue.Queue[_Picture | None] = queue.Queue(_QUEUED_FRAMES)
+        self._queue: queue.Queue[_Picture | None] = queue.Queue()
         self._failed = threading.Event()
         self._finished_by_s = math.inf
         # A size is known only with the first frame; that nothing can be written there is known now.
@@ -83,14 +84,13 @@ class Recording:
         slot = round((frame.captured_ns - self._first_ns) / self._period_ns)
         if slot < self._next_slot or self._failed.is_set():
             return
-        try:
-            self._queue.put_nowait(_Picture(frame, detections, self.lines, self.highlight))
-        except queue.Full:
+        self._note_lost_before(slot)
+        most = min(_QUEUED_S * self._rate_hz, _QUEUED_BYTES / frame.image.nbytes)
+        if self._queue.qsize() >= max(_LEAST_QUEUED, most):
             # Not lost yet: a later frame may still take this picture's place in the film.
-            self._note_lost_before(slot)
             self._refused_slot = slot
         else:
-            self._note_lost_before(slot)
+            self._queue.put(_Picture(frame, detections, self.lines, self.highlight))
             self._refused_slot = None
             self._next_slot = slot + 1
 

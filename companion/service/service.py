@@ -37,8 +37,6 @@ from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__package__)
 
-_EVENTS_KEPT = 100
-
 
 class Service:
     """One vehicle's companion.
@@ -59,7 +57,7 @@ class Service:
         self.settings = settings
         self._on_event = on_event
         self._console = console
-        self.events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
+        self.events: deque[Event] = deque(maxlen=100)
         self.driver: Driver = driver_of(settings)
         self.streamer = streamer_of(settings, self.driver.send_setpoint)
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))

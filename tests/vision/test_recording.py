@@ -4,10 +4,12 @@ import logging
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import vision.recording
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.recording import Recording
@@ -181,3 +183,23 @@ def test_a_recording_that_fails_says_so_once_and_takes_no_more(
     assert (
         len([record for record in caplog.records if "the recording has failed" in record.getMessage()]) == 1
     )
+
+
+def test_an_encoder_that_pauses_for_a_second_leaves_no_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, may_go_on = tmp_path / "flight.webm", threading.Event()
+    add = vision.recording._add
+
+    def paused(*arguments: Any) -> None:
+        assert may_go_on.wait(30)
+        add(*arguments)
+
+    monkeypatch.setattr("vision.recording._add", paused)
+    recording = Recording(path, 20.0)
+    for sequence in range(20):
+        recording.write(frame_of(sequence), SPOT)
+    may_go_on.set()
+    recording.close()
+    assert recording.skipped == 0
+    assert len(played(path)) == 20
