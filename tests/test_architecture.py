@@ -126,6 +126,34 @@ def test_rooms_of_the_companion_import_downwards_only() -> None:
             assert FLOORS[room(other)] < FLOORS[here], f"{name} imports upwards: {other}"
 
 
+def test_guidance_has_no_clock_and_no_input_or_output() -> None:
+    """What it knows and when it is comes in as values; see `companion.guidance.interface`."""
+    forbidden = {"asyncio", "time", "threading", "socket", "subprocess", "zenoh", "mavsdk", "pymavlink"}
+    for name, path in modules().items():
+        if not name.startswith("companion.guidance."):
+            continue
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+        imported |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+        assert not {module.split(".")[0] for module in imported} & forbidden, name
+        calls = {
+            node.func.id for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert "open" not in calls, name
+
+
+def test_one_file_calls_the_update_of_a_behaviour_besides_behaviours() -> None:
+    """Whoever flies one goes through `Guidance.step`; only behaviours made of others call `update` too."""
+    callers = set()
+    for name, path in modules().items():
+        if name.startswith("companion.") and not name.startswith("companion.guidance."):
+            for node in ast.walk(ast.parse(path.read_text())):
+                called = node.func if isinstance(node, ast.Call) else None
+                if isinstance(called, ast.Attribute) and called.attr in ("update", "on_activate"):
+                    callers.add((name, ast.unparse(called)))
+    assert not [caller for caller in callers if "behaviour" in caller[1]], callers
+
+
 def test_rooms_of_the_simulator_import_downwards_only() -> None:
     def floor(module: str) -> int:
         return SIMULATOR_FLOORS.get(module.split(".")[1], SIMULATOR_TOP)

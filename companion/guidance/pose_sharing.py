@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 import uuid
 from collections.abc import Callable
 from typing import Any
@@ -37,9 +36,8 @@ class PoseSharing:
         self._neighbours = Neighbours(vehicle, self._source)
         self.unread = 0
 
-    def hear(self, payload: bytes) -> None:
-        """A message on anybody's `pose`, this vehicle's own too."""
-        receipt_ns = time.monotonic_ns()
+    def hear(self, payload: bytes, receipt_ns: int) -> None:
+        """A message on anybody's `pose`, this vehicle's own too, that came at that time (CLOCK_MONOTONIC)."""
         try:
             pose = pose_from_message(json.loads(payload))
         except (PoseError, ValueError) as error:

@@ -74,7 +74,7 @@ class Service:
             on_event=self._event,
             on_command=self.command,
             views=tuple(settings.views),
-            listeners=[(topics.POSE, self.inputs.poses.hear)],
+            listeners=[(topics.POSE, lambda data: self.inputs.poses.hear(data, time.monotonic_ns()))],
         )
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs)
         self._loop = GuidanceLoop(

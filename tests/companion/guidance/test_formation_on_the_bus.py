@@ -41,7 +41,7 @@ class Companion:
             name,
             on_event=lambda level, text: None,
             on_command=self.flight.loop.execute,
-            listeners=[(topics.POSE, self.poses.hear)],
+            listeners=[(topics.POSE, lambda data: self.poses.hear(data, time.monotonic_ns()))],
         )
 
     async def command(self, text: str) -> dict[str, Any]:
