@@ -5,7 +5,7 @@ import math
 import pytest
 from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
-from companion.guidance.behaviour import Behaviour, Outcome
+from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
@@ -200,3 +200,31 @@ def test_closing_ends_the_behaviour_and_the_stream():
     harness.run(0.5)
     assert len(harness.autopilot.setpoints) == sent
     assert harness.step(ending=True).released
+
+
+class Stops(HoldBehaviour):
+    """Ends at once, and tells where the vehicle is to stand."""
+
+    name = "stops"
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        return Outcome(True, "there", (1.0, 0.5, -5.0)) if dt_s else super().update(dt_s, situation)
+
+
+def test_the_hold_that_follows_keeps_the_goal_of_what_has_ended() -> None:
+    harness = GuidanceHarness(flying())
+    harness.run(0.1)
+    harness.vehicle.position[0] = 0.6
+    assert harness.outcome(harness.command(Stops()), 5.0).success
+    harness.run(6.0)
+    assert math.dist(harness.vehicle.position, (1.0, 0.5, -5.0)) < 0.1
+    # An operator's hold keeps it too; after a pilot's mode change nothing is left of it.
+    harness.command(HoldBehaviour())
+    harness.run(3.0)
+    assert math.dist(harness.vehicle.position, (1.0, 0.5, -5.0)) < 0.1
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.run(0.5)
+    harness.vehicle.position[1] = 0.0
+    harness.command(HoldBehaviour())
+    harness.run(5.0)
+    assert abs(harness.vehicle.position[1]) < 0.1
