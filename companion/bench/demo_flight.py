@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from typing import Any
 
@@ -40,6 +40,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.shapes import CLASS_NAMES, shape_of, variant_of
 from mavlink_sim.world.world import World, WorldObject, range_to
+from vision.attitude import wrap_angle
 
 LIMIT_S = 240.0
 # As the demonstration draws and looks at them, on two cores.
@@ -106,6 +107,8 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     elif not outcome.success:
         words = behaviour.told(outcome) if isinstance(behaviour, SequenceBehaviour) else outcome
         failure = words.reason
+    elif confirmed not in (TARGET_CLASS, None):
+        failure = f"confirmed a {confirmed}, not a {TARGET_CLASS}"
     elif hold_m is None or abs(hold_m - STOP_DISTANCE_M) > RANGE_TOLERANCE_M:
         failure = f"stood {_metres(hold_m)} from the {TARGET_CLASS}, not {STOP_DISTANCE_M:g} m"
     elif vehicle.truth.armed or not vehicle.truth.landed:
@@ -218,7 +221,7 @@ def _faced(world: World, flight: LockstepFlight) -> str | None:
     seen = [t for t in situation.targets if t.class_name == TARGET_CLASS and t.position_ned_m is not None]
     if not seen:
         return None
-    faced = min(seen, key=lambda target: abs(target.bearing_rad - yaw_rad))
+    faced = min(seen, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))
     assert faced.position_ned_m is not None
     place = faced.position_ned_m
     return min(world.objects, key=lambda item: range_to(item, place)).class_name
@@ -235,7 +238,7 @@ def _synthetic_camera(settings: Settings, scene: Scene, seed: int) -> SyntheticC
         size=(model.width, model.height),
         rate_hz=CAMERA_RATE_HZ,
         latency_s=LATENCY_S,
-        tracker=replace(settings.tracker.following(settings.detector.confidence)),
+        tracker=settings.tracker.following(settings.detector.confidence),
     )
 
 

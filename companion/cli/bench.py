@@ -143,7 +143,7 @@ def bench_flights(
     seed: Annotated[int, typer.Option(min=0, help="the first one")] = 0,
     processes: Annotated[int, typer.Option(min=1, help="flights at once")] = 1,
     rendered: Annotated[
-        bool, typer.Option("--rendered", help="the rendered camera with the real detector and tracker")
+        bool, typer.Option("--rendered", help="the rendered camera, and what looks at its pictures")
     ] = False,
     as_json: _JSON = False,
 ) -> None:

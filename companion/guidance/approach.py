@@ -39,6 +39,10 @@ ANCHOR_M = (1.5, 3.0)
 PLACE_TIME_CONSTANT_S = 1.5
 STILL_M = 0.6
 STILL_SHARE = 0.1
+MAX_LAG_M = 0.25
+# Reached within this. Less than other arrivals allow: the range and the vehicle's own estimate err too, and
+# the hold that follows keeps to the latter.
+REACHED_M = 0.15
 # Detectors miss single frames; this long without the object and the vehicle brakes.
 LOST_AFTER_S = 1.0
 # What appears where a lost object was, in this direction and at half to twice its range, is taken for it.
@@ -96,7 +100,7 @@ class ApproachBehaviour(Behaviour):
         self._wait_place: Vector3 | None = None
         self._anchor_rad: float | None = None
         self._place: Vector3 = (0.0, 0.0, 0.0)
-        self._arrival, self._controller = Arrival(), PositionController()
+        self._arrival, self._controller = Arrival(REACHED_M), PositionController()
         self._range_m = math.nan
 
     def on_activate(self, situation: Situation) -> None:
@@ -108,7 +112,7 @@ class ApproachBehaviour(Behaviour):
         self._choice = Choice()
         self._doubted = False
         self.lost_at = None
-        self._arrival, self._controller = Arrival(), PositionController()
+        self._arrival, self._controller = Arrival(REACHED_M), PositionController()
         self._range_m = math.nan
         if self._tracking is not None:
             self._tracking.begin(situation)
@@ -222,8 +226,14 @@ class ApproachBehaviour(Behaviour):
         away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
         if chosen:
             share = min(1.0, dt_s / PLACE_TIME_CONSTANT_S)
-            was, down = self._place, place[2]
-            place = (was[0] + share * (place[0] - was[0]), was[1] + share * (place[1] - was[1]), down)
+            was, now, down = self._place, place, place[2]
+            place = (was[0] + share * (now[0] - was[0]), was[1] + share * (now[1] - was[1]), down)
+            # The smoothed place of an object that comes nearer lags behind it, but not by more than this.
+            nearer_m = (now[0] - place[0]) * math.cos(away_rad) + (now[1] - place[1]) * math.sin(away_rad)
+            if nearer_m > MAX_LAG_M:
+                north, east = math.cos(away_rad), math.sin(away_rad)
+                excess_m = nearer_m - MAX_LAG_M
+                place = (place[0] + excess_m * north, place[1] + excess_m * east, down)
         goal = (
             place[0] + self._distance_m * math.cos(away_rad),
             place[1] + self._distance_m * math.sin(away_rad),
@@ -239,7 +249,7 @@ class ApproachBehaviour(Behaviour):
 
     def _leave_goal(self) -> None:
         self._anchor_rad = None
-        self._arrival, self._controller = Arrival(), PositionController()
+        self._arrival, self._controller = Arrival(REACHED_M), PositionController()
 
     def _wait(self, dt_s: float, situation: Situation, position: Vector3, unseen_s: float) -> Step:
         """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""

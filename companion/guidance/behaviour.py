@@ -105,6 +105,10 @@ class ModeRequest:
     altitude_m: float | None = None
     arm: bool = False
 
+    def __post_init__(self) -> None:
+        if self.mode is FlightMode.TAKEOFF and self.altitude_m is None:
+            raise ValueError("a take-off needs an altitude")
+
 
 # What an update may answer: a setpoint to fly, a mode of the autopilot's own, or the end.
 Step = Setpoint | ModeRequest | Outcome

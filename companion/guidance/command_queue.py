@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement
-from companion.guidance.gimbal_controller import FIND_TIMEOUT_S, GimbalController, is_known
+from companion.guidance.gimbal_controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
 from companion.vehicle.state import VehicleState
 
@@ -43,6 +43,9 @@ class CommandQueue:
     ) -> None:
         """A new command. `active`: the behaviour that is flown now."""
         self.supersede(command.text, out)
+        if command.mode_changes not in (None, self._mode_changes):
+            out.result(command.identifier, Outcome(False, f"superseded by {_change(state)}"))
+            return
         if command.aim is not None and active is not None and active.flown.gimbal_aim is not None:
             reason = f"gimbal: {active.flown.name} moves it; end that first"
             out.result(command.identifier, Outcome(False, reason))
@@ -58,8 +61,7 @@ class CommandQueue:
     def watch(self, mode_changes: int, state: VehicleState, out: OutputCollector) -> None:
         """A change of mode or arming: it is not the vehicle that a waiting command was given to."""
         if self._mode_changes is not None and mode_changes != self._mode_changes:
-            now = f"{state.mode.value}, {'armed' if state.armed else 'disarmed'}"
-            self.supersede(f"a change of the vehicle (now {now})", out)
+            self.supersede(_change(state), out)
         self._mode_changes = mode_changes
 
     def supersede(self, by: str, out: OutputCollector) -> None:
@@ -73,13 +75,26 @@ class CommandQueue:
                 out.result(waiting.command.identifier, Outcome(False, reason))
         self._waiting = left
 
+    def close(self, out: OutputCollector) -> None:
+        """The service ends: nothing that waits begins any more."""
+        self.supersede("the end of the service", out)
+        for waiting in self._waiting:
+            out.result(waiting.command.identifier, Outcome(False, ENDING))
+        self._waiting = []
+
     def take_due(self, now_ns: int, state: VehicleState, out: OutputCollector) -> list[CommandInput]:
         """The behaviours that are to begin now, in their order. Gimbal commands go to the gimbal."""
         known = is_known(state.gimbal, now_ns)
-        over = [w for w in self._waiting if known or now_ns > w.until_ns or not self._gimbal.finding]
+        over = [w for w in self._waiting if known or now_ns > w.until_ns or self._gimbal.not_found]
         self._waiting = [w for w in self._waiting if w not in over]
         due, self._due = [*(w.command for w in over), *self._due], []
         for command in due:
             if command.aim is not None:
                 self._gimbal.point(command.identifier, command.aim, now_ns, state, out)
         return [command for command in due if command.behaviour is not None]
+
+
+def _change(state: VehicleState) -> str:
+    """What has changed, for the answer of a command that was given before."""
+    now = f"{state.mode.value}, {'armed' if state.armed else 'disarmed'}"
+    return f"a change of the vehicle (now {now})"

@@ -121,6 +121,7 @@ class Guidance:
         self._position_lost_ns: int | None = None
         self._blind = False
         self._goal_ned_m: Vector3 | None = None
+        self._mode_changes = 0
         self._landing_target_ns = 0
 
     @property
@@ -161,12 +162,15 @@ class Guidance:
         """
         out = self._out
         out.begin(now_ns)
-        before, situation = self._situation, self._look_at(now_ns, inputs)
-        self._situation, self._class_names = situation, inputs.class_names
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)
+        if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
+            self._goal_ned_m = None  # somebody else has flown since
+        self._mode_changes = inputs.mode_changes
+        before, situation = self._situation, self._observe(now_ns, inputs)
+        self._situation, self._class_names = situation, inputs.class_names
         if inputs.ending:
-            self._queue.supersede("the end of the service", out)
+            self._queue.close(out)
             for command in inputs.commands:
                 out.result(command.identifier, Outcome(False, ENDING))
             self._end(Outcome(False, ENDING))
@@ -196,9 +200,8 @@ class Guidance:
                 return f"{behaviour.name} would leave the limits: {why}"
         return None
 
-    def _look_at(self, now_ns: int, inputs: GuidanceInput) -> Situation:
-        """What behaviours see. Targets that are too old, or of a camera that looks nobody knows where, are
-        left out."""
+    def _observe(self, now_ns: int, inputs: GuidanceInput) -> Situation:
+        """What behaviours see, without targets that are too old or whose camera has no known direction."""
         gimbal = self.gimbal.sight(now_ns, inputs.state)
         age_s = None if inputs.seen_ns is None else (now_ns - inputs.seen_ns) / 1e9
         fresh = age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.undirected
@@ -237,7 +240,12 @@ class Guidance:
         """Let a command's behaviour take the place of the active one; refused, the active one goes on."""
         behaviour = command.behaviour
         assert behaviour is not None
-        if (missing := self.check_requirements(behaviour)) is not None:
+        try:
+            missing = self.check_requirements(behaviour)
+        except Exception as error:
+            logger.exception("%s cannot be checked", behaviour.name)
+            missing = f"{behaviour.name} cannot begin: {type(error).__name__}: {error}"
+        if missing is not None:
             outcome = Outcome(False, missing)
             self._out.result(command.identifier, outcome)
             self._out.event(EventKind.REFUSED, behaviour.name, f"refused: {missing}", outcome)
@@ -551,11 +559,12 @@ class Guidance:
 
     def _drop_request(self) -> None:
         """Forget a request: it is not repeated, but it may still take effect."""
+        pending = self._request is not None or self._sequence is not None
         self._requested = self._sequence = None
         if self._request is not None:
             self._out.cancel(self._request)
             self._request = None
-            if self._situation is not None:
-                self._authority.dropped(self._situation.now_ns)
+        if pending and self._situation is not None:
+            self._authority.dropped(self._situation.now_ns)
         if self.phase in (Phase.REQUESTING, Phase.DELEGATED):
             self.phase = Phase.READY

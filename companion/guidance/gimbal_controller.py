@@ -70,8 +70,9 @@ class GimbalController:
     def __init__(self, own: Address, mounting: GimbalMounting) -> None:
         self._mounting = mounting
         self._control = GimbalControl(own)
-        self._asked: tuple[int, GimbalAsk] | None = None
+        self._asked: tuple[int, GimbalAsk, int] | None = None
         self._find: int | None = None
+        self._not_found = False
         self._search_due_ns = 0
         self._point: _PointRequest | None = None
         self._told_problem = ""
@@ -118,12 +119,12 @@ class GimbalController:
     def find(self, out: OutputCollector) -> None:
         """Ask for the gimbal, unless that is being asked already."""
         if self._find is None:
-            self._find = out.request(FindGimbal())
+            self._find, self._not_found = out.request(FindGimbal()), False
 
     @property
-    def finding(self) -> bool:
-        """The gimbal was asked for and there is no answer yet."""
-        return self._find is not None
+    def not_found(self) -> bool:
+        """The newest answer to `find` is that there is none. Found, it still has to tell its attitude."""
+        return self._find is None and self._not_found
 
     def point(
         self, identifier: int, aim: GimbalAim, now_ns: int, state: VehicleState, out: OutputCollector
@@ -140,7 +141,7 @@ class GimbalController:
     def take_answer(self, answer: Answer, now_ns: int, out: OutputCollector) -> None:
         """What became of a request; one of somebody else is passed over."""
         if answer.identifier == self._find:
-            self._find = None
+            self._find, self._not_found = None, answer.refused is not None
         elif self._asked is not None and answer.identifier == self._asked[0]:
             ask, self._asked = self._asked[1], None
             self._control.answered(now_ns, answer.refused)
@@ -164,7 +165,7 @@ class GimbalController:
             aim, owner = self._point.aim, self._point
         request = self._control.update(now_ns, state.gimbal, aim, owner)
         if request is not None:
-            self._asked = (out.request(_action(request)), request.ask)
+            self._asked = (out.request(_action(request)), request.ask, now_ns)
         self._tell_problem(out)
         if self._point is not None:
             self._judge(self._point, now_ns, state, out)
@@ -181,16 +182,17 @@ class GimbalController:
         late = now_ns - self._ending_since_ns > RELEASE_TIMEOUT_S * 1e9
         if self._asked is not None and late:
             # What the manager has shown since it was asked tells instead.
-            out.cancel(self._asked[0])
+            identifier, _, asked_ns = self._asked
+            out.cancel(identifier)
             self._asked = None
-            self._control.answered(now_ns, "the gimbal manager did not answer")
+            self._control.answered(asked_ns, "the gimbal manager did not answer")
         if self._asked is not None or self.released:
             return
         request = None if self._last_try else self._control.update(now_ns, state.gimbal, None, None)
         if request is None:
             self.released = True
         else:
-            self._asked, self._last_try = (out.request(_action(request)), request.ask), True
+            self._asked, self._last_try = (out.request(_action(request)), request.ask, now_ns), True
             self._ending_since_ns = now_ns
 
     def _end_point(self, outcome: Outcome, out: OutputCollector) -> None:

@@ -88,6 +88,8 @@ class CommandInput:
         behaviour: what is to be flown; None: the command only points the gimbal.
         aim: where the gimbal is to look; None for a behaviour.
         endless: the command has no end of its own, so it is answered when the vehicle flies it.
+        mode_changes: `GuidanceInput.mode_changes` when the command was given; None: not known. A change of
+            mode or arming since then supersedes it: it was given to the vehicle as it was.
     """
 
     identifier: int
@@ -95,6 +97,7 @@ class CommandInput:
     behaviour: Behaviour | None = None
     aim: GimbalAim | None = None
     endless: bool = False
+    mode_changes: int | None = None
 
     def __post_init__(self) -> None:
         if (self.behaviour is None) == (self.aim is None):
@@ -226,8 +229,11 @@ class OutputCollector:
         return self._identifier
 
     def cancel(self, identifier: int) -> None:
-        """Nobody waits for this request any more."""
-        self.cancelled.append(identifier)
+        """Nobody waits for this request any more; one of this very step is not made at all."""
+        kept = [request for request in self.requests if request.identifier != identifier]
+        if len(kept) == len(self.requests):
+            self.cancelled.append(identifier)
+        self.requests = kept
 
     def event(
         self,

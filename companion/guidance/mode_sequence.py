@@ -11,20 +11,14 @@ READY_TIMEOUT_S = 3.0
 
 
 class ModeSequence:
-    """Only a take-off that says so arms.
-
-    Raises:
-        ValueError: a take-off without an altitude.
-    """
+    """Only a take-off that says so arms."""
 
     def __init__(self, request: ModeRequest, state: VehicleState) -> None:
         self._actions: list[SetMode | Arm | TakeOff] = []
         self._waiting_since_ns: int | None = None
-        if request.mode is not FlightMode.TAKEOFF:
+        if request.mode is not FlightMode.TAKEOFF or request.altitude_m is None:
             self._actions.append(SetMode(request.mode))
             return
-        if request.altitude_m is None:
-            raise ValueError("a take-off needs an altitude")
         if request.arm and not state.armed:
             # After a landing PX4 may show a mode in which it never arms: the one from before the landing.
             if state.mode is not FlightMode.HOLD:

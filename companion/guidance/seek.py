@@ -17,6 +17,8 @@ from vision.attitude import wrap_angle
 BLIND_TIMEOUT_S = 5.0
 # A turn may take this many times what it should, plus the looks on the way.
 SLOWEST_TURN = 3.0
+# Time is given to face so many candidates that turn out to be nothing.
+MOST_CANDIDATES = 5
 # Nose and gimbal are so near to an object's direction that the camera sees the object.
 POINTED_RAD = math.radians(8.0)
 # A gimbal that swept in vain is let back to where it looked before, so long at most.
@@ -83,7 +85,7 @@ class SeekBehaviour(Behaviour):
         gimbal = situation.state.gimbal
         if self._sweep is not None and gimbal is not None and gimbal.pitch_rad is not None:
             self._sweep.begin(gimbal.pitch_rad)  # else the first step says what is missing
-        limit_s = SLOWEST_TURN * self._laps * math.tau / self._rate_radps + 2 * FACING_TIMEOUT_S
+        limit_s = SLOWEST_TURN * self._laps * math.tau / self._rate_radps + MOST_CANDIDATES * FACING_TIMEOUT_S
         self._give_up_ns = situation.now_ns + limit_s * 1e9
 
     def update(self, dt_s: float, situation: Situation) -> Step:

@@ -24,7 +24,6 @@ class TakeoffBehaviour(Behaviour):
     """Arms, takes off to `altitude_m` above home and ends when that height is reached."""
 
     name = "takeoff"
-    requirements = frozenset({Requirement.ON_GROUND})
 
     def __init__(self, altitude_m: float = 2.5) -> None:
         self._altitude_m = altitude_m
@@ -35,6 +34,12 @@ class TakeoffBehaviour(Behaviour):
         self._yaw_rad: float | None = None
         self._controller = PositionController()
         self._altitude_now_m = 0.0
+
+    @property
+    def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
+        """The last of the climb is flown by setpoints: not without a fresh position."""
+        climbing = set() if self._top is None else {Requirement.POSITION}
+        return frozenset({Requirement.ON_GROUND} | climbing)
 
     def on_activate(self, situation: Situation) -> None:
         limit_s = BASE_TIMEOUT_S + self._altitude_m / SLOWEST_CLIMB_MPS

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.guidance.core import Guidance
+from companion.guidance.gimbal_controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceOutput, StreamStatus
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
@@ -87,10 +88,12 @@ class GuidanceLoop:
     async def until_released(self) -> None:
         """After `begin_to_end`: give back what is held, and wait for that, but not for ever."""
         until_s = time.monotonic() + RELEASE_TIMEOUT_S
-        while not self._step(time.monotonic_ns()).released and time.monotonic() < until_s:
-            await self._something_new_until(time.monotonic() + self._period_s)
-        await self._requests.close()
-        self._commands.close("the service ends")
+        try:
+            while not self._step(time.monotonic_ns()).released and time.monotonic() < until_s:
+                await self._something_new_until(time.monotonic() + self._period_s)
+        finally:
+            await self._requests.close()
+            self._commands.close(ENDING)
 
     def _step(self, now_ns: int) -> GuidanceOutput:
         stream = StreamStatus(self._streamer.state, self._streamer.sent_count)

@@ -125,7 +125,7 @@ class InputAssembler:
         names = self.steering.class_names
         command: Command = parse(text, names)
         if isinstance(command, Gimbal):
-            return CommandInput(identifier, str(command), aim=command.aim)
+            return CommandInput(identifier, str(command), aim=command.aim, mode_changes=self._mode_changes)
         camera = self.steering.settings.camera
         footprint = Footprint(camera.field_rad, -self.camera_pitch_rad(state))
         behaviour: Behaviour
@@ -135,4 +135,10 @@ class InputAssembler:
             raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
         else:
             behaviour = behaviour_for(command, footprint)
-        return CommandInput(identifier, str(command), behaviour, endless=command.endless)
+        return CommandInput(
+            identifier,
+            str(command),
+            behaviour,
+            endless=command.endless,
+            mode_changes=self._mode_changes,
+        )

@@ -33,19 +33,29 @@ class RequestRunner:
     def __init__(self, driver: Driver, on_answer: Callable[[], None]) -> None:
         self._driver, self._on_answer = driver, on_answer
         self._tasks: dict[int, asyncio.Task[None]] = {}
+        self._cancelled: set[int] = set()
         self._answers: list[Answer] = []
 
     def start(self, request: Request) -> None:
         """Begin to carry it out."""
         task = asyncio.get_running_loop().create_task(self._run(request))
         self._tasks[request.identifier] = task
-        task.add_done_callback(lambda _: self._tasks.pop(request.identifier, None))
+        task.add_done_callback(lambda done: self._on_done(request.identifier, done))
 
     def cancel(self, identifier: int) -> None:
         """Nobody waits for it any more; what has been sent may still take effect."""
         task = self._tasks.get(identifier)
         if task is not None:
+            self._cancelled.add(identifier)
             task.cancel()
+
+    def _on_done(self, identifier: int, task: asyncio.Task[None]) -> None:
+        self._tasks.pop(identifier, None)
+        if task.cancelled() and identifier not in self._cancelled:
+            # Not by us: unanswered, guidance would wait for ever.
+            self._answers.append(Answer(identifier, "the request was cancelled"))
+            self._on_answer()
+        self._cancelled.discard(identifier)
 
     def take_answers(self) -> tuple[Answer, ...]:
         """Those that have come since the last call."""
@@ -55,8 +65,8 @@ class RequestRunner:
     async def close(self) -> None:
         """End what is still asked."""
         tasks = list(self._tasks.values())
-        for task in tasks:
-            task.cancel()
+        for identifier in list(self._tasks):
+            self.cancel(identifier)
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _run(self, request: Request) -> None:

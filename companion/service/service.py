@@ -205,12 +205,13 @@ class Service:
             self._loop.begin_to_end()
         finally:
             self.streamer.stop()
-            if flying and self.driver.state.connected(time.monotonic_ns()):
-                try:
+            try:
+                if flying and self.driver.state.connected(time.monotonic_ns()):
                     await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
-                except CommandRefusedError as error:
-                    self._event("error", f"leaving: {error}; the autopilot's offboard-loss failsafe acts")
-        await self._loop.until_released()
+            except CommandRefusedError as error:
+                self._event("error", f"leaving: {error}; the autopilot's offboard-loss failsafe acts")
+            finally:
+                await self._loop.until_released()
 
     async def _publish_status(self) -> None:
         while True:

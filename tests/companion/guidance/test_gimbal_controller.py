@@ -149,7 +149,7 @@ def test_an_unanswered_request_is_released_if_the_manager_shows_it_as_ours(
     harness.run(DOWN)
     steps = round(RELEASE_TIMEOUT_S / 0.05) + 2
     for _ in range(2 * steps):
-        harness.gimbal = GimbalState(1, status_ns=harness.vehicle.now_ns + 60_000_000, primary_control=shown)
+        harness.gimbal = GimbalState(1, status_ns=harness.vehicle.now_ns, primary_control=shown)
         harness.run(DOWN, 1, ending=True)
     assert harness.asked == asked
     assert harness.controller.released

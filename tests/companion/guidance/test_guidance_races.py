@@ -1,0 +1,157 @@
+"""What must not happen when several things come in one step, or not at all."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+
+from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.core import Phase
+from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.hold import HoldBehaviour
+from companion.guidance.interface import Answer, CommandInput, EventKind, FindGimbal, GuidanceInput, Request
+from companion.guidance.takeoff import TakeoffBehaviour
+from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
+from companion.vehicle.state import FlightMode, LandedState
+
+
+def test_a_takeoff_that_loses_its_position_stops_to_climb() -> None:
+    harness = GuidanceHarness(parked())
+    harness.autopilot.takeoff_short_m = 1.0
+    harness.run(0.2)
+    takeoff = harness.command(TakeoffBehaviour(5.0))
+    harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 30.0)
+    harness.autopilot.position_alive = False
+    outcome = harness.outcome(takeoff, 10.0)
+    assert not outcome.success
+    assert "position" in outcome.reason
+    assert -harness.vehicle.position[2] < 5.5
+    assert not harness.guidance.in_command
+
+
+class TakesOffOnce(Behaviour):
+    """Asks to take off, and ends as soon as the pre-arm checks have passed."""
+
+    name = "takes-off-once"
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        if situation.state.ready_to_arm:
+            return Outcome(False, "enough")
+        return ModeRequest(FlightMode.TAKEOFF, 3.0, arm=True)
+
+
+def test_a_request_that_is_cancelled_in_its_own_step_is_not_made() -> None:
+    ready = False
+    harness = GuidanceHarness(
+        parked(),
+        inputs=lambda inputs: replace(inputs, state=replace(inputs.state, ready_to_arm=ready)),
+    )
+    harness.run(0.1)
+    command = harness.command(TakesOffOnce())
+    harness.run(0.5)
+    ready = True
+    harness.run(0.5)
+    assert command.result() == Outcome(False, "enough")
+    assert harness.autopilot.requests == []
+    assert not harness.vehicle.armed
+
+
+def test_a_check_that_fails_is_an_answer_and_the_flight_goes_on() -> None:
+    def homeless(inputs: GuidanceInput) -> GuidanceInput:
+        return replace(inputs, state=replace(inputs.state, home_position_ned_m=None))
+
+    harness = GuidanceHarness(flying(), inputs=homeless)
+    engaged(harness)
+    refused = harness.command(FollowPathBehaviour([(0.0, 0.0), (10.0, 0.0)], 2.0)).result()
+    assert not refused.success
+    assert "home" in refused.reason
+    assert kinds(harness)[-1] is EventKind.REFUSED
+    harness.run(0.5)
+    assert harness.guidance.phase is Phase.OFFBOARD
+
+
+def test_a_takeoff_needs_an_altitude() -> None:
+    with pytest.raises(ValueError, match="altitude"):
+        ModeRequest(FlightMode.TAKEOFF)
+
+
+def test_a_pilot_who_switches_after_a_command_was_given_wins_over_it() -> None:
+    harness = GuidanceHarness(flying())
+    harness.run(0.1)
+    given = CommandInput(99, "hold", HoldBehaviour(), mode_changes=harness.autopilot.mode_changes)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.autopilot.step(0.02)
+    harness.step(given)
+    assert harness.results[99].reason == "superseded by a change of the vehicle (now position, armed)"
+    harness.run(1.0)
+    assert not harness.guidance.in_command
+    assert harness.autopilot.setpoints == []
+
+
+class NeedsGimbal(HoldBehaviour):
+    name = "needs-gimbal"
+    requirements = HoldBehaviour.requirements | {Requirement.GIMBAL}
+
+
+def test_a_gimbal_that_was_found_has_its_time_to_tell_its_attitude() -> None:
+    gimbal: GimbalState | None = None
+
+    def told(inputs: GuidanceInput) -> GuidanceInput:
+        return replace(inputs, state=replace(inputs.state, gimbal=gimbal))
+
+    harness = GuidanceHarness(flying(), inputs=told)
+    start = harness.autopilot.start
+
+    def found(request: Request) -> None:
+        if isinstance(request.action, FindGimbal):
+            harness.autopilot._answers.append(Answer(request.identifier))
+        else:
+            start(request)
+
+    harness.autopilot.start = found  # type: ignore[method-assign]
+    harness.run(0.1)
+    command = harness.command(NeedsGimbal())
+    harness.run(1.0)
+    assert not command.done()
+    now_ns = harness.vehicle.now_ns + 10**9
+    gimbal = GimbalState(
+        1, now_ns, now_ns, now_ns, (1.0, 0.0, 0.0, 0.0), YawFrame.NOSE, primary_control=NOBODY
+    )
+    harness.run(0.2)
+    assert harness.guidance.behaviour is not None
+    assert harness.guidance.behaviour.name == "needs-gimbal"
+
+
+def test_the_old_goal_is_forgotten_when_somebody_else_flies() -> None:
+    harness = GuidanceHarness(parked())
+    harness.run(0.2)
+    assert harness.outcome(harness.command(TakeoffBehaviour(3.0))).success
+    assert not harness.guidance.in_command
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.run(0.5)
+    place = (harness.vehicle.position[0] + 0.7, *harness.vehicle.position[1:])
+    harness.vehicle.position[0] = place[0]
+    harness.command(HoldBehaviour())
+    harness.run(5.0)
+    assert harness.vehicle.landed is LandedState.IN_AIR
+    assert math.dist(harness.vehicle.position, place) < 0.1
+
+
+@pytest.mark.parametrize(("speed_mps", "nearest_m"), [(0.5, 4.2), (0.8, 3.9)])
+def test_an_approach_backs_off_from_what_comes_nearer(speed_mps: float, nearest_m: float) -> None:
+    from guidance_harness import Flight
+    from kinematic_vehicle import KinematicVehicle, SeenObject
+
+    car, vehicle = SeenObject("car", 20.0, 0.0), KinematicVehicle()
+    ranges: list[float] = []
+
+    def each(seconds: float, flown: KinematicVehicle) -> None:
+        car.north = 20.0 - speed_mps * seconds
+        ranges.append(math.hypot(car.north - flown.position[0], car.east - flown.position[1]))
+
+    Flight(ApproachBehaviour("car", distance_m=5.0), vehicle, [car]).run(25.0, each)
+    assert min(ranges) > nearest_m

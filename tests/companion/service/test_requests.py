@@ -1,0 +1,72 @@
+"""Each request to the vehicle is answered once, however it ends; a cancelled one is not."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import cast
+
+from companion.guidance.interface import Arm, FindGimbal, Request, SetMode
+from companion.service.requests import RequestRunner
+from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.state import FlightMode
+
+
+class FakeDriver:
+    """Refuses, fails, cancels itself or waits, as it is told."""
+
+    def __init__(self, fault: BaseException | None = None) -> None:
+        self.fault = fault
+        self.asked: list[str] = []
+
+    async def set_mode(self, mode: FlightMode) -> None:
+        self.asked.append(mode.value)
+        if self.fault is not None:
+            raise self.fault
+        await asyncio.Event().wait()
+
+    async def arm(self) -> None:
+        self.asked.append("arm")
+
+    async def find_gimbal(self) -> bool:
+        return False
+
+
+def runner_of(driver: FakeDriver) -> tuple[RequestRunner, asyncio.Event]:
+    answered = asyncio.Event()
+    return RequestRunner(cast(Driver, driver), answered.set), answered
+
+
+async def refusal_of(driver: FakeDriver, request: Request) -> str | None:
+    runner, answered = runner_of(driver)
+    runner.start(request)
+    async with asyncio.timeout(10):
+        await answered.wait()
+    (answer,) = runner.take_answers()
+    assert answer.identifier == request.identifier
+    assert runner.take_answers() == ()
+    return answer.refused
+
+
+async def test_what_was_done_and_what_was_refused_is_answered() -> None:
+    hold = Request(7, SetMode(FlightMode.HOLD))
+    assert await refusal_of(FakeDriver(), Request(1, Arm())) is None
+    assert await refusal_of(FakeDriver(CommandRefusedError("denied")), hold) == "denied"
+    assert await refusal_of(FakeDriver(ZeroDivisionError("a bug")), hold) == "ZeroDivisionError: a bug"
+    assert await refusal_of(FakeDriver(), Request(2, FindGimbal())) == "no gimbal answers"
+
+
+async def test_a_cancellation_from_inside_is_answered() -> None:
+    hold = Request(7, SetMode(FlightMode.HOLD))
+    assert await refusal_of(FakeDriver(asyncio.CancelledError()), hold) == "the request was cancelled"
+
+
+async def test_a_request_that_was_cancelled_is_not_answered() -> None:
+    driver = FakeDriver()
+    runner, answered = runner_of(driver)
+    runner.start(Request(7, SetMode(FlightMode.HOLD)))
+    while not driver.asked:
+        await asyncio.sleep(0)
+    runner.cancel(7)
+    await runner.close()
+    assert runner.take_answers() == ()
+    assert not answered.is_set()
