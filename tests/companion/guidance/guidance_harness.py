@@ -5,9 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
-
-from kinematic_vehicle import KinematicVehicle, SeenObject, look
 
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
@@ -31,6 +28,7 @@ from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
 
 CLIMB_MPS = 1.5
 DISARM_AFTER_LANDING_S = 2.0
@@ -316,7 +314,7 @@ class Flight:
     limits: Limits = field(default_factory=Limits)
     camera_hz: float = 10.0
     latency_s: float = 0.1
-    steps: list[Any] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
     track: list[tuple[float, float, float]] = field(default_factory=list)
 
     def run(

@@ -2,19 +2,19 @@ import math
 import random
 
 import pytest
-from guidance_harness import Flight
-from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.target import RangeSource
+from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
-def distance_to(vehicle, thing):
+def distance_to(vehicle: KinematicVehicle, thing: SeenObject) -> float:
     return math.dist(vehicle.position[:2], (thing.north, thing.east)) - thing.radius_m
 
 
 @pytest.mark.parametrize(("north", "east"), [(20.0, 5.0), (8.0, -3.0), (45.0, 0.0), (6.0, 0.0)])
-def test_approach_stops_at_the_asked_distance_without_passing_it(north, east):
+def test_approach_stops_at_the_asked_distance_without_passing_it(north: float, east: float) -> None:
     car = SeenObject("car", north, east)
     vehicle = KinematicVehicle()
     nearest = []
@@ -29,7 +29,7 @@ def test_approach_stops_at_the_asked_distance_without_passing_it(north, east):
     assert math.hypot(*vehicle.velocity) < 0.3
 
 
-def test_approach_arrives_with_noisy_ranges():
+def test_approach_arrives_with_noisy_ranges() -> None:
     noise = random.Random(7)
     car = SeenObject("car", 25.0, -6.0)
     vehicle = KinematicVehicle()
@@ -40,7 +40,7 @@ def test_approach_arrives_with_noisy_ranges():
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.8)
 
 
-def test_approach_backs_off_when_it_begins_too_near():
+def test_approach_backs_off_when_it_begins_too_near() -> None:
     person = SeenObject("person", 2.0, 0.0)
     vehicle = KinematicVehicle()
     outcome = Flight(ApproachBehaviour("person", distance_m=4.0), vehicle, [person]).run(60.0)
@@ -49,11 +49,11 @@ def test_approach_backs_off_when_it_begins_too_near():
     assert distance_to(vehicle, person) == pytest.approx(4.0, abs=0.35)
 
 
-def test_approach_stays_with_its_object_when_a_nearer_one_of_the_class_appears():
+def test_approach_stays_with_its_object_when_a_nearer_one_of_the_class_appears() -> None:
     first, second = SeenObject("car", 25.0, 0.0), SeenObject("car", 14.0, 7.0, visible=False)
     vehicle = KinematicVehicle()
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         second.visible = seconds > 2.0
 
     outcome = Flight(ApproachBehaviour("car"), vehicle, [first, second]).run(90.0, each)
@@ -62,10 +62,10 @@ def test_approach_stays_with_its_object_when_a_nearer_one_of_the_class_appears()
     assert distance_to(vehicle, first) == pytest.approx(5.0, abs=0.35)
 
 
-def test_approach_follows_an_object_that_walks():
+def test_approach_follows_an_object_that_walks() -> None:
     person = SeenObject("person", 20.0, 0.0)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         if seconds < 10.0:
             person.east = 0.8 * seconds
 
@@ -76,12 +76,12 @@ def test_approach_follows_an_object_that_walks():
     assert distance_to(vehicle, person) == pytest.approx(5.0, abs=0.5)
 
 
-def test_a_lost_object_brakes_the_vehicle_and_ends_the_approach_after_the_timeout():
+def test_a_lost_object_brakes_the_vehicle_and_ends_the_approach_after_the_timeout() -> None:
     car = SeenObject("car", 40.0, 0.0)
     vehicle = KinematicVehicle()
     stopped_at = []
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.visible = seconds < 5.0
         if seconds > 9.0:
             stopped_at.append(vehicle.position[0])
@@ -93,10 +93,10 @@ def test_a_lost_object_brakes_the_vehicle_and_ends_the_approach_after_the_timeou
     assert max(stopped_at) - min(stopped_at) < 0.2
 
 
-def test_an_object_that_comes_back_in_time_is_approached_on():
+def test_an_object_that_comes_back_in_time_is_approached_on() -> None:
     car = SeenObject("car", 25.0, 0.0)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.visible = not 4.0 < seconds < 7.0
 
     vehicle = KinematicVehicle()
@@ -105,10 +105,10 @@ def test_an_object_that_comes_back_in_time_is_approached_on():
     assert outcome.success, outcome.reason
 
 
-def test_a_silent_detector_brakes_and_ends_the_approach():
+def test_a_silent_detector_brakes_and_ends_the_approach() -> None:
     flight = Flight(ApproachBehaviour("car"), objects=[SeenObject("car", 40.0, 0.0)])
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 4.0
 
     outcome = flight.run(60.0, each)
@@ -118,7 +118,7 @@ def test_a_silent_detector_brakes_and_ends_the_approach():
     assert math.hypot(*flight.vehicle.velocity) < 0.1
 
 
-def test_without_any_range_the_vehicle_turns_to_the_object_but_does_not_fly_at_it():
+def test_without_any_range_the_vehicle_turns_to_the_object_but_does_not_fly_at_it() -> None:
     car = SeenObject("car", 20.0, 12.0, with_range=False)
     vehicle = KinematicVehicle()
     outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(60.0)
@@ -129,10 +129,10 @@ def test_without_any_range_the_vehicle_turns_to_the_object_but_does_not_fly_at_i
     assert vehicle.yaw_rad == pytest.approx(math.atan2(12.0, 20.0), abs=0.05)
 
 
-def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away():
+def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away() -> None:
     car = SeenObject("car", 20.0, 2.0)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.with_range = distance_to(vehicle, car) > 7.0
 
     vehicle = KinematicVehicle()
@@ -143,11 +143,11 @@ def test_the_last_metres_are_flown_on_bearings_alone_when_the_range_goes_away():
 
 
 @pytest.mark.parametrize("source", [RangeSource.DEPTH, RangeSource.GROUND_PLANE])
-def test_a_first_range_that_was_wrong_does_not_lose_the_object_for_good(source):
+def test_a_first_range_that_was_wrong_does_not_lose_the_object_for_good(source: RangeSource) -> None:
     car = SeenObject("car", 16.0, 1.0, source=source)
     wrong = [0.8]
 
-    def noise():
+    def noise() -> float:
         return wrong.pop() if wrong else 0.0
 
     vehicle = KinematicVehicle()

@@ -1,19 +1,26 @@
 import math
+from collections.abc import Callable
 
 import pytest
-from guidance_harness import Flight
-from kinematic_vehicle import KinematicVehicle, SeenObject
 
+from companion.guidance.behaviour import Outcome
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
+from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
+
+Each = Callable[[float, Flight], None]
 
 
-def flown(text, car, each, seconds=300.0):
-    behaviour, notes = behaviour_for(parse(text)), []
+def flown(
+    text: str, car: SeenObject, each: Each, seconds: float = 300.0
+) -> tuple[Outcome, list[str], Flight]:
+    behaviour = behaviour_for(parse(text))
+    notes: list[str] = []
     vehicle = KinematicVehicle()
     flight = Flight(behaviour, vehicle, [car])
 
-    def listen(at, vehicle):
+    def listen(at: float, vehicle: KinematicVehicle) -> None:
         notes.extend(behaviour.take_notes())
         each(at, flight)
 
@@ -22,10 +29,10 @@ def flown(text, car, each, seconds=300.0):
     return outcome, [*notes, *behaviour.take_notes()], flight
 
 
-def test_what_comes_back_where_it_was_is_approached_on():
+def test_what_comes_back_where_it_was_is_approached_on() -> None:
     car = SeenObject("car", 30.0, 0.0)
 
-    def each(seconds, flight):
+    def each(seconds: float, flight: Flight) -> None:
         car.visible = not 5.0 < seconds < 11.0
 
     outcome, notes, flight = flown("approach car", car, each)
@@ -37,10 +44,10 @@ def test_what_comes_back_where_it_was_is_approached_on():
     assert math.dist(flight.vehicle.position[:2], (30.0, 0.0)) == pytest.approx(5.0, abs=0.4)
 
 
-def test_what_went_elsewhere_is_found_by_turning_and_approached():
+def test_what_went_elsewhere_is_found_by_turning_and_approached() -> None:
     car = SeenObject("car", 25.0, 0.0, track_id=1)
 
-    def each(seconds, flight):
+    def each(seconds: float, flight: Flight) -> None:
         car.visible = not 5.0 < seconds < 12.0
         if seconds > 6.0:
             car.north, car.east, car.track_id = -8.0, 14.0, 2
@@ -54,11 +61,11 @@ def test_what_went_elsewhere_is_found_by_turning_and_approached():
 @pytest.mark.parametrize(
     ("retries", "said"), [(0, ""), (1, "; looked for it again once"), (2, "again 2 times")]
 )
-def test_what_is_gone_for_good_is_looked_for_so_often_and_the_vehicle_stands(retries, said):
+def test_what_is_gone_for_good_is_looked_for_so_often_and_the_vehicle_stands(retries: int, said: str) -> None:
     car = SeenObject("car", 30.0, 0.0)
     places = []
 
-    def each(seconds, flight):
+    def each(seconds: float, flight: Flight) -> None:
         car.visible = seconds < 5.0
         if seconds > 9.0:
             places.append(tuple(flight.vehicle.position))
@@ -71,14 +78,14 @@ def test_what_is_gone_for_good_is_looked_for_so_often_and_the_vehicle_stands(ret
     assert max(math.dist(places[0], place) for place in places) < 0.5
 
 
-def test_what_was_never_seen_is_not_sought():
+def test_what_was_never_seen_is_not_sought() -> None:
     outcome, notes, _ = flown("approach car", SeenObject("car", -20.0, 0.0), lambda seconds, flight: None)
     assert "never seen" in outcome.reason
     assert notes == []
 
 
-def test_a_silent_detector_is_no_lost_object():
-    def each(seconds, flight):
+def test_a_silent_detector_is_no_lost_object() -> None:
+    def each(seconds: float, flight: Flight) -> None:
         flight.perception_alive = seconds < 4.0
 
     outcome, notes, _ = flown("approach car", SeenObject("car", 40.0, 0.0), each)
@@ -86,6 +93,6 @@ def test_a_silent_detector_is_no_lost_object():
     assert notes == []
 
 
-def test_retries_are_whole():
+def test_retries_are_whole() -> None:
     with pytest.raises(ValueError, match="whole number"):
         parse("approach car retries=1.5")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import random
+from typing import TypedDict
 
 import pytest
 
@@ -28,7 +29,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from vision.attitude import wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 
-VEHICLES = {
+VEHICLES: dict[str, dict[str, float]] = {
     "px4": {},
     "slow": {"MPC_XY_VEL_P_ACC": 1.4, "MC_YAW_P": 1.4},
     "loose": {"MPC_XY_VEL_P_ACC": 1.2, "MPC_XY_VEL_I_ACC": 0.6, "MPC_XY_P": 0.8, "MC_YAW_P": 2.0},
@@ -38,7 +39,16 @@ GUSTS_MPS = 0.6
 HOLD_S = 10.0
 
 
-def air(name: str, seed: int) -> dict[str, object]:
+class Air(TypedDict):
+    """Options of a flight in some wind."""
+
+    seed: int
+    wind_mps: float
+    gusts_mps: float
+    parameters: dict[str, float]
+
+
+def air(name: str, seed: int) -> Air:
     """Options of a flight in some wind."""
     wind_mps = random.Random(seed).uniform(0.0, 3.0)
     return {"seed": seed, "wind_mps": wind_mps, "gusts_mps": GUSTS_MPS, "parameters": VEHICLES[name]}
@@ -81,7 +91,7 @@ def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
-def test_goto_arrives_and_the_hold_keeps_its_goal(name, seed):
+def test_goto_arrives_and_the_hold_keeps_its_goal(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
@@ -95,7 +105,7 @@ def test_goto_arrives_and_the_hold_keeps_its_goal(name, seed):
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
-def test_figure_eight_ends_standing_where_it_began(name, seed):
+def test_figure_eight_ends_standing_where_it_began(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
     begin: list[Vector3] = []
 
@@ -109,7 +119,7 @@ def test_figure_eight_ends_standing_where_it_began(name, seed):
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
-def test_approach_fixes_its_goal_on_arrival(name, seed):
+def test_approach_fixes_its_goal_on_arrival(name: str, seed: int) -> None:
     camera = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
     mount = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
     car = SceneObject("car", (4.2, 1.8, 1.5), lambda _: ScenePose(15.0, 3.0, 0.5))
@@ -146,7 +156,7 @@ def on_circle(radius_m: float, speed_mps: float, name: str, seed: int) -> tuple[
 
 @pytest.mark.parametrize(("radius_m", "speed_mps"), [(8.0, 4.0), (10.0, 2.0), (5.0, 3.0)])
 @pytest.mark.parametrize(("name", "seed"), [("px4", 1), ("px4", 2), ("slow", 3)])
-def test_orbit_keeps_radius_and_nose(radius_m, speed_mps, name, seed):
+def test_orbit_keeps_radius_and_nose(radius_m: float, speed_mps: float, name: str, seed: int) -> None:
     wide, nose = on_circle(radius_m, speed_mps, name, seed)
     share = round(0.9 * len(wide))
     assert wide[share] <= (0.3 if name == "px4" else 0.45)
@@ -155,7 +165,7 @@ def test_orbit_keeps_radius_and_nose(radius_m, speed_mps, name, seed):
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
 @pytest.mark.parametrize("height_m", [2.5, 5.0])
-def test_takeoff_reaches_its_height_and_reports_it(name, seed, height_m):
+def test_takeoff_reaches_its_height_and_reports_it(name: str, seed: int, height_m: float) -> None:
     vehicle = LockstepVehicle({"onboard": RATES_HZ}, **air(name, seed))
     flight = LockstepFlight(SimulatedDriver(vehicle), plain_settings())
     assert flight.run_until(lambda: flight.state.ready_to_arm, 30.0)

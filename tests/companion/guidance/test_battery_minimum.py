@@ -1,8 +1,9 @@
-import pytest
-from guidance_harness import GuidanceHarness
-from kinematic_vehicle import KinematicVehicle
+from collections.abc import Callable
 
-from companion.guidance.battery import BATTERY_MAX_AGE_S, BatteryMinimum
+import pytest
+
+from companion.guidance.battery import BATTERY_MAX_AGE_S, BatteryAction, BatteryMinimum
+from companion.guidance.behaviour import Behaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
@@ -12,15 +13,17 @@ from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry_fold import fold
+from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 MINIMUM = BatteryMinimum(0.15)
 
 
-def flying(battery=MINIMUM):
+def flying(battery: BatteryMinimum = MINIMUM) -> GuidanceHarness:
     return GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD), options=GuidanceOptions(battery=battery))
 
 
-def orbiting(harness):
+def orbiting(harness: GuidanceHarness) -> Pending:
     harness.run(0.1)
     future = harness.command(OrbitBehaviour())
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
@@ -28,12 +31,14 @@ def orbiting(harness):
     return future
 
 
-def told(harness):
+def told(harness: GuidanceHarness) -> list[str]:
     return [event.message for event in harness.events if event.kind is EventKind.BATTERY]
 
 
 @pytest.mark.parametrize("behaviour", [HoldBehaviour, OrbitBehaviour, TakeoffBehaviour])
-def test_nothing_begins_to_fly_below_the_least_charge_and_the_refusal_names_it(behaviour):
+def test_nothing_begins_to_fly_below_the_least_charge_and_the_refusal_names_it(
+    behaviour: type[HoldBehaviour | OrbitBehaviour | TakeoffBehaviour],
+) -> None:
     harness = flying()
     if behaviour is TakeoffBehaviour:
         harness.vehicle.landed = LandedState.ON_GROUND
@@ -45,14 +50,14 @@ def test_nothing_begins_to_fly_below_the_least_charge_and_the_refusal_names_it(b
 
 
 @pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour, StopBehaviour])
-def test_the_ways_down_and_handing_back_need_no_charge(behaviour):
+def test_the_ways_down_and_handing_back_need_no_charge(behaviour: Callable[[], Behaviour]) -> None:
     harness = flying()
     harness.autopilot.battery_fraction = 0.01
     harness.run(0.1)
     assert not harness.command(behaviour()).done()
 
 
-def test_a_charge_that_is_not_told_is_a_refusal_that_says_so():
+def test_a_charge_that_is_not_told_is_a_refusal_that_says_so() -> None:
     harness = flying()
     harness.autopilot.battery_fraction = None
     harness.run(0.1)
@@ -60,7 +65,7 @@ def test_a_charge_that_is_not_told_is_a_refusal_that_says_so():
     assert "the autopilot does not tell its charge" in reason
 
 
-def test_a_charge_that_is_old_is_a_refusal_that_says_how_old():
+def test_a_charge_that_is_old_is_a_refusal_that_says_how_old() -> None:
     harness = flying()
     harness.autopilot.battery_alive = False
     harness.run(BATTERY_MAX_AGE_S + 1.0)
@@ -68,7 +73,7 @@ def test_a_charge_that_is_old_is_a_refusal_that_says_how_old():
     assert "last told 7 s ago" in reason
 
 
-def test_zero_turns_it_off():
+def test_zero_turns_it_off() -> None:
     harness = flying(BatteryMinimum(0.0))
     harness.autopilot.battery_fraction = None
     harness.run(0.1)
@@ -76,7 +81,9 @@ def test_zero_turns_it_off():
 
 
 @pytest.mark.parametrize(("action", "mode"), [("rtl", FlightMode.RETURN), ("land", FlightMode.LAND)])
-def test_a_flight_below_it_brakes_and_goes_the_way_the_operator_chose(action, mode):
+def test_a_flight_below_it_brakes_and_goes_the_way_the_operator_chose(
+    action: BatteryAction, mode: FlightMode
+) -> None:
     harness = flying(BatteryMinimum(0.15, action))
     future = orbiting(harness)
     harness.autopilot.battery_fraction = 0.14
@@ -96,7 +103,7 @@ def test_a_flight_below_it_brakes_and_goes_the_way_the_operator_chose(action, mo
     ]
 
 
-def test_hold_after_low_battery_stays_under_our_command():
+def test_hold_after_low_battery_stays_under_our_command() -> None:
     harness = flying(BatteryMinimum(0.15, "hold"))
     future = orbiting(harness)
     harness.autopilot.battery_fraction = 0.14
@@ -107,7 +114,7 @@ def test_hold_after_low_battery_stays_under_our_command():
     assert len(told(harness)) == 1
 
 
-def test_the_hold_that_goes_on_after_a_command_is_ended_too():
+def test_the_hold_that_goes_on_after_a_command_is_ended_too() -> None:
     harness = flying()
     harness.run(0.1)
     future = harness.command(HoldBehaviour(0.5))
@@ -116,7 +123,7 @@ def test_the_hold_that_goes_on_after_a_command_is_ended_too():
     harness.until(lambda: harness.autopilot.state.mode is FlightMode.RETURN, 5.0)
 
 
-def test_a_dip_of_the_charge_ends_nothing():
+def test_a_dip_of_the_charge_ends_nothing() -> None:
     harness = flying()
     future = orbiting(harness)
     for _ in range(3):
@@ -127,7 +134,7 @@ def test_a_dip_of_the_charge_ends_nothing():
     assert not future.done()
 
 
-def test_a_charge_that_comes_no_more_in_flight_is_said_once_and_the_flight_goes_on():
+def test_a_charge_that_comes_no_more_in_flight_is_said_once_and_the_flight_goes_on() -> None:
     harness = flying()
     future = orbiting(harness)
     harness.autopilot.battery_alive = False
@@ -137,7 +144,7 @@ def test_a_charge_that_comes_no_more_in_flight_is_said_once_and_the_flight_goes_
     assert "flying on" in told(harness)[0]
 
 
-def test_a_low_battery_while_offboard_is_still_asked_for_ends_in_the_return_as_well():
+def test_a_low_battery_while_offboard_is_still_asked_for_ends_in_the_return_as_well() -> None:
     harness = flying()
     harness.autopilot.lag_s = 1.5
     harness.run(0.1)
@@ -148,7 +155,7 @@ def test_a_low_battery_while_offboard_is_still_asked_for_ends_in_the_return_as_w
     harness.until(lambda: harness.autopilot.state.mode is FlightMode.RETURN, 5.0)
 
 
-def test_both_battery_messages_carry_their_stamp():
+def test_both_battery_messages_carry_their_stamp() -> None:
     state = fold(VehicleState(), "BATTERY_STATUS", {"id": 0, "battery_remaining": 40}, 5)
     assert (state.battery_fraction, state.battery_ns) == (0.4, 5)
     fields = {"onboard_control_sensors_health": 0, "battery_remaining": 39}
@@ -159,6 +166,6 @@ def test_both_battery_messages_carry_their_stamp():
 
 
 @pytest.mark.parametrize(("fraction", "action"), [(1.5, "rtl"), (-0.1, "rtl"), (0.2, "dive")])
-def test_a_minimum_that_is_none_is_refused(fraction, action):
+def test_a_minimum_that_is_none_is_refused(fraction: float, action: str) -> None:
     with pytest.raises(ValueError, match="must be"):
-        BatteryMinimum(fraction, action)
+        BatteryMinimum(fraction, action)  # type: ignore[arg-type]  # one of them is no action

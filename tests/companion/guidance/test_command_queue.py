@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from guidance_harness import GuidanceHarness, Pending, flying, kinds
 
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
 from companion.guidance.gimbal_controller import FIND_TIMEOUT_S
@@ -16,6 +15,7 @@ from companion.guidance.orbit import OrbitBehaviour
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, flying, kinds
 
 
 class NeedsGimbal(Behaviour):

@@ -1,22 +1,28 @@
 import math
 from dataclasses import replace
+from typing import TypedDict
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kinematic_vehicle import KinematicVehicle
 
 from companion.geometry.fence import Fence
 from companion.guidance.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import VehicleState
+from companion.vehicle.state import Vector3, VehicleState
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import quaternion_from_euler, wrap_angle
 
 LIMITS = Limits()
 NOW = 10**12
 
 
-def vehicle(position=(0.0, 0.0, -10.0), velocity=(0.0, 0.0, 0.0), yaw=0.0, home=(0.0, 0.0, 0.0)):
+def vehicle(
+    position: Vector3 = (0.0, 0.0, -10.0),
+    velocity: Vector3 = (0.0, 0.0, 0.0),
+    yaw: float = 0.0,
+    home: Vector3 = (0.0, 0.0, 0.0),
+) -> VehicleState:
     return VehicleState(
         position_ned_m=position,
         velocity_ned_mps=velocity,
@@ -25,7 +31,9 @@ def vehicle(position=(0.0, 0.0, -10.0), velocity=(0.0, 0.0, 0.0), yaw=0.0, home=
     )
 
 
-def settled(envelope, setpoint, state, seconds=20.0):
+def settled(
+    envelope: Envelope, setpoint: Setpoint, state: VehicleState, seconds: float = 20.0
+) -> tuple[Setpoint, tuple[str, ...]]:
     """What is sent once slew limits have run out."""
     for _ in range(round(seconds / 0.1)):
         sent, reasons = envelope.apply(setpoint, state, NOW, 0.1)
@@ -49,10 +57,14 @@ durations = st.floats(0, 0.5)
 
 
 @given(st.lists(st.tuples(velocity_setpoints, states, durations), min_size=1, max_size=6))
-def test_a_velocity_never_leaves_faster_than_it_came_nor_beyond_a_limit(steps):
+def test_a_velocity_never_leaves_faster_than_it_came_nor_beyond_a_limit(
+    steps: list[tuple[Setpoint, VehicleState, float]],
+) -> None:
     envelope = Envelope(LIMITS)
     for asked, state, dt_s in steps:
         sent, _ = envelope.apply(asked, state, NOW, dt_s)
+        assert sent.velocity_ned_mps is not None
+        assert asked.velocity_ned_mps is not None
         north, east, down = sent.velocity_ned_mps
         asked_north, asked_east, asked_down = asked.velocity_ned_mps
         assert math.hypot(north, east) <= math.hypot(asked_north, asked_east) + 1e-6
@@ -75,7 +87,9 @@ inside_states = st.builds(
 
 # A vehicle outside the fences is led back step by step, so its positions do change from step to step.
 @given(setpoints, inside_states, durations)
-def test_what_was_let_through_passes_again_unchanged(asked, state, dt_s):
+def test_what_was_let_through_passes_again_unchanged(
+    asked: Setpoint, state: VehicleState, dt_s: float
+) -> None:
     envelope = Envelope(LIMITS)
     once, _ = envelope.apply(asked, state, NOW, dt_s)
     again, _ = envelope.apply(once, state, NOW, dt_s)
@@ -85,6 +99,7 @@ def test_what_was_let_through_passes_again_unchanged(asked, state, dt_s):
         if first is not None:
             assert second == pytest.approx(first, abs=1e-6)
     if once.yaw_rad is not None:
+        assert again.yaw_rad is not None
         assert wrap_angle(again.yaw_rad - once.yaw_rad) == pytest.approx(0.0, abs=1e-6)
     assert again.yaw_rate_radps == once.yaw_rate_radps
 
@@ -93,7 +108,7 @@ def test_what_was_let_through_passes_again_unchanged(asked, state, dt_s):
     st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-1.9, 0.9)),
     st.tuples(st.floats(-100, 100), st.floats(-100, 100), st.floats(-40, -5)),
 )
-def test_inside_every_limit_the_very_same_setpoint_is_sent(velocity, place):
+def test_inside_every_limit_the_very_same_setpoint_is_sent(velocity: Vector3, place: Vector3) -> None:
     envelope = Envelope(LIMITS)
     asked = Setpoint.velocity(velocity, NOW, yaw_rate_radps=0.5)
     sent, reasons = envelope.apply(asked, vehicle(place, velocity), NOW, 0.02)
@@ -102,25 +117,30 @@ def test_inside_every_limit_the_very_same_setpoint_is_sent(velocity, place):
 
 
 @given(places, states)
-def test_a_position_leaves_inside_the_band_of_altitudes_unless_the_way_there_is_long(place, state):
+def test_a_position_leaves_inside_the_band_of_altitudes_unless_the_way_there_is_long(
+    place: Vector3, state: VehicleState
+) -> None:
     sent, _ = Envelope(LIMITS).apply(Setpoint.position(place, NOW), state, NOW, 0.02)
+    assert sent.position_ned_m is not None
     north, east, down = sent.position_ned_m
     here = state.position_ned_m
+    assert here is not None
     assert math.dist((north, east), here[:2]) <= LIMITS.max_horizontal_speed_mps + 1e-6
     assert -LIMITS.max_climb_mps - 1e-6 <= down - here[2] <= LIMITS.max_descend_mps + 1e-6
 
 
-def test_a_position_outside_the_fence_becomes_the_nearest_one_inside():
+def test_a_position_outside_the_fence_becomes_the_nearest_one_inside() -> None:
     state = vehicle((199.0, 0.0, -49.5))
     sent, reasons = Envelope(LIMITS).apply(Setpoint.position((300.0, 0.0, -80.0), NOW), state, NOW, 0.02)
     assert sent.position_ned_m == pytest.approx((200.0, 0.0, -50.0))
     assert len(reasons) == 2
 
 
-def test_a_velocity_grows_with_no_more_than_the_greatest_acceleration():
+def test_a_velocity_grows_with_no_more_than_the_greatest_acceleration() -> None:
     envelope, state, previous = Envelope(LIMITS), vehicle(), 0.0
     for _ in range(40):
         sent, _ = envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05)
+        assert sent.velocity_ned_mps is not None
         speed = sent.velocity_ned_mps[0]
         assert speed - previous <= 2.0 * 0.05 + 1e-9
         previous = speed
@@ -128,18 +148,19 @@ def test_a_velocity_grows_with_no_more_than_the_greatest_acceleration():
     assert envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05).reasons == ()
 
 
-def test_braking_is_never_delayed():
+def test_braking_is_never_delayed() -> None:
     envelope = Envelope(LIMITS)
     settled(envelope, Setpoint.velocity((5.0, 0.0, 1.0), NOW), vehicle())
     sent, _ = envelope.apply(Setpoint.brake(NOW), vehicle(velocity=(5.0, 0.0, 1.0)), NOW, 0.02)
     assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
 
 
-def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves():
+def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves() -> None:
     envelope = Envelope(LIMITS)
     sent, _ = envelope.apply(
         Setpoint.velocity((4.0, 0.0, 0.0), NOW), vehicle(velocity=(3.0, 0.0, 0.0)), NOW, 0.1
     )
+    assert sent.velocity_ned_mps is not None
     assert sent.velocity_ned_mps[0] == pytest.approx(3.2)
 
 
@@ -154,13 +175,16 @@ def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves():
     ],
     ids=["floor", "below the floor", "ceiling", "fence", "beyond the fence"],
 )
-def test_at_a_fence_nothing_goes_further_out(asked, state, component, sign):
+def test_at_a_fence_nothing_goes_further_out(
+    asked: Vector3, state: VehicleState, component: int, sign: int
+) -> None:
     sent, reasons = settled(Envelope(LIMITS), Setpoint.velocity(asked, NOW), state)
+    assert sent.velocity_ned_mps is not None
     assert sent.velocity_ned_mps[component] * sign <= 1e-9
     assert reasons
 
 
-def test_the_lowest_altitude_does_not_hold_for_a_landing_and_all_else_does():
+def test_the_lowest_altitude_does_not_hold_for_a_landing_and_all_else_does() -> None:
     state, down = vehicle((0.0, 0.0, -0.6)), Setpoint.velocity((0.0, 0.0, 3.0), NOW)
     envelope = Envelope(LIMITS)
     for _ in range(100):
@@ -169,11 +193,15 @@ def test_the_lowest_altitude_does_not_hold_for_a_landing_and_all_else_does():
     place = Setpoint.position((0.0, 0.0, 0.0), NOW)
     assert envelope.apply(place, state, NOW, 0.05, landing=True).sent is place
     # Only as long as it is said.
-    assert envelope.apply(down, state, NOW, 0.05).sent.velocity_ned_mps[2] <= 0.0
-    assert envelope.apply(place, state, NOW, 0.05).sent.position_ned_m[2] == -LIMITS.min_altitude_m
+    velocity = envelope.apply(down, state, NOW, 0.05).sent.velocity_ned_mps
+    assert velocity is not None
+    assert velocity[2] <= 0.0
+    position = envelope.apply(place, state, NOW, 0.05).sent.position_ned_m
+    assert position is not None
+    assert position[2] == -LIMITS.min_altitude_m
 
 
-def test_along_and_back_from_the_fence_the_vehicle_may_fly():
+def test_along_and_back_from_the_fence_the_vehicle_may_fly() -> None:
     state = vehicle((220.0, 0.0, -10.0))
     back, _ = settled(Envelope(LIMITS), Setpoint.velocity((-3.0, 0.0, 0.0), NOW), state)
     assert back.velocity_ned_mps == pytest.approx((-3.0, 0.0, 0.0))
@@ -181,36 +209,48 @@ def test_along_and_back_from_the_fence_the_vehicle_may_fly():
     assert along.velocity_ned_mps == pytest.approx((0.0, 3.0, 0.0), abs=1e-6)
 
 
-def test_the_fence_is_around_home_not_around_the_origin():
+def test_the_fence_is_around_home_not_around_the_origin() -> None:
     state = vehicle((250.0, 0.0, -10.0), home=(200.0, 0.0, 5.0))
     sent, _ = settled(Envelope(LIMITS), Setpoint.velocity((3.0, 0.0, 0.0), NOW), state)
+    assert sent.velocity_ned_mps is not None
     assert sent.velocity_ned_mps[0] == pytest.approx(3.0)
 
 
-def test_a_vehicle_flown_against_the_fence_stops_inside_it():
+def test_a_vehicle_flown_against_the_fence_stops_inside_it() -> None:
     envelope, north, speed = Envelope(LIMITS), 150.0, 0.0
     for _ in range(2000):
         state = vehicle((north, 0.0, -10.0), (speed, 0.0, 0.0))
         sent, _ = envelope.apply(Setpoint.velocity((5.0, 0.0, 0.0), NOW), state, NOW, 0.02)
+        assert sent.velocity_ned_mps is not None
         speed += (sent.velocity_ned_mps[0] - speed) * 0.02 / 0.3
         north += speed * 0.02
     assert 199.0 < north < 200.3
 
 
-def test_a_wanted_heading_runs_ahead_no_faster_than_the_yaw_rate():
-    envelope, headings = Envelope(LIMITS), []
+def test_a_wanted_heading_runs_ahead_no_faster_than_the_yaw_rate() -> None:
+    envelope = Envelope(LIMITS)
+    headings: list[float] = []
     for _ in range(50):
         asked = Setpoint.velocity((0.0, 0.0, 0.0), NOW, yaw_rad=-3.0)
-        headings.append(envelope.apply(asked, vehicle(yaw=3.0), NOW, 0.02).sent.yaw_rad)
+        yaw_rad = envelope.apply(asked, vehicle(yaw=3.0), NOW, 0.02).sent.yaw_rad
+        assert yaw_rad is not None
+        headings.append(yaw_rad)
     steps = [wrap_angle(b - a) for a, b in zip([3.0, *headings], headings, strict=False)]
     assert all(0 <= step <= 0.02 + 1e-9 for step in steps)
     assert headings[-1] == pytest.approx(-3.0)
 
 
-def test_without_a_position_a_position_setpoint_becomes_a_brake():
+def test_without_a_position_a_position_setpoint_becomes_a_brake() -> None:
     sent, reasons = Envelope(LIMITS).apply(Setpoint.position((5, 0, -5), NOW), VehicleState(), NOW, 0.02)
     assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
     assert reasons == ("position unknown",)
+
+
+class SomeLimits(TypedDict, total=False):
+    max_climb_mps: float
+    max_distance_m: float
+    min_altitude_m: float
+    max_yaw_rate_radps: float
 
 
 @pytest.mark.parametrize(
@@ -222,15 +262,16 @@ def test_without_a_position_a_position_setpoint_becomes_a_brake():
         {"max_yaw_rate_radps": -1},
     ],
 )
-def test_limits_that_make_no_sense_are_refused_by_name(arguments):
+def test_limits_that_make_no_sense_are_refused_by_name(arguments: SomeLimits) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
         Limits(**arguments)
 
 
-def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why():
+def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why() -> None:
     fence = Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0)))
     limits = Limits(fence=fence)
-    vehicle, envelope, reasons = KinematicVehicle(), Envelope(limits), set()
+    vehicle, envelope = KinematicVehicle(), Envelope(limits)
+    reasons: set[str] = set()
     for _ in range(1500):
         setpoint = Setpoint.velocity((4.0, 2.0, 0.0), vehicle.now_ns)
         sent, why = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
@@ -242,7 +283,7 @@ def test_a_vehicle_flown_against_a_polygon_stops_inside_it_and_says_why():
     assert "slowed down at the fence" in reasons
 
 
-def test_a_position_beyond_a_polygon_is_kept_inside_of_it():
+def test_a_position_beyond_a_polygon_is_kept_inside_of_it() -> None:
     limits = Limits(fence=Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0))))
     vehicle = KinematicVehicle(position=[12.0, 0.0, -5.0])
     setpoint = Setpoint.position((30.0, 0.0, -5.0), vehicle.now_ns)
@@ -251,16 +292,17 @@ def test_a_position_beyond_a_polygon_is_kept_inside_of_it():
     assert "kept inside the fence" in why
 
 
-def test_a_steep_velocity_is_shortened_and_not_bent():
+def test_a_steep_velocity_is_shortened_and_not_bent() -> None:
     asked = Setpoint.velocity((8.0, 0.0, -8.0), 1)
     sent, why = Envelope(Limits(max_acceleration_mps2=20.0)).apply(asked, KinematicVehicle().state, 1, 0.2)
+    assert sent.velocity_ned_mps is not None
     north, _, down = sent.velocity_ned_mps
     assert down == pytest.approx(-2.0)
     assert north == pytest.approx(2.0)
     assert any("climb" in reason for reason in why)
 
 
-def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fence_lets_nothing_fly():
+def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fence_lets_nothing_fly() -> None:
     fence = Fence(((50.0, -50.0), (150.0, -50.0), (150.0, 50.0), (50.0, 50.0)))
     vehicle = KinematicVehicle(position=[149.0, 0.0, -5.0])
     homeless = replace(vehicle.state, home_position_ned_m=None)
@@ -280,7 +322,7 @@ def test_home_that_is_not_told_for_a_while_is_where_it_was_and_without_one_a_fen
 
 @pytest.mark.parametrize("acceleration_mps2", [2.0, 5.0, 10.0, 20.0])
 @pytest.mark.parametrize("lag_s", [0.2, 0.4])
-def test_strong_braking_does_not_shoot_over_the_fence(acceleration_mps2, lag_s):
+def test_strong_braking_does_not_shoot_over_the_fence(acceleration_mps2: float, lag_s: float) -> None:
     limits = Limits(
         max_horizontal_speed_mps=20.0,
         max_acceleration_mps2=acceleration_mps2,

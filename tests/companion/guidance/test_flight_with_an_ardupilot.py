@@ -7,18 +7,26 @@ import math
 import time
 
 import pytest
-from live_flight import LiveFlight, ground_station
 
 from companion.guidance.behaviour import Outcome
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import running_simulator
+from tests.companion.live_flight import LiveFlight, ground_station
 
 LOITER, GUIDED = 5, 4
 
 
+def speed_mps(state: VehicleState) -> float:
+    """Over ground."""
+    assert state.velocity_ned_mps is not None
+    return math.hypot(*state.velocity_ned_mps[:2])
+
+
 async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot() -> None:
-    options = {"autopilot": "ardupilot", "ready_after": 0.0, "speed": 2.0, "seed": 3}
-    with running_simulator(**options) as simulator, ground_station(simulator.gcs_port) as station:
+    with (
+        running_simulator(autopilot="ardupilot", ready_after=0.0, speed=2.0, seed=3) as simulator,
+        ground_station(simulator.gcs_port) as station,
+    ):
         service = LiveFlight("pymavlink", simulator.onboard_port)
         async with service.running():
             driver, guidance = service.driver, service.guidance
@@ -29,7 +37,7 @@ async def test_a_flight_by_commands_until_the_pilot_takes_over_with_an_ardupilot
             assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
 
             assert await service.fly("orbit radius=6 speed=2") == Outcome(True, "in progress")
-            await service.until(lambda: math.hypot(*driver.state.velocity_ned_mps[:2]) > 1.5)
+            await service.until(lambda: speed_mps(driver.state) > 1.5)
             assert driver.state.mode is FlightMode.OFFBOARD
             assert guidance.busy
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
+from typing import TypedDict, Unpack
 
 import pytest
 
 from companion.bench.formation import Fleet, PointAirframe
+from companion.guidance.behaviour import Outcome
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.follow_path import FollowPathBehaviour
@@ -17,7 +20,7 @@ from companion.guidance.hold import HoldBehaviour
 GRID = [(0.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 6.0), (-12.0, 0.0), (-12.0, -6.0), (-12.0, 6.0)]
 
 
-def flying(count, seed=1, places=GRID):
+def flying(count: int, seed: int = 1, places: Sequence[tuple[float, float]] = GRID) -> Fleet:
     """Vehicles a, b, c … hovering, every one known to all others."""
     fleet = Fleet(seed)
     for index in range(count):
@@ -29,26 +32,43 @@ def flying(count, seed=1, places=GRID):
     return fleet
 
 
-def follow(fleet, names, shape="wedge", **options):
+class Options(TypedDict, total=False):
+    """Those of FormationBehaviour that tests choose."""
+
+    spacing_m: float
+    slot: int
+    lost_timeout_s: float
+
+
+def follow(fleet: Fleet, names: str, shape: str = "wedge", **options: Unpack[Options]) -> None:
     for name in names:
         assert fleet.command(name, FormationBehaviour(shape, "a", **options)) is None
 
 
-def settled(fleet, names, within_m=0.8):
+def settled(fleet: Fleet, names: Collection[str], within_m: float = 0.8) -> bool:
     errors = fleet.slot_errors()
     return set(names) <= set(errors) and max(errors[name] for name in names) < within_m
 
 
-def apart(fleet):
+def apart(fleet: Fleet) -> bool:
     return fleet.least_m >= Limits().min_separation_m
 
 
-def slots(fleet, name):
-    return dict(fleet.members[name].behaviour.note.slots)
+def slots(fleet: Fleet, name: str) -> dict[str, int]:
+    behaviour = fleet.members[name].behaviour
+    assert isinstance(behaviour, FormationBehaviour)
+    assert behaviour.note is not None
+    return dict(behaviour.note.slots)
+
+
+def ended(fleet: Fleet, name: str) -> Outcome:
+    outcome = fleet.members[name].outcome
+    assert outcome is not None
+    return outcome
 
 
 @pytest.mark.parametrize("shape", ["line", "column", "wedge", "circle"])
-def test_followers_take_their_slots_and_keep_them_through_turns(shape):
+def test_followers_take_their_slots_and_keep_them_through_turns(shape: str) -> None:
     fleet = flying(4)
     follow(fleet, "bcd", shape)
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
@@ -63,7 +83,7 @@ def test_followers_take_their_slots_and_keep_them_through_turns(shape):
     assert not slots(fleet, "c")
 
 
-def test_one_that_joins_gets_a_slot_and_nobody_comes_near_anybody():
+def test_one_that_joins_gets_a_slot_and_nobody_comes_near_anybody() -> None:
     fleet = flying(5)
     follow(fleet, "bc", "line")
     # c goes a long way round: d and e stand where the short one leads.
@@ -74,11 +94,11 @@ def test_one_that_joins_gets_a_slot_and_nobody_comes_near_anybody():
     assert apart(fleet)
 
 
-def test_the_slot_of_a_silent_vehicle_stays_free_for_a_while_and_then_they_close_up():
+def test_the_slot_of_a_silent_vehicle_stays_free_for_a_while_and_then_they_close_up() -> None:
     fleet = flying(4)
     follow(fleet, "bcd", "column")
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
-    first = min(slots(fleet, "b"), key=slots(fleet, "b").get)
+    first = min(slots(fleet, "b"), key=slots(fleet, "b").__getitem__)
     assert first in "bcd"
     silent = next(name for name in "cd" if slots(fleet, "b")[name] < 3) if first == "b" else first
     others = [name for name in "bcd" if name != silent]
@@ -95,7 +115,7 @@ def test_the_slot_of_a_silent_vehicle_stays_free_for_a_while_and_then_they_close
     assert all(fleet.members[name].outcome is None for name in others)
 
 
-def test_one_that_leaves_by_command_is_out_at_once_and_the_others_close_up():
+def test_one_that_leaves_by_command_is_out_at_once_and_the_others_close_up() -> None:
     fleet = flying(4)
     follow(fleet, "bcd", "line")
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
@@ -106,7 +126,7 @@ def test_one_that_leaves_by_command_is_out_at_once_and_the_others_close_up():
     assert apart(fleet)
 
 
-def test_without_their_leader_followers_brake_and_hold_and_go_on_when_it_is_back():
+def test_without_their_leader_followers_brake_and_hold_and_go_on_when_it_is_back() -> None:
     fleet = flying(3)
     follow(fleet, "bc", lost_timeout_s=6.0)
     assert fleet.run_until(lambda: settled(fleet, "bc"), 30.0)
@@ -116,19 +136,22 @@ def test_without_their_leader_followers_brake_and_hold_and_go_on_when_it_is_back
     fleet.run(3.5)
     for name in "bc":
         member = fleet.members[name]
-        assert math.hypot(*member.airframe.state.velocity_ned_mps) < 0.5
+        velocity = member.airframe.state.velocity_ned_mps
+        assert velocity is not None
+        assert math.hypot(*velocity) < 0.5
+        assert member.behaviour is not None
         assert "a, the leader, is not heard" in member.behaviour.status
     fleet.members["a"].muted = False
     assert fleet.run_until(lambda: settled(fleet, "bc", 1.2), 40.0)
     fleet.members["a"].muted = True
     fleet.run(8.5)
     for name in "bc":
-        assert fleet.members[name].outcome.reason == "a, the leader, is not heard; waited for 6 s"
-        assert not fleet.members[name].outcome.success
+        assert ended(fleet, name).reason == "a, the leader, is not heard; waited for 6 s"
+        assert not ended(fleet, name).success
     assert apart(fleet)
 
 
-def test_when_the_one_who_assigns_is_lost_the_next_does_and_slots_stay():
+def test_when_the_one_who_assigns_is_lost_the_next_does_and_slots_stay() -> None:
     fleet = flying(4)
     follow(fleet, "bcd", "wedge")
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
@@ -138,7 +161,7 @@ def test_when_the_one_who_assigns_is_lost_the_next_does_and_slots_stay():
     assert slots(fleet, "c") == before
 
 
-def test_a_command_to_one_changes_the_shape_for_all():
+def test_a_command_to_one_changes_the_shape_for_all() -> None:
     fleet = flying(4)
     follow(fleet, "bcd", "wedge")
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
@@ -146,11 +169,13 @@ def test_a_command_to_one_changes_the_shape_for_all():
     fleet.run(1.0)
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 40.0)
     for name in "bcd":
-        assert "line" in fleet.members[name].behaviour.status
+        behaviour = fleet.members[name].behaviour
+        assert behaviour is not None
+        assert "line" in behaviour.status
     assert apart(fleet)
 
 
-def test_a_slot_that_was_asked_for_is_given_once():
+def test_a_slot_that_was_asked_for_is_given_once() -> None:
     fleet = flying(4)
     follow(fleet, "b", "line", slot=3)
     follow(fleet, "c", "line")
@@ -158,10 +183,10 @@ def test_a_slot_that_was_asked_for_is_given_once():
     assert slots(fleet, "b") == {"b": 3, "c": 1}
     follow(fleet, "d", "line", slot=3)
     fleet.run(2.0)
-    assert fleet.members["d"].outcome.reason == "slot 3 is b's: choose another, or slot=auto"
+    assert ended(fleet, "d").reason == "slot 3 is b's: choose another, or slot=auto"
 
 
-def test_two_cannot_follow_each_other_nor_one_itself_nor_anybody_not_heard():
+def test_two_cannot_follow_each_other_nor_one_itself_nor_anybody_not_heard() -> None:
     fleet = flying(2)
     assert fleet.command("b", FormationBehaviour("line", "a")) is None
     fleet.run(1.0)
@@ -169,13 +194,15 @@ def test_two_cannot_follow_each_other_nor_one_itself_nor_anybody_not_heard():
     fleet.run(1.0)
     reasons = [member.outcome.reason for member in fleet.members.values() if member.outcome is not None]
     assert any("two cannot follow each other" in reason for reason in reasons)
-    assert "another leader than itself" in fleet.command("a", FormationBehaviour("line", "a"))
-    assert "the pose of zeus (none came; heard are b)" in fleet.command(
-        "a", FormationBehaviour("line", "zeus")
-    )
+    refused = fleet.command("a", FormationBehaviour("line", "a"))
+    assert refused is not None
+    assert "another leader than itself" in refused
+    refused = fleet.command("a", FormationBehaviour("line", "zeus"))
+    assert refused is not None
+    assert "the pose of zeus (none came; heard are b)" in refused
 
 
-def test_a_virtual_structure_flies_its_path_waits_and_all_end_together():
+def test_a_virtual_structure_flies_its_path_waits_and_all_end_together() -> None:
     fleet = flying(3)
     points = ((0.0, 0.0), (20.0, 0.0), (20.0, 12.0, 8.0))
     for name in "abc":
@@ -184,14 +211,14 @@ def test_a_virtual_structure_flies_its_path_waits_and_all_end_together():
         )
     members = fleet.members.values()
     assert fleet.run_until(lambda: all(member.outcome is not None for member in members), 90.0)
-    assert {member.outcome.reason for member in members} == {"the structure has flown its path"}
+    assert {ended(fleet, name).reason for name in fleet.members} == {"the structure has flown its path"}
     assert apart(fleet)
     centre = [sum(member.airframe.place()[axis] for member in members) / 3 for axis in range(3)]
     # Three abreast with one in the middle: their centre is the structure's.
     assert centre == pytest.approx([20.0, 12.0, -8.0], abs=0.8)
 
 
-def test_when_the_one_who_moves_the_structure_falls_silent_the_next_goes_on():
+def test_when_the_one_who_moves_the_structure_falls_silent_the_next_goes_on() -> None:
     fleet = flying(3)
     points = ((0.0, 0.0), (40.0, 0.0))
     for name in "abc":
@@ -199,12 +226,12 @@ def test_when_the_one_who_moves_the_structure_falls_silent_the_next_goes_on():
     fleet.run(14.0)
     fleet.members["a"].muted = fleet.members["a"].deaf = True
     assert fleet.run_until(lambda: all(fleet.members[name].outcome for name in "bc"), 90.0)
-    assert all(fleet.members[name].outcome.success for name in "bc")
+    assert all(ended(fleet, name).success for name in "bc")
     norths = [fleet.members[name].airframe.place()[0] for name in "bc"]
     assert norths == pytest.approx([40.0, 40.0], abs=1.5)
 
 
-def test_a_vehicle_that_hovers_in_the_way_is_flown_around():
+def test_a_vehicle_that_hovers_in_the_way_is_flown_around() -> None:
     fleet = flying(3, places=[(0.0, 0.0), (0.0, -30.0), (0.0, -15.0)])
     assert fleet.command("b", FormationBehaviour("line", "a", slot=2)) is None
     assert isinstance(fleet.members["c"].behaviour, HoldBehaviour)
@@ -212,7 +239,7 @@ def test_a_vehicle_that_hovers_in_the_way_is_flown_around():
     assert apart(fleet)
 
 
-def test_a_figure_of_eight_in_a_circle_of_six_keeps_them_apart():
+def test_a_figure_of_eight_in_a_circle_of_six_keeps_them_apart() -> None:
     fleet = flying(7)
     follow(fleet, "bcdefg", "circle")
     fleet.run(15.0)

@@ -9,10 +9,8 @@ import math
 import os
 import socket
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
-
-from live_flight import LiveFlight
 
 from companion.bus import topics
 from companion.bus.session import Bus
@@ -20,6 +18,7 @@ from companion.guidance.formation import FormationBehaviour
 from companion.guidance.neighbours import Neighbourhood
 from companion.settings import ZenohSection
 from mavlink_sim.testing import FleetMember, RunningSimulator, free_port, running_simulator
+from tests.companion.live_flight import LiveFlight
 
 VEHICLES = int(os.environ.get("FORMATION_VEHICLES", "3"))
 
@@ -81,13 +80,13 @@ async def companions(simulator: RunningSimulator, count: int) -> AsyncIterator[l
             await asyncio.gather(*publishing, return_exceptions=True)
 
 
-async def until(condition, timeout_s=60.0):
+async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
     async with asyncio.timeout(timeout_s):
         while not condition():
             await asyncio.sleep(0.02)
 
 
-async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation():
+async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation() -> None:
     with running_simulator(vehicles=VEHICLES, spacing=7.0, ready_after=0.0) as simulator:
         async with companions(simulator, VEHICLES) as fleet:
             leader, followers = fleet[0], fleet[1:]
@@ -99,9 +98,9 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation():
             await until(lambda: all({v.name for v in m.around().vehicles} == names - {m.name} for m in fleet))
             # The grid of the fleet, though each has its own local origin.
             second = next(v for v in leader.around().vehicles if v.name == "vehicle2")
-            assert (
-                abs(math.dist(second.position_ned_m[:2], leader.driver.state.position_ned_m[:2]) - 7.0) < 2.0
-            )
+            first_ned_m = leader.driver.state.position_ned_m
+            assert first_ned_m is not None
+            assert abs(math.dist(second.position_ned_m[:2], first_ned_m[:2]) - 7.0) < 2.0
 
             refused = await followers[0].command("formation line leader=nobody")
             until_s = time.monotonic() + 30.0
@@ -115,21 +114,25 @@ async def test_vehicles_of_one_process_share_their_poses_and_fly_in_formation():
             formed = [member.command("formation line leader=vehicle1 spacing=6") for member in followers]
             assert all(reply["success"] for reply in await asyncio.gather(*formed))
 
-            def error_m(member):
+            def error_m(member: Companion) -> float:
                 behaviour = member.guidance.behaviour
-                formed = isinstance(behaviour, FormationBehaviour) and behaviour.note is not None
-                return behaviour.note.error_m if formed and behaviour.slot_offset_ned_m else math.inf
+                if not isinstance(behaviour, FormationBehaviour) or behaviour.note is None:
+                    return math.inf
+                return behaviour.note.error_m if behaviour.slot_offset_ned_m else math.inf
 
             await until(lambda: max(map(error_m, followers)) < 1.0)
 
-            def role():
-                return leader.poses.message(leader.driver.state, None, time.monotonic_ns())["role"]
+            def role() -> object:
+                message = leader.poses.message(leader.driver.state, None, time.monotonic_ns())
+                assert message is not None
+                return message["role"]
 
             await until(lambda: role() == "leader")
-            least_m = []
+            least_m: list[float] = []
 
-            def watch():
+            def watch() -> bool:
                 here = leader.driver.state.position_ned_m
+                assert here is not None
                 least_m.extend(math.dist(v.position_ned_m, here) for v in leader.around().vehicles)
                 return flight.done()
 

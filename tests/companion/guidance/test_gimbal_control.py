@@ -23,19 +23,21 @@ def point(aim: GimbalAim) -> GimbalRequest:
 class Bench:
     """A manager that shows what it is told to show, 0.1 s a turn."""
 
-    def __init__(self, primary=NOBODY) -> None:
+    def __init__(self, primary: tuple[int, int] | None = NOBODY) -> None:
         self.control = GimbalControl(OURS)
         self.now_ns = 10_000_000_000
         self.gimbal = GimbalState(device=1, primary_control=primary, status_ns=self.now_ns)
 
-    def turn(self, aim, owner=SEEK, *, seconds: float = 0.1) -> GimbalRequest | None:
+    def turn(
+        self, aim: GimbalAim | None, owner: object = SEEK, *, seconds: float = 0.1
+    ) -> GimbalRequest | None:
         self.now_ns += round(seconds * 1e9)
         return self.control.update(self.now_ns, self.gimbal, aim, owner)
 
     def answer(self, refused: str | None = None) -> None:
         self.control.answered(self.now_ns, refused)
 
-    def shows(self, primary) -> None:
+    def shows(self, primary: tuple[int, int]) -> None:
         self.now_ns += 1_000_000
         self.gimbal = replace(self.gimbal, primary_control=primary, status_ns=self.now_ns)
 
@@ -79,7 +81,9 @@ def test_an_aim_that_moves_goes_out_ten_times_a_second() -> None:
 @pytest.mark.parametrize(
     ("primary", "free"), [(NOBODY, True), (OURS, True), (AUTOPILOT, True), (None, False)]
 )
-def test_it_is_taken_from_nobody_and_from_the_autopilot_itself(primary, free) -> None:
+def test_it_is_taken_from_nobody_and_from_the_autopilot_itself(
+    primary: tuple[int, int] | None, free: bool
+) -> None:
     assert (Bench(primary).turn(DOWN) == TAKE) is free
 
 
@@ -99,7 +103,9 @@ def test_who_has_it_keeps_it() -> None:
         (NOBODY, "control of it was taken away"),
     ],
 )
-def test_who_takes_it_wins_and_it_is_not_taken_again_for_the_same_errand(primary, words) -> None:
+def test_who_takes_it_wins_and_it_is_not_taken_again_for_the_same_errand(
+    primary: tuple[int, int], words: str
+) -> None:
     bench = Bench()
     bench.held()
     bench.shows(primary)
@@ -195,7 +201,7 @@ def test_what_could_not_be_given_back_is_tried_again_once_it_shows_to_be_ours_st
 
 
 @pytest.mark.parametrize("shown", [NOBODY, STATION, AUTOPILOT])
-def test_what_could_not_be_given_back_and_is_not_ours_any_more_is_left(shown) -> None:
+def test_what_could_not_be_given_back_and_is_not_ours_any_more_is_left(shown: tuple[int, int]) -> None:
     bench = Bench()
     bench.held()
     assert bench.turn(None, None) == GIVE_BACK

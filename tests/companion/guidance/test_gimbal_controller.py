@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.gimbal_controller import (
     FIND_TIMEOUT_S,
@@ -25,6 +24,7 @@ from companion.guidance.interface import (
 )
 from companion.vehicle.gimbal import NOBODY, GimbalAim, GimbalState
 from companion.vehicle.state import VehicleState
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 DOWN = PointGimbalBehaviour(GimbalAim(-0.5, 0.3))
 OWN, STATION = (1, 191), (245, 190)

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,6 +30,7 @@ from companion.vehicle.gimbal import GimbalAim, GimbalState
 from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState
 from mavlink_sim.wire.messages import dialect
+from tests.companion.guidance.gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
 from vision.camera_model import CameraMount
 
 MIDDLE_M = PERSON_M[2] / 2
@@ -92,11 +92,20 @@ def take(flight: LockstepFlight) -> None:
 
 def primary(flight: LockstepFlight) -> tuple[int, int]:
     """Who has it."""
-    who: tuple[int, int] = flight.vehicle.vehicle.gimbal_manager.primary
+    manager = flight.vehicle.vehicle.gimbal_manager
+    assert manager is not None
+    who: tuple[int, int] = manager.primary
     return who
 
 
-def test_an_approach_keeps_what_a_camera_at_rest_loses():
+def pitch_deg(state: VehicleState) -> float:
+    """Where the gimbal looks, above the horizon."""
+    assert state.gimbal is not None
+    assert state.gimbal.pitch_rad is not None
+    return math.degrees(state.gimbal.pitch_rad)
+
+
+def test_an_approach_keeps_what_a_camera_at_rest_loses() -> None:
     thing = person(0.0, 12.0)
     _, still = fly(command("approach person distance=2 retries=0"), thing)
     assert "lost the person" in reason(still, False)
@@ -109,10 +118,10 @@ def test_an_approach_keeps_what_a_camera_at_rest_loses():
     # Nobody holds it any more, and it stays as it was pointed.
     flight.run(1.0)
     assert primary(flight) == NOBODY
-    assert math.degrees(flight.state.gimbal.pitch_rad) < -70.0
+    assert pitch_deg(flight.state) < -70.0
 
 
-def test_somebody_who_walks_is_followed_from_nearly_above():
+def test_somebody_who_walks_is_followed_from_nearly_above() -> None:
     thing = SceneObject("person", PERSON_M, lambda seconds: ScenePose(8.0, seconds))
     _, still = fly(command("follow person distance=2 duration=20"), thing)
     assert "lost the person" in reason(still, False)
@@ -122,7 +131,7 @@ def test_somebody_who_walks_is_followed_from_nearly_above():
     assert max(off_rad(moment, thing) for moment in log.moments[20:]) < IN_THE_MIDDLE_RAD
 
 
-def test_a_camera_that_is_mounted_askew_is_brought_to_the_object():
+def test_a_camera_that_is_mounted_askew_is_brought_to_the_object() -> None:
     down_rad = math.radians(-15.0)
     thing = person(0.0, 12.0)
     _, log = fly(
@@ -136,19 +145,19 @@ def test_a_camera_that_is_mounted_askew_is_brought_to_the_object():
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
-def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word):
+def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word: str) -> None:
     """The picture ends 46° down, above its wheels: it has no range until the gimbal looks at it."""
     thing = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
     # an approach ends by itself, long before; who follows has been there for half a minute
     flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-14.0, limit_s=50.0)
     first = next(seen for moment in log.moments for seen in moment.situation.targets)
     assert first.position_ned_m is None
-    assert math.degrees(flight.state.gimbal.pitch_rad) < -40.0
+    assert pitch_deg(flight.state) < -40.0
     assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(4.0, abs=1.0)
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
-def test_who_takes_the_gimbal_meanwhile_wins(word):
+def test_who_takes_the_gimbal_meanwhile_wins(word: str) -> None:
     def at_three(flight: LockstepFlight, moment: Moment) -> None:
         if 3.0 <= moment.seconds < 3.04:
             take(flight)
@@ -172,13 +181,12 @@ def who_leaves() -> SceneObject:
     return SceneObject("person", PERSON_M, lambda seconds: near if seconds < GONE_AFTER_S else gone)
 
 
-def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_given_back():
+def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_given_back() -> None:
     seen: list[tuple[str, float, tuple[int, int]]] = []
     behaviour = command("approach person retries=1 gimbal=track")
 
     def note(flight: LockstepFlight, moment: Moment) -> None:
-        gimbal = moment.situation.state.gimbal
-        seen.append((behaviour.status, math.degrees(gimbal.pitch_rad), primary(flight)))
+        seen.append((behaviour.status, pitch_deg(moment.situation.state), primary(flight)))
 
     flight, log = fly(behaviour, who_leaves(), note)
     assert "looked for it again once" in reason(log, False)
@@ -192,7 +200,7 @@ def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_give
 
 
 @pytest.mark.parametrize("phase", ["where it was", "all around"])
-def test_taken_while_it_is_looked_for_it_ends_too(phase):
+def test_taken_while_it_is_looked_for_it_ends_too(phase: str) -> None:
     behaviour = command("approach person retries=2 gimbal=track")
     taken_s: list[float] = []
 
@@ -207,7 +215,7 @@ def test_taken_while_it_is_looked_for_it_ends_too(phase):
     assert primary(flight) == STATION
 
 
-def test_a_gimbal_that_does_not_follow_ends_it():
+def test_a_gimbal_that_does_not_follow_ends_it() -> None:
     def stick(flight: LockstepFlight, moment: Moment) -> None:
         flight.vehicle.vehicle.parameters.set("MNT_MIN_PITCH", -37.0)  # a stop that it has not told of
 
@@ -216,7 +224,7 @@ def test_a_gimbal_that_does_not_follow_ends_it():
     assert "follow lost the gimbal: it does not follow: asked for -" in reason(log, False)
 
 
-def test_the_steps_of_a_mission_hand_it_on():
+def test_the_steps_of_a_mission_hand_it_on() -> None:
     table = "".join(
         f'[[step]]\ndo = "approach person distance={distance} gimbal=track"\n' for distance in (6, 3)
     )
@@ -240,7 +248,7 @@ def flying(gimbal: GimbalState | None, sight: GimbalSight) -> Situation:
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
-def test_without_a_camera_on_a_gimbal_tracking_is_refused_and_the_rest_is_not(word):
+def test_without_a_camera_on_a_gimbal_tracking_is_refused_and_the_rest_is_not(word: str) -> None:
     now = flying(None, GimbalSight(carries_camera=False))
     assert refusal(command(f"{word} person"), now, ("person",)) is None
     refused = refusal(command(f"{word} person gimbal=track"), now, ("person",))
@@ -254,8 +262,11 @@ def target(elevation_rad: float, range_m: float) -> Target:
     return Target("person", 0.9, 1, 0.0, elevation_rad, range_m)
 
 
-def situation(gimbal: GimbalState, now_ns: int = 1, **sight: object) -> Situation:
-    return Situation(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=GimbalSight(True, **sight))
+def situation(
+    gimbal: GimbalState, now_ns: int = 1, *, problem: str = "", camera_pitch_rad: float = 0.0
+) -> Situation:
+    sight = GimbalSight(True, problem=problem, camera_pitch_rad=camera_pitch_rad)
+    return Situation(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=sight)
 
 
 FREE = GimbalState()
@@ -267,7 +278,9 @@ FREE = GimbalState()
     later_m=st.floats(0.2, 80.0),
     climbed_m=st.floats(-20.0, 20.0),
 )
-def test_it_looks_at_the_height_that_the_detection_told(elevation_deg, then_m, later_m, climbed_m):
+def test_it_looks_at_the_height_that_the_detection_told(
+    elevation_deg: float, then_m: float, later_m: float, climbed_m: float
+) -> None:
     tracking = GimbalTracking()
     now = situation(FREE)
     seen = target(math.radians(elevation_deg), then_m)
@@ -289,7 +302,9 @@ def test_it_looks_at_the_height_that_the_detection_told(elevation_deg, then_m, l
     low_deg=st.floats(-200.0, 200.0) | st.just(-math.inf),
     high_deg=st.floats(-200.0, 200.0) | st.just(math.inf),
 )
-def test_it_asks_for_nothing_beyond_the_stops(elevation_deg, range_m, low_deg, high_deg):
+def test_it_asks_for_nothing_beyond_the_stops(
+    elevation_deg: float, range_m: float, low_deg: float, high_deg: float
+) -> None:
     low, high = math.radians(low_deg), math.radians(high_deg)
     now = situation(GimbalState(lowest_pitch_rad=low, highest_pitch_rad=high), camera_pitch_rad=-0.3)
     tracking = GimbalTracking()
@@ -304,7 +319,7 @@ def test_it_asks_for_nothing_beyond_the_stops(elevation_deg, range_m, low_deg, h
     assert tracking.aim is not None
 
 
-def test_what_hindered_the_one_before_is_no_hindrance_in_the_first_turn():
+def test_what_hindered_the_one_before_is_no_hindrance_in_the_first_turn() -> None:
     tracking = GimbalTracking()
     first = situation(FREE, 5 * SECOND_NS, problem="245/190 has taken control of it")
     tracking.begin(first)

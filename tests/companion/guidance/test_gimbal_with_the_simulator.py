@@ -6,11 +6,11 @@ import asyncio
 import math
 
 import pytest
-from live_flight import STATION, LiveFlight, ground_station
 
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.gimbal import NOBODY, GimbalState
 from mavlink_sim.testing import running_simulator
+from tests.companion.live_flight import STATION, LiveFlight, ground_station
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 

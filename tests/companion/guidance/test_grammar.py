@@ -60,7 +60,7 @@ NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic l
         ("gimbal", Gimbal(0.0, 0.0)),
     ],
 )
-def test_commands_are_read_as_they_are_written(text, command):
+def test_commands_are_read_as_they_are_written(text: str, command: Command) -> None:
     assert parse(text, NAMES) == command
 
 
@@ -93,7 +93,7 @@ def test_commands_are_read_as_they_are_written(text, command):
         ("seek car pattern=square radius=20 sweep=-60", ["pattern=square takes no sweep"]),
     ],
 )
-def test_errors_are_one_line_that_says_what_would_be_right(text, parts):
+def test_errors_are_one_line_that_says_what_would_be_right(text: str, parts: list[str]) -> None:
     with pytest.raises(GrammarError) as caught:
         parse(text, NAMES)
     message = str(caught.value)
@@ -102,11 +102,11 @@ def test_errors_are_one_line_that_says_what_would_be_right(text, parts):
         assert part in message
 
 
-def test_without_class_names_any_name_is_taken():
+def test_without_class_names_any_name_is_taken() -> None:
     assert parse("seek dragon") == Seek("dragon")
 
 
-def test_a_command_made_in_code_is_held_to_the_same_ranges():
+def test_a_command_made_in_code_is_held_to_the_same_ranges() -> None:
     with pytest.raises(GrammarError, match="altitude"):
         Takeoff(0.1)
     with pytest.raises(GrammarError, match="class"):
@@ -115,7 +115,7 @@ def test_a_command_made_in_code_is_held_to_the_same_ranges():
         Seek("car", laps=math.nan)
 
 
-def test_the_help_names_every_command_and_every_argument_with_its_range():
+def test_the_help_names_every_command_and_every_argument_with_its_range() -> None:
     text = describe()
     for kind in COMMANDS.values():
         assert kind.word in text
@@ -123,7 +123,7 @@ def test_the_help_names_every_command_and_every_argument_with_its_range():
     assert "takeoff [altitude=2.5]" in text
 
 
-def number(low, high):
+def number(low: float, high: float) -> st.SearchStrategy[float]:
     return st.floats(low, high, allow_nan=False)
 
 
@@ -185,12 +185,12 @@ without_class_name = st.one_of(
 
 
 @given(commands | without_class_name)
-def test_what_is_written_is_read_back(command: Command):
+def test_what_is_written_is_read_back(command: Command) -> None:
     assert parse(str(command)) == command
 
 
 @given(commands)
-def test_every_command_has_a_behaviour_of_its_name(command: Command):
+def test_every_command_has_a_behaviour_of_its_name(command: Command) -> None:
     behaviour = behaviour_for(command)
     assert behaviour.name == command.word
     name = getattr(command, "class_name", "")
@@ -198,7 +198,7 @@ def test_every_command_has_a_behaviour_of_its_name(command: Command):
 
 
 @given(st.text(max_size=60))
-def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text):
+def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text: str) -> None:
     try:
         command = parse(text, NAMES)
     except GrammarError as error:
@@ -209,7 +209,7 @@ def test_any_text_gives_a_command_or_a_grammar_error_of_one_line(text):
     assert "\n" not in said
 
 
-def test_every_field_of_every_command_has_its_place_in_the_grammar():
+def test_every_field_of_every_command_has_its_place_in_the_grammar() -> None:
     for kind in COMMANDS.values():
         assert len(arguments_of(kind)) == len(fields(kind))
 
@@ -218,5 +218,5 @@ def test_every_field_of_every_command_has_its_place_in_the_grammar():
     ("text", "endless"),
     [("hold", True), ("hold 5", False), ("orbit", True), ("orbit laps=2", False), ("land", False)],
 )
-def test_a_command_says_whether_it_ends_by_itself(text, endless):
+def test_a_command_says_whether_it_ends_by_itself(text: str, endless: bool) -> None:
     assert parse(text).endless is endless

@@ -1,9 +1,9 @@
 """The pilot runs one behaviour at a time: how it engages, goes from one to the next, and ends."""
 
 import math
+from collections.abc import Callable
 
 import pytest
-from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
 from companion.guidance.hold import HoldBehaviour
@@ -14,10 +14,11 @@ from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.05, 1.0])
-def test_setpoints_leave_before_offboard_is_asked_for(lag_s):
+def test_setpoints_leave_before_offboard_is_asked_for(lag_s: float) -> None:
     harness = GuidanceHarness(flying(), lag_s)
     harness.run(0.1 + lag_s)
     harness.command(HoldBehaviour())
@@ -30,19 +31,20 @@ def test_setpoints_leave_before_offboard_is_asked_for(lag_s):
     assert "arm" not in harness.autopilot.requests
 
 
-def test_after_a_behaviour_a_hold_goes_on_until_the_next_command():
+def test_after_a_behaviour_a_hold_goes_on_until_the_next_command() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, HoldBehaviour(duration_s=1.0))
     assert (harness.outcome(future)).success
     sent = len(harness.autopilot.setpoints)
     harness.run(2.0)
     assert len(harness.autopilot.setpoints) >= sent + 99
+    assert harness.guidance.behaviour is not None
     assert harness.guidance.behaviour.name == "hold"
     assert not harness.guidance.busy
     assert "no command" in harness.guidance.status
 
 
-def test_a_new_command_replaces_the_current_one_without_leaving_offboard():
+def test_a_new_command_replaces_the_current_one_without_leaving_offboard() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, HoldBehaviour())
     second = harness.command(OrbitBehaviour(10.0, 2.0))
@@ -55,7 +57,7 @@ def test_a_new_command_replaces_the_current_one_without_leaving_offboard():
 
 @pytest.mark.parametrize("lag_s", [0.0, 1.0])
 @pytest.mark.parametrize("mode", [FlightMode.HOLD, FlightMode.OFFBOARD])
-def test_takeoff_arms_climbs_and_leaves_the_holding_to_the_autopilot(mode, lag_s):
+def test_takeoff_arms_climbs_and_leaves_the_holding_to_the_autopilot(mode: FlightMode, lag_s: float) -> None:
     harness = GuidanceHarness(parked(mode), lag_s)
     harness.run(1.2)
     assert harness.autopilot.requests == []
@@ -67,7 +69,7 @@ def test_takeoff_arms_climbs_and_leaves_the_holding_to_the_autopilot(mode, lag_s
     assert not harness.guidance.in_command
 
 
-def test_a_takeoff_that_px4_ends_short_is_climbed_to_its_end():
+def test_a_takeoff_that_px4_ends_short_is_climbed_to_its_end() -> None:
     harness = GuidanceHarness(parked())
     harness.autopilot.takeoff_short_m = 0.6
     harness.run(0.2)
@@ -81,7 +83,9 @@ def test_a_takeoff_that_px4_ends_short_is_climbed_to_its_end():
 
 @pytest.mark.parametrize("lag_s", [0.0, 1.0])
 @pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour])
-def test_landing_from_offboard_ends_disarmed_with_nothing_sent_after_it(behaviour, lag_s):
+def test_landing_from_offboard_ends_disarmed_with_nothing_sent_after_it(
+    behaviour: Callable[[], Behaviour], lag_s: float
+) -> None:
     harness = GuidanceHarness(flying(), lag_s)
     engaged(harness)
     outcome = harness.outcome(harness.command(behaviour()))
@@ -94,7 +98,7 @@ def test_landing_from_offboard_ends_disarmed_with_nothing_sent_after_it(behaviou
     assert EventKind.LOST not in kinds(harness)
 
 
-def test_stop_gives_the_vehicle_to_the_autopilot_and_sends_nothing():
+def test_stop_gives_the_vehicle_to_the_autopilot_and_sends_nothing() -> None:
     harness = GuidanceHarness(flying(), lag_s=0.5)
     future = engaged(harness)
     outcome = harness.outcome(harness.command(StopBehaviour()), 10.0)
@@ -107,7 +111,7 @@ def test_stop_gives_the_vehicle_to_the_autopilot_and_sends_nothing():
     assert EventKind.LOST not in kinds(harness)
 
 
-def test_while_a_mode_is_asked_for_out_of_offboard_a_brake_is_sent():
+def test_while_a_mode_is_asked_for_out_of_offboard_a_brake_is_sent() -> None:
     harness = GuidanceHarness(flying(), lag_s=0.8)
     engaged(harness, OrbitBehaviour(10.0, 3.0))
     harness.command(LandBehaviour())
@@ -116,7 +120,7 @@ def test_while_a_mode_is_asked_for_out_of_offboard_a_brake_is_sent():
     assert not harness.autopilot.setpoints[-1].expired(harness.vehicle.now_ns)
 
 
-def test_a_landing_replaced_before_it_shows_is_taken_back():
+def test_a_landing_replaced_before_it_shows_is_taken_back() -> None:
     harness = GuidanceHarness(flying(), lag_s=1.0)
     engaged(harness)
     harness.command(LandBehaviour())
@@ -132,22 +136,24 @@ def test_a_landing_replaced_before_it_shows_is_taken_back():
 class Broken(Behaviour):
     name = "broken"
 
-    def __init__(self, after):
+    def __init__(self, after: int) -> None:
         self.updates_left = after
         self.deactivated = 0
 
-    def update(self, dt_s, situation):
+    def update(self, dt_s: float, situation: Situation) -> Setpoint:
         self.updates_left -= 1
         if self.updates_left < 0:
             raise ZeroDivisionError("a bug")
         return Setpoint.velocity((1.0, 0.0, 0.0), situation.now_ns)
 
-    def on_deactivate(self):
+    def on_deactivate(self) -> None:
         self.deactivated += 1
 
 
 @pytest.mark.parametrize("after", [0, 20])
-def test_an_exception_in_a_behaviour_is_logged_ends_it_and_holds(after, caplog):
+def test_an_exception_in_a_behaviour_is_logged_ends_it_and_holds(
+    after: int, caplog: pytest.LogCaptureFixture
+) -> None:
     harness = GuidanceHarness(flying())
     engaged(harness)
     behaviour = Broken(after)
@@ -164,34 +170,38 @@ class Curious(Behaviour):
     name = "curious"
     requirements = frozenset()
 
-    def __init__(self):
-        self.seen = []
+    def __init__(self) -> None:
+        self.seen: list[tuple[float, Setpoint | None]] = []
 
-    def update(self, dt_s, situation):
+    def update(self, dt_s: float, situation: Situation) -> Setpoint:
         self.seen.append((dt_s, situation.sent))
         return Setpoint.velocity((9.0, 0.0, 0.0), situation.now_ns)
 
 
-def test_what_was_sent_is_told_to_the_behaviour_and_published_beside_what_was_asked():
+def test_what_was_sent_is_told_to_the_behaviour_and_published_beside_what_was_asked() -> None:
     harness = GuidanceHarness(flying())
     behaviour = Curious()
     engaged(harness, behaviour)
     harness.run(5.0)
+    assert harness.guidance.asked is not None
     assert harness.guidance.asked.velocity_ned_mps == (9.0, 0.0, 0.0)
+    assert harness.guidance.sent is not None
     assert harness.guidance.sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
     assert harness.guidance.limited_by
-    assert behaviour.seen[-1][0] == pytest.approx(0.02)
-    assert behaviour.seen[-1][1].velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
+    dt_s, sent = behaviour.seen[-1]
+    assert dt_s == pytest.approx(0.02)
+    assert sent is not None
+    assert sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
 
 
-def test_nothing_is_asked_for_without_a_command():
+def test_nothing_is_asked_for_without_a_command() -> None:
     harness = GuidanceHarness(parked())
     harness.run(5.0)
     assert harness.autopilot.requests == []
     assert harness.autopilot.setpoints == []
 
 
-def test_closing_ends_the_behaviour_and_the_stream():
+def test_closing_ends_the_behaviour_and_the_stream() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     harness.close()

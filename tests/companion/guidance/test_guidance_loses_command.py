@@ -1,7 +1,6 @@
 """What ends our command of the vehicle: a pilot, the autopilot, a lost link, a loop that hung."""
 
 import pytest
-from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 from companion.guidance.behaviour import Outcome
 from companion.guidance.hold import HoldBehaviour
@@ -10,6 +9,7 @@ from companion.guidance.land import LandBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 OTHER_MODES = [
     FlightMode.POSITION,
@@ -23,7 +23,9 @@ OTHER_MODES = [
 
 @pytest.mark.parametrize("lag_s", [0.0, 1.0])
 @pytest.mark.parametrize("mode", OTHER_MODES)
-def test_a_mode_we_did_not_ask_for_ends_our_command_at_once_and_for_good(mode, lag_s):
+def test_a_mode_we_did_not_ask_for_ends_our_command_at_once_and_for_good(
+    mode: FlightMode, lag_s: float
+) -> None:
     harness = GuidanceHarness(flying(), lag_s)
     future = engaged(harness, OrbitBehaviour())
     harness.autopilot.change_mode(mode)
@@ -46,7 +48,7 @@ def test_a_mode_we_did_not_ask_for_ends_our_command_at_once_and_for_good(mode, l
     assert len(harness.autopilot.setpoints) > sent
 
 
-def test_a_pilot_who_takes_over_during_the_request_for_offboard_wins():
+def test_a_pilot_who_takes_over_during_the_request_for_offboard_wins() -> None:
     harness = GuidanceHarness(flying(), lag_s=1.0)
     harness.run(1.2)
     future = harness.command(HoldBehaviour())
@@ -59,11 +61,12 @@ def test_a_pilot_who_takes_over_during_the_request_for_offboard_wins():
     assert len(harness.autopilot.setpoints) == sent
 
 
-def test_the_idle_hold_yields_to_the_pilot_as_well():
+def test_the_idle_hold_yields_to_the_pilot_as_well() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, HoldBehaviour(duration_s=1.0))
     assert (harness.outcome(future)).success
     harness.run(1.0)
+    assert harness.streamer.last_sent is not None
     assert harness.streamer.last_sent.yaw_rad is not None  # a hold's; a brake has a yaw rate
     harness.autopilot.change_mode(FlightMode.POSITION)
     harness.run(0.04)
@@ -73,7 +76,7 @@ def test_the_idle_hold_yields_to_the_pilot_as_well():
     assert harness.events[-1].kind is EventKind.LOST
 
 
-def test_a_pilot_who_stops_a_takeoff_half_way_wins():
+def test_a_pilot_who_stops_a_takeoff_half_way_wins() -> None:
     harness = GuidanceHarness(parked())
     harness.run(0.2)
     future = harness.command(TakeoffBehaviour(10.0))
@@ -84,7 +87,7 @@ def test_a_pilot_who_stops_a_takeoff_half_way_wins():
     assert harness.autopilot.setpoints == []
 
 
-def test_a_pilot_who_catches_a_landing_wins():
+def test_a_pilot_who_catches_a_landing_wins() -> None:
     harness = GuidanceHarness(flying())
     engaged(harness)
     future = harness.command(LandBehaviour())
@@ -93,7 +96,7 @@ def test_a_pilot_who_catches_a_landing_wins():
     assert (harness.outcome(future, 2.0)).reason == "the pilot took over: position mode"
 
 
-def test_a_streamer_that_does_not_run_is_noticed():
+def test_a_streamer_that_does_not_run_is_noticed() -> None:
     harness = GuidanceHarness(flying())
     harness.streaming = False
     harness.run(0.1)
@@ -101,7 +104,7 @@ def test_a_streamer_that_does_not_run_is_noticed():
     assert "no setpoint left" in outcome.reason
 
 
-def test_a_failsafe_of_the_autopilot_ends_our_command():
+def test_a_failsafe_of_the_autopilot_ends_our_command() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     harness.autopilot.failsafe = True
@@ -113,7 +116,7 @@ def test_a_failsafe_of_the_autopilot_ends_our_command():
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
 
 
-def test_a_loop_that_hung_gives_up_its_command_and_sends_not_one_setpoint_more():
+def test_a_loop_that_hung_gives_up_its_command_and_sends_not_one_setpoint_more() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     sent = len(harness.autopilot.setpoints)
@@ -126,7 +129,7 @@ def test_a_loop_that_hung_gives_up_its_command_and_sends_not_one_setpoint_more()
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
 
 
-def test_a_lost_link_ends_our_command_and_its_return_does_not_resume_it():
+def test_a_lost_link_ends_our_command_and_its_return_does_not_resume_it() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     harness.autopilot.linked = False
@@ -139,7 +142,7 @@ def test_a_lost_link_ends_our_command_and_its_return_does_not_resume_it():
     assert len(harness.autopilot.setpoints) == sent
 
 
-def test_a_landing_whose_link_is_lost_says_so():
+def test_a_landing_whose_link_is_lost_says_so() -> None:
     harness = GuidanceHarness(flying())
     harness.run(0.1)
     future = harness.command(LandBehaviour())
@@ -149,7 +152,7 @@ def test_a_landing_whose_link_is_lost_says_so():
     assert "no heartbeat for 3" in outcome.reason
 
 
-def test_without_a_position_the_vehicle_brakes_and_then_command_is_given_up():
+def test_without_a_position_the_vehicle_brakes_and_then_command_is_given_up() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, OrbitBehaviour())
     harness.autopilot.position_alive = False
@@ -162,7 +165,7 @@ def test_without_a_position_the_vehicle_brakes_and_then_command_is_given_up():
     assert len(harness.autopilot.setpoints) == sent
 
 
-def test_a_disarmed_vehicle_is_not_ours_any_more():
+def test_a_disarmed_vehicle_is_not_ours_any_more() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     harness.vehicle.armed = False
@@ -170,7 +173,7 @@ def test_a_disarmed_vehicle_is_not_ours_any_more():
     assert future.result() == Outcome(False, "the vehicle was disarmed")
 
 
-def test_a_stream_that_fell_silent_ends_the_command_with_its_reason():
+def test_a_stream_that_fell_silent_ends_the_command_with_its_reason() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     harness.streaming = False

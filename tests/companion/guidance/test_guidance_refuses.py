@@ -1,10 +1,11 @@
 """What cannot be done is refused and named, by us before the flight or by the autopilot in it."""
 
+from collections.abc import Callable
+
 import pytest
-from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 from companion.geometry.fence import Fence
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour
@@ -17,9 +18,11 @@ from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
-def test_a_refused_landing_holds_in_offboard():
+def test_a_refused_landing_holds_in_offboard() -> None:
     harness = GuidanceHarness(flying())
     engaged(harness)
     harness.autopilot.refuse[FlightMode.LAND] = "land refused: no position"
@@ -27,10 +30,11 @@ def test_a_refused_landing_holds_in_offboard():
     assert outcome == Outcome(False, "land refused: no position")
     harness.run(1.0)
     assert harness.guidance.phase == "offboard"
+    assert harness.streamer.last_sent is not None
     assert not harness.streamer.last_sent.expired(harness.vehicle.now_ns)
 
 
-def test_a_refused_offboard_ends_the_command_and_sends_nothing_more():
+def test_a_refused_offboard_ends_the_command_and_sends_nothing_more() -> None:
     harness = GuidanceHarness(flying())
     harness.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
     harness.run(0.1)
@@ -49,7 +53,9 @@ def test_a_refused_offboard_ends_the_command_and_sends_nothing_more():
         (flying, lambda: SeekBehaviour("zebra"), ["seek needs", "zebra"]),
     ],
 )
-def test_a_refusal_names_what_is_missing(vehicle, behaviour, words):
+def test_a_refusal_names_what_is_missing(
+    vehicle: Callable[[], KinematicVehicle], behaviour: Callable[[], Behaviour], words: list[str]
+) -> None:
     harness = GuidanceHarness(vehicle(), class_names=("car", "person"))
     harness.run(0.1)
     future = harness.command(behaviour())
@@ -61,7 +67,7 @@ def test_a_refusal_names_what_is_missing(vehicle, behaviour, words):
 
 
 @pytest.mark.parametrize("age_s", [None, 2.0])
-def test_without_perception_seek_is_refused_with_its_age(age_s):
+def test_without_perception_seek_is_refused_with_its_age(age_s: float | None) -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = age_s
     harness.run(0.1)
@@ -70,7 +76,7 @@ def test_without_perception_seek_is_refused_with_its_age(age_s):
     assert ("2.0 s old" if age_s else "nothing came") in reason
 
 
-def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_steer_it_either():
+def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_steer_it_either() -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = 0.8
     harness.run(0.1)
@@ -78,6 +84,7 @@ def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_
     harness.run(0.5)
     assert not future.done()
     assert harness.guidance.phase == "offboard"
+    assert harness.guidance.asked is not None
     assert harness.guidance.asked.yaw_rate_radps in (None, 0.0)
 
 
@@ -90,7 +97,9 @@ def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_
         (FigureEightBehaviour(6000.0, 3.0, 1.0), "is farther than guidance.max_distance_m"),
     ],
 )
-def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(behaviour, where):
+def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(
+    behaviour: Behaviour, where: str
+) -> None:
     harness = GuidanceHarness(flying())
     harness.run(0.1)
     outcome = harness.command(behaviour).result()
@@ -100,7 +109,7 @@ def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(
     assert not harness.autopilot.setpoints
 
 
-def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not():
+def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not() -> None:
     fence = Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)))
     harness = GuidanceHarness(flying(), options=GuidanceOptions(Limits(fence=fence)))
     harness.run(0.1)
@@ -112,7 +121,7 @@ def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not():
     assert not harness.command(GotoBehaviour(from_home_m=(10.0, 0.0))).done()
 
 
-def test_a_refusal_leaves_the_current_behaviour_flying():
+def test_a_refusal_leaves_the_current_behaviour_flying() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness)
     assert harness.command(TakeoffBehaviour()).done()
@@ -125,11 +134,11 @@ class Daring(Behaviour):
     name = "daring"
     requirements = frozenset({Requirement.ON_GROUND})
 
-    def update(self, dt_s, situation):
+    def update(self, dt_s: float, situation: Situation) -> ModeRequest:
         return ModeRequest(FlightMode.LAND, arm=True)
 
 
-def test_only_a_takeoff_arms():
+def test_only_a_takeoff_arms() -> None:
     harness = GuidanceHarness(parked())
     harness.run(0.1)
     harness.command(Daring())

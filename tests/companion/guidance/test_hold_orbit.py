@@ -3,14 +3,14 @@ import math
 from dataclasses import replace
 
 import pytest
-from guidance_harness import Flight
-from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.behaviour import Behaviour, Situation, Step
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.orbit import OrbitBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
+from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from vision.attitude import wrap_angle
 
 
@@ -29,7 +29,7 @@ class AfterGoal(Behaviour):
         return self._behaviour.update(dt_s, situation)
 
 
-def test_hold_keeps_the_place_and_heading_it_began_with():
+def test_hold_keeps_the_place_and_heading_it_began_with() -> None:
     vehicle = KinematicVehicle(position=[3.0, -2.0, -6.0], yaw_rad=1.2)
     flight = Flight(HoldBehaviour(), vehicle)
     assert flight.run(5.0) is None
@@ -40,7 +40,7 @@ def test_hold_keeps_the_place_and_heading_it_began_with():
 
 
 @pytest.mark.parametrize(("goal", "held"), [((3.6, -2.0, -6.3), True), ((4.5, -2.0, -6.0), False)])
-def test_hold_keeps_the_goal_before_where_it_is_near(goal, held):
+def test_hold_keeps_the_goal_before_where_it_is_near(goal: Vector3, held: bool) -> None:
     vehicle = KinematicVehicle(position=[3.0, -2.0, -6.0])
     flight = Flight(AfterGoal(HoldBehaviour(8.0), goal), vehicle)
     outcome = flight.run(10.0)
@@ -50,7 +50,7 @@ def test_hold_keeps_the_goal_before_where_it_is_near(goal, held):
     assert math.dist(vehicle.position, place) < 0.05
 
 
-def test_hold_brakes_first_and_does_not_fly_back_to_where_it_began():
+def test_hold_brakes_first_and_does_not_fly_back_to_where_it_began() -> None:
     vehicle = KinematicVehicle(velocity=[4.0, 0.0, 0.0])
     flight = Flight(HoldBehaviour(), vehicle)
     flight.run(8.0)
@@ -60,7 +60,7 @@ def test_hold_brakes_first_and_does_not_fly_back_to_where_it_began():
     assert math.hypot(*vehicle.velocity) < 0.05
 
 
-def test_hold_with_a_duration_ends_by_itself():
+def test_hold_with_a_duration_ends_by_itself() -> None:
     outcome = Flight(HoldBehaviour(duration_s=2.0)).run(3.0)
     assert outcome is not None
     assert outcome.success
@@ -68,12 +68,12 @@ def test_hold_with_a_duration_ends_by_itself():
 
 
 @pytest.mark.parametrize("clockwise", [True, False])
-def test_orbit_flies_its_laps_at_its_radius_with_the_nose_to_the_centre(clockwise):
+def test_orbit_flies_its_laps_at_its_radius_with_the_nose_to_the_centre(clockwise: bool) -> None:
     vehicle = KinematicVehicle(yaw_rad=math.pi / 2)
     centre = (0.0, 10.0)
     seen = []
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         north, east = vehicle.position[0] - centre[0], vehicle.position[1] - centre[1]
         if seconds > 8.0:
             to_centre = math.atan2(-east, -north)
@@ -98,7 +98,7 @@ def test_orbit_flies_its_laps_at_its_radius_with_the_nose_to_the_centre(clockwis
     assert (turned > 0) is clockwise
 
 
-def test_orbit_about_an_object_comes_onto_the_circle_from_afar():
+def test_orbit_about_an_object_comes_onto_the_circle_from_afar() -> None:
     car = SeenObject("car", 30.0, 4.0)
     vehicle = KinematicVehicle()
     flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, class_name="car"), vehicle, [car])
@@ -110,14 +110,14 @@ def test_orbit_about_an_object_comes_onto_the_circle_from_afar():
     assert math.dist(vehicle.position[:2], (30.0, 4.0)) == pytest.approx(8.0, abs=0.6)
 
 
-def test_orbit_about_an_object_that_is_not_in_sight_ends_with_the_reason():
+def test_orbit_about_an_object_that_is_not_in_sight_ends_with_the_reason() -> None:
     outcome = Flight(OrbitBehaviour(class_name="boat")).run(5.0)
     assert outcome is not None
     assert not outcome.success
     assert "boat" in outcome.reason
 
 
-def test_an_orbit_pushed_into_its_centre_still_gives_finite_setpoints():
+def test_an_orbit_pushed_into_its_centre_still_gives_finite_setpoints() -> None:
     behaviour = OrbitBehaviour(5.0, 1.0)
     vehicle = KinematicVehicle()
     flight = Flight(behaviour, vehicle)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from companion.guidance.marker_target import MarkerSight, looks_down, marker_targets
+from companion.guidance.marker_target import MarkerSight, MarkerTarget, looks_down, marker_targets
 from companion.guidance.pad_filter import PadFilter
 from companion.guidance.targets import HistoryError, StateHistory
-from companion.vehicle.state import VehicleState
+from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import PadMarker, marker_from_corners, square
@@ -22,7 +23,19 @@ CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(75.0))
 DOWNWARD = CameraMount(forward_m=0.1, right_m=-0.05, down_m=0.08, pitch_rad=-math.pi / 2)
 
 
-def seen(position, roll, pitch, yaw, centre, heading, *, identifier=7, size_m=0.6, on_pads=None, noise=None):
+def seen(
+    position: Vector3,
+    roll: float,
+    pitch: float,
+    yaw: float,
+    centre: tuple[float, float],
+    heading: float,
+    *,
+    identifier: int = 7,
+    size_m: float = 0.6,
+    on_pads: dict[int, PadMarker] | None = None,
+    noise: NDArray[np.float64] | None = None,
+) -> MarkerTarget:
     """What a camera looking down makes of a marker lying at `centre` (north, east) on the ground."""
     attitude = quaternion_from_euler(roll, pitch, yaw)
     history = StateHistory()
@@ -49,7 +62,9 @@ def seen(position, roll, pitch, yaw, centre, heading, *, identifier=7, size_m=0.
     north=st.floats(-1.0, 1.0), east=st.floats(-1.0, 1.0), height=st.floats(2.0, 9.0),
     heading=st.floats(-3.0, 3.0),
 )  # fmt: skip
-def test_a_banking_vehicle_does_not_swing_its_marker(roll, pitch, yaw, north, east, height, heading):
+def test_a_banking_vehicle_does_not_swing_its_marker(
+    roll: float, pitch: float, yaw: float, north: float, east: float, height: float, heading: float
+) -> None:
     position = (12.0, -7.0, -height)
     target = seen(position, roll, pitch, yaw, (12.0 + north, -7.0 + east), heading)
     assert target.position_ned_m == pytest.approx((12.0 + north, -7.0 + east, 0.0), abs=0.02)
@@ -62,7 +77,9 @@ def test_a_banking_vehicle_does_not_swing_its_marker(roll, pitch, yaw, north, ea
 
 @settings(max_examples=30, deadline=None)
 @given(heading=st.floats(-3.1, 3.1), seed=st.integers(0, 1000))
-def test_a_marker_beside_the_centre_tells_where_its_pad_is_in_spite_of_noise(heading, seed):
+def test_a_marker_beside_the_centre_tells_where_its_pad_is_in_spite_of_noise(
+    heading: float, seed: int
+) -> None:
     """The small one is seen nearly face on, where its turning is ambiguous."""
     right, up = 0.3, 0.58
     cosine, sine = math.cos(heading), math.sin(heading)
@@ -77,8 +94,9 @@ def test_a_marker_beside_the_centre_tells_where_its_pad_is_in_spite_of_noise(hea
     assert target.pad_ned_m[:2] == pytest.approx((0.0, 0.0), abs=0.06)
 
 
-def test_without_the_pose_of_that_moment_there_is_no_place():
+def test_without_the_pose_of_that_moment_there_is_no_place() -> None:
     marker = marker_from_corners(1, CAMERA.project(square(0.5) * (1, -1, 1) + (0, 0, 3.0)), 0.5, CAMERA)
+    assert marker is not None
     with pytest.raises(HistoryError, match="no attitude"):
         marker_targets([marker], 1000, DOWNWARD, StateHistory(), {})
     assert marker_targets([], 1000, DOWNWARD, StateHistory(), {}) == ()
@@ -87,20 +105,24 @@ def test_without_the_pose_of_that_moment_there_is_no_place():
 @pytest.mark.parametrize(
     ("pitch_deg", "down"), [(-90, True), (-75, True), (-60, False), (-20, False), (0, False)]
 )
-def test_only_a_camera_with_the_ground_below_in_its_picture_looks_down(pitch_deg, down):
+def test_only_a_camera_with_the_ground_below_in_its_picture_looks_down(pitch_deg: float, down: bool) -> None:
     assert looks_down(CAMERA, CameraMount(pitch_rad=math.radians(pitch_deg))) is down
 
 
-def test_what_is_missing_is_named():
+def test_what_is_missing_is_named() -> None:
     assert MarkerSight().unavailable(1.5) == (
         "perception that looks for markers (markers.dictionary is not set)"
     )
-    assert "nothing came from it yet" in MarkerSight(missing="").unavailable(1.5)
-    assert "is 2.0 s old" in MarkerSight((), 1, 2.0, False, "").unavailable(1.5)
+    nothing = MarkerSight(missing="").unavailable(1.5)
+    assert nothing is not None
+    assert "nothing came from it yet" in nothing
+    old = MarkerSight((), 1, 2.0, False, "").unavailable(1.5)
+    assert old is not None
+    assert "is 2.0 s old" in old
     assert MarkerSight((), 1, 0.1, True, "").unavailable(1.5) is None
 
 
-def sighting(north, stamp_s, distance=3.0):
+def sighting(north: float, stamp_s: float, distance: float = 3.0) -> MarkerTarget:
     target = seen((0.0, 0.0, -distance), 0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
     place = (north, 0.0, 0.0)
     from dataclasses import replace
@@ -108,7 +130,7 @@ def sighting(north, stamp_s, distance=3.0):
     return replace(target, captured_ns=round(stamp_s * 1e9), pad_ned_m=place, distance_m=distance)
 
 
-def test_a_single_wrong_sighting_does_not_move_the_pad_and_many_do():
+def test_a_single_wrong_sighting_does_not_move_the_pad_and_many_do() -> None:
     pad = PadFilter(sighting(1.0, 1.0), moving=False)
     for step in range(10):
         assert pad.add(sighting(1.0, 1.1 + step * 0.05))
@@ -119,7 +141,7 @@ def test_a_single_wrong_sighting_does_not_move_the_pad_and_many_do():
     assert pad.at(3_000_000_000)[0] == pytest.approx(3.0, abs=0.1)
 
 
-def test_a_moving_pad_is_where_it_will_be_and_a_still_one_where_it_was():
+def test_a_moving_pad_is_where_it_will_be_and_a_still_one_where_it_was() -> None:
     rng = np.random.default_rng(4)
     for moving in (True, False):
         pad = PadFilter(sighting(0.0, 1.0), moving=moving)
@@ -132,7 +154,7 @@ def test_a_moving_pad_is_where_it_will_be_and_a_still_one_where_it_was():
             assert pad.velocity_mps == (0.0, 0.0)
 
 
-def test_old_sightings_are_passed_over():
+def test_old_sightings_are_passed_over() -> None:
     pad = PadFilter(sighting(1.0, 1.0), moving=False)
     assert not pad.add(sighting(5.0, 0.9))
     assert pad.count == 1
