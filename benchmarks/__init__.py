@@ -1,0 +1,1 @@
+"""Programs for development: they measure what the repository claims. Not installed."""
