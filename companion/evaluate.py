@@ -50,13 +50,17 @@ class ClassMapping:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What came out: the score over the judged classes, who was not judged, and the mistakes."""
+    """What came out: the score over the judged classes, who was not judged, and the mistakes.
+
+    `results` has each image's detections and true objects, numbered as `mapping.names`.
+    """
 
     score: Score
     mapping: ClassMapping
     unjudged_objects: int
     seconds: float
     misses: WorstMisses
+    results: tuple[ImageResult, ...]
 
     def plain(self) -> dict[str, Any]:
         """For JSON: NaN, where a class has no object, is null."""
@@ -137,7 +141,7 @@ def evaluate_dataset(dataset: Dataset, detector: FrameDetector, mapping: ClassMa
             misses.add(sample.image, image, found, boxes, true_ids, ignored)
             advance()
     score = score_detections(results, mapping.names)
-    return Evaluation(score, mapping, unjudged, time.monotonic() - started, misses)
+    return Evaluation(score, mapping, unjudged, time.monotonic() - started, misses, tuple(results))
 
 
 def report_lines(evaluation: Evaluation) -> list[str]:

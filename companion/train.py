@@ -15,13 +15,13 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mavlink_sim.datasets.training_scenes import random_scene
+from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
-from vision.yolo.checkpoint import save_checkpoint
+from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX
 from vision.yolo.evaluation import evaluate
 from vision.yolo.metrics import Score
-from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE
+from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, REFINEMENT
 from vision.yolo.training import Progress as TrainingProgress
 from vision.yolo.training import TrainedModel, TrainingSettings, train
 
@@ -37,36 +37,53 @@ def train_default(
     workers: int | None = None,
     threads: int | None = None,
     resume: bool = False,
+    start: Path | None = None,
     held_out: int = 400,
 ) -> Score:
     """Train by the recipe (with what is given here changed), judge, and write the result (`judge_and_save`).
 
-    The state of training is kept beside it as `<output>.training`, for `resume`.
+    The first course begins with random weights, the second refines what came of it. The state of each is kept
+    beside the output as `<output>.training` and `<output>.refining`, for `resume`. `steps` and
+    `time_limit_s` are of the courses that are run, each in proportion.
+
+    Args:
+        start: a model of the recipe's network to refine, in place of the first course.
 
     Raises:
-        FileNotFoundError: `resume` without a state. ValueError: the state is of another recipe.
+        FileNotFoundError: `resume` without a state. CheckpointError: `start` cannot be read.
+        ValueError: the state or `start` is of another recipe.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
     changes: dict[str, Any] = {
-        "seed": seed,
-        "time_limit_s": time_limit_s,
-        "workers": workers,
-        "threads": threads,
+        key: value for key, value in (("workers", workers), ("threads", threads)) if value is not None
     }
-    settings = replace(DEFAULT_RECIPE, **{key: value for key, value in changes.items() if value is not None})
-    if tuple(settings.class_names) != tuple(CLASS_NAMES):
-        raise ValueError(f"the recipe knows {settings.class_names}, the scenes draw {CLASS_NAMES}")
+    first, second = replace(DEFAULT_RECIPE, **changes), replace(REFINEMENT, **changes)
+    if tuple(first.class_names) != tuple(CLASS_NAMES):
+        raise ValueError(f"the recipe knows {first.class_names}, the scenes draw {CLASS_NAMES}")
+    if seed is not None:
+        first, second = replace(first, seed=seed), replace(second, seed=seed + 1)
+    share = 0.0 if start is not None else first.steps / (first.steps + second.steps)
     if steps is not None:
-        settings = settings.with_steps(steps)
+        second = second.with_steps(max(1, round(steps * (1 - share))))
+        first = first.with_steps(max(1, round(steps * share)))
+    if time_limit_s is not None:
+        first = replace(first, time_limit_s=time_limit_s * share)
+        second = replace(second, time_limit_s=time_limit_s * (1 - share))
+    states = [output.with_suffix(f"{output.suffix}.{name}") for name in ("training", "refining")]
     with _Shown() as shown:
-        trained = train(
-            settings,
-            random_scene,
+        if start is not None:
+            begun = load_checkpoint(start).model
+        else:
+            begun = train(first, random_scene, shown, checkpoint=states[0], resume=resume).model
+        refined = train(
+            second,
+            training_scene,
             shown,
-            checkpoint=output.with_suffix(output.suffix + ".training"),
-            resume=resume,
+            checkpoint=states[1],
+            resume=resume and (start is not None or states[1].is_file()),
+            start=begun,
         )
-    return judge_and_save(output, trained, settings, held_out)
+    return judge_and_save(output, refined, second, held_out)
 
 
 def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettings, held_out: int) -> Score:
@@ -75,7 +92,7 @@ def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettin
     Whatever the ending of `output`, what is written is the pair `NAME.safetensors` and `NAME.yaml`.
     """
     width, height = HELD_OUT_SIZE
-    score = evaluate(trained.model, random_scene, HELD_OUT_SEED, held_out, width, height)
+    score = evaluate(trained.model, training_scene, HELD_OUT_SEED, held_out, width, height)
     metadata = {
         "licence": LICENCE,
         "trained_on": "scenes drawn by mavlink_sim.datasets.training_scenes",

@@ -14,7 +14,7 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,6 +26,7 @@ from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
 from companion.cli.models import models
 from companion.settings import Settings
+from companion.settings.perception import DEFAULT_MODEL
 from vision.loading import uncollected
 
 if TYPE_CHECKING:
@@ -92,10 +93,34 @@ def _keep_what_is_loaded() -> None:
     gc.freeze()
 
 
+def _warn_drawn_scenes_only(looked_at: Iterable[tuple[str, str]]) -> None:
+    """Say once that the bundled model is not for real pictures, if it is to look at any.
+
+    Args:
+        looked_at: (address of a source, model) of each detector. The simulator's camera is read from shared
+            memory; what comes from anywhere else may be a photograph.
+    """
+    if any(model == DEFAULT_MODEL and not uri.startswith("shm://") for uri, model in looked_at):
+        typer.echo(
+            f"companion: the bundled model '{DEFAULT_MODEL}' knows only scenes drawn by mavlink-sim and is "
+            "wrong about real pictures; for those run `companion models pull yolo11n`, then use "
+            "--model yolo11n",
+            err=True,
+        )
+
+
 async def _run_until_signal(settings: Settings, make: type[Service]) -> None:
     service = make(settings, console=True)
     loop = asyncio.get_running_loop()
-    running = asyncio.ensure_future(service.run(_keep_what_is_loaded))
+
+    def on_ready() -> None:
+        _keep_what_is_loaded()
+        views = [settings.of_view(name) for name in (None, *settings.views)]
+        _warn_drawn_scenes_only(
+            (view.source.uri, view.detector.model) for view in views if view.detector.enabled
+        )
+
+    running = asyncio.ensure_future(service.run(on_ready))
     for number in (signal.SIGINT, signal.SIGTERM):
         # Before the service is up there is nothing to leave in order: end at once.
         loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
@@ -235,6 +260,7 @@ def detect(
         )
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
+        _warn_drawn_scenes_only([(source, model)])
         looked_at = detect_source(
             frames,
             looking,
@@ -269,13 +295,15 @@ def train(
     workers: Annotated[int | None, typer.Option(min=0, help="processes that draw scenes")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="processor threads of torch")] = None,
     resume: Annotated[bool, typer.Option(help="go on from OUTPUT's training state")] = False,
+    start: Annotated[Path | None, typer.Option(help="weights to refine, instead of the first course")] = None,
     held_out: Annotated[int, typer.Option(min=1, help="scenes to judge the result on")] = 400,
 ) -> None:
     """Train the default detector on drawn scenes, judge it on held-out ones, write it with its score."""
     from companion.train import train_default
+    from vision.yolo.safe_pickle import CheckpointError
 
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    with plain_errors(FileNotFoundError, ValueError, OSError):
+    with plain_errors(CheckpointError, FileNotFoundError, ValueError, OSError):
         score = train_default(
             output,
             seed=seed,
@@ -284,6 +312,7 @@ def train(
             workers=workers,
             threads=threads,
             resume=resume,
+            start=start,
             held_out=held_out,
         )
     typer.echo(

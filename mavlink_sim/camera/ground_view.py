@@ -117,7 +117,7 @@ def ground_atlas(ground: Ground) -> MipAtlas:
     return _painted_tile(replace(ground, gain=(1.0, 1.0, 1.0)))
 
 
-@lru_cache(maxsize=12)
+@lru_cache(maxsize=16)
 def _painted_tile(ground: Ground) -> MipAtlas:
     size, texel = ground.tile_texels, ground.texel_m
     rng = np.random.default_rng((ground.seed, 8))

@@ -21,7 +21,7 @@ from mavlink_sim.camera.lens import CameraMotion
 from mavlink_sim.camera.renderer import VisibleObject
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, frame_truth
-from mavlink_sim.datasets.training_scenes import random_frame
+from mavlink_sim.datasets.training_scenes import training_frame
 from mavlink_sim.world.shapes import CLASS_NAMES
 from mavlink_sim.world.textures import Plane
 from mavlink_sim.world.world import OBJECT_NAMES, WorldObject, range_to
@@ -164,7 +164,7 @@ def _counts(item: VisibleObject, options: DatasetOptions) -> bool:
 def _random_frames(options: DatasetOptions) -> Iterator[Captured]:
     width, height = options.size
     for index in range(options.frames):
-        rendered = random_frame(np.random.default_rng((options.seed, index)), width, height)
+        rendered = training_frame(np.random.default_rng((options.seed, index)), width, height)
         frame = Frame(np.ascontiguousarray(rendered.image), index, index, rendered.depth_m)
         yield Captured(frame, rendered, 0.0, index)
 

@@ -1,23 +1,29 @@
 """Labelled pictures to train the detector with: random places, cameras, light, and things on the ground.
 
-Every draw comes from one generator, so that a seed gives the same pictures again.
+`random_frame` looks from anywhere at large objects, `flight_frame` as a low vehicle does, at near and far
+ones between many distractors, `world_frame` at the default world and the example scenes. `training_frame`
+mixes them. Every draw comes from one generator, so that a seed gives the same pictures again.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.camera.ground_view import Buffers, View
-from mavlink_sim.camera.image_effects import ImageEffects
+from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.renderer import Rendered, Renderer
-from mavlink_sim.world.shapes import CLASS_NAMES, CLUTTER_NAMES, shape_of, variant_of
+from mavlink_sim.camera.scene import Scene
+from mavlink_sim.camera.scene_file import example_scenes, load_scene
+from mavlink_sim.world.plates import Print
+from mavlink_sim.world.shapes import CLASS_NAMES, CLUTTER_NAMES
 from mavlink_sim.world.textures import KINDS, Image
-from mavlink_sim.world.world import Ground, Light, Patch, Sky, World, WorldObject
+from mavlink_sim.world.world import Ground, Light, Patch, Sky, World, WorldObject, demo_world, range_to
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_euler
 
@@ -43,8 +49,31 @@ CLASS_WEIGHTS = {
     "dog": 1.0,
     "chair": 1.0,
 }
+FLIGHT_SHARE, WORLD_SHARE = 0.42, 0.28
+"""Shares of `flight_frame` and `world_frame` in training; the rest is `random_frame`."""
+TRAINING_WORLDS = tuple(range(1_000_000, 1_000_008))
+"""Seeds of the default worlds in training. Flights and held-out frames use small seeds."""
+FARTHEST_M = 70.0
+LEARNED_SIDE_PX, LEARNED_AREA_PX = 5.0, 60.0
+"""What is smaller is not learned, neither as an object nor as background."""
+DISTRACTOR_NAMES = (
+    *CLUTTER_NAMES,
+    *("autumn_tree", "autumn_tree", "tree", "building", "box", "wall", "drone", "plate"),
+)
+ALIKE = (("car", "truck", "boat"), ("person", "bicycle", "dog", "chair"), ("tree", "bush", "autumn_tree"))
 NARROW_SIDE_M = np.array([0.5, 0.5, 1.5, 2.2, 1.7, 0.4, 0.5])
 """Of each class: how wide it looks at least, from most sides. Smaller than MIN_SIDE_PX is not tried."""
+
+
+FAR_WEIGHTS = np.array([1.3, 1.2, 1.4, 1.2, 1.8, 1.2, 1.2])
+"""Of each class where all distances are alike; boats most, which were taken for cars."""
+_SIZES_M = {
+    "building": ((8.0, 6.0, 3.2), (14.0, 8.0, 6.0), (20.0, 10.0, 4.0), (10.0, 10.0, 9.0)),
+    "box": ((1.0, 1.0, 1.0), (4.0, 1.8, 1.4), (2.0, 1.2, 0.6), (0.5, 0.5, 1.7), (6.0, 2.5, 2.6)),
+    "wall": ((3.0, 0.24, 1.0), (6.0, 0.3, 2.0), (12.0, 0.3, 2.6), (1.5, 0.2, 1.8)),
+    "autumn_tree": ((2.0, 2.0, 3.5), (3.0, 3.4, 5.0), (5.0, 4.0, 6.5), (1.6, 1.2, 1.8), (3.5, 2.5, 2.4)),
+}
+"""Of distractors: different enough to be looked at twice, few enough to be kept."""
 
 
 def random_scene(
@@ -73,6 +102,146 @@ def random_scene(
             boxes.append(item.xyxy)
             ids.append(CLASS_NAMES.index(class_name))
     return rendered.image, np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+
+
+def training_scene(rng: np.random.Generator, width: int, height: int) -> tuple[Image, Boxes, ClassIds]:
+    """One picture of the mixture with its labels, as `random_scene`.
+
+    Objects too small or too much hidden to be learned have the id ~class: they are no background either.
+    """
+    rendered = training_frame(rng, width, height)
+    boxes: list[tuple[float, float, float, float]] = []
+    ids: list[int] = []
+    for item in rendered.objects:
+        if item.world_object.class_name in CLASS_NAMES:
+            class_id = CLASS_NAMES.index(item.world_object.class_name)
+            sides = np.subtract(item.xyxy[2:], item.xyxy[:2])
+            large = sides.min() >= LEARNED_SIDE_PX and sides.prod() >= LEARNED_AREA_PX
+            boxes.append(item.xyxy)
+            ids.append(class_id if large and item.visible_fraction >= MIN_VISIBLE_FRACTION else ~class_id)
+    return rendered.image, np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+
+
+def training_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
+    """One frame of the mixture that the bundled model is trained on."""
+    kind = float(rng.random())
+    if kind < FLIGHT_SHARE:
+        return flight_frame(rng, width, height)
+    if kind < FLIGHT_SHARE + WORLD_SHARE:
+        return world_frame(rng, width, height)
+    return random_frame(rng, width, height)
+
+
+def flight_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
+    """What a low vehicle sees ahead: things 3 to 70 m away, many distractors, painted ground, shadows."""
+    low = rng.random() < 0.85
+    altitude = float(math.exp(rng.uniform(math.log(1.5), math.log(10.0)) + (0.0 if low else math.log(5.0))))
+    camera = _wide_camera(rng, width, height, float(rng.uniform(60.0, 92.0)))
+    down = math.radians(float(rng.uniform(4.0, 32.0) if low else rng.uniform(12.0, 65.0)))
+    yaw = float(rng.uniform(-math.pi, math.pi))
+    attitude = matrix_from_euler(math.radians(float(rng.normal(0.0, 4.0))), -down, yaw)
+    ground = _random_ground(rng, painted=0.45)
+    place = rng.uniform(-45.0, 45.0, 2)
+    if ground.pad or ground.patches:
+        # Look at what is painted: a pad, a pond.
+        spots = [(patch.north_m, patch.east_m) for patch in ground.patches] + [(0.0, 0.0)] * ground.pad
+        spot = spots[int(rng.integers(len(spots)))]
+        bearing = yaw + float(rng.uniform(-0.5, 0.5))
+        away = altitude / math.tan(down) * float(rng.uniform(0.5, 2.5))
+        place = np.array(spot) - min(away, 40.0) * np.array([math.cos(bearing), math.sin(bearing)])
+    position = (float(place[0]), float(place[1]), -altitude)
+    light, sky, buffers = _random_light(rng), _random_sky(rng), _buffers(width, height)
+    renderer = Renderer(World((), ground, light, sky), camera, CameraMount(), None, buffers)
+    objects = _random_objects(rng, renderer, position, attitude, ground, far=True)
+    if light.shadow > 0.2 and rng.random() < 0.5:
+        objects += _shadow_casters(rng, renderer.view(position, attitude), light, objects)
+    effects = _random_effects(rng) if rng.random() < 0.6 else MILD_EFFECTS
+    renderer = Renderer(World(objects, ground, light, sky), camera, CameraMount(), effects, buffers, rng)
+    return renderer.render(position, attitude)
+
+
+def world_frame(rng: np.random.Generator, width: int, height: int) -> Rendered:
+    """A default world or an example scene, its objects in other colours and builds, from a random place."""
+    scenes = _scenes()
+    scene = scenes[int(rng.integers(len(scenes)))]
+    world = scene.world
+    objects = scene.objects_at(float(rng.uniform(0.0, 60.0)))
+    if scene.name == "demo" or rng.random() < 0.5:
+        objects = tuple(_another(rng, item) for item in objects)
+    light = world.light if rng.random() < 0.5 else _random_light(rng)
+    sky = world.sky if rng.random() < 0.5 else _random_sky(rng)
+    effects = scene.camera.effects if rng.random() < 0.5 else _random_effects(rng)
+    model = scene.camera.model
+    seen_deg = math.degrees(2 * math.atan(model.width / 2 / model.fx)) * float(rng.uniform(0.85, 1.15))
+    camera = _wide_camera(rng, width, height, seen_deg, model.distortion)
+    buffers = None if camera.distortion else _buffers(width, height)
+    shown = World(objects, world.ground, light, sky)
+    renderer = Renderer(shown, camera, CameraMount(), effects, buffers, rng)
+    return renderer.render(*_gaze(rng, objects, camera))
+
+
+@lru_cache(maxsize=1)
+def _scenes() -> tuple[Scene, ...]:
+    worlds = tuple(Scene(demo_world(seed), name="demo") for seed in TRAINING_WORLDS)
+    return worlds + tuple(load_scene(name) for name in example_scenes())
+
+
+def _another(rng: np.random.Generator, item: WorldObject) -> WorldObject:
+    """The object in another build and colour, now and then one of another kind as large."""
+    if item.printed is not None:
+        return item
+    class_name, size = item.class_name, item.size_m
+    alike = next((names for names in ALIKE if class_name in names), None)
+    if alike is not None and rng.random() < 0.25:
+        class_name = alike[int(rng.integers(len(alike)))]
+    yaw = item.yaw_rad + float(rng.normal(0.0, 0.6))
+    appearance, scale = int(rng.integers(2**31)), item.scale * float(rng.uniform(0.9, 1.12))
+    return replace(item, class_name=class_name, size_m=size, yaw_rad=yaw, appearance=appearance, scale=scale)
+
+
+def _gaze(
+    rng: np.random.Generator, objects: Sequence[WorldObject], camera: CameraModel
+) -> tuple[tuple[float, float, float], NDArray[np.float64]]:
+    """A place 3 to 60 m from one of the objects, mostly low, and an attitude with it in the picture."""
+    known = [item for item in objects if item.class_name in CLASS_NAMES]
+    across, along = math.atan(camera.width / 2 / camera.fx), math.atan(camera.height / 2 / camera.fy)
+    north, east, altitude, yaw, depression = 0.0, 0.0, FARTHEST_M, 0.0, math.pi / 2
+    for _ in range(20):
+        target = (known or objects)[int(rng.integers(len(known or objects)))]
+        if rng.random() < 0.3:
+            target = objects[int(rng.integers(len(objects)))]
+        away = math.exp(rng.uniform(math.log(3.0), math.log(60.0)))
+        highest = 9.0 if rng.random() < 0.75 else 40.0
+        altitude = math.exp(rng.uniform(math.log(1.8), math.log(highest)))
+        yaw = float(rng.uniform(-math.pi, math.pi))
+        north = target.position_ned_m[0] - away * math.cos(yaw)
+        east = target.position_ned_m[1] - away * math.sin(yaw)
+        aim = target.height_m / 2 - target.position_ned_m[2]
+        depression = math.atan2(altitude - aim, away)
+        if not any(
+            range_to(item, (north, east)) < 0.8 and altitude < item.height_m - item.position_ned_m[2] + 0.8
+            for item in objects
+        ):
+            break
+    else:
+        altitude = FARTHEST_M
+    pitch = -depression + float(rng.uniform(-0.7, 0.7)) * along
+    if rng.random() < 0.4:
+        pitch = -math.radians(float(rng.uniform(8.0, 28.0)))
+    yaw += float(rng.uniform(-0.7, 0.7)) * across
+    roll = math.radians(float(rng.normal(0.0, 4.0)))
+    return (north, east, -altitude), matrix_from_euler(roll, pitch, yaw)
+
+
+def _wide_camera(
+    rng: np.random.Generator,
+    width: int,
+    height: int,
+    horizontal_fov_deg: float,
+    distortion: tuple[float, ...] = (),
+) -> CameraModel:
+    focal = width / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
+    return CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, distortion)
 
 
 def random_frame(
@@ -127,10 +296,10 @@ def _pitch_down(rng: np.random.Generator, altitude_m: float) -> float:
     return math.radians(float(np.clip(rng.normal(middle, 16.0), -10.0, 90.0)))
 
 
-def _random_ground(rng: np.random.Generator) -> Ground:
+def _random_ground(rng: np.random.Generator, painted: float = 0.22) -> Ground:
     gain = rng.uniform(0.72, 1.2) * rng.uniform(0.93, 1.07, 3)
     tint = (float(gain[0]), float(gain[1]), float(gain[2]))
-    if rng.random() < 0.22:
+    if rng.random() < painted:
         return _painted_ground(int(rng.integers(PAINTED_TILES)), tint)
     seed = int(rng.integers(TILES))
     kinds, texels, texel_m = _tile_recipe(seed)
@@ -238,12 +407,16 @@ def _random_objects(
     position: tuple[float, float, float],
     attitude: NDArray[np.float64],
     ground: Ground,
+    far: bool = False,
 ) -> tuple[WorldObject, ...]:
-    """Things put where the camera sees them large enough, and not much hidden by each other."""
+    """Things put where the camera sees them large enough, and not much hidden by each other.
+
+    `far`: as many at each distance, small ones too, and every kind of distractor.
+    """
     view = renderer.view(position, attitude)
     empty = rng.random() < EMPTY_SHARE
     wanted = 0 if empty else 1 + int(rng.integers(MAX_OBJECTS))
-    clutter = int(rng.integers(0, 9))
+    clutter = int(rng.integers(2, 16) if far else rng.integers(0, 9))
     water = ground.kinds[0] == "water"
     weights = np.array(list(CLASS_WEIGHTS.values()))
     if water:
@@ -262,27 +435,48 @@ def _random_objects(
         if ray[2] <= 1e-3:
             continue
         depth = float(-view.eye[2] / ray[2])
-        if real:
+        if far:
+            # The same column, at a distance of its own.
+            depth = math.exp(rng.uniform(math.log(3.0), math.log(FARTHEST_M)))
+            ahead = ray[:2] / math.hypot(*ray[:2])
+            ray = np.array([*ahead, -view.eye[2] / depth])
+        if real and far:
+            class_name = CLASS_NAMES[int(rng.choice(len(CLASS_NAMES), p=FAR_WEIGHTS / FAR_WEIGHTS.sum()))]
+        elif real:
             fitting = weights * (NARROW_SIDE_M * view.focal_px / depth > MIN_SIDE_PX)
             if not fitting.any():
                 continue
             class_name = CLASS_NAMES[int(rng.choice(len(CLASS_NAMES), p=fitting / fitting.sum()))]
         else:
-            class_name = CLUTTER_NAMES[int(rng.integers(len(CLUTTER_NAMES)))]
+            names = DISTRACTOR_NAMES if far else CLUTTER_NAMES
+            class_name = names[int(rng.integers(len(names)))]
         appearance = int(rng.integers(2**31))
         scale = float(rng.uniform(0.9, 1.12))
         yaw = float(rng.uniform(-math.pi, math.pi))
         where = view.eye + depth * ray
         item = WorldObject(
-            len(placed), class_name, (float(where[0]), float(where[1]), 0.0), yaw, scale, appearance
+            len(placed),
+            class_name,
+            (float(where[0]), float(where[1]), 0.0),
+            yaw,
+            scale,
+            appearance,
+            printed=_random_print(rng) if class_name == "plate" else None,
         )
+        if class_name in _SIZES_M:
+            item = replace(item, size_m=_SIZES_M[class_name][appearance % len(_SIZES_M[class_name])])
+        if class_name == "drone":
+            height = float(rng.uniform(0.0, 2.0 * -view.eye[2]))
+            item = replace(item, position_ned_m=(*item.position_ned_m[:2], -height))
         outline = _outline(item, view)
         if outline is None:
             continue
         box, inside = outline
         sides = box[2:] - box[:2]
         limit = MIN_SIDE_PX * 1.35
-        if real and (sides.min() < limit or sides.prod() < 2.2 * MIN_AREA_PX or inside < 0.5):
+        if far and (inside < 0.3 or sides.min() < (3 if real else 1)):
+            continue
+        if real and not far and (sides.min() < limit or sides.prod() < 2.2 * MIN_AREA_PX or inside < 0.5):
             continue
         if not real and (inside < 0.2 or sides.prod() > 0.3 * view.width * view.height or sides.max() < 4):
             continue
@@ -298,9 +492,43 @@ def _random_objects(
     return tuple(placed)
 
 
+def _random_print(rng: np.random.Generator) -> Print:
+    side = float(rng.choice((0.3, 0.6, 1.0, 2.0)))
+    dictionary = ("APRILTAG_36h11", "4X4_50", "6X6_250")[int(rng.integers(3))]
+    return Print(dictionary, int(rng.integers(50)), side, standing=bool(rng.random() < 0.4))
+
+
+def _shadow_casters(
+    rng: np.random.Generator, view: View, light: Light, objects: tuple[WorldObject, ...]
+) -> tuple[WorldObject, ...]:
+    """Things outside the picture whose shadows reach into it."""
+    casters: list[WorldObject] = []
+    sun = np.array(light.towards_sun_ned)
+    for _ in range(4):
+        pixel = np.array([rng.uniform(0, view.width), rng.uniform(view.height / 2, view.height), 1.0])
+        ray = view.ned_from_pixel @ pixel
+        if ray[2] <= 0.05:
+            continue
+        names = ("tree", "autumn_tree", "pole", "shed", "building")
+        class_name = names[int(rng.integers(len(names)))]
+        shadow = view.eye + ray * float(-view.eye[2] / ray[2])
+        appearance, yaw = int(rng.integers(2**31)), float(rng.uniform(-math.pi, math.pi))
+        item = WorldObject(1000 + len(casters), class_name, (0.0, 0.0, 0.0), yaw, 1.0, appearance)
+        reach = item.height_m * float(rng.uniform(0.5, 1.0)) / max(-sun[2], 0.1)
+        place = (float(shadow[0] + sun[0] * reach), float(shadow[1] + sun[1] * reach), 0.0)
+        item = replace(item, position_ned_m=place)
+        outline = _outline(item, view)
+        # Behind the lens counts as outside, but not right over it.
+        outside = outline is None or outline[1] < 0.02
+        clear = range_to(item, (view.eye[0], view.eye[1])) > 1.0
+        if outside and clear and not any(_touch(item, other) for other in (*objects, *casters)):
+            casters.append(item)
+    return tuple(casters)
+
+
 def _outline(item: WorldObject, view: View) -> tuple[NDArray[np.float64], float] | None:
     """The box (4,) in the image around the object's bounding box, and the share of it that is inside."""
-    shape = shape_of(item.class_name, variant_of(item.class_name, item.appearance))
+    shape = item.shape
     low, high = shape.low * item.scale, shape.high * item.scale
     x, y, z = np.meshgrid((low[0], high[0]), (low[1], high[1]), (low[2], high[2]))
     c, s = math.cos(item.yaw_rad), math.sin(item.yaw_rad)

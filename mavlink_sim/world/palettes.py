@@ -52,6 +52,17 @@ COATS: tuple[Colour, ...] = (
     (110, 112, 116),
     (40, 70, 140),
 )
+AUTUMN: tuple[Colour, ...] = (
+    (28, 60, 168),
+    (30, 104, 206),
+    (44, 160, 214),
+    (40, 84, 116),
+    (52, 44, 132),
+    (70, 150, 170),
+    (196, 184, 222),
+    (84, 96, 104),
+)
+"""Of leaves: red, orange, yellow, brown, purple, pale; blossom; bare twigs."""
 WOOD: tuple[Colour, ...] = ((70, 110, 150), (52, 84, 122), (110, 150, 186), (60, 70, 84), (140, 160, 170))
 
 FIXED: dict[str, Colour] = {
@@ -122,6 +133,8 @@ def _colour(rng: np.random.Generator, class_name: str, slot: str, chosen: dict[s
         return _near(rng, (92, 168, 196)) if slot == "hay" else _one_of(rng, WOOD)
     if slot in ("leaves", "needles"):
         return _one_of(rng, ((40, 92, 56), (34, 74, 44), (48, 116, 84), (44, 100, 110)), 0.18)
+    if slot == "autumn_leaves":
+        return _one_of(rng, AUTUMN, 0.18)
     if slot == "stone":
         return _one_of(rng, ((128, 134, 138), (100, 110, 120), (150, 158, 164)))
     if slot == "frame":

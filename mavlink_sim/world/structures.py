@@ -1,4 +1,4 @@
-"""The solids of what a scene file can add to a world: walls and boxes of a given size, plates, other drones.
+"""The solids of a given size that a scene file can add: walls, boxes, buildings, trees, plates, other drones.
 
 Frame and units as in `solids`. These names are apart from `shapes.BUILDERS`, from which training scenes draw
 at random: a name more there would change every picture that follows.
@@ -31,6 +31,51 @@ def box(rng: np.random.Generator, size_m: Triple) -> Body:
     """A plain block of (length along x, width, height)."""
     body = Body()
     body.box((0, 0, size_m[2] / 2), size_m, "wall", top_slot="lid")
+    return body
+
+
+def building(rng: np.random.Generator, size_m: Triple) -> Body:
+    """A house of (length, width, height) with a flat roof, rows of windows on each side, and a door."""
+    length, width, height = size_m
+    body = Body()
+    body.box((0, 0, height / 2), size_m, "wall", top_slot="roof")
+    floors = max(1, round(height / 3.0))
+    for half, across, turned in ((width / 2, length, False), (length / 2, width, True)):
+        count = max(1, round(across / 3.0))
+        for side in (-1.0, 1.0):
+            for floor in range(floors):
+                for column in range(count):
+                    middle = (column + 0.5) * across / count - across / 2
+                    low, high = (floor + 0.35) * height / floors, (floor + 0.8) * height / floors
+                    pane = [
+                        (middle - 0.5, low),
+                        (middle + 0.5, low),
+                        (middle + 0.5, high),
+                        (middle - 0.5, high),
+                    ]
+                    if floor == 0 and column == count // 2 and side > 0:
+                        pane = [(x, z if z > low else 0.0) for x, z in pane]
+                    points = [(side * half, x, z) if turned else (x, side * half, z) for x, z in pane]
+                    outwards = (side, 0.0, 0.0) if turned else (0.0, side, 0.0)
+                    body.add_decal(np.array(points), "glass", outwards)
+    return body
+
+
+def autumn_tree(rng: np.random.Generator, size_m: Triple) -> Body:
+    """A tree in autumn colours or in blossom, of (crown length, crown width, height)."""
+    length, width, height = size_m
+    body = Body()
+    body.tube((0, 0, 0), (0, 0, height * 0.6), 0.03 * height, "bark", 6, 0.02 * height)
+    for _ in range(int(rng.integers(2, 6))):
+        share = float(rng.uniform(0.3, 0.5))
+        high = height * float(rng.uniform(0.16, 0.28))
+        centre = (
+            float(rng.uniform(-1, 1)) * length * (0.5 - share),
+            float(rng.uniform(-1, 1)) * width * (0.5 - share),
+            float(rng.uniform(0.45 * height, height - high)),
+        )
+        radii = (length * share, width * share, high)
+        body.ellipsoid(centre, radii, "autumn_leaves", 7, 4, rng, 0.16, 0.16)
     return body
 
 
@@ -69,12 +114,16 @@ def drone(rng: np.random.Generator, size_m: Triple) -> Body:
 SIZED_BUILDERS: dict[str, Callable[[np.random.Generator, Triple], Body]] = {
     "wall": wall,
     "box": box,
+    "building": building,
+    "autumn_tree": autumn_tree,
     "drone": drone,
     "plate": plate,
 }
 DEFAULT_SIZES_M: dict[str, Triple] = {
     "wall": (4.0, 0.24, 2.0),
     "box": (1.0, 1.0, 1.0),
+    "building": (10.0, 7.0, 5.0),
+    "autumn_tree": (3.0, 3.0, 5.0),
     "drone": (0.5, 0.5, 0.22),
     "plate": (0.5, 0.5, PLATE_THICKNESS_M),
 }

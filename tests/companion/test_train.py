@@ -12,7 +12,7 @@ import yaml
 import companion.train
 from companion.train import train_default
 from vision.detector import Detector
-from vision.yolo.recipe import DEFAULT_RECIPE
+from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
 
 
@@ -24,6 +24,10 @@ def test_a_training_run_leaves_a_model_with_licence_and_score(
         DEFAULT_RECIPE, stages=(Stage(96, 96, 2, 2),), width_multiple=0.0625, workers=0, threads=1
     )
     monkeypatch.setattr(companion.train, "DEFAULT_RECIPE", small)
+    stages = (Stage(96, 96, 2, 2, drawn=(128, 96)),)
+    monkeypatch.setattr(
+        companion.train, "REFINEMENT", replace(REFINEMENT, stages=stages, width_multiple=0.0625, workers=0)
+    )
     monkeypatch.setattr(companion.train, "HELD_OUT_SIZE", (96, 96))
     output = tmp_path / "out" / "model.safetensors"
     score = train_default(output, held_out=2)
@@ -37,6 +41,9 @@ def test_a_training_run_leaves_a_model_with_licence_and_score(
     detector.detect(np.zeros((96, 96, 3), np.uint8))
     # The state is there, and going on from it has nothing left to do.
     assert train_default(output, held_out=2, resume=True).map50 == pytest.approx(score.map50)
+    refined = train_default(tmp_path / "refined.safetensors", start=output, held_out=2)
+    assert 0.0 <= refined.map50 <= 1.0
+    assert not (tmp_path / "refined.safetensors.training").exists()
 
 
 def test_going_on_without_a_state_is_refused(tmp_path: Path) -> None:

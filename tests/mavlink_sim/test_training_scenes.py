@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.datasets.training_scenes import (
+    LEARNED_SIDE_PX,
     MIN_AREA_PX,
     MIN_SIDE_PX,
     Boxes,
     ClassIds,
+    flight_frame,
     random_scene,
     render_dataset,
+    training_frame,
+    training_scene,
+    world_frame,
 )
 from mavlink_sim.world.shapes import CLASS_NAMES
 from mavlink_sim.world.textures import Image
@@ -84,3 +90,34 @@ def test_the_focal_length_is_within_what_was_asked() -> None:
         return float(np.median(sides))
 
     assert mean_side((500.0, 600.0)) > mean_side((120.0, 150.0))
+
+
+@pytest.mark.parametrize("draw", [flight_frame, world_frame, training_frame])
+def test_other_frames_follow_from_their_generator_too(draw: Callable[..., Rendered]) -> None:
+    first, again = (draw(np.random.default_rng(5), 160, 128) for _ in range(2))
+    assert np.array_equal(first.image, again.image)
+    assert first.image.shape == (128, 160, 3)
+    assert not np.array_equal(first.image, draw(np.random.default_rng(6), 160, 128).image)
+
+
+def test_what_is_too_small_to_learn_has_an_id_below_zero() -> None:
+    small = 0
+    for n in range(12):
+        _, boxes, ids = training_scene(np.random.default_rng((3, n)), 160, 128)
+        sides = boxes[:, 2:] - boxes[:, :2]
+        assert (sides[ids >= 0] >= LEARNED_SIDE_PX).all()
+        assert ((ids >= -len(CLASS_NAMES)) & (ids < len(CLASS_NAMES))).all()
+        small += int((ids < 0).sum())
+    assert small > 0
+
+
+def test_flights_have_every_kind_of_distractor_and_far_objects() -> None:
+    ranges, names = [], set()
+    for n in range(30):
+        for item in flight_frame(np.random.default_rng((4, n)), 160, 128).objects:
+            names.add(item.world_object.class_name)
+            if item.world_object.class_name in CLASS_NAMES:
+                ranges.append(item.range_m)
+    assert {"autumn_tree", "building", "plate"} < names
+    assert max(ranges) > 40.0
+    assert min(ranges) < 6.0

@@ -151,3 +151,17 @@ def test_following_the_gradient_lowers_the_loss() -> None:
 def test_maps_without_room_for_classes_are_refused() -> None:
     with pytest.raises(ValueError, match="64 \\+ classes channels, got 64"):
         detection_loss([torch.zeros(1, 64, 2, 2)], [8], one_object(0, 0, 0, 8, 8))
+
+
+def test_an_ignored_object_is_held_against_no_class_but_the_others() -> None:
+    nothing_there = Truth(
+        torch.zeros(1, 0, 4), torch.zeros(1, 0, dtype=torch.int64), torch.zeros(1, 0).bool()
+    )
+    corners = torch.tensor([[[12.0, 12.0, 28.0, 28.0]]])
+    absent, present = torch.zeros(1, 1).bool(), torch.ones(1, 1).bool()
+    maps, strides = head_maps(3, sure_of=(1, 12, 12, 28, 28))
+    wrong = detection_loss(maps, strides, nothing_there).classes
+    same = detection_loss(maps, strides, Truth(corners, torch.tensor([[1]]), absent, present)).classes
+    other = detection_loss(maps, strides, Truth(corners, torch.tensor([[2]]), absent, present)).classes
+    assert same < 0.1 * wrong
+    assert other == pytest.approx(wrong, rel=0.01)

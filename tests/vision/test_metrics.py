@@ -10,7 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vision.yolo.metrics import ImageResult, average_precision, box_iou, score_detections
+from vision.yolo.metrics import (
+    NEITHER,
+    RIGHT,
+    WRONG,
+    ImageResult,
+    average_precision,
+    box_iou,
+    judge,
+    operating_points,
+    score_detections,
+)
 
 NAMES = ("car", "boat")
 SQUARE = (0.0, 0.0, 10.0, 10.0)
@@ -192,3 +202,22 @@ def test_the_score_is_that_of_cocos_own_program() -> None:
     for index, name in enumerate(NAMES):
         assert score.per_class[name].ap50 == pytest.approx(precision[0, :, index].mean(), abs=1e-3)
         assert score.per_class[name].ap50_95 == pytest.approx(precision[:, :, index].mean(), abs=1e-3)
+
+
+def test_precision_and_recall_count_what_is_confident_enough() -> None:
+    seen = result([(SQUARE, 0.9, 0), (SQUARE, 0.8, 0), (FAR, 0.7, 0), (FAR, 0.3, 1)], [(SQUARE, 0), (FAR, 1)])
+    assert judge(seen, 0.5).tolist() == [RIGHT, WRONG, WRONG, NEITHER]
+    assert judge(seen, 0.2).tolist() == [RIGHT, WRONG, WRONG, RIGHT]
+    points = operating_points([seen], NAMES, 0.5)
+    assert (points["car"].precision, points["car"].recall) == pytest.approx((1 / 3, 1.0))
+    assert math.isnan(points["boat"].precision)
+    assert points["boat"].recall == 0.0
+
+
+def test_an_ignored_object_may_be_found_but_not_called_by_another_class() -> None:
+    seen = result([(SQUARE, 0.9, 0), (SQUARE, 0.8, 1)], [(SQUARE, 0)])
+    ignoring = ImageResult(
+        seen.boxes, seen.confidences, seen.class_ids, seen.true_boxes, seen.true_class_ids, np.array([True])
+    )
+    assert judge(ignoring, 0.5).tolist() == [NEITHER, WRONG]
+    assert operating_points([ignoring], NAMES, 0.5)["car"].objects == 0

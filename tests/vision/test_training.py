@@ -243,6 +243,49 @@ def test_augmented_boxes_still_hold_their_objects(seed: int) -> None:
         )
 
 
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_smaller_picture_shows_the_whole_scene_or_a_part(seed: int) -> None:
+    image = np.full((96, 128, 3), 114, np.uint8)
+    image[30:60, 40:90] = (0, 0, 255)
+    scene = image, np.array([[40, 30, 90, 60]], np.float32), np.zeros(1, np.int64)
+    limits = Augmentation(mirror=0, zoom_probability=0.5, hue=0, saturation=0, brightness=0)
+    changed, boxes, ids = augment(np.random.default_rng(seed), scene, limits, (64, 64))
+    assert changed.shape == (64, 64, 3)
+    assert (boxes >= 0).all()
+    assert (boxes <= 64).all()
+    rows, columns = np.nonzero(changed[:, :, 2].astype(int) - changed[:, :, 0] > 120)
+    if len(ids):
+        assert boxes[0] == pytest.approx(
+            [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], abs=1.6
+        )
+
+
+def test_an_object_that_became_too_small_is_ignored() -> None:
+    scene = (
+        np.zeros((96, 128, 3), np.uint8),
+        np.array([[40, 30, 48, 60], [60, 30, 100, 60]], np.float32),
+        np.array([1, 0]),
+    )
+    limits = replace(NO_AUGMENTATION, min_side_px=5.0)
+    _, boxes, ids = augment(np.random.default_rng(0), scene, limits, (64, 48))
+    assert ids.tolist() == [~1, 0]
+    _, truth = collate([(np.zeros((48, 64, 3), np.uint8), boxes, ids)])
+    assert truth.present.tolist() == [[False, True]]
+    assert truth.ignored is not None
+    assert truth.ignored.tolist() == [[True, False]]
+    assert truth.classes.tolist() == [[1, 0]]
+
+
+def test_training_can_begin_with_the_weights_of_another() -> None:
+    first = train(SMALL, rectangles, silent)
+    gentle = replace(SMALL, learning_rate=1e-9, average_decay=0.0)
+    assert torch.allclose(
+        weights(train(gentle, rectangles, silent, start=first.model))[:100], weights(first)[:100], atol=1e-5
+    )
+    with pytest.raises(ValueError, match="another scale"):
+        train(replace(SMALL, width_multiple=0.125), rectangles, silent, start=first.model)
+
+
 def test_the_same_key_draws_the_same_picture() -> None:
     key = SceneKey(3, 4, 96, 64)
     first, second = (draw_scene(rectangles, key, 2) for _ in range(2))

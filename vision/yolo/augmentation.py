@@ -12,7 +12,9 @@ PADDING_GREY = 114
 """The grey a letterbox pads with, so that training has seen such borders."""
 
 LabelledImage = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]
-"""Image (height, width, 3) uint8 BGR; boxes (N, 4) float32 pixels xyxy; class ids (N,) int64."""
+"""Image (height, width, 3) uint8 BGR; boxes (N, 4) float32 pixels xyxy; class ids (N,) int64.
+
+An id ~class (negative) marks an object that is neither to be found nor to be taken for background."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,8 @@ class Augmentation:
         saturation: largest relative change of the saturation.
         brightness: largest relative change of the brightness.
         visible_fraction: an object of which less than this stays in the picture is no longer labelled.
+        min_side_px: nor is one whose box gets a smaller side than this.
+        min_area_px: nor one whose box gets a smaller area.
     """
 
     mirror: float = 0.5
@@ -38,18 +42,31 @@ class Augmentation:
     saturation: float = 0.4
     brightness: float = 0.25
     visible_fraction: float = 0.35
+    min_side_px: float = 0.0
+    min_area_px: float = 0.0
 
 
 NO_AUGMENTATION = Augmentation(mirror=0, zoom_probability=0, hue=0, saturation=0, brightness=0)
 
 
-def augment(rng: np.random.Generator, scene: LabelledImage, limits: Augmentation) -> LabelledImage:
-    """A changed copy of the same size. The same `rng` state gives the same change."""
+def augment(
+    rng: np.random.Generator,
+    scene: LabelledImage,
+    limits: Augmentation,
+    size: tuple[int, int] | None = None,
+) -> LabelledImage:
+    """A changed copy. The same `rng` state gives the same change.
+
+    `size` (width, height) of the copy; None: the scene's own. In a smaller one the scene is shown whole, as a
+    letterbox shows it, or a part of it, zoomed up to `zoom_max` times the scene's own pixels.
+    """
     image, boxes, class_ids = scene
     if rng.random() < limits.mirror:
         image, boxes = mirrored(image, boxes)
-    if rng.random() < limits.zoom_probability:
-        image, boxes, class_ids = _zoomed(rng, image, boxes, class_ids, limits)
+    own = (image.shape[1], image.shape[0])
+    zoomed = rng.random() < limits.zoom_probability
+    if zoomed or size not in (None, own):
+        image, boxes, class_ids = _zoomed(rng, image, boxes, class_ids, limits, size or own, zoomed)
     if limits.hue or limits.saturation or limits.brightness:
         image = _recoloured(rng, image, limits)
     return np.ascontiguousarray(image), boxes, class_ids
@@ -71,28 +88,44 @@ def _zoomed(
     boxes: NDArray[np.float32],
     class_ids: NDArray[np.int64],
     limits: Augmentation,
+    size: tuple[int, int],
+    zoomed: bool,
 ) -> LabelledImage:
-    height, width = image.shape[:2]
-    zoom = float(np.exp(rng.uniform(np.log(limits.zoom_min), np.log(limits.zoom_max))))
-    # Zoomed in, the window lies anywhere in the picture; zoomed out, the picture anywhere in the window.
-    shift = rng.random(2) * ((1 - zoom) * width, (1 - zoom) * height)
+    whole, window = np.array([image.shape[1], image.shape[0]]), np.array(size)
+    zoom = float((window / whole).min())
+    shift = (window - zoom * whole) / 2
+    if zoomed:
+        zoom = float(np.exp(rng.uniform(np.log(zoom * limits.zoom_min), np.log(limits.zoom_max))))
+        # Zoomed in, the window lies anywhere in the picture; zoomed out, the picture anywhere in the window.
+        shift = rng.random(2) * (window - zoom * whole)
+        if len(boxes) and (window < whole).any() and rng.random() < 0.7:
+            # Most of a large scene is empty: look where an object is.
+            middle = boxes[int(rng.integers(len(boxes)))].reshape(2, 2).mean(axis=0) * zoom
+            room = window - zoom * whole
+            shift = np.clip(
+                rng.uniform(0.1, 0.9, 2) * window - middle, np.minimum(room, 0), np.maximum(room, 0)
+            )
     # warpAffine counts from pixel centres, boxes from pixel edges: half a pixel each way.
     centre_shift = shift + 0.5 * zoom - 0.5
     matrix = np.array([[zoom, 0, centre_shift[0]], [0, zoom, centre_shift[1]]])
     warped = cv2.warpAffine(
         np.ascontiguousarray(image),
         matrix,
-        (width, height),
+        size,
         flags=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=(PADDING_GREY, PADDING_GREY, PADDING_GREY),
     )
     moved = boxes * zoom + np.tile(shift, 2)
-    clipped = np.clip(moved, 0, (width, height, width, height)).astype(np.float32)
+    clipped = np.clip(moved, 0, np.tile(window, 2)).astype(np.float32)
     area = (moved[:, 2:] - moved[:, :2]).prod(1)
-    left = (clipped[:, 2:] - clipped[:, :2]).prod(1)
-    kept = left >= limits.visible_fraction * np.maximum(area, 1e-9)
-    return warped.astype(np.uint8, copy=False), clipped[kept], class_ids[kept]
+    sides = clipped[:, 2:] - clipped[:, :2]
+    left = sides.prod(1)
+    cut = left < limits.visible_fraction * np.maximum(area, 1e-9)
+    small = (sides.min(1, initial=np.inf) < limits.min_side_px) | (left < limits.min_area_px)
+    ids = np.where((cut | small) & (class_ids >= 0), ~class_ids, class_ids)
+    shown = left > 0
+    return warped.astype(np.uint8, copy=False), clipped[shown], ids[shown]
 
 
 def _recoloured(

@@ -42,6 +42,7 @@ def evaluate(
     for index in range(count):
         scene = draw_scene(scenes, SceneKey(seed, index, width, height), len(model.class_names))
         images, _ = collate([scene])
+        true_ids = np.asarray(scene[2], np.int64)
         found = select_boxes(model, model(network_input(images)), confidence=confidence, iou=iou)
         results.append(
             ImageResult(
@@ -49,7 +50,8 @@ def evaluate(
                 found.confidence,
                 found.class_id,
                 np.asarray(scene[1], np.float32),
-                np.asarray(scene[2], np.int64),
+                np.where(true_ids < 0, ~true_ids, true_ids),
+                true_ids < 0,
             )
         )
     return score_detections(results, model.class_names)

@@ -52,11 +52,14 @@ class Truth:
         boxes: (B, M, 4) float32, pixels xyxy of the network's input.
         classes: (B, M) int64.
         present: (B, M) bool, false for padding.
+        ignored: (B, M) bool: objects too small or too much hidden to be learned. Where one is, its class is
+            neither asked for nor held against the network; other classes are. None: there is none.
     """
 
     boxes: Tensor
     classes: Tensor
     present: Tensor
+    ignored: Tensor | None = None
 
 
 def ciou(first: Tensor, second: Tensor) -> Tensor:
@@ -153,9 +156,8 @@ def detection_loss(maps: Sequence[Tensor], strides: Sequence[float], truth: Trut
         )
     # The soft targets' sum is the batch's amount of evidence; below one object it must not blow losses up.
     evidence = target.class_scores.sum().clamp(min=1.0)
-    classes = (
-        F.binary_cross_entropy_with_logits(class_logits, target.class_scores, reduction="sum") / evidence
-    )
+    entropy = F.binary_cross_entropy_with_logits(class_logits, target.class_scores, reduction="none")
+    classes = (entropy * _judged(truth, centres, cell_sizes, target.class_scores)).sum() / evidence
 
     image, cell = target.foreground.nonzero(as_tuple=True)
     weight = target.class_scores[image, cell].sum(-1)
@@ -174,6 +176,19 @@ def detection_loss(maps: Sequence[Tensor], strides: Sequence[float], truth: Trut
         float(distribution.detach()),
         len(image) / max(len(flat), 1),
     )
+
+
+def _judged(truth: Truth, centres: Tensor, cell_sizes: Tensor, class_scores: Tensor) -> Tensor:
+    """(B, A, classes) 1, and 0 where an ignored object of the class is and nothing is to be learned."""
+    judged = torch.ones_like(class_scores)
+    if truth.ignored is None:
+        return judged
+    for image, item in truth.ignored.nonzero().tolist():
+        left, top, right, bottom = truth.boxes[image, item].tolist()
+        x, y, reach = centres[:, 0], centres[:, 1], cell_sizes / 2
+        inside = (x > left - reach) & (x < right + reach) & (y > top - reach) & (y < bottom + reach)
+        judged[image, inside, int(truth.classes[image, item])] = 0.0
+    return torch.where(class_scores > 0, 1.0, judged)
 
 
 def _boxes_from_bins(bin_logits: Tensor, centres: Tensor, cell_sizes: Tensor) -> Tensor:

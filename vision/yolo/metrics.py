@@ -16,7 +16,8 @@ IOU_THRESHOLDS: NDArray[np.float64] = np.linspace(0.5, 0.95, 10)
 # k / 100 rounds as a recall of found / objects does; multiples of a step would not, and miss by one bit.
 RECALL_POINTS = np.arange(101) / 100
 DETECTIONS_PER_IMAGE = 100
-_WRONG, _RIGHT, _NEITHER = 0, 1, 2
+WRONG, RIGHT, NEITHER = 0, 1, 2
+"""What a detection is: it finds no object, it finds one, or it lies on one that may or may not be found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +61,26 @@ class Score:
     images: int
 
 
+@dataclass(frozen=True, slots=True)
+class OperatingPoint:
+    """One class at one confidence and IoU 0.50: detections that are right and wrong, and the true objects.
+
+    `precision` and `recall` are NaN where there is no detection, no object.
+    """
+
+    right: int
+    wrong: int
+    objects: int
+
+    @property
+    def precision(self) -> float:
+        return self.right / (self.right + self.wrong) if self.right + self.wrong else float("nan")
+
+    @property
+    def recall(self) -> float:
+        return self.right / self.objects if self.objects else float("nan")
+
+
 def box_iou(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float64]:
     """(N, 4) and (M, 4) boxes xyxy → (N, M) intersection over union."""
     a, b = first.astype(np.float64)[:, None], second.astype(np.float64)[None]
@@ -93,6 +114,31 @@ def score_detections(results: Sequence[ImageResult], class_names: Sequence[str])
         per_class,
         len(results),
     )
+
+
+def judge(result: ImageResult, confidence: float) -> NDArray[np.int8]:
+    """(N,) what each detection of an image is at IoU 0.50; NEITHER for those below `confidence`."""
+    verdict = np.full(len(result.class_ids), NEITHER, np.int8)
+    for class_id in np.unique(result.class_ids).tolist():
+        mine = np.flatnonzero((result.class_ids == class_id) & (result.confidences >= confidence))
+        mine = mine[np.argsort(-result.confidences[mine], kind="stable")]
+        true = result.true_class_ids == class_id
+        verdict[mine] = _verdicts(result.boxes[mine], result.true_boxes[true], result.ignored[true])[0]
+    return verdict
+
+
+def operating_points(
+    results: Sequence[ImageResult], class_names: Sequence[str], confidence: float
+) -> dict[str, OperatingPoint]:
+    """Class name → what all detections of at least this confidence come to."""
+    verdicts = [judge(result, confidence) for result in results]
+    points = {}
+    for class_id, name in enumerate(class_names):
+        said = [v[r.class_ids == class_id] for v, r in zip(verdicts, results, strict=True)]
+        right, wrong = (sum(int((v == kind).sum()) for v in said) for kind in (RIGHT, WRONG))
+        objects = sum(int(((r.true_class_ids == class_id) & ~r.ignored).sum()) for r in results)
+        points[name] = OperatingPoint(right, wrong, objects)
+    return points
 
 
 def average_precision(confidences: NDArray[np.float32], right: NDArray[np.bool_], objects: int) -> float:
@@ -140,7 +186,7 @@ def _score_class(results: Sequence[ImageResult], class_id: int) -> ClassScore:
         return ClassScore(0.0, 0.0, objects)
     confidence, verdict = np.concatenate(confidences), np.concatenate(verdicts, axis=1)
     precisions = [
-        average_precision(confidence[row != _NEITHER], row[row != _NEITHER] == _RIGHT, objects)
+        average_precision(confidence[row != NEITHER], row[row != NEITHER] == RIGHT, objects)
         for row in verdict
     ]
     return ClassScore(precisions[0], float(np.mean(precisions)), objects)
@@ -153,7 +199,7 @@ def _verdicts(
 
     `boxes` come in falling confidence.
     """
-    verdict = np.full((len(IOU_THRESHOLDS), len(boxes)), _WRONG, np.int8)
+    verdict = np.full((len(IOU_THRESHOLDS), len(boxes)), WRONG, np.int8)
     if not len(true_boxes):
         return verdict
     overlap = box_iou(boxes, true_boxes[~ignored])
@@ -163,10 +209,10 @@ def _verdicts(
         for index in range(len(boxes)):
             best = int(np.where(free, overlap[index], -1.0).argmax()) if len(free) else -1
             if best >= 0 and free[best] and overlap[index, best] >= threshold:
-                verdict[row, index] = _RIGHT
+                verdict[row, index] = RIGHT
                 free[best] = False
             elif inside[index] >= threshold:
-                verdict[row, index] = _NEITHER
+                verdict[row, index] = NEITHER
     return verdict
 
 

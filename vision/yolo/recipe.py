@@ -1,7 +1,8 @@
-"""The course of training that made the bundled weights, and the scenes they are judged on."""
+"""The two courses of training that made the bundled weights, and the scenes they are judged on."""
 
 from __future__ import annotations
 
+from vision.yolo.augmentation import Augmentation
 from vision.yolo.training import Stage, TrainingSettings
 
 HELD_OUT_SEED = 10_000_000
@@ -34,3 +35,25 @@ DEFAULT_RECIPE = TrainingSettings(
     threads=1,
     workers=1,
 )
+"""The first course: large objects from anywhere (`random_scene`), from random weights."""
+
+REFINEMENT = TrainingSettings(
+    class_names=DEFAULT_RECIPE.class_names,
+    depth_multiple=DEFAULT_RECIPE.depth_multiple,
+    width_multiple=DEFAULT_RECIPE.width_multiple,
+    max_channels=DEFAULT_RECIPE.max_channels,
+    # A scene of the camera's size is expensive to draw and has many pictures in it: whole at half its pixels,
+    # and parts of it at up to 1.3 times its own.
+    stages=(Stage(320, 256, 16, 8000, scenes=6_000, decay_steps=8000, drawn=(640, 480)),),
+    learning_rate=2e-3,
+    warmup_steps=150,
+    augmentation=Augmentation(
+        zoom_probability=0.6, zoom_min=0.9, zoom_max=1.3, min_side_px=5.0, min_area_px=60.0
+    ),
+    seed=2,
+    threads=1,
+    bfloat16=True,
+    workers=1,
+)
+"""The second, from the first one's weights: what a flight sees, near and far, and much that is no object
+(`training_scene`)."""

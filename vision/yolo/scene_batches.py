@@ -19,7 +19,8 @@ from vision.yolo.losses import Truth
 SceneSource = Callable[[np.random.Generator, int, int], LabelledImage]
 """`(rng, width, height) → (image (height, width, 3) uint8 BGR, boxes (N, 4) pixels xyxy, class ids (N,))`.
 
-All randomness must come from `rng`. With workers it must be picklable: a function of a module, or a
+A class id ~class marks an object that is not to be learned (`LabelledImage`). All randomness must come from
+`rng`. With workers it must be picklable: a function of a module, or a
 `functools.partial` of one.
 """
 
@@ -31,6 +32,7 @@ KEPT_BYTES = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4
 class SceneKey:
     """Names one training picture: scene number `scene` of `seed`, seen with augmentation number `view`.
 
+    The scene is drawn `width` by `height` pixels; `size` is the picture's (width, height), None: the same.
     Its random numbers follow from these alone: never from the process that draws it, nor from what it drew
     before.
     """
@@ -40,6 +42,7 @@ class SceneKey:
     width: int
     height: int
     view: int = 0
+    size: tuple[int, int] | None = None
 
 
 def draw_scene(scenes: SceneSource, key: SceneKey, class_count: int) -> LabelledImage:
@@ -59,7 +62,7 @@ def draw_scene(scenes: SceneSource, key: SceneKey, class_count: int) -> Labelled
     class_ids = np.asarray(class_ids, np.int64).reshape(-1)
     if len(boxes) != len(class_ids):
         raise ValueError(f"a scene has {len(boxes)} boxes but {len(class_ids)} class ids")
-    if len(class_ids) and not (0 <= class_ids.min() and class_ids.max() < class_count):
+    if len(class_ids) and not (-class_count <= class_ids.min() and class_ids.max() < class_count):
         raise ValueError(f"class ids must be 0..{class_count - 1}, the source gave {np.unique(class_ids)}")
     return image, boxes, class_ids
 
@@ -71,12 +74,14 @@ def collate(scenes: Sequence[LabelledImage]) -> tuple[Tensor, Truth]:
     boxes = torch.zeros(len(scenes), most, 4)
     classes = torch.zeros(len(scenes), most, dtype=torch.int64)
     present = torch.zeros(len(scenes), most, dtype=torch.bool)
+    ignored = torch.zeros(len(scenes), most, dtype=torch.bool)
     for row, (_, scene_boxes, class_ids) in enumerate(scenes):
         count = len(class_ids)
         boxes[row, :count] = torch.from_numpy(scene_boxes)
-        classes[row, :count] = torch.from_numpy(class_ids)
-        present[row, :count] = True
-    return images, Truth(boxes, classes, present)
+        classes[row, :count] = torch.from_numpy(np.where(class_ids < 0, ~class_ids, class_ids))
+        present[row, :count] = torch.from_numpy(class_ids >= 0)
+        ignored[row, :count] = torch.from_numpy(class_ids < 0)
+    return images, Truth(boxes, classes, present, ignored)
 
 
 def network_input(images: Tensor) -> Tensor:
@@ -109,7 +114,7 @@ class _Scenes(Dataset[LabelledImage]):
                 self.drawn[plain] = scene
                 self.room -= scene[0].nbytes
         rng = np.random.default_rng([key.seed, key.scene, key.view])
-        return augment(rng, scene, self.augmentation)
+        return augment(rng, scene, self.augmentation, key.size)
 
 
 def _returning(plan: Sequence[Sequence[SceneKey]]) -> frozenset[SceneKey]:

@@ -13,10 +13,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from companion.cli import commands as companion_commands
 from companion.cli.commands import app
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
@@ -246,3 +248,19 @@ def test_setpoints_are_measured_and_told_as_json(tmp_path: Path) -> None:
     figures = json.loads(done.stdout)
     assert figures["rate_hz"] == 50.0
     assert figures["setpoints"] > 10
+
+
+def test_the_bundled_model_is_not_for_photographs_and_says_so_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "photo.png"
+    cv2.imwrite(str(picture), np.full((64, 96, 3), 90, np.uint8))
+    done = companion("detect", picture, "--image-size", "96", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
+    assert "'default'" in line
+    warn = companion_commands._warn_drawn_scenes_only
+    warn([("shm://simulator", "default"), ("/dev/video0", "yolo11n")])
+    assert capsys.readouterr().err == ""
+    warn([("shm://simulator", "default"), ("/dev/video0", "default"), ("/dev/video1", "default")])
+    assert capsys.readouterr().err.count("models pull") == 1
