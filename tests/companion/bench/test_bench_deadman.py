@@ -27,7 +27,7 @@ def flight(speeds, modes=None, start_ns=0, step_ns=20_000_000):
     left=st.integers(0, 100),
     start=st.integers(0, 10**12),
 )
-def test_the_first_moment_of_each_counts(braked, stood, left, start):
+def test_the_first_moment_of_each_counts(braked, stood, left, start) -> None:
     slow, still = braked, braked + stood
     speeds = [2.0] * (50 + slow) + [1.0] * (still - slow) + [0.1] * 10
     modes = ["OFFBOARD"] * (50 + min(left, still)) + ["HOLD"] * (len(speeds) - 50 - min(left, still))
@@ -37,7 +37,7 @@ def test_the_first_moment_of_each_counts(braked, stood, left, start):
     assert told.failsafe_s == pytest.approx(min(left, still) * 0.02)
 
 
-def test_what_never_came_is_none_and_a_flight_without_a_beginning_is_refused():
+def test_what_never_came_is_none_and_a_flight_without_a_beginning_is_refused() -> None:
     rows = flight([2.0] * 100)
     told = reaction(rows, 1_000_000_000)
     assert (told.braking_s, told.standing_s, told.failsafe_s) == (None, None, None)
@@ -45,7 +45,7 @@ def test_what_never_came_is_none_and_a_flight_without_a_beginning_is_refused():
         reaction(rows, 10_000_000_000)
 
 
-def test_the_table_tells_the_longest_and_how_often_it_never_came():
+def test_the_table_tells_the_longest_and_how_often_it_never_came() -> None:
     out = io.StringIO()
     figures = {"x": {"braking_s": [0.2, 0.35], "standing_s": [None, 1.5], "failsafe_s": [None, None]}}
     Console(file=out, width=100).print(deadman_table(figures))

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import pytest
-from guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
@@ -17,6 +16,7 @@ from companion.guidance.interface import Answer, CommandInput, EventKind, FindGi
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
 from companion.vehicle.state import FlightMode, LandedState
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 
 
 def test_a_takeoff_that_loses_its_position_stops_to_climb() -> None:
@@ -143,8 +143,8 @@ def test_the_old_goal_is_forgotten_when_somebody_else_flies() -> None:
 
 @pytest.mark.parametrize(("speed_mps", "nearest_m"), [(0.5, 4.2), (0.8, 3.9)])
 def test_an_approach_backs_off_from_what_comes_nearer(speed_mps: float, nearest_m: float) -> None:
-    from guidance_harness import Flight
-    from kinematic_vehicle import KinematicVehicle, SeenObject
+    from tests.companion.guidance.guidance_harness import Flight
+    from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
     car, vehicle = SeenObject("car", 20.0, 0.0), KinematicVehicle()
     ranges: list[float] = []

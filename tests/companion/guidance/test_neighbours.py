@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_pose import NOW_NS, STATE
 
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
 from companion.guidance.neighbours import Anchor, Neighbours, missing_neighbours
 from companion.guidance.pose import Pose
 from companion.guidance.refusal import refusal
+from tests.companion.guidance.test_pose import NOW_NS, STATE
 
 SECOND = 10**9
 PLACE = Anchor(47.4, 8.5, 493.0, (0.0, 0.0, 0.0))
@@ -40,12 +40,12 @@ def state_at(now_ns):
 @given(
     st.floats(-80, 80), st.floats(-180, 180), st.tuples(*[st.floats(-3000, 3000)] * 2, st.floats(-100, 100))
 )
-def test_a_place_goes_round_the_globe_and_back(latitude, longitude, place):
+def test_a_place_goes_round_the_globe_and_back(latitude, longitude, place) -> None:
     anchor = Anchor(latitude, longitude, 100.0, (3.0, -4.0, 5.0))
     assert anchor.local(*anchor.globally(place)) == pytest.approx(place, abs=0.01)
 
 
-def test_local_origins_that_differ_do_not_matter():
+def test_local_origins_that_differ_do_not_matter() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(0), NOW_NS)
     # The own local origin is somewhere else: here stands at (1, 2, -5) of it.
@@ -53,7 +53,7 @@ def test_local_origins_that_differ_do_not_matter():
     assert alpha.position_ned_m == pytest.approx((11.0, 2.0, -5.0), abs=0.02)
 
 
-def test_the_age_counts_a_delay_though_the_clocks_differ_by_hours():
+def test_the_age_counts_a_delay_though_the_clocks_differ_by_hours() -> None:
     neighbours, apart_ns = Neighbours("beta", "b"), 7_000 * SECOND
     delays_s = [0.1, 0.03, 0.25]
     for index, delay_s in enumerate(delays_s):
@@ -64,7 +64,7 @@ def test_the_age_counts_a_delay_though_the_clocks_differ_by_hours():
     assert neighbours.ages_s(now_ns)["alpha"] == pytest.approx(0.3 - 0.03, abs=0.002)
 
 
-def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_ever():
+def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_ever() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(0), NOW_NS)
     for after_s, north, silent in ((0.5, 12.0, False), (3.0, 13.0, True)):
@@ -76,14 +76,14 @@ def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_eve
         assert alpha.heading_rad == pytest.approx(0.5 + 0.1 * min(after_s, 1.0))
 
 
-def test_who_is_silent_for_half_a_minute_is_forgotten():
+def test_who_is_silent_for_half_a_minute_is_forgotten() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(0), NOW_NS)
     assert neighbours.around(state_at(NOW_NS + 29 * SECOND), NOW_NS + 29 * SECOND).vehicles
     assert not neighbours.around(state_at(NOW_NS + 31 * SECOND), NOW_NS + 31 * SECOND).vehicles
 
 
-def test_what_comes_late_does_not_replace_what_is_newer():
+def test_what_comes_late_does_not_replace_what_is_newer() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(2 * SECOND), NOW_NS)
     neighbours.hear(pose(1 * SECOND, offset=(50.0, 0.0, 0.0)), NOW_NS + 1)
@@ -94,7 +94,7 @@ def test_what_comes_late_does_not_replace_what_is_newer():
     assert neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha").position_ned_m[0] > 50.0
 
 
-def test_the_own_message_is_nobody_and_a_namesake_is_somebody_else():
+def test_the_own_message_is_nobody_and_a_namesake_is_somebody_else() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(1, "beta", source="b"), NOW_NS)
     assert not neighbours.around(state_at(NOW_NS), NOW_NS).vehicles
@@ -105,7 +105,7 @@ def test_the_own_message_is_nobody_and_a_namesake_is_somebody_else():
     assert around.named("beta") is None
 
 
-def test_without_an_own_place_nobody_can_be_placed():
+def test_without_an_own_place_nobody_can_be_placed() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(1), NOW_NS)
     around = neighbours.around(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
@@ -122,7 +122,7 @@ class Needy(Behaviour):
         raise NotImplementedError
 
 
-def test_a_behaviour_that_needs_a_neighbour_is_refused_with_its_name():
+def test_a_behaviour_that_needs_a_neighbour_is_refused_with_its_name() -> None:
     neighbours = Neighbours("beta", "b")
 
     def words(now_ns):

@@ -1,10 +1,8 @@
 import math
 
 import pytest
-from guidance_harness import GuidanceHarness
 from hypothesis import given
 from hypothesis import strategies as st
-from kinematic_vehicle import KinematicVehicle
 
 from companion.bench.flights_obstacles import ALLOWED_M, MARGIN_M, run
 from companion.guidance.behaviour import Situation
@@ -23,6 +21,8 @@ from companion.guidance.obstacles import (
 from companion.guidance.refusal import refusal
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import GuidanceHarness
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.obstacle_sectors import SECTORS, ObstacleSectors
 
 NAN, INF = math.nan, math.inf
@@ -41,13 +41,13 @@ def situation(obstacles, *, age_s=0.0, vehicle=None):
 
 
 @given(left_m=st.floats(0.0, 50.0), late_s=st.floats(0.1, 2.0))
-def test_the_speed_allowed_always_stops_in_the_way_that_is_left(left_m, late_s):
+def test_the_speed_allowed_always_stops_in_the_way_that_is_left(left_m, late_s) -> None:
     speed = speed_towards(left_m, late_s, 0.7)
     assert speed >= 0.0
     assert speed * late_s + speed**2 / (2 * 0.7) <= left_m + 1e-6
 
 
-def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it():
+def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it() -> None:
     vehicle = KinematicVehicle(velocity=[0.0, 1.0, 0.0])
     now_ns = vehicle.now_ns
     # A wall 2 m north, at right angles.
@@ -63,7 +63,7 @@ def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it():
     assert away.sent.velocity_ned_mps[0] < 0.0
 
 
-def test_a_place_behind_an_obstacle_is_not_flown_to():
+def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
     vehicle = KinematicVehicle()
     envelope = Envelope()
     near = sectors(vehicle.now_ns, {0: 3.0, 1: 3.0, -1: 3.0})
@@ -74,7 +74,7 @@ def test_a_place_behind_an_obstacle_is_not_flown_to():
     assert sent.sent.position_ned_m[0] < 1.0
 
 
-def test_unknown_is_not_limited_unless_the_operator_says_so():
+def test_unknown_is_not_limited_unless_the_operator_says_so() -> None:
     seen = sectors(KinematicVehicle().now_ns, rest=NAN)
     assert ObstacleRules("auto").rows(situation(seen)) == ()
     rows = ObstacleRules("auto", unknown_speed_mps=1.0).rows(situation(seen))
@@ -82,7 +82,7 @@ def test_unknown_is_not_limited_unless_the_operator_says_so():
     assert {row[2] for row in rows} == {1.0}
 
 
-def test_depth_that_stops_coming_is_named_and_brakes():
+def test_depth_that_stops_coming_is_named_and_brakes() -> None:
     vehicle = KinematicVehicle()
     seen = sectors(vehicle.now_ns)
     rules = ObstacleRules("auto")
@@ -93,7 +93,7 @@ def test_depth_that_stops_coming_is_named_and_brakes():
     assert ObstacleRules("off").blind(situation(seen, age_s=9.0)) is None
 
 
-def test_required_depth_that_is_missing_is_a_refusal_that_names_it():
+def test_required_depth_that_is_missing_is_a_refusal_that_names_it() -> None:
     goto = GotoBehaviour(from_here_m=(5.0, 0.0))
     rules = ObstacleRules("required")
     assert "needs depth (none came yet" in refusal(goto, situation(None), None, obstacles=rules)
@@ -101,7 +101,7 @@ def test_required_depth_that_is_missing_is_a_refusal_that_names_it():
     assert refusal(goto, situation(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
 
 
-def test_the_pilot_sends_a_brake_while_depth_is_missing():
+def test_the_pilot_sends_a_brake_while_depth_is_missing() -> None:
     harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
     harness.run(0.1)
     harness.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
@@ -122,7 +122,7 @@ def test_the_pilot_sends_a_brake_while_depth_is_missing():
     ]
 
 
-def test_what_has_left_the_picture_is_remembered_where_it_stands():
+def test_what_has_left_the_picture_is_remembered_where_it_stands() -> None:
     memory, vehicle = ObstacleMemory(), KinematicVehicle()
     memory.filled(situation(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
     vehicle.position[0] += 1.0
@@ -135,14 +135,14 @@ def test_what_has_left_the_picture_is_remembered_where_it_stands():
     )
 
 
-def test_the_message_tells_unknown_from_free():
+def test_the_message_tells_unknown_from_free() -> None:
     message = obstacles_message(sectors(5, {0: 1.234, 1: NAN}), "v")
     assert message["distance_m"][:3] == [1.23, None, None]
     assert message["known"][:3] == [True, False, True]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_goto_stops_before_what_stands_in_its_way(seed):
+def test_goto_stops_before_what_stands_in_its_way(seed) -> None:
     result = run(seed)
     assert result.success, result.reason
     assert result.values["nearest_m"] >= MARGIN_M - ALLOWED_M

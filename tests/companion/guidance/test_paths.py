@@ -7,10 +7,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from guidance_harness import Flight
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
@@ -23,6 +21,8 @@ from companion.guidance.goto import GotoBehaviour
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.guidance.registry import behaviour_for
 from companion.vehicle.setpoint import Setpoint
+from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import wrap_angle
 
 WIDE = Limits(max_distance_m=1000.0, max_altitude_m=100.0)
@@ -46,7 +46,7 @@ def off_the_line(place, start, end) -> float:
     return math.dist(place, [a + share * w for a, w in zip(start, way, strict=True)])
 
 
-def test_goto_flies_straight_there_and_stops_with_the_nose_along_the_way():
+def test_goto_flies_straight_there_and_stops_with_the_nose_along_the_way() -> None:
     flight, outcome = flown(GotoBehaviour(from_home_m=(20.0, -10.0), altitude_m=8.0))
     assert outcome.success
     assert math.dist(flight.vehicle.position, (20.0, -10.0, -8.0)) < 0.5
@@ -61,7 +61,7 @@ def test_goto_flies_straight_there_and_stops_with_the_nose_along_the_way():
     )
 
 
-def test_goto_by_the_nose_and_with_a_heading():
+def test_goto_by_the_nose_and_with_a_heading() -> None:
     vehicle = KinematicVehicle(position=[5.0, 5.0, -5.0], yaw_rad=math.pi / 2)
     flight, outcome = flown(GotoBehaviour(from_here_m=(10.0, 2.0), heading_rad=math.pi), vehicle=vehicle)
     assert outcome.success
@@ -69,19 +69,19 @@ def test_goto_by_the_nose_and_with_a_heading():
     assert abs(wrap_angle(flight.vehicle.yaw_rad - math.pi)) < 0.05
 
 
-def test_goto_where_it_is_already_ends_at_once_and_in_success():
+def test_goto_where_it_is_already_ends_at_once_and_in_success() -> None:
     _, outcome = flown(GotoBehaviour(from_here_m=(0.0, 0.0)), 10.0)
     assert outcome.success
 
 
-def test_goto_by_latitude_and_longitude_needs_to_know_its_own():
+def test_goto_by_latitude_and_longitude_needs_to_know_its_own() -> None:
     behaviour = GotoBehaviour(global_deg=(47.0, 8.0))
     _, outcome = flown(behaviour)
     assert not outcome.success
     assert "does not know its latitude" in outcome.reason
 
 
-def test_goto_by_latitude_and_longitude():
+def test_goto_by_latitude_and_longitude() -> None:
     vehicle = KinematicVehicle()
     here = {"latitude_deg": 47.397742, "longitude_deg": 8.545594}
     state = replace(vehicle.state, global_ns=vehicle.now_ns, **here)
@@ -96,7 +96,7 @@ def test_goto_by_latitude_and_longitude():
     assert abs(step.velocity_ned_mps[1]) < 1e-6
 
 
-def test_a_goal_beyond_a_limit_is_given_up_with_the_reason():
+def test_a_goal_beyond_a_limit_is_given_up_with_the_reason() -> None:
     flight = Flight(GotoBehaviour(from_home_m=(60.0, 0.0)), limits=Limits(max_distance_m=30.0))
     outcome = flight.run(120.0)
     assert outcome is not None
@@ -105,7 +105,7 @@ def test_a_goal_beyond_a_limit_is_given_up_with_the_reason():
     assert "guidance" in outcome.reason
 
 
-def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners():
+def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners() -> None:
     points = [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0, 8.0), (0.0, 20.0)]
     flight, outcome = flown(FollowPathBehaviour(points, 4.0))
     assert outcome.success, outcome.reason
@@ -116,7 +116,7 @@ def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners():
     assert max(min(off_the_line(place, *leg) for leg in legs) for place in flight.track) < 0.8
 
 
-def test_a_path_is_flown_round_and_round_from_a_vehicle_far_from_it():
+def test_a_path_is_flown_round_and_round_from_a_vehicle_far_from_it() -> None:
     points = [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)]
     vehicle = KinematicVehicle(position=[-60.0, 0.0, -5.0])
     flight, outcome = flown(FollowPathBehaviour(points, 3.0, laps=2.0), 200.0, vehicle)
@@ -129,7 +129,7 @@ def test_a_path_is_flown_round_and_round_from_a_vehicle_far_from_it():
     assert times_by == 2
 
 
-def test_where_a_path_turns_back_on_itself_it_is_flown_to_the_end_first():
+def test_where_a_path_turns_back_on_itself_it_is_flown_to_the_end_first() -> None:
     flight, outcome = flown(FollowPathBehaviour([(10.0, 0.0), (0.0, 0.0)], 3.0))
     assert outcome.success
     assert max(place[0] for place in flight.track) > 9.5
@@ -138,7 +138,7 @@ def test_where_a_path_turns_back_on_itself_it_is_flown_to_the_end_first():
     assert sum(a[0] < 3.4 <= b[0] for a, b in itertools.pairwise(flight.track)) == 3
 
 
-def test_a_round_is_begun_at_its_first_point_from_wherever():
+def test_a_round_is_begun_at_its_first_point_from_wherever() -> None:
     points = [(0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)]
     vehicle = KinematicVehicle(position=[30.0, -30.0, -5.0])
     flight, outcome = flown(FollowPathBehaviour(points, 4.0, laps=2.0), 200.0, vehicle)
@@ -148,13 +148,13 @@ def test_a_round_is_begun_at_its_first_point_from_wherever():
     assert first < second
 
 
-def test_a_steep_way_stays_on_its_line_within_the_limits_of_climb():
+def test_a_steep_way_stays_on_its_line_within_the_limits_of_climb() -> None:
     flight, outcome = flown(GotoBehaviour(from_home_m=(30.0, 0.0), altitude_m=35.0, speed_mps=8.0))
     assert outcome.success
     assert max(off_the_line(place, (0, 0, -5), (30, 0, -35)) for place in flight.track) < 1.5
 
 
-def test_a_slow_climb_is_as_slow_as_it_was_asked_for():
+def test_a_slow_climb_is_as_slow_as_it_was_asked_for() -> None:
     behaviour = GotoBehaviour(from_here_m=(0.0, 0.0), altitude_m=8.0, speed_mps=0.2)
     flight, outcome = flown(behaviour)
     assert outcome.success
@@ -162,7 +162,7 @@ def test_a_slow_climb_is_as_slow_as_it_was_asked_for():
     assert max(abs(b[2] - a[2]) for a, b in steps) < 0.25 / 50
 
 
-def test_a_place_about_home_needs_to_know_home():
+def test_a_place_about_home_needs_to_know_home() -> None:
     vehicle = KinematicVehicle()
     state = replace(vehicle.state, home_position_ned_m=None)
     for text in ("goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"):
@@ -173,7 +173,7 @@ def test_a_place_about_home_needs_to_know_home():
         assert "where home is" in step.reason
 
 
-def test_an_eight_is_flown_on_its_line():
+def test_an_eight_is_flown_on_its_line() -> None:
     flight, outcome = flown(FigureEightBehaviour(10.0, 2.5, 1.0), vehicle=KinematicVehicle(yaw_rad=0.7))
     assert outcome.success, outcome.reason
     line = lemniscate((0.0, 0.0, -5.0), 0.7, 10.0)
@@ -187,7 +187,7 @@ def test_an_eight_is_flown_on_its_line():
 
 @given(st.lists(places, min_size=2, max_size=8), st.booleans(), st.floats(0.5, 15))
 @settings(max_examples=60, deadline=None)
-def test_speeds_along_any_path_can_be_flown(points, closed, speed_mps):
+def test_speeds_along_any_path_can_be_flown(points, closed, speed_mps) -> None:
     points = [tuple(point) for point in points]
     if all(math.dist(point, points[0]) < 0.01 for point in points):
         with pytest.raises(ValueError, match="two different points"):
@@ -214,7 +214,7 @@ def test_speeds_along_any_path_can_be_flown(points, closed, speed_mps):
 
 @given(st.lists(places, min_size=2, max_size=6), st.tuples(*[st.floats(-200, 200)] * 3))
 @settings(max_examples=60, deadline=None)
-def test_progress_never_goes_back_and_velocities_are_finite(points, position):
+def test_progress_never_goes_back_and_velocities_are_finite(points, position) -> None:
     points = [tuple(point) for point in points]
     if all(math.dist(point, points[0]) < 0.01 for point in points):
         return
@@ -228,7 +228,7 @@ def test_progress_never_goes_back_and_velocities_are_finite(points, position):
 
 
 @given(st.floats(-60, 60), st.floats(-180, 180), st.floats(-2000, 2000), st.floats(-2000, 2000))
-def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_m, east_m):
+def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_m, east_m) -> None:
     """Against the chord between the two places in earth-centred coordinates."""
 
     def earth_centred(place):
@@ -262,7 +262,7 @@ def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_
         ("figure-eight radius=1", "3 to 200"),
     ],
 )
-def test_what_cannot_be_meant_is_one_line(text, words):
+def test_what_cannot_be_meant_is_one_line(text, words) -> None:
     with pytest.raises(GrammarError, match=words):
         grammar.parse(text)
 
@@ -277,12 +277,12 @@ def test_what_cannot_be_meant_is_one_line(text, words):
         "figure-eight radius=8 nose=still",
     ],
 )
-def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text):
+def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text) -> None:
     command = grammar.parse(text)
     assert grammar.parse(str(command)) == command
     assert behaviour_for(command).name == command.word
     assert command.endless == ("laps=0" in text)
 
 
-def test_points_may_stand_without_quotes():
+def test_points_may_stand_without_quotes() -> None:
     assert grammar.parse("follow-path 0,0 10,0 10,10,4").places == ((0, 0), (10, 0), (10, 10, 4))

@@ -1,13 +1,13 @@
 import math
 
 import pytest
-from guidance_harness import Flight, GuidanceHarness
-from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.grammar import parse
 from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.registry import behaviour_for
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 ROUND = ((0.0, 0.0), (24.0, 0.0), (24.0, 24.0), (0.0, 24.0))
 
@@ -29,7 +29,7 @@ def nearest(flight, place):
     return min(math.dist(place, position[:2]) for position in flight.track)
 
 
-def test_a_round_without_anything_to_see_is_flown_whole():
+def test_a_round_without_anything_to_see_is_flown_whole() -> None:
     outcome, notes, flight = flown(PatrolBehaviour(ROUND, ["car"], laps=1.0), [SeenObject("person", 10, 3)])
     assert outcome is not None
     assert outcome.success, outcome.reason
@@ -38,7 +38,7 @@ def test_a_round_without_anything_to_see_is_flown_whole():
     assert max(nearest(flight, corner) for corner in ROUND) < 1.5
 
 
-def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_left_the_way():
+def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_left_the_way() -> None:
     car = SeenObject("car", 18.0, 6.0, track_id=7)
     behaviour = PatrolBehaviour(ROUND, ["person", "car"], laps=1.0, wait_s=4.0)
     standing = []
@@ -64,7 +64,7 @@ def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_l
             assert nearest(flight, wanted) < 1.5, wanted
 
 
-def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way():
+def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way() -> None:
     car = SeenObject("car", 16.0, 9.0, track_id=3)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, wait_s=1.0)
     outcome, notes, flight = flown(behaviour, [car])
@@ -77,7 +77,7 @@ def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way():
 
 
 @pytest.mark.parametrize("with_identity", [True, False])
-def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity):
+def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity) -> None:
     car = SeenObject("car", 12.0, 5.0, track_id=7 if with_identity else None)
     outcome, notes, _ = flown(
         PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=600.0), [car], 400
@@ -92,7 +92,7 @@ def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_iden
     assert len(notes) >= 2
 
 
-def test_two_objects_of_a_class_stop_it_once_each():
+def test_two_objects_of_a_class_stop_it_once_each() -> None:
     cars = [SeenObject("car", 15.0, 4.0, track_id=1), SeenObject("car", 20.0, 16.0, track_id=2)]
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, wait_s=1.0)
     outcome, notes, _ = flown(behaviour, cars)
@@ -101,7 +101,7 @@ def test_two_objects_of_a_class_stop_it_once_each():
     assert sorted(note.split("(")[1][:7] for note in notes) == ["track 1", "track 2"]
 
 
-def test_what_does_not_count_as_true_does_not_stop_it():
+def test_what_does_not_count_as_true_does_not_stop_it() -> None:
     outcome, notes, _ = flown(
         PatrolBehaviour(ROUND, ["car"], laps=1.0), [SeenObject("car", 15.0, 4.0, trusted=False)]
     )
@@ -110,7 +110,7 @@ def test_what_does_not_count_as_true_does_not_stop_it():
     assert notes == []
 
 
-def test_what_vanishes_before_it_is_faced_is_told_and_the_round_goes_on():
+def test_what_vanishes_before_it_is_faced_is_told_and_the_round_goes_on() -> None:
     car = SeenObject("car", 12.0, 8.0, track_id=9)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0)
 
@@ -124,7 +124,7 @@ def test_what_vanishes_before_it_is_faced_is_told_and_the_round_goes_on():
     assert notes == ["patrol: lost sight of a car (track 9) before it was faced"]
 
 
-def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_not():
+def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_not() -> None:
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0)
     flight = Flight(behaviour, KinematicVehicle())
 
@@ -146,7 +146,7 @@ def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_no
     assert math.hypot(*flight.vehicle.velocity) < 0.1
 
 
-def test_the_grammar_of_a_patrol():
+def test_the_grammar_of_a_patrol() -> None:
     command = parse('patrol "0,0 20,0 20,20" classes=Person,CAR do=approach distance=3', ("person", "car"))
     assert command.names == ("person", "car")
     assert parse(str(command)) == command
@@ -163,7 +163,7 @@ def test_the_grammar_of_a_patrol():
             parse(text, ("person", "car") if "zebra" in text else None)
 
 
-def test_a_pilots_mode_ends_a_patrol_and_an_operators_command_takes_its_place():
+def test_a_pilots_mode_ends_a_patrol_and_an_operators_command_takes_its_place() -> None:
     harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
     harness.run(0.1)
     future = harness.command(PatrolBehaviour(ROUND, ["car"]))

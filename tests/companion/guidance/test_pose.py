@@ -50,11 +50,11 @@ STATE = VehicleState(
     "pose",
     [POSE, replace(POSE, formation=None), replace(POSE, formation=replace(NOTE, wish=None, structure=None))],
 )
-def test_a_pose_comes_back_from_its_message_as_it_was(pose):
+def test_a_pose_comes_back_from_its_message_as_it_was(pose) -> None:
     assert pose_from_message(json.loads(json.dumps(pose_message(pose)))) == pose
 
 
-def test_a_vehicle_tells_where_it_is_and_how_old_that_is():
+def test_a_vehicle_tells_where_it_is_and_how_old_that_is() -> None:
     pose = pose_of(STATE, NOW_NS, vehicle="beta", source="s")
     assert pose is not None
     assert (pose.age_s, pose.latitude_deg, pose.altitude_m) == (0.02, 47.4, 493.0)
@@ -73,11 +73,11 @@ def test_a_vehicle_tells_where_it_is_and_how_old_that_is():
         replace(STATE, velocity_ned_mps=None),
     ],
 )
-def test_a_vehicle_that_does_not_know_its_place_tells_nothing(state):
+def test_a_vehicle_that_does_not_know_its_place_tells_nothing(state) -> None:
     assert pose_of(state, NOW_NS, vehicle="beta", source="s") is None
 
 
-def test_the_heading_turns_by_the_body_rates_through_roll():
+def test_the_heading_turns_by_the_body_rates_through_roll() -> None:
     banked = replace(
         STATE,
         attitude=quaternion_from_euler(math.pi / 6, 0.0, 0.7),
@@ -104,7 +104,7 @@ def test_the_heading_turns_by_the_body_rates_through_roll():
         (("formation", "structure", "origin"), [0.0, 0.0, 1e9], "origin must be"),
     ],
 )
-def test_a_message_that_is_no_pose_is_refused_by_name(path, value, words):
+def test_a_message_that_is_no_pose_is_refused_by_name(path, value, words) -> None:
     message = json.loads(json.dumps(pose_message(POSE)))
     inner = message
     for key in path[:-1]:
@@ -115,7 +115,7 @@ def test_a_message_that_is_no_pose_is_refused_by_name(path, value, words):
 
 
 @pytest.mark.parametrize("key", list(pose_message(POSE)))
-def test_a_message_without_one_of_its_fields_is_refused(key):
+def test_a_message_without_one_of_its_fields_is_refused(key) -> None:
     message = pose_message(POSE)
     del message[key]
     with pytest.raises(PoseError, match=f"{key} is missing"):
@@ -130,7 +130,7 @@ json_value = st.recursive(
 
 
 @given(st.sampled_from(sorted(pose_message(POSE))), json_value)
-def test_whatever_stands_in_a_field_it_is_a_pose_or_refused(key, value):
+def test_whatever_stands_in_a_field_it_is_a_pose_or_refused(key, value) -> None:
     message = pose_message(POSE)
     message[key] = value
     try:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import pytest
-from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.behaviour import Situation
 from companion.guidance.grammar import parse
 from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.refusal import refusal
 from companion.guidance.registry import behaviour_for
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel
 
 NEEDING = ("approach kite", "follow kite", "orbit kite", 'patrol "0,0 9,9" classes=kite do=approach')

@@ -2,16 +2,16 @@ import math
 from itertools import pairwise
 
 import pytest
-from guidance_harness import Flight
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
 from companion.guidance.search import SearchBehaviour
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
 from companion.guidance.target import DOUBTED
+from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
 def beside(place, points):
@@ -28,14 +28,14 @@ unit = st.floats(-1.0, 1.0)
 
 
 @given(st.floats(1, 100), st.floats(2, 40), unit, unit)
-def test_every_place_of_the_square_is_passed_within_half_a_spacing(radius, spacing, north, east):
+def test_every_place_of_the_square_is_passed_within_half_a_spacing(radius, spacing, north, east) -> None:
     points = expanding_square(radius, spacing)
     assert beside((north * radius, east * radius), points) <= spacing / 2 + 1e-6
     assert all(max(map(abs, point)) <= radius + spacing / 2 + 1e-6 for point in points)
 
 
 @given(st.floats(1, 200), st.floats(1, 200), st.floats(2, 40), unit, unit)
-def test_every_place_of_the_area_is_passed_within_half_a_spacing(width, height, spacing, north, east):
+def test_every_place_of_the_area_is_passed_within_half_a_spacing(width, height, spacing, north, east) -> None:
     points = lawnmower(width, height, spacing)
     assert beside((north * height / 2, east * width / 2), points) <= spacing / 2 + 1e-6
     assert all(abs(p[0]) <= height / 2 + 1e-9 and abs(p[1]) <= width / 2 + 1e-9 for p in points)
@@ -43,13 +43,13 @@ def test_every_place_of_the_area_is_passed_within_half_a_spacing(width, height, 
 
 @settings(max_examples=30)
 @given(st.floats(0.2, 2.5), st.floats(-0.5, 1.5), st.floats(1, 60))
-def test_the_spacing_is_less_than_what_the_camera_sees(fov, depression, height):
+def test_the_spacing_is_less_than_what_the_camera_sees(fov, depression, height) -> None:
     spacing = Footprint(fov, depression).spacing_m(height)
     assert 1.0 <= spacing <= max(1.0, 2 * 25.0 * math.tan(fov / 2))
     assert Footprint(fov, depression).spacing_m(height * 2) >= spacing
 
 
-def test_a_camera_that_looks_steeply_down_needs_narrow_strips():
+def test_a_camera_that_looks_steeply_down_needs_narrow_strips() -> None:
     down = Footprint(math.radians(80), math.radians(90)).spacing_m(10.0)
     assert down == pytest.approx(0.8 * 2 * 10 * math.tan(math.radians(40)))
     assert Footprint(math.radians(80), 0.0).spacing_m(10.0) == pytest.approx(
@@ -60,7 +60,7 @@ def test_a_camera_that_looks_steeply_down_needs_narrow_strips():
 @pytest.mark.parametrize(
     "text", ["pattern=square radius=12 spacing=8", "pattern=lawnmower width=24 height=16 spacing=8"]
 )
-def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text):
+def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text) -> None:
     car = SeenObject("car", 6.0, -9.0, track_id=4)
 
     def each(seconds, vehicle):
@@ -76,7 +76,7 @@ def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text):
     assert outcome.reason.startswith("found a car: bearing ")
 
 
-def test_an_area_without_the_object_is_flown_whole_and_the_reason_is_told():
+def test_an_area_without_the_object_is_flown_whole_and_the_reason_is_told() -> None:
     doubtful = SeenObject("car", 6.0, 2.0, trusted=False)
     flight = Flight(SearchBehaviour("car", radius_m=8.0, spacing_m=8.0), KinematicVehicle(), [doubtful])
     outcome = flight.run(120.0)
@@ -84,7 +84,7 @@ def test_an_area_without_the_object_is_flown_whole_and_the_reason_is_told():
     assert outcome.reason == f"no car seen in the whole area: {DOUBTED}"
 
 
-def test_without_spacing_or_camera_a_search_says_what_is_missing():
+def test_without_spacing_or_camera_a_search_says_what_is_missing() -> None:
     outcome = Flight(SearchBehaviour("car", radius_m=30.0), KinematicVehicle()).run(1.0)
     assert outcome is not None
     assert outcome.reason == "seek: the camera's footprint is not known: give spacing"
@@ -100,6 +100,6 @@ def test_without_spacing_or_camera_a_search_says_what_is_missing():
         ("seek car pattern=zigzag", "turn or square or lawnmower"),
     ],
 )
-def test_the_area_fits_the_pattern(text, said):
+def test_the_area_fits_the_pattern(text, said) -> None:
     with pytest.raises(ValueError, match=said):
         parse(text)

@@ -1,17 +1,17 @@
 import math
 
 import pytest
-from guidance_harness import Flight
-from kinematic_vehicle import KinematicVehicle, SeenObject
 
 from companion.guidance.grammar import parse
 from companion.guidance.registry import behaviour_for
 from companion.guidance.seek import SeekBehaviour
+from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from vision.attitude import wrap_angle
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 179, 200, 300, 355])
-def test_seek_finds_an_object_in_any_direction_and_ends_facing_it(degrees):
+def test_seek_finds_an_object_in_any_direction_and_ends_facing_it(degrees) -> None:
     angle = math.radians(degrees)
     car = SeenObject("car", 12.0 * math.cos(angle), 12.0 * math.sin(angle))
     vehicle = KinematicVehicle()
@@ -23,7 +23,7 @@ def test_seek_finds_an_object_in_any_direction_and_ends_facing_it(degrees):
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.2
 
 
-def test_seek_gives_up_after_its_laps_counted_from_the_real_heading():
+def test_seek_gives_up_after_its_laps_counted_from_the_real_heading() -> None:
     vehicle = KinematicVehicle()
     turned = [0.0, 0.0]
 
@@ -37,13 +37,13 @@ def test_seek_gives_up_after_its_laps_counted_from_the_real_heading():
     assert turned[0] / math.tau == pytest.approx(2.0, abs=0.02)
 
 
-def test_seek_turns_the_other_way_when_told():
+def test_seek_turns_the_other_way_when_told() -> None:
     vehicle = KinematicVehicle()
     Flight(SeekBehaviour("car", clockwise=False), vehicle).run(2.0)
     assert vehicle.yaw_rad < -0.5
 
 
-def test_a_single_false_sighting_is_not_believed_and_the_turn_goes_on():
+def test_a_single_false_sighting_is_not_believed_and_the_turn_goes_on() -> None:
     ghost = SeenObject("car", 10.0, 3.0)
 
     def each(seconds, vehicle):
@@ -54,7 +54,7 @@ def test_a_single_false_sighting_is_not_believed_and_the_turn_goes_on():
     assert outcome.reason == "no car seen in 1 lap"
 
 
-def test_an_object_that_vanishes_before_it_is_faced_is_given_up_and_the_turn_goes_on():
+def test_an_object_that_vanishes_before_it_is_faced_is_given_up_and_the_turn_goes_on() -> None:
     car = SeenObject("car", 0.0, 10.0)
     flight = Flight(SeekBehaviour("car", laps=1.0), objects=[car])
     in_view_since = []
@@ -69,14 +69,14 @@ def test_an_object_that_vanishes_before_it_is_faced_is_given_up_and_the_turn_goe
     assert not outcome.success
 
 
-def test_sightings_without_enough_confidence_do_not_count():
+def test_sightings_without_enough_confidence_do_not_count() -> None:
     weak = SeenObject("car", 10.0, 0.0, confidence=0.3)
     outcome = Flight(SeekBehaviour("car", laps=0.5), objects=[weak]).run(60.0)
     assert outcome is not None
     assert not outcome.success
 
 
-def test_a_detector_that_falls_silent_stops_the_turn_and_then_ends_it():
+def test_a_detector_that_falls_silent_stops_the_turn_and_then_ends_it() -> None:
     flight = Flight(SeekBehaviour("car"))
 
     def each(seconds, vehicle):
@@ -100,7 +100,7 @@ def faces(vehicle, thing):
     return abs(wrap_angle(math.atan2(thing.east, thing.north) - vehicle.yaw_rad)) < math.radians(5)
 
 
-def test_the_command_compares_what_a_whole_turn_shows():
+def test_the_command_compares_what_a_whole_turn_shows() -> None:
     first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
     surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
     vehicle = KinematicVehicle()
@@ -111,7 +111,7 @@ def test_the_command_compares_what_a_whole_turn_shows():
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.3
 
 
-def test_without_a_whole_turn_the_first_is_faced():
+def test_without_a_whole_turn_the_first_is_faced() -> None:
     first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
     surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
     vehicle = KinematicVehicle()
@@ -119,7 +119,7 @@ def test_without_a_whole_turn_the_first_is_faced():
     assert faces(vehicle, first)
 
 
-def test_of_objects_as_sure_the_nearest_is_faced():
+def test_of_objects_as_sure_the_nearest_is_faced() -> None:
     far = SeenObject("car", 34.0, 12.0, track_id=1, track_score=0.85)
     near = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.8)
     vehicle = KinematicVehicle()
@@ -129,7 +129,7 @@ def test_of_objects_as_sure_the_nearest_is_faced():
     assert faces(vehicle, near)
 
 
-def test_both_of_two_in_one_view_are_compared():
+def test_both_of_two_in_one_view_are_compared() -> None:
     """The one that is surer in every frame has the poorer history."""
     poor = SeenObject("car", 20.0, 0.0, confidence=0.9, track_id=1, track_score=0.45)
     good = SeenObject("car", 20.0, 9.0, confidence=0.8, track_id=2, track_score=0.8)
@@ -138,7 +138,7 @@ def test_both_of_two_in_one_view_are_compared():
     assert faces(vehicle, good)
 
 
-def test_an_object_doubted_in_many_frames_comes_after_one_that_never_was():
+def test_an_object_doubted_in_many_frames_comes_after_one_that_never_was() -> None:
     doubted = SeenObject("car", 12.0, 6.0, track_id=1, track_score=0.8)
     clear = SeenObject("car", -25.0, 9.0, track_id=2, track_score=0.7)
     vehicle = KinematicVehicle()
@@ -152,7 +152,7 @@ def test_an_object_doubted_in_many_frames_comes_after_one_that_never_was():
     assert faces(vehicle, clear)
 
 
-def test_the_next_best_is_faced_where_the_best_has_gone():
+def test_the_next_best_is_faced_where_the_best_has_gone() -> None:
     best = SeenObject("car", 10.0, 10.0, track_id=1, track_score=0.9)
     other = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
@@ -166,7 +166,7 @@ def test_the_next_best_is_faced_where_the_best_has_gone():
     assert faces(vehicle, other)
 
 
-def test_what_is_doubted_when_it_is_faced_is_not_confirmed():
+def test_what_is_doubted_when_it_is_faced_is_not_confirmed() -> None:
     car = SeenObject("car", 10.0, 10.0, track_id=1, track_score=0.9)
 
     def each(seconds, vehicle):
@@ -177,7 +177,7 @@ def test_what_is_doubted_when_it_is_faced_is_not_confirmed():
     assert not outcome.success
 
 
-def test_less_than_a_lap_is_compared_as_far_as_it_goes():
+def test_less_than_a_lap_is_compared_as_far_as_it_goes() -> None:
     beyond = SeenObject("car", 0.0, -15.0, track_id=1, track_score=0.9)
     within = SeenObject("car", 0.0, 15.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
@@ -187,7 +187,7 @@ def test_less_than_a_lap_is_compared_as_far_as_it_goes():
     assert faces(vehicle, within)
 
 
-def test_a_second_lap_faces_its_first_find_at_once():
+def test_a_second_lap_faces_its_first_find_at_once() -> None:
     late = SeenObject("car", 0.0, 15.0, track_id=1, visible=False)
     vehicle = KinematicVehicle()
 
@@ -201,7 +201,7 @@ def test_a_second_lap_faces_its_first_find_at_once():
     assert seconds[-1] < 20.0
 
 
-def test_without_a_tracker_the_best_of_a_turn_is_found_by_bearing():
+def test_without_a_tracker_the_best_of_a_turn_is_found_by_bearing() -> None:
     far = SeenObject("car", 34.0, 12.0)
     near = SeenObject("car", -15.0, 9.0)
     vehicle = KinematicVehicle()

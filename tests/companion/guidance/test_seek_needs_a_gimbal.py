@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import pytest
-from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
@@ -17,6 +16,7 @@ from companion.guidance.refusal import refusal
 from companion.guidance.seek import SeekBehaviour
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from companion.vehicle.setpoint import Setpoint
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import quaternion_from_euler
 
 CARRIED = GimbalSight(carries_camera=True)

@@ -10,7 +10,6 @@ import math
 
 import numpy as np
 import pytest
-from gimbal_flight import CAMERA, FOOTPRINT, HEIGHT_M, PERSON_M, gimbal_flight, person
 
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject
@@ -19,6 +18,14 @@ from companion.guidance.registry import behaviour_for
 from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.target import Target
 from companion.missions.mission_file import plan_from
+from tests.companion.guidance.gimbal_flight import (
+    CAMERA,
+    FOOTPRINT,
+    HEIGHT_M,
+    PERSON_M,
+    gimbal_flight,
+    person,
+)
 
 # Two axes and an estimate: what the picture, the gimbal and the estimator are off by together.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
@@ -61,7 +68,7 @@ def pitches(log: FlightLog) -> list[float]:
 
 
 @pytest.mark.parametrize("bearing_deg", [0.0, 150.0])
-def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing_deg):
+def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing_deg) -> None:
     thing = person(bearing_deg)
     flight, log, seen = fly("seek person sweep=-60", thing)
     assert log.outcome is not None
@@ -78,7 +85,7 @@ def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing
     assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
 
 
-def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there():
+def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there() -> None:
     table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
     mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
     flight = LockstepFlight.airborne(seed=5, height_m=HEIGHT_M, gimbal=True)
@@ -91,13 +98,13 @@ def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there()
     assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
 
 
-def test_without_the_sweep_it_is_not_found():
+def test_without_the_sweep_it_is_not_found() -> None:
     _, log, _ = fly("seek person laps=1", person(0.0))
     assert log.outcome is not None
     assert (log.outcome.success, log.outcome.reason) == (False, "no person seen in 1 lap")
 
 
-def test_directions_and_places_are_right_while_the_gimbal_moves_and_the_vehicle_turns():
+def test_directions_and_places_are_right_while_the_gimbal_moves_and_the_vehicle_turns() -> None:
     """Another class is looked for, so that the sweep never stops; wind leans the vehicle."""
     thing = person(60.0)
     _, log, seen = fly("seek car sweep=-60 laps=1", thing, wind_mps=3.0)

@@ -8,12 +8,12 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.neighbours import Neighbour
 from companion.guidance.separation import Row, allowed_speed, apart, around, level_rows, pushed_apart, rows_at
 from companion.vehicle.setpoint import Setpoint
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 speeds = st.floats(-5, 5)
 velocity = st.tuples(speeds, speeds, st.floats(-2, 2))
@@ -24,7 +24,9 @@ def neighbour(place, moving=(0.0, 0.0, 0.0), *, name="alpha", age_s=0.1, role="a
 
 
 @given(st.floats(-5, 50), st.floats(-8, 8), st.floats(0, 1), st.floats(0.5, 5))
-def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(left, ahead, age, braking):
+def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(
+    left, ahead, age, braking
+) -> None:
     allowed = allowed_speed(left, ahead, age, braking)
     assert allowed >= 0.0
     assert allowed_speed(left - 0.5, ahead, age, braking) <= allowed
@@ -33,7 +35,7 @@ def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(lef
 
 
 @given(st.floats(0.1, 50), st.floats(0, 8), st.floats(0.5, 5))
-def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(left, ahead, braking):
+def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(left, ahead, braking) -> None:
     speed = allowed_speed(left, ahead, 0.1, braking)
     own_way = speed * 0.5 + speed**2 / 2 / braking
     assert own_way <= left + ahead**2 / 2 / braking + 1e-6
@@ -56,7 +58,7 @@ rows = st.lists(
 
 @settings(max_examples=200)
 @given(velocity, rows)
-def test_a_limit_takes_away_and_leaves_every_limit_kept(asked, limits):
+def test_a_limit_takes_away_and_leaves_every_limit_kept(asked, limits) -> None:
     left, names = apart(asked, limits)
     assert math.hypot(*left) <= math.hypot(*asked) + 1e-6
     for row in limits:
@@ -64,18 +66,18 @@ def test_a_limit_takes_away_and_leaves_every_limit_kept(asked, limits):
     assert (left == asked) or names
 
 
-def test_a_virtual_vehicle_is_no_obstacle():
+def test_a_virtual_vehicle_is_no_obstacle() -> None:
     assert rows_at((0, 0, 0), [neighbour((1.0, 0.0, 0.0), role="virtual")], 3.0, 2.0) == []
 
 
-def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not():
+def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not() -> None:
     (row,) = rows_at((0.0, 0.0, -10.0), [neighbour((0.0, 0.0, -6.0))], 3.0, 2.0)
     assert row.down == 1.0
     assert level_rows([row], 0.0) == []
     assert apart((3.0, 0.0, 1.0), [row])[0] == pytest.approx((3.0, 0.0, row.allowed_mps))
 
 
-def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right():
+def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right() -> None:
     def side(east):
         way, _ = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
         assert math.hypot(*way) == pytest.approx(2.0)
@@ -97,7 +99,7 @@ def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_r
     assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), ring, 4.0)[0] == (0.0, 0.0)
 
 
-def test_who_is_too_near_is_pushed_away_and_nobody_else():
+def test_who_is_too_near_is_pushed_away_and_nobody_else() -> None:
     assert pushed_apart((0, 0, 0), [neighbour((3.0, 0.0, 0.0)), neighbour((0.0, 9.0, 0.0))], 4.0) == (
         -0.8,
         0.0,
@@ -108,7 +110,9 @@ def test_who_is_too_near_is_pushed_away_and_nobody_else():
 
 @settings(max_examples=25, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(2, 5), st.booleans())
-def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(random, count, by_position):
+def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
+    random, count, by_position
+) -> None:
     """Whatever behaviours ask: each asks for the same place, or for a velocity of its own, at full speed."""
     fleet = [
         (
@@ -137,7 +141,7 @@ def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
             assert math.dist(one[0].position, other[0].position) >= 3.0, turn
 
 
-def test_the_envelope_says_from_whom_it_keeps_away():
+def test_the_envelope_says_from_whom_it_keeps_away() -> None:
     vehicle = KinematicVehicle()
     asked = Setpoint.velocity((1.0, 0.0, 0.0), vehicle.now_ns)
     vehicle.velocity = [1.0, 0.0, 0.0]

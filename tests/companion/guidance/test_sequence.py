@@ -1,8 +1,6 @@
 """Missions flown in lockstep by the real pilot, streamer and envelope."""
 
 import pytest
-from guidance_harness import GuidanceHarness
-from kinematic_vehicle import KinematicVehicle
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement
 from companion.guidance.hold import HoldBehaviour
@@ -12,6 +10,8 @@ from companion.missions.mission_file import plan_from
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
+from tests.companion.guidance.guidance_harness import GuidanceHarness
+from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
 def flying():
@@ -40,7 +40,7 @@ def told(harness):
     return [event.message for event in harness.events if event.kind is EventKind.NOTED]
 
 
-def test_a_mission_from_the_ground_and_back_to_it():
+def test_a_mission_from_the_ground_and_back_to_it() -> None:
     harness = GuidanceHarness(parked())
     behaviour = mission(
         harness,
@@ -60,7 +60,7 @@ def test_a_mission_from_the_ground_and_back_to_it():
     assert "offboard" in harness.autopilot.requests
 
 
-def test_between_two_steps_flown_by_setpoints_not_one_setpoint_is_missing():
+def test_between_two_steps_flown_by_setpoints_not_one_setpoint_is_missing() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(
         harness, {"do": "hold 1", "repeat": 2}, {"do": "goto 3 0"}, {"do": "orbit radius=3 laps=0.5"}
@@ -78,7 +78,7 @@ def test_between_two_steps_flown_by_setpoints_not_one_setpoint_is_missing():
     assert harness.autopilot.requests == ["offboard"]
 
 
-def test_from_a_landing_the_next_step_may_take_off_again():
+def test_from_a_landing_the_next_step_may_take_off_again() -> None:
     harness = GuidanceHarness(parked())
     behaviour = mission(
         harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}
@@ -88,7 +88,7 @@ def test_from_a_landing_the_next_step_may_take_off_again():
     assert harness.autopilot.requests.count("arm") == 2
 
 
-def test_a_step_that_fails_ends_the_mission_and_is_named_and_the_vehicle_holds():
+def test_a_step_that_fails_ends_the_mission_and_is_named_and_the_vehicle_holds() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(
         harness, {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
@@ -100,7 +100,7 @@ def test_a_step_that_fails_ends_the_mission_and_is_named_and_the_vehicle_holds()
     assert "land" not in harness.autopilot.requests
 
 
-def test_on_failure_branches_are_taken():
+def test_on_failure_branches_are_taken() -> None:
     harness = GuidanceHarness(flying())
     steps = [
         {"do": "hold 60", "timeout_s": 1, "on_failure": "other"},
@@ -118,7 +118,7 @@ def test_on_failure_branches_are_taken():
 
 
 @pytest.mark.parametrize(("way", "mode"), [("rtl", FlightMode.RETURN), ("land", FlightMode.LAND)])
-def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_same(way, mode):
+def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_same(way, mode) -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "hold 60", "timeout_s": 1, "name": "wait", "on_failure": way})
     future = begun(harness, behaviour)
@@ -131,7 +131,7 @@ def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_
     assert not harness.vehicle.armed
 
 
-def test_a_step_that_is_refused_fails_with_what_it_needs():
+def test_a_step_that_is_refused_fails_with_what_it_needs() -> None:
     harness = GuidanceHarness(parked())
     behaviour = mission(
         harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}
@@ -142,7 +142,7 @@ def test_a_step_that_is_refused_fails_with_what_it_needs():
     )
 
 
-def test_what_the_first_step_needs_refuses_the_mission_and_leaves_what_flies_alone():
+def test_what_the_first_step_needs_refuses_the_mission_and_leaves_what_flies_alone() -> None:
     harness = GuidanceHarness(flying())
     current = begun(harness, HoldBehaviour())
     refused = harness.command(mission(harness, {"do": "takeoff 3"}, {"do": "land"}))
@@ -155,14 +155,14 @@ def test_what_the_first_step_needs_refuses_the_mission_and_leaves_what_flies_alo
     assert current.result().reason == "replaced by mission"
 
 
-def test_a_class_the_detector_does_not_know_refuses_the_whole_mission():
+def test_a_class_the_detector_does_not_know_refuses_the_whole_mission() -> None:
     harness = GuidanceHarness(flying(), class_names=("person", "car"))
     harness.run(0.1)
     outcome = harness.command(mission(harness, {"do": "hold 1"}, {"do": "seek zebra"})).result()
     assert outcome == Outcome(False, "mission needs a detector that knows zebra")
 
 
-def test_a_mode_the_autopilot_refuses_is_the_failure_of_its_step_alone():
+def test_a_mode_the_autopilot_refuses_is_the_failure_of_its_step_alone() -> None:
     harness = GuidanceHarness(flying())
     harness.autopilot.refuse[FlightMode.LAND] = "land refused: no place"
     behaviour = mission(
@@ -181,7 +181,7 @@ def test_a_mode_the_autopilot_refuses_is_the_failure_of_its_step_alone():
     assert harness.autopilot.requests.count("offboard") == 1
 
 
-def test_a_refused_offboard_is_a_failure_of_the_step_and_nothing_is_sent_any_more():
+def test_a_refused_offboard_is_a_failure_of_the_step_and_nothing_is_sent_any_more() -> None:
     harness = GuidanceHarness(flying())
     harness.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
     behaviour = mission(harness, {"do": "hold 1", "name": "stay", "on_failure": "land"})
@@ -189,7 +189,7 @@ def test_a_refused_offboard_is_a_failure_of_the_step_and_nothing_is_sent_any_mor
     assert outcome.reason == "step 1 of 1 (stay): offboard refused; landed and disarmed"
 
 
-def test_an_arming_that_is_refused_ends_the_mission_on_the_ground():
+def test_an_arming_that_is_refused_ends_the_mission_on_the_ground() -> None:
     harness = GuidanceHarness(parked())
 
     harness.autopilot.refuse_arming = "arming refused: no GPS"
@@ -199,7 +199,7 @@ def test_an_arming_that_is_refused_ends_the_mission_on_the_ground():
     assert not harness.autopilot.setpoints
 
 
-def test_a_command_without_end_is_done_after_its_time():
+def test_a_command_without_end_is_done_after_its_time() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
     outcome = harness.outcome(begun(harness, behaviour))
@@ -207,7 +207,7 @@ def test_a_command_without_end_is_done_after_its_time():
     assert behaviour.records[0].reason == "flown for 4 s"
 
 
-def test_a_limit_of_visits_ends_a_loop():
+def test_a_limit_of_visits_ends_a_loop() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(
         harness,
@@ -219,7 +219,7 @@ def test_a_limit_of_visits_ends_a_loop():
     assert [record.title for record in behaviour.records] == ["a", "b"] * 3
 
 
-def test_steps_that_fail_at_once_do_not_go_round_for_ever():
+def test_steps_that_fail_at_once_do_not_go_round_for_ever() -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = None
     behaviour = mission(harness, {"do": "hold 0.2"}, {"do": "seek car", "name": "look", "on_failure": "look"})
@@ -229,7 +229,7 @@ def test_steps_that_fail_at_once_do_not_go_round_for_ever():
     assert "perception" in outcome.reason
 
 
-def test_the_time_of_the_whole_mission_ends_the_step_that_is_flown():
+def test_the_time_of_the_whole_mission_ends_the_step_that_is_flown() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "hold 60", "name": "wait", "on_failure": "continue"}, timeout_s=3)
     outcome = harness.outcome(begun(harness, behaviour))
@@ -237,7 +237,7 @@ def test_the_time_of_the_whole_mission_ends_the_step_that_is_flown():
 
 
 @pytest.mark.parametrize("mode", [FlightMode.POSITION, FlightMode.HOLD, FlightMode.RETURN])
-def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode):
+def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode) -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(
         harness, *({"do": "hold 0.1", "on_failure": "continue"} for _ in range(30)), {"do": "land"}
@@ -258,7 +258,7 @@ def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode):
     assert not harness.guidance.in_command
 
 
-def test_an_operators_command_ends_the_mission_at_once():
+def test_an_operators_command_ends_the_mission_at_once() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "hold 5", "on_failure": "land"}, {"do": "land"})
     future = begun(harness, behaviour)
@@ -283,11 +283,11 @@ class Broken(Behaviour):
             raise ZeroDivisionError("no such luck")
         return Setpoint.brake(situation.now_ns)
 
-    def on_deactivate(self):
+    def on_deactivate(self) -> None:
         self.left = True
 
 
-def test_what_goes_wrong_in_a_step_is_its_failure_and_the_plan_goes_on():
+def test_what_goes_wrong_in_a_step_is_its_failure_and_the_plan_goes_on() -> None:
     harness, broken = GuidanceHarness(flying()), Broken()
     plan = Plan(
         "test",
@@ -311,7 +311,7 @@ class Telling(HoldBehaviour):
     landing_target = TARGET
 
 
-def test_what_a_step_tells_and_needs_is_told_and_needed_by_the_mission():
+def test_what_a_step_tells_and_needs_is_told_and_needed_by_the_mission() -> None:
     harness, telling = GuidanceHarness(flying()), Telling(1.0)
     plan = Plan(
         "test", (PlannedStep("tell", "hold", lambda: telling),), way_down=lambda word: HoldBehaviour()

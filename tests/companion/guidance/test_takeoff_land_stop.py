@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import pytest
-from kinematic_vehicle import START_NS, KinematicVehicle
 
 from companion.guidance.behaviour import ModeRequest, Outcome, Situation
 from companion.guidance.land import LandBehaviour, ReturnBehaviour
@@ -11,6 +10,7 @@ from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
+from tests.companion.guidance.kinematic_vehicle import START_NS, KinematicVehicle
 
 PARKED = replace(
     KinematicVehicle(position=[0.0, 0.0, 0.0], armed=False, landed=LandedState.ON_GROUND).state,
@@ -27,7 +27,7 @@ def climbing(altitude_m, mode=FlightMode.TAKEOFF, landed=LandedState.TAKING_OFF)
     return {"armed": True, "mode": mode, "landed": landed, "position_ned_m": (0.0, 0.0, -altitude_m)}
 
 
-def test_takeoff_asks_the_autopilot_until_it_holds_near_the_height():
+def test_takeoff_asks_the_autopilot_until_it_holds_near_the_height() -> None:
     behaviour = TakeoffBehaviour(5.0)
     behaviour.on_activate(situation(0))
     request = ModeRequest(FlightMode.TAKEOFF, 5.0, arm=True)
@@ -42,7 +42,7 @@ def test_takeoff_asks_the_autopilot_until_it_holds_near_the_height():
     )
 
 
-def test_takeoff_climbs_the_rest_of_a_climb_that_was_ended_short():
+def test_takeoff_climbs_the_rest_of_a_climb_that_was_ended_short() -> None:
     behaviour = TakeoffBehaviour(2.5)
     behaviour.on_activate(situation(0))
     short = climbing(2.1, FlightMode.HOLD, LandedState.IN_AIR)
@@ -59,7 +59,7 @@ def test_takeoff_climbs_the_rest_of_a_climb_that_was_ended_short():
     )
 
 
-def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached():
+def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached() -> None:
     behaviour = TakeoffBehaviour(5.0)
     behaviour.on_activate(situation(0))
     outcome = behaviour.update(0.02, situation(60, armed=True, mode=FlightMode.TAKEOFF))
@@ -73,7 +73,7 @@ def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached(
         (ReturnBehaviour, FlightMode.RETURN, "returned, landed and disarmed"),
     ],
 )
-def test_the_ways_down_end_when_the_autopilot_has_disarmed(behaviour, mode, words):
+def test_the_ways_down_end_when_the_autopilot_has_disarmed(behaviour, mode, words) -> None:
     behaviour = behaviour()
     behaviour.on_activate(situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR)))
     assert behaviour.update(
@@ -86,14 +86,14 @@ def test_the_ways_down_end_when_the_autopilot_has_disarmed(behaviour, mode, word
 
 
 @pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour])
-def test_landing_what_stands_on_the_ground_is_done_at_once(behaviour):
+def test_landing_what_stands_on_the_ground_is_done_at_once(behaviour) -> None:
     behaviour = behaviour()
     behaviour.on_activate(situation(0))
     assert behaviour.update(0.0, situation(0)) == Outcome(True, "already on the ground, disarmed")
 
 
 @pytest.mark.parametrize(("behaviour", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
-def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(behaviour, seconds):
+def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(behaviour, seconds) -> None:
     behaviour = behaviour()
     aloft = climbing(5.0, FlightMode.LAND, LandedState.LANDING)
     behaviour.on_activate(situation(0, **aloft))
@@ -102,21 +102,21 @@ def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(behavi
     assert outcome.reason == f"{behaviour.name} timed out: landing and armed"
 
 
-def test_a_higher_or_further_vehicle_is_given_more_time():
+def test_a_higher_or_further_vehicle_is_given_more_time() -> None:
     near = situation(0, **climbing(5.0)).state
     far = replace(near, position_ned_m=(150.0, 0.0, -40.0))
     assert LandBehaviour().timeout_s(far) > LandBehaviour().timeout_s(near) + 50
     assert ReturnBehaviour().timeout_s(far) > ReturnBehaviour().timeout_s(near) + 50
 
 
-def test_stop_asks_for_hold_once_more_even_when_it_is_shown_already():
+def test_stop_asks_for_hold_once_more_even_when_it_is_shown_already() -> None:
     behaviour = StopBehaviour()
     behaviour.on_activate(situation(0))
     assert behaviour.update(0.0, situation(0)) == ModeRequest(FlightMode.HOLD)
     assert behaviour.update(0.02, situation(0.1)) == Outcome(True, "stopped: the autopilot holds")
 
 
-def test_stop_that_the_autopilot_does_not_follow_times_out_with_its_mode():
+def test_stop_that_the_autopilot_does_not_follow_times_out_with_its_mode() -> None:
     behaviour = StopBehaviour()
     behaviour.on_activate(situation(0))
     outcome = behaviour.update(0.02, situation(6, mode=FlightMode.OFFBOARD))

@@ -61,7 +61,7 @@ def optical_point(camera, mount, attitude, position, point):
     return mount.body_from_optical.T @ body
 
 
-def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_true():
+def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_true() -> None:
     tracks = [
         {},  # nobody looks for tracks
         {"track_id": None, "track_score": None, "track_state": "none"},
@@ -88,14 +88,14 @@ def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_tru
     ],
     ids=["much less sure", "nearly as sure", "a little surer", "surer", "beside it", "of its class"],
 )
-def test_one_thing_with_two_names_is_chosen_only_by_the_one_that_is_clearly_surer(other, trusted):
+def test_one_thing_with_two_names_is_chosen_only_by_the_one_that_is_clearly_surer(other, trusted) -> None:
     car = detection((310, 300, 330, 400))
     both = [car, detection((311, 300, 331, 400)) | other]
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     assert [t.trusted for t in targets_from_detections(both, T0, CAMERA, MOUNT, history)] == trusted
 
 
-def test_of_two_names_the_score_of_the_track_counts_not_that_of_a_frame():
+def test_of_two_names_the_score_of_the_track_counts_not_that_of_a_frame() -> None:
     tracks = {"track_state": "confirmed"}
     car = detection((310, 300, 330, 400)) | tracks | {"track_id": 1, "track_score": 0.9, "confidence": 0.5}
     truck = car | tracks | {"track_id": 2, "track_score": 0.6, "confidence": 0.8, "class_name": "truck"}
@@ -118,7 +118,7 @@ scenes = st.tuples(
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
 @given(scene=scenes)
-def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, scene):
+def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, scene) -> None:
     roll, pitch, yaw, distance, off, height, (north, east) = scene
     attitude = quaternion_from_euler(roll, pitch, yaw)
     home_down = 1.5
@@ -142,7 +142,7 @@ def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, s
 
 
 @given(scene=scenes, down=st.floats(-4.0, 4.0))
-def test_a_point_in_space_is_found_again_from_its_depth(scene, down):
+def test_a_point_in_space_is_found_again_from_its_depth(scene, down) -> None:
     roll, pitch, yaw, distance, off, height, (north, east) = scene
     attitude = quaternion_from_euler(roll, pitch, yaw)
     position = (north, east, -height)
@@ -165,7 +165,7 @@ def test_a_point_in_space_is_found_again_from_its_depth(scene, down):
     assert abs(wrap_angle(target.bearing_rad - bearing)) < 0.2 / (distance - 0.2)
 
 
-def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner():
+def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -8.0))
     # A wall square to the view, 6 m ahead, of which the right half is in the box.
     level = CameraMount()
@@ -180,7 +180,7 @@ def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner():
     assert math.atan2(east, north) == pytest.approx(bearing)
 
 
-def test_a_box_cut_by_the_edge_has_a_less_certain_range():
+def test_a_box_cut_by_the_edge_has_a_less_certain_range() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     whole, cut = targets_from_detections(
         [detection((10, 300, 60, 400), (-4, 1, 7)), detection((0, 300, 60, 400), (-4, 1, 7))],
@@ -193,7 +193,7 @@ def test_a_box_cut_by_the_edge_has_a_less_certain_range():
 
 
 @given(scene=scenes, tall_m=st.floats(0.8, 4.0))
-def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene, tall_m):
+def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene, tall_m) -> None:
     _, pitch, yaw, distance, _, height, (north, east) = scene
     attitude = quaternion_from_euler(0.0, pitch, yaw)  # so that it is upright in the picture
     position = (north, east, -height)
@@ -211,7 +211,7 @@ def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene, tal
     assert np.array(position) + found == pytest.approx(foot, abs=0.02 * distance)
 
 
-def test_a_known_height_tells_the_range_where_the_ground_does_not():
+def test_a_known_height_tells_the_range_where_the_ground_does_not() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -1.5))
     # 50 px tall before a camera that looks down by 20°, its foot near the horizon.
     box = [300, 50, 320, 100]
@@ -231,7 +231,7 @@ def test_a_known_height_tells_the_range_where_the_ground_does_not():
     assert known.ground_range_m == pytest.approx(1.7 / (top - bottom) + 0.1, rel=0.01)
 
 
-def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells():
+def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells() -> None:
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     heights = {"car": 1.5}
     (by_ground, by_depth) = targets_from_detections(
@@ -246,7 +246,7 @@ def test_a_known_height_does_not_replace_what_the_ground_or_depth_tells():
     assert by_depth.range_source is RangeSource.DEPTH
 
 
-def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range():
+def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0.7))
     (target,) = targets_from_detections([detection((300, 300, 339, 479))], T0, CAMERA, MOUNT, history)
     assert target.range_source is RangeSource.NONE
@@ -256,7 +256,7 @@ def test_a_box_cut_by_the_lower_edge_has_a_direction_but_no_range():
     assert target.elevation_rad < 0
 
 
-def test_a_foot_near_the_horizon_has_no_range():
+def test_a_foot_near_the_horizon_has_no_range() -> None:
     level = CameraMount()
     (target,) = targets_from_detections(
         [detection((310, 230, 330, 245))], T0, CAMERA, level, history_of(quaternion_from_euler(0, 0, 0))
@@ -264,13 +264,13 @@ def test_a_foot_near_the_horizon_has_no_range():
     assert target.range_source is RangeSource.NONE
 
 
-def test_on_the_ground_there_is_no_ground_plane_range():
+def test_on_the_ground_there_is_no_ground_plane_range() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0), (0.0, 0.0, -0.1))
     (target,) = targets_from_detections([detection((310, 300, 330, 400))], T0, CAMERA, MOUNT, history)
     assert target.range_source is RangeSource.NONE
 
 
-def test_a_depth_that_is_no_number_falls_back_to_the_ground():
+def test_a_depth_that_is_no_number_falls_back_to_the_ground() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0))
     (target,) = targets_from_detections(
         [detection((310, 300, 330, 400), (math.nan,) * 3)], T0, CAMERA, MOUNT, history
@@ -278,7 +278,7 @@ def test_a_depth_that_is_no_number_falls_back_to_the_ground():
     assert target.range_source is RangeSource.GROUND_PLANE
 
 
-def test_the_attitude_is_that_of_the_capture_not_of_now():
+def test_the_attitude_is_that_of_the_capture_not_of_now() -> None:
     history = StateHistory()
     for step in range(20):
         yaw = 0.05 * step
@@ -290,7 +290,7 @@ def test_the_attitude_is_that_of_the_capture_not_of_now():
     assert target.bearing_rad == pytest.approx(0.425, abs=1e-6)
 
 
-def test_position_and_height_are_interpolated_at_their_own_stamps():
+def test_position_and_height_are_interpolated_at_their_own_stamps() -> None:
     history = StateHistory()
     attitude = quaternion_from_euler(0, 0, 0)
     for step in range(5):
@@ -301,7 +301,7 @@ def test_position_and_height_are_interpolated_at_their_own_stamps():
     assert pose.height_m == pytest.approx(1.5)
 
 
-def test_moments_outside_the_history_are_refused_by_how_much():
+def test_moments_outside_the_history_are_refused_by_how_much() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0))
     history.at(T0 - 190_000_000)
     history.at(T0 + 180_000_000 + 190_000_000)
@@ -313,7 +313,7 @@ def test_moments_outside_the_history_are_refused_by_how_much():
         StateHistory().at(T0)
 
 
-def test_the_history_is_bounded_and_passes_over_old_stamps():
+def test_the_history_is_bounded_and_passes_over_old_stamps() -> None:
     history = StateHistory(duration_s=1.0)
     for step in range(1000):
         history.add(state_at(T0 + step * 20_000_000, quaternion_from_euler(0, 0, 0)))
@@ -326,7 +326,7 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for 
 
 
 @given(quaternions, quaternions, st.floats(0, 1))
-def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction):
+def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction) -> None:
     def angle(a, b):
         a, b = (np.array(q) / np.linalg.norm(q) for q in (a, b))
         return 2 * math.acos(min(1.0, abs(float(a @ b))))
@@ -338,6 +338,6 @@ def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction):
     assert angle(middle, second) == pytest.approx(whole * (1 - fraction), abs=2e-3)
 
 
-def test_slerp_takes_the_sign_of_quaternions_for_nothing():
+def test_slerp_takes_the_sign_of_quaternions_for_nothing() -> None:
     half = slerp(quaternion_from_euler(0, 0, 0.4), tuple(-v for v in quaternion_from_euler(0, 0, 0.8)), 0.5)
     assert euler_from_quaternion(half)[2] == pytest.approx(0.6)

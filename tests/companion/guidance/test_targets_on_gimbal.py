@@ -70,7 +70,9 @@ def history_of(
 @pytest.mark.parametrize("frame", list(YawFrame))
 @pytest.mark.parametrize("gimbal_every", [1, 10])
 @given(step=st.floats(0.0, 49.0))
-def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(frame, gimbal_every, step):
+def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(
+    frame, gimbal_every, step
+) -> None:
     """Also when the gimbal tells five times a second: between two words it moved evenly here."""
     history = history_of(frame, gimbal_every=gimbal_every)
     captured_ns = T0 + round(step * STEP_NS)
@@ -81,7 +83,7 @@ def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(f
 
 @pytest.mark.parametrize("frame", list(YawFrame))
 @given(step=st.floats(0.0, 49.0), right_m=st.floats(-2.0, 2.0), below_m=st.floats(-1.0, 1.0))
-def test_nearest_point_is_turned_by_the_gimbal_of_the_capture(frame, step, right_m, below_m):
+def test_nearest_point_is_turned_by_the_gimbal_of_the_capture(frame, step, right_m, below_m) -> None:
     point = np.array([right_m, below_m, 8.0])
     captured_ns = T0 + round(step * STEP_NS)
     box = dict(MIDDLE, nearest_camera_m=point.tolist(), depth_m=8.0)
@@ -100,7 +102,7 @@ def test_nearest_point_is_turned_by_the_gimbal_of_the_capture(frame, step, right
     assert (target.depth_m, target.range_source) == (8.0, RangeSource.DEPTH)
 
 
-def test_without_the_gimbals_attitude_a_box_has_no_direction_and_the_reason_is_told():
+def test_without_the_gimbals_attitude_a_box_has_no_direction_and_the_reason_is_told() -> None:
     history = StateHistory()
     level = quaternion_from_euler(0.0, 0.0, 0.0)
     state = VehicleState(
@@ -121,7 +123,7 @@ def test_without_the_gimbals_attitude_a_box_has_no_direction_and_the_reason_is_t
     assert targets_from_detections([MIDDLE], late_ns, CAMERA, CameraMount(), history)
 
 
-def test_where_the_yaw_counts_from_may_change_and_nothing_is_mixed():
+def test_where_the_yaw_counts_from_may_change_and_nothing_is_mixed() -> None:
     history = history_of(YawFrame.NOSE, steps=10)
     stamp = T0 + 10 * STEP_NS
     heading = 0.6 * 10 * 0.02
@@ -144,7 +146,7 @@ def test_where_the_yaw_counts_from_may_change_and_nothing_is_mixed():
         assert target.bearing_rad == pytest.approx(heading, abs=0.02)
 
 
-def test_a_mount_on_a_gimbal_refuses_to_say_where_it_looks_without_it():
+def test_a_mount_on_a_gimbal_refuses_to_say_where_it_looks_without_it() -> None:
     with pytest.raises(ValueError, match="needs the gimbal's attitude"):
         MOUNT.ned_from_optical(np.eye(3))
     with pytest.raises(ValueError, match="does not look one way of the body"):
@@ -152,7 +154,7 @@ def test_a_mount_on_a_gimbal_refuses_to_say_where_it_looks_without_it():
 
 
 @pytest.mark.parametrize(("pitch_deg", "down"), [(-90.0, True), (-75.0, True), (-40.0, False), (0.0, False)])
-def test_a_camera_on_a_gimbal_looks_down_when_the_gimbal_does(pitch_deg, down):
+def test_a_camera_on_a_gimbal_looks_down_when_the_gimbal_does(pitch_deg, down) -> None:
     history = StateHistory()
     attitude = quaternion_from_euler(0.0, math.radians(pitch_deg), 1.0)
     history.add(VehicleState(gimbal=GimbalState(attitude_ns=T0, attitude=attitude)))

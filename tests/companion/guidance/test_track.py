@@ -28,7 +28,7 @@ def seen(place, vehicle=(0.0, 0.0, -5.0), frame=0, *, source=RangeSource.GROUND_
     )
 
 
-def test_range_sigma_of_the_target_decides_how_much_it_counts():
+def test_range_sigma_of_the_target_decides_how_much_it_counts() -> None:
     vehicle = (0.0, 0.0, -5.0)
     places = []
     for sigma_m in (0.2, 3.0):
@@ -39,13 +39,13 @@ def test_range_sigma_of_the_target_decides_how_much_it_counts():
     assert places[1] < 20.2
 
 
-def test_a_track_cannot_begin_without_a_place():
+def test_a_track_cannot_begin_without_a_place() -> None:
     with pytest.raises(ValueError, match="no range"):
         ObjectTrack(seen((5.0, 0.0), source=RangeSource.NONE), (0.0, 0.0, -5.0))
 
 
 @given(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 6.28))
-def test_repeated_measurements_draw_the_place_to_the_truth(north, east, direction):
+def test_repeated_measurements_draw_the_place_to_the_truth(north, east, direction) -> None:
     truth = (north, east)
     start = (north + math.cos(direction), east + math.sin(direction))
     vehicle = (-40.0, -40.0, -5.0)
@@ -55,7 +55,7 @@ def test_repeated_measurements_draw_the_place_to_the_truth(north, east, directio
     assert math.dist(track.position_ned_m[:2], truth) < 0.3
 
 
-def test_a_frame_already_seen_changes_nothing():
+def test_a_frame_already_seen_changes_nothing() -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((20.5, 0.0), frame=0)], vehicle)
@@ -66,21 +66,21 @@ def test_a_frame_already_seen_changes_nothing():
 
 
 @pytest.mark.parametrize("source", list(RangeSource))
-def test_an_object_in_another_direction_is_another_object(source):
+def test_an_object_in_another_direction_is_another_object(source) -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((18.0, 9.0), frame=1, source=source)], vehicle)
     assert not track.update([seen((20.0, 0.0), frame=2, name="truck")], vehicle)
 
 
-def test_of_two_candidates_the_nearer_one_is_taken():
+def test_of_two_candidates_the_nearer_one_is_taken() -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert track.update([seen((20.0, 1.5), frame=1), seen((20.2, 0.1), frame=1)], vehicle)
     assert track.position_ned_m[1] == pytest.approx(0.05, abs=0.1)
 
 
-def test_a_bearing_alone_corrects_across_and_leaves_the_range():
+def test_a_bearing_alone_corrects_across_and_leaves_the_range() -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0), source=RangeSource.DEPTH), vehicle)
     for frame in range(1, 20):
@@ -90,7 +90,7 @@ def test_a_bearing_alone_corrects_across_and_leaves_the_range():
     assert math.hypot(north, east) == pytest.approx(20.0, abs=0.1)
 
 
-def test_a_long_unseen_object_may_have_wandered():
+def test_a_long_unseen_object_may_have_wandered() -> None:
     vehicle = (0.0, 0.0, -5.0)
     near = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
     late = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)

@@ -10,9 +10,9 @@ import uuid
 from pathlib import Path
 
 import pytest
-from service_process import running_service
 
 from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import running_service
 
 SCENE = """
 name = "pad"

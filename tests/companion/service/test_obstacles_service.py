@@ -11,9 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from service_process import running_service
-
 from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import running_service
 
 WALL_NORTH_M, THICKNESS_M, MARGIN_M = 12.0, 0.4, 2.0
 # As for `companion bench flights obstacles`: in gusts it is blown a little into the margin.

@@ -13,10 +13,10 @@ from typing import Any
 
 import imageio_ffmpeg
 import pytest
-from service_process import ServiceProcess, running_service
 
 from companion.bus.client import listen
 from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import ServiceProcess, running_service
 
 # COM_OF_LOSS_T of the built-in vehicle, as PX4's default, and what the promise allows beyond it.
 LOSS_S, ALLOWED_S = 1.0, 0.5

@@ -7,10 +7,9 @@ import queue
 from pathlib import Path
 from typing import Any
 
-from service_process import running_service
-
 from companion.bus.client import listen
 from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import running_service
 
 
 def test_identities_and_their_events_are_published(seeing: list[str], tmp_path: Path) -> None:
