@@ -1,1 +1,1 @@
-"""From what is seen to where to go: behaviours, limits, and the pilot that runs one behaviour at a time."""
+"""From what is seen to where to go: behaviours, limits, and the core that steps one behaviour at a time."""

@@ -32,7 +32,7 @@ NARROW_FIELD_RAD = math.radians(40.0)
 
 
 def behaviour_for(command: commands.Command, footprint: Footprint | None = None) -> Behaviour:
-    """A new behaviour, ready for the pilot. Raises TypeError for a command no behaviour is written for.
+    """A new behaviour, ready for guidance. Raises TypeError for a command no behaviour is written for.
 
     Args:
         footprint: of the camera that steers; where it is not known, searches must be given a spacing.

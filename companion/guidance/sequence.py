@@ -1,6 +1,6 @@
 """A mission: behaviours in turn, each with its time-out and where to go on when it worked or did not.
 
-It is one behaviour to the pilot, so what holds for one holds for all of its steps. One setpoint follows the
+It is one behaviour to guidance, so what holds for one holds for all of its steps. One setpoint follows the
 other where steps change, in the same turn of the loop. An operator's next command takes its place as a whole,
 and a pilot's mode change ends it as a whole: between two steps our command is never given up and taken again.
 """
@@ -81,7 +81,7 @@ class SequenceBehaviour(Behaviour):
     """Flies a plan.
 
     Args:
-        refused: why a behaviour cannot begin now, None if it can; the pilot's own rule, asked at every step.
+        refused: why a behaviour cannot begin now, None if it can; guidance's own rule, asked at every step.
 
     Attributes:
         records: the steps that have ended, in the order in which they were flown.
