@@ -31,6 +31,8 @@ from companion.rehearsal import (
 )
 from companion.service import Event, Service
 from mavlink_sim.testing import free_port
+from mavlink_sim.world.mesh import surface_range_to
+from mavlink_sim.world.world import demo_world
 from vision.video_encoders import has_pyav
 
 VIDEO_NAME = "flight.webm"
@@ -70,12 +72,13 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say) -> Summary:
     truth_path.unlink(missing_ok=True)
     started = time.monotonic()
     flight = asyncio.run(_fly(output, truth_path, seed=seed, limit_s=limit_s, say=say))
-    final_range_m = _range_at(truth_path, flight.reached_ns) if flight.reached_ns else None
+    final_range_m = _range_at(truth_path, flight.reached_ns, seed) if flight.reached_ns else None
     reached = final_range_m is not None and abs(final_range_m - STOP_DISTANCE_M) <= RANGE_TOLERANCE_M
     landed = flight.ended and _landed(truth_path)
     failure = flight.failure
     if failure is None and not reached:
-        failure = f"stopped at {final_range_m} m of the car, not at {STOP_DISTANCE_M:g} m"
+        where = "never stood before the car" if final_range_m is None else f"stood {final_range_m:.2f} m from it"
+        failure = f"{where}, not {STOP_DISTANCE_M:g} m"
     if failure is None and not flight.received:
         failure = "no detection message came over zenoh"
     if failure is None and not landed:
@@ -167,14 +170,14 @@ async def _mission(service: Service, flight: _Flight) -> None:
     flight.ended = not service.driver.state.armed
 
 
-def _range_at(truth_path: Path, stamp_ns: int) -> float | None:
-    """The true range to the nearest car at a moment."""
+def _range_at(truth_path: Path, stamp_ns: int, seed: int) -> float | None:
+    """The true range to the surface of the nearest car at a moment."""
     rows = _rows(truth_path)
     if not rows:
         return None
-    row = min(rows, key=lambda row: abs(row["stamp_ns"] - stamp_ns))
-    ranges = [item["range_m"] for item in row["objects"] if item["class_name"] == TARGET_CLASS]
-    return min(ranges) if ranges else None
+    place = min(rows, key=lambda row: abs(row["stamp_ns"] - stamp_ns))["position_ned_m"]
+    cars = [item for item in demo_world(seed).objects if item.class_name == TARGET_CLASS]
+    return min(surface_range_to(car, place) for car in cars)
 
 
 def _landed(truth_path: Path) -> bool:
