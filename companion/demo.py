@@ -77,8 +77,8 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say) -> Summary:
     landed = flight.ended and _landed(truth_path)
     failure = flight.failure
     if failure is None and not reached:
-        where = "never stood before the car" if final_range_m is None else f"stood {final_range_m:.2f} m from it"
-        failure = f"{where}, not {STOP_DISTANCE_M:g} m"
+        stood = "nowhere" if final_range_m is None else f"{final_range_m:.2f} m from the {TARGET_CLASS}"
+        failure = f"stood {stood}, not {STOP_DISTANCE_M:g} m from it"
     if failure is None and not flight.received:
         failure = "no detection message came over zenoh"
     if failure is None and not landed:
