@@ -8,6 +8,7 @@ from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situat
 from companion.guidance.choosing import Choice
 from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import (
+    ARRIVED_M,
     STOPPING_MPS2,
     Arrival,
     PositionController,
@@ -19,7 +20,7 @@ from companion.guidance.motion import (
     stopping_point,
     stopping_speed,
 )
-from companion.guidance.target import DOUBTED, Target
+from companion.guidance.target import DOUBTED, RangeSource, Target
 from companion.guidance.track import ObjectTrack
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
@@ -40,8 +41,8 @@ PLACE_TIME_CONSTANT_S = 1.5
 STILL_M = 0.6
 STILL_SHARE = 0.1
 MAX_LAG_M = 0.25
-# Reached within this. Less than other arrivals allow: the range and the vehicle's own estimate err too, and
-# the hold that follows keeps to the latter.
+# With depth, reached within this. Other arrivals allow more, but range and own estimate err as well here, and
+# the hold that follows keeps to the latter. By the ground alone the goal itself wanders by more.
 REACHED_M = 0.15
 # Detectors miss single frames; this long without the object and the vehicle brakes.
 LOST_AFTER_S = 1.0
@@ -100,7 +101,7 @@ class ApproachBehaviour(Behaviour):
         self._wait_place: Vector3 | None = None
         self._anchor_rad: float | None = None
         self._place: Vector3 = (0.0, 0.0, 0.0)
-        self._arrival, self._controller = Arrival(REACHED_M), PositionController()
+        self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
 
     def on_activate(self, situation: Situation) -> None:
@@ -112,7 +113,7 @@ class ApproachBehaviour(Behaviour):
         self._choice = Choice()
         self._doubted = False
         self.lost_at = None
-        self._arrival, self._controller = Arrival(REACHED_M), PositionController()
+        self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
         if self._tracking is not None:
             self._tracking.begin(situation)
@@ -151,7 +152,9 @@ class ApproachBehaviour(Behaviour):
             moved_m = math.dist(self._place[:2], track.position_ned_m[:2])
             still = moved_m < max(STILL_M, STILL_SHARE * self._range_m)
             off_m = math.dist(goal, position) if still else math.inf
-            if self._arrival.update(off_m, speed_of(state), now_ns):
+            by_depth = track.newest.range_source is RangeSource.DEPTH
+            near_m = REACHED_M if by_depth else ARRIVED_M
+            if self._arrival.update(off_m, speed_of(state), now_ns, near_m):
                 return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m", goal)
             velocity = self._controller.velocity(goal, state, dt_s, top)
             return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
@@ -249,7 +252,7 @@ class ApproachBehaviour(Behaviour):
 
     def _leave_goal(self) -> None:
         self._anchor_rad = None
-        self._arrival, self._controller = Arrival(REACHED_M), PositionController()
+        self._arrival, self._controller = Arrival(), PositionController()
 
     def _wait(self, dt_s: float, situation: Situation, position: Vector3, unseen_s: float) -> Step:
         """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""

@@ -160,28 +160,23 @@ class PositionController:
 
 
 class Arrival:
-    """Whether the vehicle has arrived: near its goal, slow, and settled there.
+    """Whether the vehicle has arrived: near its goal, slow, and settled there."""
 
-    Args:
-        tolerance_m: how near; `ARRIVED_M` at most.
-    """
-
-    def __init__(self, tolerance_m: float = ARRIVED_M) -> None:
-        self._tolerance_m = tolerance_m
+    def __init__(self) -> None:
         self._since_ns: list[int | None] = [None] * len(SETTLED)
 
-    def update(self, distance_m: float, speed_mps: float, now_ns: int) -> bool:
-        """Call at every update with the distance to the goal and the speed."""
+    def update(self, distance_m: float, speed_mps: float, now_ns: int, near_m: float = ARRIVED_M) -> bool:
+        """Call at every update with the distance to the goal and the speed. `near_m`: `ARRIVED_M` or less."""
         arrived = False
         for index, (tolerance_m, slow_mps, lasting_s) in enumerate(SETTLED):
             since_ns = self._since_ns[index]
-            tolerance_m = self._tolerance_m if index == 0 else tolerance_m
-            if not (distance_m <= tolerance_m and speed_mps <= slow_mps):
+            allowed_m = near_m if index == 0 else tolerance_m
+            if not (distance_m <= allowed_m and speed_mps <= slow_mps):
                 self._since_ns[index] = None
             elif since_ns is None:
                 self._since_ns[index] = now_ns
             elif now_ns - since_ns >= lasting_s * 1e9:
-                arrived |= distance_m <= self._tolerance_m and speed_mps <= ARRIVED_MPS
+                arrived |= distance_m <= near_m and speed_mps <= ARRIVED_MPS
         return arrived
 
 
