@@ -44,7 +44,7 @@ REFINEMENT = TrainingSettings(
     max_channels=DEFAULT_RECIPE.max_channels,
     # A scene of the camera's size is expensive to draw and has many pictures in it: whole at half its pixels,
     # and parts of it at up to 1.3 times its own.
-    stages=(Stage(320, 256, 16, 8000, scenes=6_000, decay_steps=8000, drawn=(640, 480)),),
+    stages=(Stage(320, 256, 16, 4315, scenes=6_000, decay_steps=4315, drawn=(640, 480)),),
     learning_rate=2e-3,
     warmup_steps=150,
     augmentation=Augmentation(
