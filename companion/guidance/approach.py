@@ -35,9 +35,11 @@ STANDING_MPS = 0.3
 # around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
 ANCHOR_M = (1.5, 3.0)
 # That place follows the filtered place of the object with this time constant: the filter lets an object
-# wander, and so follows the noise of single ranges. An object whose filtered place is farther off than
-# STILL_M, or than this share of its range, has moved, and is not reached yet.
+# wander, and so follows the noise of single ranges, which without depth is more and changes with the vehicle's
+# roll. An object whose filtered place is farther off than STILL_M, or than this share of its range, has
+# moved, and is not reached yet.
 PLACE_TIME_CONSTANT_S = 1.5
+PLACE_TIME_CONSTANT_WITHOUT_DEPTH_S = 3.0
 STILL_M = 0.6
 STILL_SHARE = 0.1
 MAX_LAG_M = 0.25
@@ -152,8 +154,7 @@ class ApproachBehaviour(Behaviour):
             moved_m = math.dist(self._place[:2], track.position_ned_m[:2])
             still = moved_m < max(STILL_M, STILL_SHARE * self._range_m)
             off_m = math.dist(goal, position) if still else math.inf
-            by_depth = track.newest.range_source is RangeSource.DEPTH
-            near_m = REACHED_M if by_depth else ARRIVED_M
+            near_m = REACHED_M if self._by_depth else ARRIVED_M
             if self._arrival.update(off_m, speed_of(state), now_ns, near_m):
                 return Outcome(True, f"reached {self._class_name} at {self._range_m:.1f} m", goal)
             velocity = self._controller.velocity(goal, state, dt_s, top)
@@ -228,7 +229,8 @@ class ApproachBehaviour(Behaviour):
         chosen = self._anchor_rad is not None
         away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
         if chosen:
-            share = min(1.0, dt_s / PLACE_TIME_CONSTANT_S)
+            late_s = PLACE_TIME_CONSTANT_S if self._by_depth else PLACE_TIME_CONSTANT_WITHOUT_DEPTH_S
+            share = min(1.0, dt_s / late_s)
             was, now, down = self._place, place, place[2]
             place = (was[0] + share * (now[0] - was[0]), was[1] + share * (now[1] - was[1]), down)
             # The smoothed place of an object that comes nearer lags behind it, but not by more than this.
@@ -249,6 +251,10 @@ class ApproachBehaviour(Behaviour):
             return None
         self._anchor_rad = away_rad
         return goal
+
+    @property
+    def _by_depth(self) -> bool:
+        return self._track is not None and self._track.newest.range_source is RangeSource.DEPTH
 
     def _leave_goal(self) -> None:
         self._anchor_rad = None

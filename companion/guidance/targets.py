@@ -42,6 +42,13 @@ LEAST_HEIGHT_PX = 12.0
 # The lowest that is seen of an object is its wheels, its feet or its underside; the nearest surface is so
 # much nearer: the median over all classes in benchmarks/range_error.py, on other seeds than the published.
 CONTACT_INSET_M = 0.2
+# Where the object of a box touches its lower edge in a rolled picture: so much of the way from the middle to
+# where a rectangle would. 95 % of errors, rendered frames, up to 20° of roll: 1.20 m with 0.25, 1.23 with 0,
+# 1.49 with 0.5. Of synthetic approaches (to boxes), in wind: 0.9 m with 0.3, 1.5 with 0.
+CONTACT_SHARE = 0.3
+# One sigma of that place, shares of the box's width. Beyond this roll nothing is known of it.
+CONTACT_SIGMA = 0.25
+MAX_CONTACT_ROLL_RAD = math.radians(30.0)
 # One sigma of the range, metres, from the same measurement. Depth: fixed, and per metre of range.
 DEPTH_SIGMA = (0.15, 0.02)
 # Of a box cut off by the picture's edge, what is nearest may be outside.
@@ -159,7 +166,7 @@ def targets_from_detections(
     """The targets of one frame, in the order of its detections.
 
     Range comes from the detection's nearest point where it has one (`nearest_camera_m`, from depth), else
-    from where the ray through the middle of the box's lower edge meets the ground, less `CONTACT_INSET_M`.
+    from where the ray through the box's lower edge meets the ground, less `CONTACT_INSET_M`.
     The ground is taken as flat and level with home. There is no range if the box touches the picture's lower
     edge, or the ray points less than 2° down. Then the class's height in `heights_m` tells it, if the whole
     object is in the picture.
@@ -216,7 +223,9 @@ def _sights(
     unknown = [math.nan] * 3
     nearest = np.array([detection["nearest_camera_m"] or unknown for detection in detections], np.float64)
     pixels = np.empty((2 * count, 2))
-    pixels[:count, 0] = pixels[count:, 0] = (left + right) / 2
+    middle = (left + right) / 2
+    pixels[:count, 0] = middle
+    pixels[count:, 0] = middle + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
     pixels[:count, 1], pixels[count:, 1] = (top + bottom) / 2, bottom
     lines = Sightlines.of(camera, mount, pose.ned_from_body, pixels)
     centres, feet = lines[:count], lines[count:]
@@ -225,6 +234,29 @@ def _sights(
     of_each, lens = (centres.directions, offsets, on_ground), lines.camera_ned_m.tolist()
     rows = zip(*(values.tolist() for values in of_each), strict=True)
     return [_Sight(direction, at, foot, lens) for direction, at, foot in rows]
+
+
+def _contact_px(
+    width: NDArray[np.float64], height: NDArray[np.float64], roll_rad: float
+) -> NDArray[np.float64]:
+    """How far right of the middle of its lower edge each box's object touches that edge, pixels.
+
+    In a rolled picture an upright rectangle touches it with its lower corner; what is rounder, nearer to the
+    middle.
+    """
+    if abs(roll_rad) > MAX_CONTACT_ROLL_RAD:
+        return np.zeros(len(width))
+    sine, cosine = math.sin(abs(roll_rad)), math.cos(roll_rad)
+    # The height of the rectangle whose outline, turned by the roll, is as wide and as high as the box.
+    upright = np.clip((height * cosine - width * sine) / (cosine**2 - sine**2), 0.0, height)
+    to_corner = np.minimum(upright * sine - width / 2, 0.0)
+    return CONTACT_SHARE * math.copysign(1.0, roll_rad) * to_corner
+
+
+def _roll_rad(mount: CameraMount, pose: Pose) -> float:
+    """By how much the picture's columns are turned from the vertical."""
+    down = mount.ned_from_optical(pose.ned_from_body)[2]
+    return math.atan2(float(down[0]), float(down[1]))
 
 
 def _named_otherwise(detections: Sequence[DetectionRecord]) -> list[bool]:
@@ -270,7 +302,10 @@ def _target(
         source = RangeSource.GROUND_PLANE
         offset = _nearer(sight.lens, sight.on_ground, CONTACT_INSET_M)
         fixed_m = GROUND_SIGMA_M + cut_m
-        growing_m = GROUND_SIGMA_RAD * (math.hypot(offset[0], offset[1]) ** 2 / offset[2] + offset[2])
+        unknown_rad = CONTACT_SIGMA * (right - left) * math.sin(_roll_rad(mount, pose)) / camera.fy
+        growing_m = math.hypot(GROUND_SIGMA_RAD, unknown_rad) * (
+            math.hypot(offset[0], offset[1]) ** 2 / offset[2] + offset[2]
+        )
     elif height_m is not None and _measurable(camera, top, bottom):
         offset = foot_of_upright(camera, mount, pose.ned_from_body, detection["xyxy"], height_m).tolist()
         if all(map(math.isfinite, offset)):

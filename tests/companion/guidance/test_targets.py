@@ -341,3 +341,21 @@ def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction) ->
 def test_slerp_takes_the_sign_of_quaternions_for_nothing() -> None:
     half = slerp(quaternion_from_euler(0, 0, 0.4), tuple(-v for v in quaternion_from_euler(0, 0, 0.8)), 0.5)
     assert euler_from_quaternion(half)[2] == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("roll_deg", [-15.0, 15.0])
+def test_a_wide_thing_in_a_rolled_picture_is_not_ranged_by_the_middle_of_its_edge(roll_deg: float) -> None:
+    # A wall 6 m wide and 2 m tall, 10 m ahead and square to the camera.
+    attitude, position = quaternion_from_euler(math.radians(roll_deg), 0.0, 0.0), np.array((0.0, 0.0, -3.0))
+    corners = [(10.0, east, down) for east in (-3.0, 3.0) for down in (-2.0, 0.0)]
+    seen = np.array([optical_point(CAMERA, MOUNT, attitude, position, corner) for corner in corners])
+    pixels = CAMERA.project(seen) + 0.5
+    box = (*pixels.min(axis=0), *pixels.max(axis=0))
+    level = quaternion_from_euler(0.0, 0.0, 0.0)
+    history, unrolled = history_of(attitude, (0.0, 0.0, -3.0)), history_of(level, (0.0, 0.0, -3.0))
+    (target,) = targets_from_detections([detection(box)], T0, CAMERA, MOUNT, history)
+    (plain,) = targets_from_detections([detection(box)], T0, CAMERA, MOUNT, unrolled)
+    # The ray through the middle of the edge would say 7.9 m.
+    assert target.ground_range_m == pytest.approx(10.0 - CONTACT_INSET_M, abs=1.5)
+    assert target.range_sigma_m > plain.range_sigma_m + 0.3
+    assert abs(target.ground_range_m - (10.0 - CONTACT_INSET_M)) < 2 * target.range_sigma_m
