@@ -35,9 +35,9 @@ STANDING_MPS = 0.3
 # around it. Inside the first distance to that place it is chosen; beyond the second it is given up.
 ANCHOR_M = (1.5, 3.0)
 # That place follows the filtered place of the object with this time constant: the filter lets an object
-# wander, and so follows the noise of single ranges, which without depth is more and changes with the vehicle's
-# roll. An object whose filtered place is farther off than STILL_M, or than this share of its range, has
-# moved, and is not reached yet.
+# wander, and so follows the noise of single ranges, which is more without depth and changes with the
+# vehicle's roll. An object whose filtered place is farther off than STILL_M, or than this share of its range,
+# has moved, and is not reached yet.
 PLACE_TIME_CONSTANT_S = 1.5
 PLACE_TIME_CONSTANT_WITHOUT_DEPTH_S = 3.0
 STILL_M = 0.6
