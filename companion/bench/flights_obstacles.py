@@ -1,4 +1,4 @@
-"""Flights of `goto` through a wall or a pillar, seen by the built-in vehicle's rendered depth camera.
+"""Flights of `goto` through a wall or a pillar, which the rendered depth camera and the real pipeline see.
 
 The place to go to lies behind a wall (even seeds) or a pillar of 2 m (odd ones), 12 to 18 m away, at up to
 4 m/s, in up to 3 m/s of wind. Depth comes ten times a second with a stereo camera's noise, 80 ms late. A
@@ -14,36 +14,18 @@ import numpy as np
 
 from companion.bench.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
-from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.rendered_camera import RenderedCamera
 from companion.guidance.goto import GotoBehaviour
-from companion.guidance.obstacles import ObstacleRules
-from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
-from mavlink_sim.camera.renderer import Renderer
+from mavlink_sim.camera.depth_camera import DepthSensor
+from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.world import World, WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
-from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
-from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(320, 240, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1)
 MARGIN_M, ALLOWED_M = 2.0, 1.0
 HEIGHT_M, FLIGHT_S = 2.5, 25.0
 RATE_HZ, LATENCY_S = 10.0, 0.08
-
-
-class DepthCamera:
-    """What a rendered depth camera makes of a world, as `SyntheticCamera.find_obstacles`."""
-
-    def __init__(self, world: World, seed: int) -> None:
-        self._rng = np.random.default_rng((seed, 62))
-        self._renderer = Renderer(world, CAMERA, MOUNT)
-
-    def __call__(self, flight: LockstepFlight) -> ObstacleSectors:
-        truth, now_ns = flight.vehicle.truth, flight.now_ns
-        rendered = self._renderer.render(truth.position_ned_m, matrix_from_quaternion(truth.quaternion))
-        depth = measured_depth(rendered.depth_m, CAMERA.fx, DepthSensor(), self._rng)
-        pose = flight.inputs.history.at(now_ns)  # the estimate, as a worker knows it
-        return obstacle_sectors(depth, now_ns, CAMERA, MOUNT, pose.ned_from_body, pose.height_m)
 
 
 def run(seed: int) -> FlightResult:
@@ -58,19 +40,26 @@ def run(seed: int) -> FlightResult:
         thing = WorldObject(0, "wall", place, slant, size_m=(40.0, 0.4, 5.0))
     else:
         thing = WorldObject(0, "box", place, heading, size_m=(2.0, 2.0, 6.0))
-    camera = SyntheticCamera(
-        camera_settings(CAMERA, MOUNT),
-        find_obstacles=DepthCamera(World((thing,)), seed),
-        size=(CAMERA.width, CAMERA.height),
-        rate_hz=RATE_HZ,
-        latency_s=LATENCY_S,
+    settings = camera_settings(
+        CAMERA,
+        MOUNT,
+        {
+            "detector.enabled": "false",
+            "guidance.obstacles": "required",
+            "guidance.obstacle_margin_m": str(MARGIN_M),
+        },
+    )
+    scene = Scene(
+        World((thing,)),
+        {},
+        CameraSettings(model=CAMERA, mount=MOUNT, depth=DepthSensor(), seed=seed),
+        "campaign",
     )
     flight = LockstepFlight.airborne(
         seed=seed,
         height_m=HEIGHT_M,
         wind_mps=wind_mps,
-        camera=lambda _: camera,
-        rules=ObstacleRules("required", MARGIN_M),
+        camera=lambda vehicle: RenderedCamera(settings, scene, vehicle, rate_hz=RATE_HZ, latency_s=LATENCY_S),
     )
     flight.turn_to(heading)
     goto = GotoBehaviour(

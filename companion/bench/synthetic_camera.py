@@ -16,7 +16,6 @@ from mavlink_sim.lockstep import Truth
 from vision.attitude import Quaternion
 from vision.detections import Detections
 from vision.markers import Marker
-from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings, TrackEvent
 
@@ -31,7 +30,6 @@ class SyntheticCamera:
         settings: the camera's model and mount, and all else that places what it sees.
         detect: None: it detects nothing.
         find_markers: at the true state and seconds of the flight; its None: the frame is lost.
-        find_obstacles: of a depth image taken now.
         tracker: how identities are given; None: no tracking.
     """
 
@@ -41,7 +39,6 @@ class SyntheticCamera:
         *,
         detect: Detect | None = None,
         find_markers: Callable[[Truth, float], tuple[Marker, ...] | None] | None = None,
-        find_obstacles: Callable[[LockstepFlight], ObstacleSectors] | None = None,
         size: tuple[int, int] = (640, 480),
         rate_hz: float = 15.0,
         latency_s: float = 0.08,
@@ -49,7 +46,7 @@ class SyntheticCamera:
     ) -> None:
         self.view = View(settings)
         self.rate_hz, self.latency_s = rate_hz, latency_s
-        self._detect, self._find_markers, self._find_obstacles = detect, find_markers, find_obstacles
+        self._detect, self._find_markers = detect, find_markers
         self._size = size
         self._tracker = None if tracker is None or detect is None else Tracker(tracker)
         self._attitudes = AttitudeHistory()
@@ -71,7 +68,6 @@ class SyntheticCamera:
             markers = self._find_markers(truth, seconds)
             if markers is None:
                 return lambda: None
-        obstacles = None if self._find_obstacles is None else self._find_obstacles(flight)
         width, height = self._size
 
         def finish() -> PerceptionResult:
@@ -91,7 +87,6 @@ class SyntheticCamera:
                 0,
                 track_events=events,
                 markers=markers,
-                obstacles=obstacles,
             )
 
         return finish
