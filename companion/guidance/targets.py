@@ -340,7 +340,7 @@ def _towards(lens: list[float], direction: list[float], nearest: list[float]) ->
 
 
 def _nearer(lens: list[float], direction: list[float], foot: list[float], by_m: float) -> list[float]:
-    """Over ground in a direction from the lens, as far that way as a foot is, less `by_m`; never behind it."""
+    """Over ground in a direction from the lens, as far that way as a foot, less `by_m`, never behind it."""
     level = max(math.hypot(direction[0], direction[1]), 1e-9)
     north, east = direction[0] / level, direction[1] / level
     range_m = (foot[0] - lens[0]) * north + (foot[1] - lens[1]) * east
