@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,7 +13,9 @@ from rich.console import Console
 from companion.bench.deadman import deadman_table, reaction
 
 
-def flight(speeds, modes=None, start_ns=0, step_ns=20_000_000):
+def flight(
+    speeds: list[float], modes: list[str] | None = None, start_ns: int = 0, step_ns: int = 20_000_000
+) -> list[dict[str, Any]]:
     """Rows of truth, 50 a second."""
     modes = modes or ["OFFBOARD"] * len(speeds)
     return [
@@ -27,7 +30,7 @@ def flight(speeds, modes=None, start_ns=0, step_ns=20_000_000):
     left=st.integers(0, 100),
     start=st.integers(0, 10**12),
 )
-def test_the_first_moment_of_each_counts(braked, stood, left, start) -> None:
+def test_the_first_moment_of_each_counts(braked: int, stood: int, left: int, start: int) -> None:
     slow, still = braked, braked + stood
     speeds = [2.0] * (50 + slow) + [1.0] * (still - slow) + [0.1] * 10
     modes = ["OFFBOARD"] * (50 + min(left, still)) + ["HOLD"] * (len(speeds) - 50 - min(left, still))
@@ -47,7 +50,9 @@ def test_what_never_came_is_none_and_a_flight_without_a_beginning_is_refused() -
 
 def test_the_table_tells_the_longest_and_how_often_it_never_came() -> None:
     out = io.StringIO()
-    figures = {"x": {"braking_s": [0.2, 0.35], "standing_s": [None, 1.5], "failsafe_s": [None, None]}}
+    figures: dict[str, dict[str, list[float | None]]] = {
+        "x": {"braking_s": [0.2, 0.35], "standing_s": [None, 1.5], "failsafe_s": [None, None]}
+    }
     Console(file=out, width=100).print(deadman_table(figures))
     text = out.getvalue()
     assert "0.35" in text

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from companion.bench.scenes import CLASS_NAMES, MOTIONS, SceneFrame, scene_frames, walkers
+from companion.bench.scenes import CLASS_NAMES, MOTIONS, SceneFrame, Walker, scene_frames, walkers
 from companion.bench.tracking import Seen, no_tracking
 from companion.cli import app
 from vision.detections import Detections
@@ -17,10 +17,9 @@ from vision.detections import Detections
 def seen(*boxes: tuple[float, float], class_id: int = 0) -> Seen:
     """Of boxes of 20 by 20 pixels at (x, confidence)."""
     xyxy = np.array([[x, 0, x + 20, 20] for x, _ in boxes], np.float32).reshape(-1, 4)
-    none = np.zeros(0, np.int64)
-    frame = SceneFrame(
-        0.0, 1, np.zeros((1, 1, 3), np.uint8), none, none, np.zeros((0, 4), np.float32), none * 1.0, none > 0
-    )
+    none, no_share = np.zeros(0, np.int64), np.zeros(0, np.float64)
+    no_boxes = np.zeros((0, 4), np.float32)
+    frame = SceneFrame(0.0, 1, np.zeros((1, 1, 3), np.uint8), none, none, no_boxes, no_share, none > 0)
     confidence = np.array([confidence for _, confidence in boxes], np.float32)
     return Seen(frame, Detections(xyxy, confidence, np.full(len(boxes), class_id), CLASS_NAMES))
 
@@ -52,7 +51,7 @@ def test_a_sequence_has_a_truth_for_every_frame_that_is_not_dropped() -> None:
 
 
 @pytest.mark.parametrize("walker", walkers(3), ids=lambda walker: walker.class_name)
-def test_those_who_walk_go_at_their_speed_and_look_where_they_go(walker) -> None:
+def test_those_who_walk_go_at_their_speed_and_look_where_they_go(walker: Walker) -> None:
     step_s = 0.01
     for time_s in np.linspace(0, 40, 23):
         before, after = walker.at(0, float(time_s)), walker.at(0, float(time_s) + step_s)

@@ -9,24 +9,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.behaviour import Behaviour, Requirement, Situation
-from companion.guidance.neighbours import Anchor, Neighbours, missing_neighbours
+from companion.guidance.behaviour import Behaviour, Requirement, Situation, Step
+from companion.guidance.neighbours import Anchor, Neighbour, Neighbours, missing_neighbours
 from companion.guidance.pose import Pose
 from companion.guidance.refusal import refusal
+from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.test_pose import NOW_NS, STATE
 
 SECOND = 10**9
 PLACE = Anchor(47.4, 8.5, 493.0, (0.0, 0.0, 0.0))
 
 
-def pose(published_ns, name="alpha", offset=(10.0, 0.0, 0.0), source="a", **more):
+def pose(
+    published_ns: int,
+    name: str = "alpha",
+    offset: Vector3 = (10.0, 0.0, 0.0),
+    source: str = "a",
+) -> Pose:
     latitude, longitude, altitude = PLACE.globally(offset)
-    return Pose(
-        name, source, published_ns, 0.0, latitude, longitude, altitude, (2.0, 0.0, 0.0), 0.5, 0.1, **more
-    )
+    return Pose(name, source, published_ns, 0.0, latitude, longitude, altitude, (2.0, 0.0, 0.0), 0.5, 0.1)
 
 
-def state_at(now_ns):
+def state_at(now_ns: int) -> VehicleState:
     return replace(
         STATE,
         heartbeat_ns=now_ns,
@@ -37,10 +41,16 @@ def state_at(now_ns):
     )
 
 
+def alpha_of(neighbours: Neighbours, now_ns: int) -> Neighbour:
+    alpha = neighbours.around(state_at(now_ns), now_ns).named("alpha")
+    assert alpha is not None
+    return alpha
+
+
 @given(
     st.floats(-80, 80), st.floats(-180, 180), st.tuples(*[st.floats(-3000, 3000)] * 2, st.floats(-100, 100))
 )
-def test_a_place_goes_round_the_globe_and_back(latitude, longitude, place) -> None:
+def test_a_place_goes_round_the_globe_and_back(latitude: float, longitude: float, place: Vector3) -> None:
     anchor = Anchor(latitude, longitude, 100.0, (3.0, -4.0, 5.0))
     assert anchor.local(*anchor.globally(place)) == pytest.approx(place, abs=0.01)
 
@@ -49,7 +59,7 @@ def test_local_origins_that_differ_do_not_matter() -> None:
     neighbours = Neighbours("beta", "b")
     neighbours.hear(pose(0), NOW_NS)
     # The own local origin is somewhere else: here stands at (1, 2, -5) of it.
-    alpha = neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha")
+    alpha = alpha_of(neighbours, NOW_NS)
     assert alpha.position_ned_m == pytest.approx((11.0, 2.0, -5.0), abs=0.02)
 
 
@@ -69,7 +79,7 @@ def test_a_neighbour_is_brought_forward_by_its_velocity_and_turn_but_not_for_eve
     neighbours.hear(pose(0), NOW_NS)
     for after_s, north, silent in ((0.5, 12.0, False), (3.0, 13.0, True)):
         now_ns = NOW_NS + round(after_s * 1e9)
-        alpha = neighbours.around(state_at(now_ns), now_ns).named("alpha")
+        alpha = alpha_of(neighbours, now_ns)
         assert alpha.position_ned_m[0] == pytest.approx(north, abs=0.02)
         assert alpha.silent is silent
         assert alpha.velocity_ned_mps == ((0.0, 0.0, 0.0) if silent else (2.0, 0.0, 0.0))
@@ -88,10 +98,10 @@ def test_what_comes_late_does_not_replace_what_is_newer() -> None:
     neighbours.hear(pose(2 * SECOND), NOW_NS)
     neighbours.hear(pose(1 * SECOND, offset=(50.0, 0.0, 0.0)), NOW_NS + 1)
     assert neighbours.refused == 1
-    assert neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha").position_ned_m[0] < 12.0
+    assert alpha_of(neighbours, NOW_NS).position_ned_m[0] < 12.0
     # A service that has started anew has a clock of its own.
     neighbours.hear(pose(5, offset=(50.0, 0.0, 0.0), source="anew"), NOW_NS + 2)
-    assert neighbours.around(state_at(NOW_NS), NOW_NS).named("alpha").position_ned_m[0] > 50.0
+    assert alpha_of(neighbours, NOW_NS).position_ned_m[0] > 50.0
 
 
 def test_the_own_message_is_nobody_and_a_namesake_is_somebody_else() -> None:
@@ -110,6 +120,7 @@ def test_without_an_own_place_nobody_can_be_placed() -> None:
     neighbours.hear(pose(1), NOW_NS)
     around = neighbours.around(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
     assert around.vehicles == ()
+    assert around.problem is not None
     assert "latitude and longitude" in around.problem
 
 
@@ -118,14 +129,14 @@ class Needy(Behaviour):
     requirements = frozenset({Requirement.NEIGHBOURS})
     neighbour_names = ("alpha",)
 
-    def update(self, dt_s, situation):
+    def update(self, dt_s: float, situation: Situation) -> Step:
         raise NotImplementedError
 
 
 def test_a_behaviour_that_needs_a_neighbour_is_refused_with_its_name() -> None:
     neighbours = Neighbours("beta", "b")
 
-    def words(now_ns):
+    def words(now_ns: int) -> str | None:
         state = state_at(now_ns)
         return refusal(
             Needy(), Situation(now_ns, state, neighbourhood=neighbours.around(state, now_ns)), None

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -20,7 +21,7 @@ from companion.guidance.obstacles import (
 )
 from companion.guidance.refusal import refusal
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.obstacle_sectors import SECTORS, ObstacleSectors
@@ -28,20 +29,36 @@ from vision.obstacle_sectors import SECTORS, ObstacleSectors
 NAN, INF = math.nan, math.inf
 
 
-def sectors(captured_ns, near=None, *, rest=INF):
+def sectors(captured_ns: int, near: dict[int, float] | None = None, *, rest: float = INF) -> ObstacleSectors:
     distances = [rest] * SECTORS
     for index, value in (near or {}).items():
         distances[index % SECTORS] = value
     return ObstacleSectors(captured_ns, tuple(distances))
 
 
-def situation(obstacles, *, age_s=0.0, vehicle=None):
+def situation(
+    obstacles: ObstacleSectors | None, *, age_s: float = 0.0, vehicle: KinematicVehicle | None = None
+) -> Situation:
     vehicle = vehicle or KinematicVehicle()
     return Situation(vehicle.now_ns + round(age_s * 1e9), vehicle.state, obstacles=obstacles)
 
 
+def sent_velocity(harness: GuidanceHarness) -> Vector3:
+    sent = harness.guidance.sent
+    assert sent is not None
+    assert sent.velocity_ned_mps is not None
+    return sent.velocity_ned_mps
+
+
+def ahead_m(memory: ObstacleMemory, vehicle: KinematicVehicle) -> float:
+    """What is known ahead when nothing is seen now."""
+    filled = memory.filled(situation(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles
+    assert filled is not None
+    return filled.distance_m[0]
+
+
 @given(left_m=st.floats(0.0, 50.0), late_s=st.floats(0.1, 2.0))
-def test_the_speed_allowed_always_stops_in_the_way_that_is_left(left_m, late_s) -> None:
+def test_the_speed_allowed_always_stops_in_the_way_that_is_left(left_m: float, late_s: float) -> None:
     speed = speed_towards(left_m, late_s, 0.7)
     assert speed >= 0.0
     assert speed * late_s + speed**2 / (2 * 0.7) <= left_m + 1e-6
@@ -56,10 +73,12 @@ def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it() 
     envelope.near = ObstacleRules("auto", 2.0).rows(situation(sectors(now_ns, near), vehicle=vehicle))
     asked = Setpoint.velocity((2.0, 2.0, 0.0), now_ns)
     sent = envelope.apply(asked, vehicle.state, now_ns, 0.05)
+    assert sent.sent.velocity_ned_mps is not None
     assert sent.sent.velocity_ned_mps[0] <= 0.02
     assert sent.sent.velocity_ned_mps[1] > 0.1
     assert "slowed down before an obstacle" in sent.reasons
     away = envelope.apply(Setpoint.velocity((-0.1, 0.0, 0.0), now_ns), vehicle.state, now_ns, 0.05)
+    assert away.sent.velocity_ned_mps is not None
     assert away.sent.velocity_ned_mps[0] < 0.0
 
 
@@ -71,6 +90,7 @@ def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
     sent = envelope.apply(
         Setpoint.position((10.0, 0.0, -5.0), vehicle.now_ns), vehicle.state, vehicle.now_ns, 0.05
     )
+    assert sent.sent.position_ned_m is not None
     assert sent.sent.position_ned_m[0] < 1.0
 
 
@@ -96,7 +116,9 @@ def test_depth_that_stops_coming_is_named_and_brakes() -> None:
 def test_required_depth_that_is_missing_is_a_refusal_that_names_it() -> None:
     goto = GotoBehaviour(from_here_m=(5.0, 0.0))
     rules = ObstacleRules("required")
-    assert "needs depth (none came yet" in refusal(goto, situation(None), None, obstacles=rules)
+    why = refusal(goto, situation(None), None, obstacles=rules)
+    assert why is not None
+    assert "needs depth (none came yet" in why
     assert refusal(LandBehaviour(), situation(None), None, obstacles=rules) is None
     assert refusal(goto, situation(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
 
@@ -107,14 +129,14 @@ def test_the_pilot_sends_a_brake_while_depth_is_missing() -> None:
     harness.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(1.0)
-    assert math.hypot(*harness.guidance.sent.velocity_ned_mps) > 1.0
+    assert math.hypot(*sent_velocity(harness)) > 1.0
     harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("required"))
     harness.run(0.1)
-    assert harness.guidance.sent.velocity_ned_mps == (0.0, 0.0, 0.0)
+    assert sent_velocity(harness) == (0.0, 0.0, 0.0)
     assert harness.guidance.limited_by == ("no depth to fly by: none came yet",)
     harness.guidance.options = GuidanceOptions(obstacles=ObstacleRules("auto"))
     harness.run(1.0)
-    assert math.hypot(*harness.guidance.sent.velocity_ned_mps) > 0.5
+    assert math.hypot(*sent_velocity(harness)) > 0.5
     told = [(event.kind, event.message) for event in harness.events][-2:]
     assert told == [
         (EventKind.BLIND, "braking: no depth to fly by: none came yet"),
@@ -127,22 +149,19 @@ def test_what_has_left_the_picture_is_remembered_where_it_stands() -> None:
     memory.filled(situation(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
     vehicle.position[0] += 1.0
     vehicle.now_ns += 10**9
-    later = memory.filled(situation(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle))
-    assert later.obstacles.distance_m[0] == pytest.approx(3.0)
+    assert ahead_m(memory, vehicle) == pytest.approx(3.0)
     vehicle.now_ns += 10**10
-    assert math.isnan(
-        memory.filled(situation(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles.distance_m[0]
-    )
+    assert math.isnan(ahead_m(memory, vehicle))
 
 
 def test_the_message_tells_unknown_from_free() -> None:
-    message = obstacles_message(sectors(5, {0: 1.234, 1: NAN}), "v")
+    message: dict[str, Any] = {**obstacles_message(sectors(5, {0: 1.234, 1: NAN}), "v")}
     assert message["distance_m"][:3] == [1.23, None, None]
     assert message["known"][:3] == [True, False, True]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_goto_stops_before_what_stands_in_its_way(seed) -> None:
+def test_goto_stops_before_what_stands_in_its_way(seed: int) -> None:
     result = run(seed)
     assert result.success, result.reason
     assert result.values["nearest_m"] >= MARGIN_M - ALLOWED_M

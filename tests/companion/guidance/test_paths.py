@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
-from companion.guidance.behaviour import Outcome, Situation
+from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.commands_of_flight import FollowPath
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour, lemniscate
 from companion.guidance.follow_path import FollowPathBehaviour
@@ -21,6 +23,7 @@ from companion.guidance.goto import GotoBehaviour
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.guidance.registry import behaviour_for
 from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import wrap_angle
@@ -30,7 +33,7 @@ places = st.tuples(*[st.floats(-50, 50)] * 3)
 
 
 def flown(
-    behaviour, seconds: float = 120.0, vehicle: KinematicVehicle | None = None
+    behaviour: Behaviour, seconds: float = 120.0, vehicle: KinematicVehicle | None = None
 ) -> tuple[Flight, Outcome]:
     flight = Flight(behaviour, vehicle or KinematicVehicle(), limits=WIDE)
     outcome = flight.run(seconds)
@@ -38,7 +41,7 @@ def flown(
     return flight, outcome
 
 
-def off_the_line(place, start, end) -> float:
+def off_the_line(place: Sequence[float], start: Sequence[float], end: Sequence[float]) -> float:
     way = [b - a for a, b in zip(start, end, strict=True)]
     length = math.hypot(*way)
     share = sum((p - a) * w for p, a, w in zip(place, start, way, strict=True)) / length**2
@@ -83,8 +86,7 @@ def test_goto_by_latitude_and_longitude_needs_to_know_its_own() -> None:
 
 def test_goto_by_latitude_and_longitude() -> None:
     vehicle = KinematicVehicle()
-    here = {"latitude_deg": 47.397742, "longitude_deg": 8.545594}
-    state = replace(vehicle.state, global_ns=vehicle.now_ns, **here)
+    state = replace(vehicle.state, global_ns=vehicle.now_ns, latitude_deg=47.397742, longitude_deg=8.545594)
     behaviour = GotoBehaviour(global_deg=(47.397742 + 1e-4, 8.545594))
     behaviour.on_activate(Situation(vehicle.now_ns, state))
     step = behaviour.update(0.0, Situation(vehicle.now_ns, state))
@@ -187,8 +189,7 @@ def test_an_eight_is_flown_on_its_line() -> None:
 
 @given(st.lists(places, min_size=2, max_size=8), st.booleans(), st.floats(0.5, 15))
 @settings(max_examples=60, deadline=None)
-def test_speeds_along_any_path_can_be_flown(points, closed, speed_mps) -> None:
-    points = [tuple(point) for point in points]
+def test_speeds_along_any_path_can_be_flown(points: list[Vector3], closed: bool, speed_mps: float) -> None:
     if all(math.dist(point, points[0]) < 0.01 for point in points):
         with pytest.raises(ValueError, match="two different points"):
             Path(points, speed_mps, closed=closed)
@@ -214,24 +215,26 @@ def test_speeds_along_any_path_can_be_flown(points, closed, speed_mps) -> None:
 
 @given(st.lists(places, min_size=2, max_size=6), st.tuples(*[st.floats(-200, 200)] * 3))
 @settings(max_examples=60, deadline=None)
-def test_progress_never_goes_back_and_velocities_are_finite(points, position) -> None:
-    points = [tuple(point) for point in points]
+def test_progress_never_goes_back_and_velocities_are_finite(points: list[Vector3], position: Vector3) -> None:
     if all(math.dist(point, points[0]) < 0.01 for point in points):
         return
     follower = PathFollower(Path(points, 3.0))
     before = 0.0
     for step in range(10):
-        velocity = follower.velocity(tuple(p + 0.3 * step for p in position), 3.0)
+        north, east, down = (p + 0.3 * step for p in position)
+        velocity = follower.velocity((north, east, down), 3.0)
         assert all(map(math.isfinite, velocity))
         assert follower.along_m >= before
         before = follower.along_m
 
 
 @given(st.floats(-60, 60), st.floats(-180, 180), st.floats(-2000, 2000), st.floats(-2000, 2000))
-def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_m, east_m) -> None:
+def test_metres_and_degrees_agree_with_the_ellipsoid(
+    latitude: float, longitude: float, north_m: float, east_m: float
+) -> None:
     """Against the chord between the two places in earth-centred coordinates."""
 
-    def earth_centred(place):
+    def earth_centred(place: tuple[float, float]) -> Vector3:
         phi, lam = map(math.radians, place)
         normal = 6378137.0 / math.sqrt(1 - 6.694379990141e-3 * math.sin(phi) ** 2)
         return (
@@ -262,7 +265,7 @@ def test_metres_and_degrees_agree_with_the_ellipsoid(latitude, longitude, north_
         ("figure-eight radius=1", "3 to 200"),
     ],
 )
-def test_what_cannot_be_meant_is_one_line(text, words) -> None:
+def test_what_cannot_be_meant_is_one_line(text: str, words: str) -> None:
     with pytest.raises(GrammarError, match=words):
         grammar.parse(text)
 
@@ -277,7 +280,7 @@ def test_what_cannot_be_meant_is_one_line(text, words) -> None:
         "figure-eight radius=8 nose=still",
     ],
 )
-def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text) -> None:
+def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text: str) -> None:
     command = grammar.parse(text)
     assert grammar.parse(str(command)) == command
     assert behaviour_for(command).name == command.word
@@ -285,4 +288,6 @@ def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text) -> Non
 
 
 def test_points_may_stand_without_quotes() -> None:
-    assert grammar.parse("follow-path 0,0 10,0 10,10,4").places == ((0, 0), (10, 0), (10, 10, 4))
+    command = grammar.parse("follow-path 0,0 10,0 10,10,4")
+    assert isinstance(command, FollowPath)
+    assert command.places == ((0, 0), (10, 0), (10, 10, 4))

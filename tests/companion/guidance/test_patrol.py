@@ -1,7 +1,10 @@
 import math
+from collections.abc import Callable, Sequence
 
 import pytest
 
+from companion.guidance.behaviour import Outcome
+from companion.guidance.commands_of_sight import Patrol
 from companion.guidance.grammar import parse
 from companion.guidance.patrol import PatrolBehaviour
 from companion.guidance.registry import behaviour_for
@@ -12,11 +15,17 @@ from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObj
 ROUND = ((0.0, 0.0), (24.0, 0.0), (24.0, 24.0), (0.0, 24.0))
 
 
-def flown(behaviour, objects, seconds=240.0, each=lambda seconds, vehicle: None, vehicle=None):
+def flown(
+    behaviour: PatrolBehaviour,
+    objects: list[SeenObject],
+    seconds: float = 240.0,
+    each: Callable[[float, KinematicVehicle], None] = lambda seconds, vehicle: None,
+    vehicle: KinematicVehicle | None = None,
+) -> tuple[Outcome | None, list[str], Flight]:
     """(outcome, what was told, the flight)."""
-    notes = []
+    notes: list[str] = []
 
-    def listen(at, vehicle):
+    def listen(at: float, vehicle: KinematicVehicle) -> None:
         notes.extend(behaviour.take_notes())
         each(at, vehicle)
 
@@ -25,7 +34,7 @@ def flown(behaviour, objects, seconds=240.0, each=lambda seconds, vehicle: None,
     return outcome, [*notes, *behaviour.take_notes()], flight
 
 
-def nearest(flight, place):
+def nearest(flight: Flight, place: Sequence[float]) -> float:
     return min(math.dist(place, position[:2]) for position in flight.track)
 
 
@@ -41,9 +50,9 @@ def test_a_round_without_anything_to_see_is_flown_whole() -> None:
 def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_left_the_way() -> None:
     car = SeenObject("car", 18.0, 6.0, track_id=7)
     behaviour = PatrolBehaviour(ROUND, ["person", "car"], laps=1.0, wait_s=4.0)
-    standing = []
+    standing: list[tuple[tuple[float, ...], float]] = []
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         if "looking at" in behaviour.status and math.hypot(*vehicle.velocity) < 0.1:
             standing.append((tuple(vehicle.position), vehicle.yaw_rad))
 
@@ -77,7 +86,7 @@ def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way() -> None:
 
 
 @pytest.mark.parametrize("with_identity", [True, False])
-def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity) -> None:
+def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity: bool) -> None:
     car = SeenObject("car", 12.0, 5.0, track_id=7 if with_identity else None)
     outcome, notes, _ = flown(
         PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=600.0), [car], 400
@@ -114,7 +123,7 @@ def test_what_vanishes_before_it_is_faced_is_told_and_the_round_goes_on() -> Non
     car = SeenObject("car", 12.0, 8.0, track_id=9)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         if "looking at" in behaviour.status:
             car.visible = False
 
@@ -128,7 +137,7 @@ def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_no
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0)
     flight = Flight(behaviour, KinematicVehicle())
 
-    def short(seconds, vehicle):
+    def short(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = not 3.0 < seconds < 8.0
 
     outcome = flight.run(200.0, short)
@@ -137,7 +146,7 @@ def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_no
 
     flight = Flight(PatrolBehaviour(ROUND, ["car"], laps=1.0), KinematicVehicle())
 
-    def silent(seconds, vehicle):
+    def silent(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 3.0
 
     outcome = flight.run(200.0, silent)
@@ -148,6 +157,7 @@ def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_no
 
 def test_the_grammar_of_a_patrol() -> None:
     command = parse('patrol "0,0 20,0 20,20" classes=Person,CAR do=approach distance=3', ("person", "car"))
+    assert isinstance(command, Patrol)
     assert command.names == ("person", "car")
     assert parse(str(command)) == command
     assert behaviour_for(command).class_names == ("person", "car")

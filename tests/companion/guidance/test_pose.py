@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -50,7 +51,7 @@ STATE = VehicleState(
     "pose",
     [POSE, replace(POSE, formation=None), replace(POSE, formation=replace(NOTE, wish=None, structure=None))],
 )
-def test_a_pose_comes_back_from_its_message_as_it_was(pose) -> None:
+def test_a_pose_comes_back_from_its_message_as_it_was(pose: Pose) -> None:
     assert pose_from_message(json.loads(json.dumps(pose_message(pose)))) == pose
 
 
@@ -61,7 +62,9 @@ def test_a_vehicle_tells_where_it_is_and_how_old_that_is() -> None:
     assert pose.heading_rad == pytest.approx(0.7)
     assert pose.turn_rate_radps == pytest.approx(0.3)
     assert pose.airborne
-    assert not pose_of(replace(STATE, armed=False), NOW_NS, vehicle="b", source="s").airborne
+    parked = pose_of(replace(STATE, armed=False), NOW_NS, vehicle="b", source="s")
+    assert parked is not None
+    assert not parked.airborne
 
 
 @pytest.mark.parametrize(
@@ -73,7 +76,7 @@ def test_a_vehicle_tells_where_it_is_and_how_old_that_is() -> None:
         replace(STATE, velocity_ned_mps=None),
     ],
 )
-def test_a_vehicle_that_does_not_know_its_place_tells_nothing(state) -> None:
+def test_a_vehicle_that_does_not_know_its_place_tells_nothing(state: VehicleState) -> None:
     assert pose_of(state, NOW_NS, vehicle="beta", source="s") is None
 
 
@@ -83,7 +86,9 @@ def test_the_heading_turns_by_the_body_rates_through_roll() -> None:
         attitude=quaternion_from_euler(math.pi / 6, 0.0, 0.7),
         angular_velocity_frd_radps=(0.0, 0.5 * math.sin(math.pi / 6), 0.5 * math.cos(math.pi / 6)),
     )
-    assert pose_of(banked, NOW_NS, vehicle="b", source="s").turn_rate_radps == pytest.approx(0.5)
+    turning = pose_of(banked, NOW_NS, vehicle="b", source="s")
+    assert turning is not None
+    assert turning.turn_rate_radps == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +109,9 @@ def test_the_heading_turns_by_the_body_rates_through_roll() -> None:
         (("formation", "structure", "origin"), [0.0, 0.0, 1e9], "origin must be"),
     ],
 )
-def test_a_message_that_is_no_pose_is_refused_by_name(path, value, words) -> None:
+def test_a_message_that_is_no_pose_is_refused_by_name(
+    path: Sequence[str | int], value: object, words: str
+) -> None:
     message = json.loads(json.dumps(pose_message(POSE)))
     inner = message
     for key in path[:-1]:
@@ -115,7 +122,7 @@ def test_a_message_that_is_no_pose_is_refused_by_name(path, value, words) -> Non
 
 
 @pytest.mark.parametrize("key", list(pose_message(POSE)))
-def test_a_message_without_one_of_its_fields_is_refused(key) -> None:
+def test_a_message_without_one_of_its_fields_is_refused(key: str) -> None:
     message = pose_message(POSE)
     del message[key]
     with pytest.raises(PoseError, match=f"{key} is missing"):
@@ -130,7 +137,7 @@ json_value = st.recursive(
 
 
 @given(st.sampled_from(sorted(pose_message(POSE))), json_value)
-def test_whatever_stands_in_a_field_it_is_a_pose_or_refused(key, value) -> None:
+def test_whatever_stands_in_a_field_it_is_a_pose_or_refused(key: str, value: object) -> None:
     message = pose_message(POSE)
     message[key] = value
     try:

@@ -1,4 +1,5 @@
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
@@ -14,7 +15,7 @@ from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
-def beside(place, points):
+def beside(place: tuple[float, float], points: Sequence[tuple[float, float]]) -> float:
     """The least distance of a place to a row of points, the greater of north and east."""
     nearest = max(abs(p - q) for p, q in zip(place, points[0], strict=True))
     for start, end in pairwise(points):
@@ -28,14 +29,18 @@ unit = st.floats(-1.0, 1.0)
 
 
 @given(st.floats(1, 100), st.floats(2, 40), unit, unit)
-def test_every_place_of_the_square_is_passed_within_half_a_spacing(radius, spacing, north, east) -> None:
+def test_every_place_of_the_square_is_passed_within_half_a_spacing(
+    radius: float, spacing: float, north: float, east: float
+) -> None:
     points = expanding_square(radius, spacing)
     assert beside((north * radius, east * radius), points) <= spacing / 2 + 1e-6
     assert all(max(map(abs, point)) <= radius + spacing / 2 + 1e-6 for point in points)
 
 
 @given(st.floats(1, 200), st.floats(1, 200), st.floats(2, 40), unit, unit)
-def test_every_place_of_the_area_is_passed_within_half_a_spacing(width, height, spacing, north, east) -> None:
+def test_every_place_of_the_area_is_passed_within_half_a_spacing(
+    width: float, height: float, spacing: float, north: float, east: float
+) -> None:
     points = lawnmower(width, height, spacing)
     assert beside((north * height / 2, east * width / 2), points) <= spacing / 2 + 1e-6
     assert all(abs(p[0]) <= height / 2 + 1e-9 and abs(p[1]) <= width / 2 + 1e-9 for p in points)
@@ -43,7 +48,7 @@ def test_every_place_of_the_area_is_passed_within_half_a_spacing(width, height, 
 
 @settings(max_examples=30)
 @given(st.floats(0.2, 2.5), st.floats(-0.5, 1.5), st.floats(1, 60))
-def test_the_spacing_is_less_than_what_the_camera_sees(fov, depression, height) -> None:
+def test_the_spacing_is_less_than_what_the_camera_sees(fov: float, depression: float, height: float) -> None:
     spacing = Footprint(fov, depression).spacing_m(height)
     assert 1.0 <= spacing <= max(1.0, 2 * 25.0 * math.tan(fov / 2))
     assert Footprint(fov, depression).spacing_m(height * 2) >= spacing
@@ -60,10 +65,10 @@ def test_a_camera_that_looks_steeply_down_needs_narrow_strips() -> None:
 @pytest.mark.parametrize(
     "text", ["pattern=square radius=12 spacing=8", "pattern=lawnmower width=24 height=16 spacing=8"]
 )
-def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text) -> None:
+def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text: str) -> None:
     car = SeenObject("car", 6.0, -9.0, track_id=4)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         # Small things are seen from near alone.
         car.visible = math.dist((car.north, car.east), vehicle.position[:2]) < 9.0
 
@@ -100,6 +105,6 @@ def test_without_spacing_or_camera_a_search_says_what_is_missing() -> None:
         ("seek car pattern=zigzag", "turn or square or lawnmower"),
     ],
 )
-def test_the_area_fits_the_pattern(text, said) -> None:
+def test_the_area_fits_the_pattern(text: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         parse(text)

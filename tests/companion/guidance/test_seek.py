@@ -11,7 +11,7 @@ from vision.attitude import wrap_angle
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 179, 200, 300, 355])
-def test_seek_finds_an_object_in_any_direction_and_ends_facing_it(degrees) -> None:
+def test_seek_finds_an_object_in_any_direction_and_ends_facing_it(degrees: float) -> None:
     angle = math.radians(degrees)
     car = SeenObject("car", 12.0 * math.cos(angle), 12.0 * math.sin(angle))
     vehicle = KinematicVehicle()
@@ -27,7 +27,7 @@ def test_seek_gives_up_after_its_laps_counted_from_the_real_heading() -> None:
     vehicle = KinematicVehicle()
     turned = [0.0, 0.0]
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         turned[0] += wrap_angle(vehicle.yaw_rad - turned[1])
         turned[1] = vehicle.yaw_rad
 
@@ -46,7 +46,7 @@ def test_seek_turns_the_other_way_when_told() -> None:
 def test_a_single_false_sighting_is_not_believed_and_the_turn_goes_on() -> None:
     ghost = SeenObject("car", 10.0, 3.0)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         ghost.visible = 0.3 < seconds < 0.42
 
     outcome = Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0, each)
@@ -57,9 +57,9 @@ def test_a_single_false_sighting_is_not_believed_and_the_turn_goes_on() -> None:
 def test_an_object_that_vanishes_before_it_is_faced_is_given_up_and_the_turn_goes_on() -> None:
     car = SeenObject("car", 0.0, 10.0)
     flight = Flight(SeekBehaviour("car", laps=1.0), objects=[car])
-    in_view_since = []
+    in_view_since: list[float] = []
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         if abs(wrap_angle(math.pi / 2 - vehicle.yaw_rad)) < math.radians(40):
             in_view_since.append(seconds)
             car.visible = seconds - in_view_since[0] < 0.5
@@ -79,7 +79,7 @@ def test_sightings_without_enough_confidence_do_not_count() -> None:
 def test_a_detector_that_falls_silent_stops_the_turn_and_then_ends_it() -> None:
     flight = Flight(SeekBehaviour("car"))
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 3.0
 
     outcome = flight.run(60.0, each)
@@ -92,11 +92,11 @@ def test_a_detector_that_falls_silent_stops_the_turn_and_then_ends_it() -> None:
 # --- the best of a turn, as the command `seek` flies it
 
 
-def whole_turn(**options):
-    return SeekBehaviour("car", whole_turn=True, **options)
+def whole_turn(laps: float = 2.0) -> SeekBehaviour:
+    return SeekBehaviour("car", whole_turn=True, laps=laps)
 
 
-def faces(vehicle, thing):
+def faces(vehicle: KinematicVehicle, thing: SeenObject) -> bool:
     return abs(wrap_angle(math.atan2(thing.east, thing.north) - vehicle.yaw_rad)) < math.radians(5)
 
 
@@ -143,7 +143,7 @@ def test_an_object_doubted_in_many_frames_comes_after_one_that_never_was() -> No
     clear = SeenObject("car", -25.0, 9.0, track_id=2, track_score=0.7)
     vehicle = KinematicVehicle()
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         doubted.trusted = int(seconds * 10) % 3 != 0
 
     outcome = Flight(whole_turn(), vehicle, [doubted, clear]).run(60.0, each)
@@ -157,7 +157,7 @@ def test_the_next_best_is_faced_where_the_best_has_gone() -> None:
     other = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         best.visible = seconds < 6.0
 
     outcome = Flight(whole_turn(laps=1.0), vehicle, [best, other]).run(60.0, each)
@@ -169,7 +169,7 @@ def test_the_next_best_is_faced_where_the_best_has_gone() -> None:
 def test_what_is_doubted_when_it_is_faced_is_not_confirmed() -> None:
     car = SeenObject("car", 10.0, 10.0, track_id=1, track_score=0.9)
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.trusted = seconds < 8.0
 
     outcome = Flight(whole_turn(laps=1.0), objects=[car]).run(90.0, each)
@@ -189,16 +189,17 @@ def test_less_than_a_lap_is_compared_as_far_as_it_goes() -> None:
 
 def test_a_second_lap_faces_its_first_find_at_once() -> None:
     late = SeenObject("car", 0.0, 15.0, track_id=1, visible=False)
+    times: list[float] = []
     vehicle = KinematicVehicle()
 
-    def each(seconds, vehicle):
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
+        times.append(seconds)
         late.visible = seconds > 8.0
 
-    seconds = []
-    outcome = Flight(whole_turn(), vehicle, [late]).run(60.0, lambda t, v: (seconds.append(t), each(t, v)))
+    outcome = Flight(whole_turn(), vehicle, [late]).run(60.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
-    assert seconds[-1] < 20.0
+    assert times[-1] < 20.0
 
 
 def test_without_a_tracker_the_best_of_a_turn_is_found_by_bearing() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -31,11 +32,11 @@ def seek() -> SeekBehaviour:
     return SeekBehaviour("car", sweep=sweep())
 
 
-def gimbal(now_ns: int, pitch_deg: float = 0.0, **changes: object) -> GimbalState:
+def gimbal(now_ns: int, pitch_deg: float = 0.0, **changes: Any) -> GimbalState:
     attitude = quaternion_from_euler(0.0, math.radians(pitch_deg), 0.0)
     low, high = math.radians(-90.0), math.radians(30.0)
     known = GimbalState(1, now_ns, now_ns, now_ns, attitude, primary_control=NOBODY)
-    return replace(known, **{"lowest_pitch_rad": low, "highest_pitch_rad": high, **changes})
+    return replace(replace(known, lowest_pitch_rad=low, highest_pitch_rad=high), **changes)
 
 
 def situation(told: GimbalState | None, sight: GimbalSight = CARRIED, now_ns: int = 0) -> Situation:
@@ -90,7 +91,9 @@ NOW_NS = KinematicVehicle().now_ns
         ),
     ],
 )
-def test_a_seek_with_a_sweep_names_what_of_the_gimbal_is_missing(told, sight, words) -> None:
+def test_a_seek_with_a_sweep_names_what_of_the_gimbal_is_missing(
+    told: GimbalState | None, sight: GimbalSight, words: str
+) -> None:
     why = refusal(seek(), situation(told, sight), None)
     assert why is not None
     assert words in why
@@ -105,7 +108,9 @@ def test_with_everything_there_nothing_is_missing_and_without_a_sweep_no_gimbal_
 
 
 @pytest.mark.parametrize("behaviour", [SeekBehaviour("car"), ApproachBehaviour("car")])
-def test_what_looks_through_a_camera_of_which_nobody_knows_where_it_looks_is_refused(behaviour) -> None:
+def test_what_looks_through_a_camera_of_which_nobody_knows_where_it_looks_is_refused(
+    behaviour: SeekBehaviour | ApproachBehaviour,
+) -> None:
     sight = GimbalSight(carries_camera=True, undirected="the gimbal that carries it: no gimbal answers")
     why = refusal(behaviour, situation(None, sight), None)
     assert why == (
@@ -128,6 +133,7 @@ def fly(
         step = behaviour.update(0.05, told)
         if isinstance(step, Outcome):
             return step
+        assert isinstance(step, Setpoint)
         aim = behaviour.gimbal_aim
         if follows and aim is not None:
             pitch_deg = math.degrees(aim.pitch_rad)
@@ -177,7 +183,7 @@ def test_a_gimbal_that_falls_silent_ends_the_seek_and_the_reason_is_told() -> No
 )
 @pytest.mark.parametrize("vain", [False, True])
 def test_a_gimbal_whose_attitude_is_withdrawn_ends_the_sweep_and_the_reason_is_told(
-    left, words, vain
+    left: GimbalState | None, words: str, vain: bool
 ) -> None:
     behaviour = SeekBehaviour("car", sweep=sweep())
     told = situation(gimbal(NOW_NS))
@@ -202,7 +208,9 @@ def test_the_mission_step_ends_when_the_gimbal_looks_there_or_will_not() -> None
 
 
 @pytest.mark.parametrize(("end_deg", "rate_dps"), [(-60.0, 20.0), (-90.0, 40.0), (30.0, 5.0)])
-def test_while_the_picture_turns_by_its_width_the_gimbal_goes_there_and_back(end_deg, rate_dps) -> None:
+def test_while_the_picture_turns_by_its_width_the_gimbal_goes_there_and_back(
+    end_deg: float, rate_dps: float
+) -> None:
     """Every direction between the ends has been in the middle row at least once before it leaves."""
     moving = sweep(end_deg, rate_dps)
     moving.begin(0.0)
@@ -211,6 +219,7 @@ def test_while_the_picture_turns_by_its_width_the_gimbal_goes_there_and_back(end
     while len(ends) < 6:
         moving.step(0.05, pitch_rad)
         seconds += 0.05
+        assert moving.aim is not None
         pitch_rad = moving.aim.pitch_rad
         if abs(pitch_rad - goal) < 1e-6:
             ends.append(seconds)

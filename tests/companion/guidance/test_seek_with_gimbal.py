@@ -7,6 +7,7 @@ ends 32° down) does not see, and one on a gimbal does once it looks down.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
 
 
 def fly(
-    command: str, thing: SceneObject, *, seed: int = 5, limit_s: float = 90.0, **options: object
+    command: str, thing: SceneObject, *, seed: int = 5, limit_s: float = 90.0, **options: Any
 ) -> tuple[LockstepFlight, FlightLog, list[Target]]:
     """The flight, its log, and every target that was seen, once."""
     flight = gimbal_flight(thing, seed=seed, **options)
@@ -64,11 +65,17 @@ def cut_off(target: Target) -> bool:
 
 
 def pitches(log: FlightLog) -> list[float]:
-    return [math.degrees(moment.situation.state.gimbal.pitch_rad) for moment in log.moments]
+    found = []
+    for moment in log.moments:
+        gimbal = moment.situation.state.gimbal
+        assert gimbal is not None
+        assert gimbal.pitch_rad is not None
+        found.append(math.degrees(gimbal.pitch_rad))
+    return found
 
 
 @pytest.mark.parametrize("bearing_deg", [0.0, 150.0])
-def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing_deg) -> None:
+def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing_deg: float) -> None:
     thing = person(bearing_deg)
     flight, log, seen = fly("seek person sweep=-60", thing)
     assert log.outcome is not None
@@ -79,10 +86,14 @@ def test_what_only_a_camera_that_looks_down_sees_is_found_with_the_sweep(bearing
     # So far off the horizon a bearing's degree is a third of one across.
     assert abs(math.remainder(truth.yaw_rad - bearing, math.tau)) < math.radians(15.0)
     assert pitches(log)[-1] < -50.0, "found, the gimbal looks at it"
-    assert thing.range_m(seen[-1].position_ned_m, 0.0) < PLACE_BOUND_M
+    place = seen[-1].position_ned_m
+    assert place is not None
+    assert thing.range_m(place, 0.0) < PLACE_BOUND_M
     # Nobody holds it any more.
     flight.run(1.0)
-    assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
+    manager = flight.vehicle.vehicle.gimbal_manager
+    assert manager is not None
+    assert manager.primary == (0, 0)
 
 
 def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there() -> None:
@@ -95,7 +106,9 @@ def test_as_a_step_of_a_mission_the_vehicle_holds_until_the_gimbal_looks_there()
     assert [step.reason for step in mission.records] == ["the gimbal looks 50° down", "held for 1 s"]
     assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)
     # The next step wants nothing of it, so it has been given back.
-    assert flight.vehicle.vehicle.gimbal_manager.primary == (0, 0)
+    manager = flight.vehicle.vehicle.gimbal_manager
+    assert manager is not None
+    assert manager.primary == (0, 0)
 
 
 def test_without_the_sweep_it_is_not_found() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from random import Random
 
 import pytest
 from hypothesis import given, settings
@@ -13,19 +14,27 @@ from companion.guidance.envelope import Envelope, Limits
 from companion.guidance.neighbours import Neighbour
 from companion.guidance.separation import Row, allowed_speed, apart, around, level_rows, pushed_apart, rows_at
 from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 speeds = st.floats(-5, 5)
 velocity = st.tuples(speeds, speeds, st.floats(-2, 2))
 
 
-def neighbour(place, moving=(0.0, 0.0, 0.0), *, name="alpha", age_s=0.1, role="alone"):
+def neighbour(
+    place: Vector3,
+    moving: Vector3 = (0.0, 0.0, 0.0),
+    *,
+    name: str = "alpha",
+    age_s: float = 0.1,
+    role: str = "alone",
+) -> Neighbour:
     return Neighbour(name, place, moving, 0.0, 0.0, age_s, role)
 
 
 @given(st.floats(-5, 50), st.floats(-8, 8), st.floats(0, 1), st.floats(0.5, 5))
 def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(
-    left, ahead, age, braking
+    left: float, ahead: float, age: float, braking: float
 ) -> None:
     allowed = allowed_speed(left, ahead, age, braking)
     assert allowed >= 0.0
@@ -35,7 +44,9 @@ def test_less_way_an_older_pose_and_a_neighbour_that_comes_nearer_allow_less(
 
 
 @given(st.floats(0.1, 50), st.floats(0, 8), st.floats(0.5, 5))
-def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(left, ahead, braking) -> None:
+def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(
+    left: float, ahead: float, braking: float
+) -> None:
     speed = allowed_speed(left, ahead, 0.1, braking)
     own_way = speed * 0.5 + speed**2 / 2 / braking
     assert own_way <= left + ahead**2 / 2 / braking + 1e-6
@@ -58,7 +69,7 @@ rows = st.lists(
 
 @settings(max_examples=200)
 @given(velocity, rows)
-def test_a_limit_takes_away_and_leaves_every_limit_kept(asked, limits) -> None:
+def test_a_limit_takes_away_and_leaves_every_limit_kept(asked: Vector3, limits: list[Row]) -> None:
     left, names = apart(asked, limits)
     assert math.hypot(*left) <= math.hypot(*asked) + 1e-6
     for row in limits:
@@ -78,7 +89,7 @@ def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not() -> 
 
 
 def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right() -> None:
-    def side(east):
+    def side(east: float) -> float:
         way, _ = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
         assert math.hypot(*way) == pytest.approx(2.0)
         return way[1]
@@ -111,7 +122,7 @@ def test_who_is_too_near_is_pushed_away_and_nobody_else() -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(2, 5), st.booleans())
 def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
-    random, count, by_position
+    random: Random, count: int, by_position: bool
 ) -> None:
     """Whatever behaviours ask: each asks for the same place, or for a velocity of its own, at full speed."""
     fleet = [
@@ -123,7 +134,7 @@ def test_vehicles_that_all_want_into_each_other_never_come_nearer_than_they_may(
     ]
     for turn in range(240):
         known = [
-            neighbour(tuple(vehicle.position), tuple(vehicle.velocity), name=str(index))
+            neighbour(vehicle.place, vehicle.state.velocity_ned_mps or (0.0, 0.0, 0.0), name=str(index))
             for index, (vehicle, _) in enumerate(fleet)
         ]
         for index, (vehicle, envelope) in enumerate(fleet):

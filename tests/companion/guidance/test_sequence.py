@@ -1,8 +1,10 @@
 """Missions flown in lockstep by the real pilot, streamer and envelope."""
 
+from typing import Any
+
 import pytest
 
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
 from companion.guidance.sequence import Plan, PlannedStep, SequenceBehaviour
@@ -10,33 +12,33 @@ from companion.missions.mission_file import plan_from
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
-from tests.companion.guidance.guidance_harness import GuidanceHarness
+from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
-def flying():
+def flying() -> KinematicVehicle:
     return KinematicVehicle(mode=FlightMode.HOLD)
 
 
-def parked():
+def parked() -> KinematicVehicle:
     return KinematicVehicle(
         position=[0.0, 0.0, 0.0], mode=FlightMode.HOLD, armed=False, landed=LandedState.ON_GROUND
     )
 
 
-def mission(harness, *steps, **top):
+def mission(harness: GuidanceHarness, *steps: dict[str, Any], **top: float | str) -> SequenceBehaviour:
     text = "".join(f"{key} = {value!r}\n" for key, value in top.items())
     for step in steps:
         text += "[[step]]\n" + "".join(f"{key} = {value!r}\n" for key, value in step.items())
     return SequenceBehaviour(plan_from(text, "test.toml"), harness.guidance.check_requirements)
 
 
-def begun(harness, behaviour):
+def begun(harness: GuidanceHarness, behaviour: Behaviour) -> Pending:
     harness.run(0.1)
     return harness.command(behaviour)
 
 
-def told(harness):
+def told(harness: GuidanceHarness) -> list[str]:
     return [event.message for event in harness.events if event.kind is EventKind.NOTED]
 
 
@@ -102,7 +104,7 @@ def test_a_step_that_fails_ends_the_mission_and_is_named_and_the_vehicle_holds()
 
 def test_on_failure_branches_are_taken() -> None:
     harness = GuidanceHarness(flying())
-    steps = [
+    steps: list[dict[str, Any]] = [
         {"do": "hold 60", "timeout_s": 1, "on_failure": "other"},
         {"do": "hold 1", "name": "skipped"},
         {"do": "hold 0.5", "name": "other", "on_failure": "skipped"},
@@ -118,7 +120,9 @@ def test_on_failure_branches_are_taken() -> None:
 
 
 @pytest.mark.parametrize(("way", "mode"), [("rtl", FlightMode.RETURN), ("land", FlightMode.LAND)])
-def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_same(way, mode) -> None:
+def test_a_failure_may_take_the_vehicle_down_and_the_mission_has_failed_all_the_same(
+    way: str, mode: FlightMode
+) -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "hold 60", "timeout_s": 1, "name": "wait", "on_failure": way})
     future = begun(harness, behaviour)
@@ -237,7 +241,7 @@ def test_the_time_of_the_whole_mission_ends_the_step_that_is_flown() -> None:
 
 
 @pytest.mark.parametrize("mode", [FlightMode.POSITION, FlightMode.HOLD, FlightMode.RETURN])
-def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode) -> None:
+def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode: FlightMode) -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(
         harness, *({"do": "hold 0.1", "on_failure": "continue"} for _ in range(30)), {"do": "land"}
@@ -278,7 +282,7 @@ class Broken(Behaviour):
     requirements = frozenset({Requirement.POSITION})
     left = False
 
-    def update(self, dt_s, situation):
+    def update(self, dt_s: float, situation: Situation) -> Step:
         if dt_s:
             raise ZeroDivisionError("no such luck")
         return Setpoint.brake(situation.now_ns)

@@ -1,6 +1,7 @@
 """What these behaviours ask for and how they end. How the pilot carries it out is tested with the pilot."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,7 @@ from companion.guidance.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.stop import StopBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from tests.companion.guidance.kinematic_vehicle import START_NS, KinematicVehicle
 
 PARKED = replace(
@@ -18,12 +19,14 @@ PARKED = replace(
 )
 
 
-def situation(seconds, state=PARKED, **changes):
+def situation(seconds: float, state: VehicleState = PARKED, **changes: Any) -> Situation:
     now_ns = START_NS + round(seconds * 1e9)
     return Situation(now_ns, replace(state, attitude_ns=now_ns, position_ns=now_ns, **changes))
 
 
-def climbing(altitude_m, mode=FlightMode.TAKEOFF, landed=LandedState.TAKING_OFF):
+def climbing(
+    altitude_m: float, mode: FlightMode = FlightMode.TAKEOFF, landed: LandedState = LandedState.TAKING_OFF
+) -> dict[str, Any]:
     return {"armed": True, "mode": mode, "landed": landed, "position_ned_m": (0.0, 0.0, -altitude_m)}
 
 
@@ -67,37 +70,44 @@ def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached(
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "mode", "words"),
+    ("kind", "mode", "words"),
     [
         (LandBehaviour, FlightMode.LAND, "landed and disarmed"),
         (ReturnBehaviour, FlightMode.RETURN, "returned, landed and disarmed"),
     ],
 )
-def test_the_ways_down_end_when_the_autopilot_has_disarmed(behaviour, mode, words) -> None:
-    behaviour = behaviour()
+def test_the_ways_down_end_when_the_autopilot_has_disarmed(
+    kind: type[LandBehaviour] | type[ReturnBehaviour], mode: FlightMode, words: str
+) -> None:
+    behaviour = kind()
     behaviour.on_activate(situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR)))
     assert behaviour.update(
         0.0, situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR))
     ) == ModeRequest(mode)
-    touched = {"armed": True, "mode": mode, "landed": LandedState.ON_GROUND}
+    touched: dict[str, Any] = {"armed": True, "mode": mode, "landed": LandedState.ON_GROUND}
     assert behaviour.update(0.02, situation(9, **touched)) == ModeRequest(mode)
     # PX4 shows the mode from before the landing once it has disarmed.
     assert behaviour.update(0.02, situation(11, mode=FlightMode.OFFBOARD)) == Outcome(True, words)
 
 
-@pytest.mark.parametrize("behaviour", [LandBehaviour, ReturnBehaviour])
-def test_landing_what_stands_on_the_ground_is_done_at_once(behaviour) -> None:
-    behaviour = behaviour()
+@pytest.mark.parametrize("kind", [LandBehaviour, ReturnBehaviour])
+def test_landing_what_stands_on_the_ground_is_done_at_once(
+    kind: type[LandBehaviour] | type[ReturnBehaviour],
+) -> None:
+    behaviour = kind()
     behaviour.on_activate(situation(0))
     assert behaviour.update(0.0, situation(0)) == Outcome(True, "already on the ground, disarmed")
 
 
-@pytest.mark.parametrize(("behaviour", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
-def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(behaviour, seconds) -> None:
-    behaviour = behaviour()
+@pytest.mark.parametrize(("kind", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
+def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(
+    kind: type[LandBehaviour] | type[ReturnBehaviour], seconds: float
+) -> None:
+    behaviour = kind()
     aloft = climbing(5.0, FlightMode.LAND, LandedState.LANDING)
     behaviour.on_activate(situation(0, **aloft))
     outcome = behaviour.update(0.02, situation(seconds, **aloft))
+    assert isinstance(outcome, Outcome)
     assert not outcome.success
     assert outcome.reason == f"{behaviour.name} timed out: landing and armed"
 

@@ -1,22 +1,25 @@
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from companion.guidance.target import RangeSource
 from companion.guidance.targets import (
     CONTACT_INSET_M,
     HistoryError,
     StateHistory,
-    slerp,
     targets_from_detections,
 )
-from companion.vehicle.state import VehicleState
-from vision.attitude import euler_from_quaternion, quaternion_from_euler, wrap_angle
+from companion.vehicle.state import Quaternion, Vector3, VehicleState
+from vision.attitude import euler_from_quaternion, quaternion_from_euler, slerp, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
+from vision.detections import DetectionRecord
 from vision.geolocation import foot_of_upright
 from vision.rotation import matrix_from_quaternion
 
@@ -26,7 +29,12 @@ MOUNT = CameraMount(forward_m=0.1, down_m=0.05, pitch_rad=math.radians(-20))
 T0 = 5_000_000_000
 
 
-def state_at(stamp_ns, attitude, position=(0.0, 0.0, -8.0), home=(0.0, 0.0, 0.0)):
+def state_at(
+    stamp_ns: int,
+    attitude: Quaternion,
+    position: Vector3 = (0.0, 0.0, -8.0),
+    home: Vector3 = (0.0, 0.0, 0.0),
+) -> VehicleState:
     return VehicleState(
         attitude_ns=stamp_ns,
         position_ns=stamp_ns,
@@ -36,39 +44,54 @@ def state_at(stamp_ns, attitude, position=(0.0, 0.0, -8.0), home=(0.0, 0.0, 0.0)
     )
 
 
-def history_of(attitude, position=(0.0, 0.0, -8.0), home=(0.0, 0.0, 0.0)):
+def history_of(
+    attitude: Quaternion, position: Vector3 = (0.0, 0.0, -8.0), home: Vector3 = (0.0, 0.0, 0.0)
+) -> StateHistory:
     history = StateHistory()
     for step in range(10):
         history.add(state_at(T0 + step * 20_000_000, attitude, position, home))
     return history
 
 
-def detection(xyxy, nearest=None, name="car"):
-    left, top, right, bottom = xyxy
-    return {
-        "class_id": 2,
-        "class_name": name,
-        "confidence": 0.8,
-        "xyxy": list(xyxy),
-        "center": [(left + right) / 2, (top + bottom) / 2],
-        "depth_m": None if nearest is None else nearest[2],
-        "nearest_camera_m": None if nearest is None else list(nearest),
-    }
+def detection(
+    edges: Sequence[float],
+    nearest: Sequence[float] | NDArray[np.float64] | None = None,
+    name: str = "car",
+    **changes: Any,
+) -> DetectionRecord:
+    left, top, right, bottom = edges
+    record = DetectionRecord(
+        class_id=2,
+        class_name=name,
+        confidence=0.8,
+        xyxy=list(edges),
+        center=[(left + right) / 2, (top + bottom) / 2],
+        depth_m=None if nearest is None else nearest[2],
+        nearest_camera_m=None if nearest is None else list(nearest),
+    )
+    record.update(changes)  # type: ignore[typeddict-item]  # some of its keys
+    return record
 
 
-def optical_point(camera, mount, attitude, position, point):
+def optical_point(
+    camera: CameraModel,
+    mount: CameraMount,
+    attitude: Quaternion,
+    position: Sequence[float] | NDArray[np.float64],
+    point: Sequence[float],
+) -> NDArray[np.float64]:
     body = matrix_from_quaternion(attitude).T @ (np.array(point) - position) - mount.position_frd_m
     return mount.body_from_optical.T @ body
 
 
 def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_true() -> None:
-    tracks = [
+    tracks: list[dict[str, Any]] = [
         {},  # nobody looks for tracks
         {"track_id": None, "track_score": None, "track_state": "none"},
         {"track_id": 4, "track_score": 0.6, "track_state": "tentative"},
         {"track_id": 5, "track_score": 0.7, "track_state": "confirmed"},
     ]
-    found = [detection((310, 300, 330, 400)) | track for track in tracks]
+    found = [detection((310, 300, 330, 400), **track) for track in tracks]
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     targets = targets_from_detections(found, T0, CAMERA, MOUNT, history)
     assert [target.trusted for target in targets] == [True, False, False, True]
@@ -88,21 +111,27 @@ def test_a_target_bears_its_track_and_may_be_chosen_only_when_that_counts_as_tru
     ],
     ids=["much less sure", "nearly as sure", "a little surer", "surer", "beside it", "of its class"],
 )
-def test_one_thing_with_two_names_is_chosen_only_by_the_one_that_is_clearly_surer(other, trusted) -> None:
+def test_one_thing_with_two_names_is_chosen_only_by_the_one_that_is_clearly_surer(
+    other: dict[str, Any], trusted: list[bool]
+) -> None:
     car = detection((310, 300, 330, 400))
-    both = [car, detection((311, 300, 331, 400)) | other]
+    both = [car, detection((311, 300, 331, 400), **other)]
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     assert [t.trusted for t in targets_from_detections(both, T0, CAMERA, MOUNT, history)] == trusted
 
 
 def test_of_two_names_the_score_of_the_track_counts_not_that_of_a_frame() -> None:
-    tracks = {"track_state": "confirmed"}
-    car = detection((310, 300, 330, 400)) | tracks | {"track_id": 1, "track_score": 0.9, "confidence": 0.5}
-    truck = car | tracks | {"track_id": 2, "track_score": 0.6, "confidence": 0.8, "class_name": "truck"}
+    box = (310, 300, 330, 400)
+    tracks: dict[str, Any] = {"track_state": "confirmed"}
+    car = detection(box, track_id=1, track_score=0.9, confidence=0.5, **tracks)
+    truck = detection(box, track_id=2, track_score=0.6, confidence=0.8, class_name="truck", **tracks)
     history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     targets = targets_from_detections([car, truck], T0, CAMERA, MOUNT, history)
     assert [target.trusted for target in targets] == [True, False]
 
+
+# Roll, pitch, yaw, distance, bearing off the nose, height, (north, east).
+Scene = tuple[float, float, float, float, float, float, tuple[float, float]]
 
 angles = st.floats(-0.5, 0.5)
 scenes = st.tuples(
@@ -118,7 +147,9 @@ scenes = st.tuples(
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
 @given(scene=scenes)
-def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, scene) -> None:
+def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(
+    camera: CameraModel, scene: Scene
+) -> None:
     roll, pitch, yaw, distance, off, height, (north, east) = scene
     attitude = quaternion_from_euler(roll, pitch, yaw)
     home_down = 1.5
@@ -134,6 +165,7 @@ def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, s
     box = (x - 9.5, y - 29.5, x + 10.5, y + 0.5)  # edges, half a pixel beyond the centres of pixels
     (target,) = targets_from_detections([detection(box)], T0 + 50_000_000, camera, MOUNT, history)
     assert target.range_source is RangeSource.GROUND_PLANE
+    assert target.position_ned_m is not None
     away = math.dist(point[:2], target.position_ned_m[:2])
     assert away == pytest.approx(CONTACT_INSET_M, abs=0.02 * distance)
     assert target.ground_range_m == pytest.approx(distance - CONTACT_INSET_M, abs=0.02 * distance)
@@ -142,7 +174,7 @@ def test_a_point_on_the_ground_is_found_again_from_the_foot_of_its_box(camera, s
 
 
 @given(scene=scenes, down=st.floats(-4.0, 4.0))
-def test_a_point_in_space_is_found_again_from_its_depth(scene, down) -> None:
+def test_a_point_in_space_is_found_again_from_its_depth(scene: Scene, down: float) -> None:
     roll, pitch, yaw, distance, off, height, (north, east) = scene
     attitude = quaternion_from_euler(roll, pitch, yaw)
     position = (north, east, -height)
@@ -175,6 +207,7 @@ def test_the_place_lies_where_the_box_is_and_not_at_the_nearest_corner() -> None
     assert target.ground_range_m == pytest.approx(math.hypot(0.5, 6.0))
     bearing = math.atan((469.5 - CAMERA.cx) / CAMERA.fx)
     assert target.bearing_rad == pytest.approx(bearing)
+    assert target.position_ned_m is not None
     north, east, down = target.position_ned_m
     assert (math.hypot(north, east), down) == pytest.approx((target.ground_range_m, -7.8))
     assert math.atan2(east, north) == pytest.approx(bearing)
@@ -193,7 +226,7 @@ def test_a_box_cut_by_the_edge_has_a_less_certain_range() -> None:
 
 
 @given(scene=scenes, tall_m=st.floats(0.8, 4.0))
-def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene, tall_m) -> None:
+def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene: Scene, tall_m: float) -> None:
     _, pitch, yaw, distance, _, height, (north, east) = scene
     attitude = quaternion_from_euler(0.0, pitch, yaw)  # so that it is upright in the picture
     position = (north, east, -height)
@@ -326,10 +359,12 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for 
 
 
 @given(quaternions, quaternions, st.floats(0, 1))
-def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction) -> None:
-    def angle(a, b):
-        a, b = (np.array(q) / np.linalg.norm(q) for q in (a, b))
-        return 2 * math.acos(min(1.0, abs(float(a @ b))))
+def test_slerp_divides_the_shorter_way_in_proportion(
+    first: Quaternion, second: Quaternion, fraction: float
+) -> None:
+    def angle(a: Quaternion, b: Quaternion) -> float:
+        one, other = (np.array(q) / np.linalg.norm(q) for q in (a, b))
+        return 2 * math.acos(min(1.0, abs(float(one @ other))))
 
     middle = slerp(first, second, fraction)
     assert math.isclose(sum(v * v for v in middle), 1.0, rel_tol=1e-9)
@@ -339,7 +374,8 @@ def test_slerp_divides_the_shorter_way_in_proportion(first, second, fraction) ->
 
 
 def test_slerp_takes_the_sign_of_quaternions_for_nothing() -> None:
-    half = slerp(quaternion_from_euler(0, 0, 0.4), tuple(-v for v in quaternion_from_euler(0, 0, 0.8)), 0.5)
+    w, x, y, z = quaternion_from_euler(0, 0, 0.8)
+    half = slerp(quaternion_from_euler(0, 0, 0.4), (-w, -x, -y, -z), 0.5)
     assert euler_from_quaternion(half)[2] == pytest.approx(0.6)
 
 

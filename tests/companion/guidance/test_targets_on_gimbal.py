@@ -16,11 +16,12 @@ from companion.vehicle.gimbal import GimbalState, YawFrame
 from companion.vehicle.state import VehicleState
 from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount
+from vision.detections import DetectionRecord
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, on_gimbal=True)
 T0, STEP_NS = 5_000_000_000, 20_000_000
-MIDDLE = {
+MIDDLE: DetectionRecord = {
     "class_id": 0,
     "class_name": "car",
     "confidence": 0.8,
@@ -71,7 +72,7 @@ def history_of(
 @pytest.mark.parametrize("gimbal_every", [1, 10])
 @given(step=st.floats(0.0, 49.0))
 def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(
-    frame, gimbal_every, step
+    frame: YawFrame, gimbal_every: int, step: float
 ) -> None:
     """Also when the gimbal tells five times a second: between two words it moved evenly here."""
     history = history_of(frame, gimbal_every=gimbal_every)
@@ -83,10 +84,13 @@ def test_the_direction_is_the_gimbals_of_the_capture_however_the_vehicle_leans(
 
 @pytest.mark.parametrize("frame", list(YawFrame))
 @given(step=st.floats(0.0, 49.0), right_m=st.floats(-2.0, 2.0), below_m=st.floats(-1.0, 1.0))
-def test_nearest_point_is_turned_by_the_gimbal_of_the_capture(frame, step, right_m, below_m) -> None:
+def test_nearest_point_is_turned_by_the_gimbal_of_the_capture(
+    frame: YawFrame, step: float, right_m: float, below_m: float
+) -> None:
     point = np.array([right_m, below_m, 8.0])
     captured_ns = T0 + round(step * STEP_NS)
-    box = dict(MIDDLE, nearest_camera_m=point.tolist(), depth_m=8.0)
+    box = MIDDLE.copy()
+    box.update({"nearest_camera_m": point.tolist(), "depth_m": 8.0})
     history = history_of(frame)
     (target,) = targets_from_detections([box], captured_ns, CAMERA, MOUNT, history)
     # By hand: the lens 0.1 m ahead of a leaning body, the camera pitched and turned by the gimbal alone.
@@ -154,7 +158,7 @@ def test_a_mount_on_a_gimbal_refuses_to_say_where_it_looks_without_it() -> None:
 
 
 @pytest.mark.parametrize(("pitch_deg", "down"), [(-90.0, True), (-75.0, True), (-40.0, False), (0.0, False)])
-def test_a_camera_on_a_gimbal_looks_down_when_the_gimbal_does(pitch_deg, down) -> None:
+def test_a_camera_on_a_gimbal_looks_down_when_the_gimbal_does(pitch_deg: float, down: bool) -> None:
     history = StateHistory()
     attitude = quaternion_from_euler(0.0, math.radians(pitch_deg), 1.0)
     history.add(VehicleState(gimbal=GimbalState(attitude_ns=T0, attitude=attitude)))

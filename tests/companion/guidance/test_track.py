@@ -1,4 +1,5 @@
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -7,12 +8,20 @@ from hypothesis import strategies as st
 
 from companion.guidance.target import RangeSource, Target
 from companion.guidance.track import ObjectTrack
+from companion.vehicle.state import Vector3
 
 T0 = 10**12
 FRAME_NS = 100_000_000
 
 
-def seen(place, vehicle=(0.0, 0.0, -5.0), frame=0, *, source=RangeSource.GROUND_PLANE, name="car"):
+def seen(
+    place: Sequence[float],
+    vehicle: Vector3 = (0.0, 0.0, -5.0),
+    frame: int = 0,
+    *,
+    source: RangeSource = RangeSource.GROUND_PLANE,
+    name: str = "car",
+) -> Target:
     north, east = place[0] - vehicle[0], place[1] - vehicle[1]
     known = source is not RangeSource.NONE
     return Target(
@@ -45,7 +54,9 @@ def test_a_track_cannot_begin_without_a_place() -> None:
 
 
 @given(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 6.28))
-def test_repeated_measurements_draw_the_place_to_the_truth(north, east, direction) -> None:
+def test_repeated_measurements_draw_the_place_to_the_truth(
+    north: float, east: float, direction: float
+) -> None:
     truth = (north, east)
     start = (north + math.cos(direction), east + math.sin(direction))
     vehicle = (-40.0, -40.0, -5.0)
@@ -66,7 +77,7 @@ def test_a_frame_already_seen_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("source", list(RangeSource))
-def test_an_object_in_another_direction_is_another_object(source) -> None:
+def test_an_object_in_another_direction_is_another_object(source: RangeSource) -> None:
     vehicle = (0.0, 0.0, -5.0)
     track = ObjectTrack(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((18.0, 9.0), frame=1, source=source)], vehicle)

@@ -8,6 +8,7 @@ import queue
 import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -68,7 +69,7 @@ def test_the_service_lands_on_the_marker_that_it_is_told(tmp_path: Path, method:
         ) as service,
         service.client() as session,
     ):
-        messages: queue.Queue[dict] = queue.Queue()
+        messages: queue.Queue[dict[str, Any]] = queue.Queue()
         session.declare_subscriber(
             "companion/vehicle1/markers",
             lambda sample: messages.put(json.loads(sample.payload.to_string())),
@@ -93,7 +94,7 @@ def test_the_service_lands_on_the_marker_that_it_is_told(tmp_path: Path, method:
     assert math.dist(last["position_ned_m"][:2], PAD) < 1.0
 
 
-def iter_queue(messages: queue.Queue[dict]) -> list[dict]:
+def iter_queue(messages: queue.Queue[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     while not messages.empty():
         found.append(messages.get())

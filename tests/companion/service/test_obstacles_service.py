@@ -50,7 +50,8 @@ class Truth:
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             *lines, self._rest = (self._rest + self._file.read()).split("\n")
-            for row in map(json.loads, lines):
+            for line in lines:
+                row: dict[str, Any] = json.loads(line)
                 self.rows.append(row)
                 if condition(row):
                     return row

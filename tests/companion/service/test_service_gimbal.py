@@ -79,7 +79,7 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     service, now_ns = service_of(camera__gimbal="true"), time.monotonic_ns()
     take(service, state_at(now_ns, None))
     see(service, now_ns)
-    assert service.views[0].targets == ()
+    assert not service.views[0].targets
     assert service.status()["targets"]["problem"] == "no attitude of the gimbal is known yet"
     assert service.status()["gimbal"]["problem"] == "no gimbal answers"
     situation = step(service, now_ns)
@@ -99,7 +99,7 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     later_ns = now_ns + 2_000_000_000
     take(service, replace(state_at(later_ns, looking_down(now_ns + 1))))
     see(service, later_ns)
-    assert service.views[0].targets == ()
+    assert not service.views[0].targets
     assert "newer than the newest attitude of the gimbal" in service.status()["targets"]["problem"]
     assert "old" in step(service, later_ns).gimbal.undirected
 

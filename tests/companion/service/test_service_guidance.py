@@ -47,7 +47,7 @@ async def test_a_new_detection_is_flown_by_at_once_and_without_one_the_rate_hold
     service = Service(settings)
     hastened: list[int] = []
     turns = steps_of(service)
-    service.streamer.hasten = hastened.append  # type: ignore[method-assign]
+    service.streamer.hasten = hastened.append  # type: ignore[assignment, method-assign]
     steering = asyncio.create_task(service._loop.run())
     try:
         await until(lambda: len(turns) == 1)
@@ -66,7 +66,7 @@ async def test_a_new_detection_is_flown_by_at_once_and_without_one_the_rate_hold
 async def test_it_is_flown_by_before_it_is_published() -> None:
     service = Service(load_settings(os.devnull, {"guidance.rate_hz": SLOWEST_HZ}, {}))
     order: list[str] = []
-    service.streamer.hasten = lambda _: order.append("setpoint")  # type: ignore[method-assign]
+    service.streamer.hasten = lambda _: order.append("setpoint")  # type: ignore[assignment, method-assign]
     service.bus.publish = lambda topic, *_: order.append(topic.name)  # type: ignore[method-assign]
     steering = asyncio.create_task(service._loop.run())
     try:
@@ -96,7 +96,7 @@ async def test_a_fault_on_one_side_does_not_silence_the_other(
         assert view.unplaced == "IndexError: list index out of range"
         await until(lambda: published == ["detections", "labels"])
     with monkeypatch.context() as broken:
-        broken.setattr("companion.service.publisher.labels_message", lambda *_: {}["nothing"])
+        broken.setattr("companion.service.publisher.labels_message", lambda *_: dict[str, str]()["nothing"])
         view._on_report(result(2))
         assert view.unplaced == "no attitude of the vehicle is known yet"
         await until(lambda: view.unplaced == "KeyError: 'nothing'")
@@ -113,7 +113,7 @@ async def test_what_another_camera_sees_is_not_waited_for() -> None:
     service = Service(settings)
     hastened: list[int] = []
     turns = steps_of(service)
-    service.streamer.hasten = hastened.append  # type: ignore[method-assign]
+    service.streamer.hasten = hastened.append  # type: ignore[assignment, method-assign]
     steering = asyncio.create_task(service._loop.run())
     try:
         await until(lambda: len(turns) == 1)

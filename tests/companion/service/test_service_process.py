@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
+import imageio_ffmpeg  # type: ignore[import-untyped]
 import pytest
 
 from companion.bus.client import listen
@@ -130,17 +130,18 @@ def test_a_killed_perception_worker_is_replaced_while_the_vehicle_holds(
 
 
 def test_a_vehicle_that_vanishes_is_told_and_found_again(filming: list[str], tmp_path: Path) -> None:
-    with running_simulator() as first:
-        ports = {"onboard_port": first.onboard_port, "onboard_bind": first.onboard_bind}
-        with running_service(first.onboard_port, filming, cwd=tmp_path) as service:
-            fly(service)
-            first.kill()
-            service.wait_for_line("autopilot heartbeat lost")
-            said = len(service.lines)
-            with running_simulator(**ports) as second:
-                service.wait_for_line("autopilot heartbeat received", after=said)
-                service.take_off(2.5)
-                second.wait_for_event("takeoff")
+    with (
+        running_simulator() as first,
+        running_service(first.onboard_port, filming, cwd=tmp_path) as service,
+    ):
+        fly(service)
+        first.kill()
+        service.wait_for_line("autopilot heartbeat lost")
+        said = len(service.lines)
+        with running_simulator(onboard_port=first.onboard_port, onboard_bind=first.onboard_bind) as second:
+            service.wait_for_line("autopilot heartbeat received", after=said)
+            service.take_off(2.5)
+            second.wait_for_event("takeoff")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
