@@ -23,6 +23,8 @@ from vision.attitude import wrap_angle
 POSITION_GAIN_PER_S = 1.0
 # A loop that stood still must not earn itself a jump.
 LONGEST_STEP_S = 0.2
+# Heights that differ by less are the same one.
+SAME_HEIGHT_M = 0.05
 # Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
 FENCE_BRAKING = 0.5
 # How late a multirotor's velocity follows.
@@ -101,7 +103,10 @@ class Envelope:
         self._velocity = self._yaw_rad = None
 
     def why_not_there(self, goal: Vector3, state: VehicleState) -> str | None:
-        """Why a goal (local NED metres) is nowhere to fly to; None: it is allowed. Height is not judged."""
+        """Why a goal (local NED metres) is nowhere to fly to; None: it is allowed.
+
+        The height the vehicle has is always allowed: a way along it asks for no other.
+        """
         home = state.home_position_ned_m or self._home or (0.0, 0.0, 0.0)
         away = (goal[0] - home[0], goal[1] - home[1])
         where = f"{away[0]:.1f} m north and {away[1]:.1f} m east of home"
@@ -109,6 +114,14 @@ class Envelope:
             return f"{where} is farther than guidance.max_distance_m = {self.limits.max_distance_m:g}"
         if not self.limits.fence.holds(away):
             return f"{where} is not inside the fence (guidance.fence_include, fence_exclude)"
+        here = state.position_ned_m
+        if here is not None and abs(goal[2] - here[2]) <= SAME_HEIGHT_M:
+            return None
+        height_m, low_m, high_m = home[2] - goal[2], self.limits.min_altitude_m, self.limits.max_altitude_m
+        if height_m > high_m + SAME_HEIGHT_M:
+            return f"{height_m:.1f} m above home is higher than guidance.max_altitude_m = {high_m:g}"
+        if height_m < low_m - SAME_HEIGHT_M:
+            return f"{height_m:.1f} m above home is lower than guidance.min_altitude_m = {low_m:g}"
         return None
 
     def apply(

@@ -41,6 +41,13 @@ class TakeoffBehaviour(Behaviour):
         climbing = set() if self._top is None else {Requirement.POSITION}
         return frozenset({Requirement.ON_GROUND} | climbing)
 
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour: the autopilot climbs there by itself, where no limit of setpoints holds."""
+        state = situation.state
+        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        north, east, _ = state.position_ned_m or home
+        return ((north, east, home[2] - self._altitude_m),)
+
     def on_activate(self, situation: Situation) -> None:
         limit_s = BASE_TIMEOUT_S + self._altitude_m / SLOWEST_CLIMB_MPS
         self._until_ns = situation.now_ns + limit_s * 1e9

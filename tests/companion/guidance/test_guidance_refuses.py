@@ -95,6 +95,15 @@ def test_a_detector_that_is_late_for_a_moment_does_not_refuse_seek_but_does_not_
         (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "0.0 m north and -7000.0 m east of home"),
         (PatrolBehaviour([(0.0, 0.0), (9000.0, 0.0)], ("car",)), "9000.0 m north"),
         (FigureEightBehaviour(6000.0, 3.0, 1.0), "is farther than guidance.max_distance_m"),
+        (
+            GotoBehaviour(from_home_m=(0.0, 0.0), altitude_m=90.0),
+            "90.0 m above home is higher than guidance.max_altitude_m = 50",
+        ),
+        (
+            GotoBehaviour(from_home_m=(0.0, 0.0), altitude_m=0.2),
+            "0.2 m above home is lower than guidance.min_altitude_m = 1",
+        ),
+        (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 60.0)], 3.0), "60.0 m above home is higher than"),
     ],
 )
 def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(
@@ -107,6 +116,24 @@ def test_a_goal_beyond_the_limits_is_refused_and_named_before_anything_is_flown(
     assert outcome.reason.startswith(f"{behaviour.name} would leave the limits: ")
     assert where in outcome.reason
     assert not harness.autopilot.setpoints
+
+
+def test_a_take_off_beyond_the_highest_altitude_is_refused_before_anything_is_armed() -> None:
+    harness = GuidanceHarness(parked())
+    harness.run(0.1)
+    outcome = harness.command(TakeoffBehaviour(60.0)).result()
+    assert outcome.reason == (
+        "takeoff would leave the limits: 60.0 m above home is higher than guidance.max_altitude_m = 50"
+    )
+    assert not harness.autopilot.requests
+
+
+def test_who_is_too_high_may_still_fly_level() -> None:
+    vehicle = flying()
+    vehicle.position[2] = -60.0
+    harness = GuidanceHarness(vehicle)
+    harness.run(0.1)
+    assert not harness.command(GotoBehaviour(from_home_m=(5.0, 0.0))).done()
 
 
 def test_a_goal_outside_the_fence_is_refused_and_one_inside_is_not() -> None:
