@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from functools import partial
@@ -17,6 +18,7 @@ from typing import Any
 
 import zenoh
 
+from companion.bus.command_intake import CommandIntake
 from companion.bus.topics import TOPICS, VIEW_TOPICS, Topic, alive_key, command_key, everybodys_key
 from companion.settings import ZenohSection
 
@@ -27,6 +29,8 @@ CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
 _RETRY_MIN_S, _RETRY_MAX_S = 0.5, 5.0
 _WATCH_PERIOD_S = 0.25
 _ANSWER_S = 0.5
+# What goes wrong in a command is logged no more often than this.
+_LOG_PERIOD_S = 1.0
 
 
 class BusError(ConnectionError):
@@ -63,6 +67,7 @@ class Bus:
     Attributes:
         published: path of a topic (`Topic.path`) → messages handed to zenoh.
         unsent: messages that came while there was no session, or that zenoh refused.
+        intake: which commands are taken.
     """
 
     def __init__(
@@ -94,6 +99,8 @@ class Bus:
         self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
         self.published: dict[str, int] = {topic.path(view): 0 for topic, view in self._streams}
         self.unsent = 0
+        self.intake = CommandIntake()
+        self._logged_s, self._unlogged = -_LOG_PERIOD_S, 0
 
     @property
     def open(self) -> bool:
@@ -217,21 +224,33 @@ class Bus:
             self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes())
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(lambda: self._spawn(self._answer(query)))
+        text, why = self.intake.read(*_payload(query))
+        loop = self._loop
+        if text is not None and loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(lambda: self._spawn(self._answer(query, text)))
+            return
+        with query:
+            _reply(query, {"command": "", "success": False, "reason": why or "the service has ended"})
 
-    async def _answer(self, query: zenoh.Query) -> None:
-        text = _command_text(query)
-        reply: dict[str, Any] = {"command": text, "success": False, "reason": "the service has ended"}
+    async def _answer(self, query: zenoh.Query, text: str) -> None:
+        reply: dict[str, Any] = {"command": text[:200], "success": False, "reason": "the service has ended"}
         try:
             reply = await self._on_command(text)
         except Exception as error:
-            logger.exception("command %r failed", text)
+            self._log_failure(text)
             reply["reason"] = f"{type(error).__name__}: {error}"
         finally:
             # Whatever happens here, the other side is not left waiting: it must not send the command again.
             with query:
-                query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
+                _reply(query, reply)
+
+    def _log_failure(self, text: str) -> None:
+        now_s = time.monotonic()
+        if now_s - self._logged_s < _LOG_PERIOD_S:
+            self._unlogged += 1
+            return
+        logger.exception("command %.200r failed (%d more were not logged)", text, self._unlogged)
+        self._logged_s, self._unlogged = now_s, 0
 
     async def _watch(self) -> None:
         """Open the session if it is not (client), then tell when the nodes in `connect` come and go."""
@@ -273,11 +292,17 @@ class Bus:
             logger.error("zenoh task failed", exc_info=error)
 
 
-def _command_text(query: zenoh.Query) -> str:
-    """The command in the query's payload, or in its parameter `text` (`…/command?text=hold`)."""
-    if query.payload is not None and len(query.payload):
-        return query.payload.to_string()
-    return str(query.parameters.get("text", ""))
+def _payload(query: zenoh.Query) -> tuple[int, Callable[[], bytes]]:
+    """Size and bytes of the command: the query's payload, or its parameter `text` (`…/command?text=hold`)."""
+    payload = query.payload
+    if payload is not None and len(payload):
+        return len(payload), payload.to_bytes
+    text = str(query.parameters.get("text", "")).encode("utf-8", "replace")
+    return len(text), lambda: text
+
+
+def _reply(query: zenoh.Query, reply: dict[str, Any]) -> None:
+    query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
 def _first_line(error: BaseException) -> str:

@@ -123,9 +123,12 @@ def find_mission(name: str) -> Path:
     """
     path = Path(name)
     bundled = sorted(file.stem for file in MISSIONS_FOLDER.glob("*.toml"))
-    for candidate in (path, path.with_name(f"{path.name}.toml")):
-        if candidate.is_file():
-            return candidate
+    try:
+        for candidate in (path, path.with_name(f"{path.name}.toml")):
+            if candidate.is_file():
+                return candidate
+    except (OSError, ValueError) as error:
+        raise MissionError(f"{name[:80]!r} is no name of a mission: {error}") from error
     if name in bundled:
         return MISSIONS_FOLDER / f"{name}.toml"
     raise MissionError(

@@ -26,6 +26,9 @@ from companion.vehicle.state import FlightMode, VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 
+# Of the line of a command; the longest that is of use is a path of hundreds of points.
+LONGEST_LINE = 8000
+
 
 class InputAssembler:
     """Gathers what comes in between two steps of guidance.
@@ -122,6 +125,10 @@ class InputAssembler:
             GrammarError, MissionError: with what is wrong, a line for each.
         """
         text, _, enclosed = text.strip().partition("\n")
+        if len(text) > LONGEST_LINE:
+            raise GrammarError(
+                f"a command has at most {LONGEST_LINE} characters in its line, got {len(text)}"
+            )
         names = self.steering.class_names
         command: Command = parse(text, names)
         if isinstance(command, Gimbal):

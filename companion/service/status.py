@@ -60,6 +60,7 @@ def status_message(
             "connected": bus.connected,
             "published": dict(bus.published),
             "unsent": bus.unsent,
+            "refused_commands": bus.intake.refused,
         },
     }
 

@@ -20,6 +20,7 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.client import NoAnswerError, client_settings, listen, open_client, send_command
+from companion.bus.command_intake import LARGEST_COMMAND_BYTES
 from companion.bus.session import Bus, BusError
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
@@ -95,6 +96,53 @@ async def test_a_subscriber_receives_what_is_published_and_a_command_is_answered
     assert message == ("companion/alpha/labels", "car, person")
     assert reply == {"success": False, "reason": "no dance"}
     assert bus.published["labels"] > 0
+
+
+async def test_every_bad_query_gets_one_answer_and_stop_is_heard_in_a_flood() -> None:
+    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
+    heard: list[str] = []
+
+    async def handle(text: str) -> dict[str, Any]:
+        heard.append(text[:20])
+        if text == "break":
+            raise ZeroDivisionError("no such luck")
+        return {"success": True, "reason": ""}
+
+    bus = Bus(settings, "alpha", on_event=Events(), on_command=handle)
+    await bus.start()
+    try:
+
+        def other_side() -> dict[str, list[str]]:
+            with open_client(client_settings(settings)) as session:
+
+                def ask(payload: bytes) -> list[str]:
+                    replies = session.get(topics.command_key("alpha"), payload=payload, timeout=WAIT_S)
+                    return [json.loads(r.ok.payload.to_string())["reason"] for r in replies if r.ok]
+
+                return {
+                    "warm up": ask(b"hold"),
+                    "bytes": ask(b"\xff\xfe hold"),
+                    "large": ask(b"x" * 10_000_000),
+                    "empty": ask(b""),
+                    "raises": ask(b"break"),
+                    "flood": [reason for _ in range(150) for reason in ask(b"dance")],
+                    "stop": ask(b" Stop\n"),
+                }
+
+        answers = await asyncio.to_thread(other_side)
+    finally:
+        await bus.close()
+    assert answers["bytes"] == ["the command was not taken: it is not UTF-8 text: byte 0 is 0xff"]
+    assert answers["large"] == [
+        f"the command was not taken: it is 10000000 bytes long; {LARGEST_COMMAND_BYTES} are taken at most"
+    ]
+    assert answers["empty"] == [""]
+    assert answers["raises"] == ["ZeroDivisionError: no such luck"]
+    assert len(answers["flood"]) == 150
+    assert "commands a second came" in answers["flood"][-1]
+    assert answers["stop"] == [""]
+    assert heard[-1] == " Stop\n"
+    assert bus.intake.refused == 2 + sum(bool(reason) for reason in answers["flood"])
 
 
 async def test_a_busy_port_is_one_clear_line() -> None:

@@ -262,3 +262,10 @@ def test_a_mission_sent_to_the_service_is_flown_and_its_steps_are_told(
         reply = service.command("mission from_the_ground\n[[step]]\ndo = 'hold 3'\n")
         assert reply["reason"].startswith("mission needs to be in the air")
         assert reply["steps"] == []
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "\0", ".", "/", "a/" * 3000])
+def test_a_name_that_no_file_can_have_is_one_line(name: str) -> None:
+    with pytest.raises(MissionError) as error:
+        find_mission(name)
+    assert "\n" not in str(error.value)
