@@ -8,9 +8,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flock import Flock, place_in_world
+from mavlink_sim.truth_file import TruthFile
 from mavlink_sim.world.aircraft import identifier_offset
 from vision.attitude import euler_from_quaternion
 
@@ -77,9 +78,10 @@ class Spectators:
         self._camera_rate_hz = 30.0
         self._scene = scene
         self._identifier_offset = 0 if scene is None else identifier_offset(scene.world)
-        self._truth: IO[str] | None = None
+        self._truth: TruthFile | None = None
         if options.truth is not None:
-            self._truth = resources.enter_context(options.truth.open("w", encoding="utf-8"))
+            self._truth = TruthFile(options.truth)
+            resources.callback(self._truth.close)
         if scene is not None and options.shows_world:
             self._open_camera(scene, resources)
 
@@ -127,8 +129,10 @@ class Spectators:
                 self._check_camera(camera)
         if self._truth is not None and simulated_s >= self._next_truth_s:
             self._next_truth_s += 1.0 / TRUTH_RATE_HZ
-            self._truth.write(json.dumps(self.truth(simulated_s, stamp_ns)) + "\n")
-            self._truth.flush()
+            why = self._truth.write(json.dumps(self.truth(simulated_s, stamp_ns)))
+            if why is not None:
+                self._truth = None
+                self._on_event(why)
 
     def _check_camera(self, camera: CameraProcess) -> None:
         """Say when the camera begins and when it is lost; the vehicle flies on without it."""

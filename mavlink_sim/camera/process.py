@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import signal
 import struct
+import sys
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.shared_poses import SharedPoses
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, truth_line
 from mavlink_sim.camera.video_outputs import check_output, open_output
+from mavlink_sim.truth_file import TruthFile
 from mavlink_sim.world.aircraft import Aircraft
 from mavlink_sim.world.world import World
 from vision.camera_model import CameraModel, CameraMount
@@ -74,7 +76,8 @@ def run_camera(
             resources.callback(sink.close)
         lines = None
         if truth is not None:
-            lines = resources.enter_context(truth.open("w", encoding="utf-8", buffering=1))
+            lines = TruthFile(truth)
+            resources.callback(lines.close)
         ready.set()
         period_s = 1.0 / rate_hz
         due_s = time.monotonic()
@@ -87,7 +90,9 @@ def run_camera(
                 for sink in sinks:
                     sink.write(captured.frame)
                 if lines is not None:
-                    lines.write(truth_line(captured))
+                    why = lines.write(truth_line(captured))
+                    if why is not None:
+                        print(f"camera: {why}", file=sys.stderr, flush=True)
             return max(on_the_way[0].arrives_ns - time.monotonic_ns(), 0) / 1e9 if on_the_way else None
 
         while True:

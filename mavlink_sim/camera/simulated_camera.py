@@ -171,4 +171,4 @@ def frame_truth(captured: Captured) -> dict[str, Any]:
 
 def truth_line(captured: Captured) -> str:
     """`frame_truth` as one line of JSON."""
-    return json.dumps(frame_truth(captured)) + "\n"
+    return json.dumps(frame_truth(captured))

@@ -1,0 +1,37 @@
+"""The truth on a disk that takes no more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mavlink_sim.testing import running_simulator
+from mavlink_sim.truth_file import TruthFile
+
+FULL = Path("/dev/full")
+needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
+
+
+def test_each_line_is_there_when_it_was_written(tmp_path: Path) -> None:
+    file = TruthFile(tmp_path / "truth.jsonl")
+    assert file.write(json.dumps({"a": 1})) is None
+    assert (tmp_path / "truth.jsonl").read_text() == '{"a": 1}\n'
+    file.close()
+    file.close()
+    assert file.write("more") is None
+
+
+@needs_full
+def test_a_full_disk_is_told_once_and_ends_the_file() -> None:
+    file = TruthFile(FULL)
+    assert file.write("line") == "the truth is no longer written to /dev/full: No space left on device"
+    assert file.write("line") is None
+
+
+@needs_full
+def test_the_vehicle_flies_on_when_its_truth_is_no_longer_written() -> None:
+    with running_simulator(truth=FULL) as simulator:
+        simulator.wait_for_event("the truth is no longer written to /dev/full: No space left on device")
+        assert simulator.process.poll() is None
