@@ -44,7 +44,10 @@ REFINEMENT = TrainingSettings(
     max_channels=DEFAULT_RECIPE.max_channels,
     # A scene of the camera's size is expensive to draw and has many pictures in it: whole at half its pixels,
     # and parts of it at up to 1.3 times its own.
-    stages=(Stage(320, 256, 16, 4315, scenes=6_000, decay_steps=4315, drawn=(640, 480)),),
+    stages=(
+        Stage(320, 256, 16, 4315, scenes=6_000, decay_steps=4315, drawn=(640, 480)),
+        Stage(320, 256, 16, 8147, scenes=4_000, decay_steps=8147, rate=0.75, drawn=(640, 480)),
+    ),
     learning_rate=2e-3,
     warmup_steps=150,
     augmentation=Augmentation(
