@@ -90,14 +90,16 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     flight.tick()
     behaviour = flight.guidance.behaviour
     confirmed: str | None = None
+    seen: str | None = None
     ranges_m: dict[str, tuple[float, float]] = {}
     while flight.seconds < LIMIT_S and flight.outcome(identifier) is None:
         flight.tick()
+        seen = _faced(scene.world, flight) or seen
         records = behaviour.records if isinstance(behaviour, SequenceBehaviour) else []
         if records and records[-1].title not in ranges_m and records[-1].success:
             ranges_m[records[-1].title] = _range_to_target(scene.world, vehicle)
             if records[-1].title == FIND:
-                confirmed = _faced(scene.world, flight)
+                confirmed = seen
     outcome = flight.outcome(identifier)
     arrival_m, _ = ranges_m.get(REACH, (None, None))
     hold_m, footprint_m = ranges_m.get(STAND, (None, None))
@@ -107,7 +109,7 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     elif not outcome.success:
         words = behaviour.told(outcome) if isinstance(behaviour, SequenceBehaviour) else outcome
         failure = words.reason
-    elif confirmed not in (TARGET_CLASS, None):
+    elif confirmed != TARGET_CLASS:
         failure = f"confirmed a {confirmed}, not a {TARGET_CLASS}"
     elif hold_m is None or abs(hold_m - STOP_DISTANCE_M) > RANGE_TOLERANCE_M:
         failure = f"stood {_metres(hold_m)} from the {TARGET_CLASS}, not {STOP_DISTANCE_M:g} m"
@@ -214,9 +216,10 @@ def _range_to_target(world: World, vehicle: LockstepVehicle) -> tuple[float, flo
 
 
 def _faced(world: World, flight: LockstepFlight) -> str | None:
-    """Class of the object that stands where guidance believes the one it faces to be."""
+    """Class of the object that stands where guidance believes the one it faces to be; None: none is seen."""
     situation = flight.guidance.situation
-    assert situation is not None
+    if situation is None or not situation.targets:
+        return None
     yaw_rad = situation.state.yaw_rad or 0.0
     seen = [t for t in situation.targets if t.class_name == TARGET_CLASS and t.position_ned_m is not None]
     if not seen:
