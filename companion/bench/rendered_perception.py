@@ -47,8 +47,8 @@ class RenderedPerception:
     True
 
     The same seed and the same calls give the same results, `timing_ms` apart. The network and OpenCV compute
-    with one thread each, the network in float32 unless `detector.precision` names another; it is loaded once a
-    process for each `[detector]`.
+    with one thread each, the network in float32 unless `detector.precision` names another; it is loaded once
+    a process for each `[detector]`.
 
     Args:
         settings: as `companion run` reads them. Of `camera`, `detector`, `tracker`, `markers` and
