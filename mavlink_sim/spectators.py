@@ -11,8 +11,8 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flock import Flock, place_in_world
-from mavlink_sim.truth_file import TruthFile
 from mavlink_sim.world.aircraft import identifier_offset
+from mavlink_sim.world.truth_file import TruthFile
 from vision.attitude import euler_from_quaternion
 
 if TYPE_CHECKING:

@@ -30,8 +30,8 @@ from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.shared_poses import SharedPoses
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, truth_line
 from mavlink_sim.camera.video_outputs import check_output, open_output
-from mavlink_sim.truth_file import TruthFile
 from mavlink_sim.world.aircraft import Aircraft
+from mavlink_sim.world.truth_file import TruthFile
 from mavlink_sim.world.world import World
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion

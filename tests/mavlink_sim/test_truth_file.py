@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mavlink_sim.testing import running_simulator
-from mavlink_sim.truth_file import TruthFile
+from mavlink_sim.world.truth_file import TruthFile
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
