@@ -88,11 +88,22 @@ class Authority:
         if state.failsafe and not self._failsafe_before and (flying_by_setpoint or not explained):
             return f"autopilot failsafe: {_shown(state.mode)}"
         if not explained:
+            # A pilot's change moves the intended mode along, a failsafe leaves it as we asked for it.
+            if state.intended_beside is state.mode and state.intended_mode is self._mode:
+                return f"autopilot failsafe: {_shown(state.mode)}"
             return f"the pilot took over: {_shown(state.mode)}"
         self._was_armed |= state.armed
         if self._was_armed and not state.armed and self._mode not in GOING_DOWN:
             return "the vehicle was disarmed"
         return None
+
+    def reason_is_told(self, state: VehicleState) -> bool:
+        """Whether what `lost` said is all that the autopilot will say of it.
+
+        A HEARTBEAT may show a new mode a moment before CURRENT_MODE tells whose it was.
+        """
+        told = state.intended_beside is not FlightMode.UNKNOWN
+        return not told or state.failsafe or state.intended_beside is state.mode
 
     def _explained(self, state: VehicleState, now_ns: int) -> bool:
         if state.mode is self._mode:

@@ -44,6 +44,8 @@ logger = logging.getLogger(__name__)
 # PX4 takes OFFBOARD after one setpoint; a few more cost 60 ms and survive a lost packet.
 SETPOINTS_BEFORE_OFFBOARD = 3
 ENGAGE_TIMEOUT_S = 3.0
+# Command was lost: so long may the autopilot take to tell why. Nothing is streamed meanwhile.
+REASON_WAIT_S = 0.3
 # In OFFBOARD without a known position: brake for this long, then leave the vehicle to the autopilot.
 POSITION_LOSS_S = 2.0
 
@@ -119,6 +121,7 @@ class Guidance:
         self._engaging_since_ns = 0
         self._sent_before_engaging = 0
         self._position_lost_ns: int | None = None
+        self._yielded: tuple[int, str] | None = None
         self._blind = False
         self._goal_ned_m: Vector3 | None = None
         self._mode_changes = 0
@@ -288,8 +291,8 @@ class Guidance:
             situation.now_ns,
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
         )
-        if why is not None:
-            self._lose(why)
+        if why is not None or self._yielded is not None:
+            self._yield(why, situation)
             return
         self._watch_battery(self._behaviour, situation)
         for answer in inputs.answers:
@@ -511,8 +514,18 @@ class Guidance:
 
     # --- the end of a behaviour, or of our command -------------------------------------------------------
 
+    def _yield(self, why: str | None, situation: Situation) -> None:
+        """Fall silent at once; say why when the autopilot has told whose change of mode it was."""
+        since_ns, first = self._yielded or (situation.now_ns, why or "")
+        self._yielded = (since_ns, why or first)
+        self._silence()
+        waited_s = (situation.now_ns - since_ns) / 1e9
+        if why is None or waited_s >= REASON_WAIT_S or self._authority.reason_is_told(situation.state):
+            self._lose(self._yielded[1])
+
     def _lose(self, why: str) -> None:
         """Command was taken from us: not one setpoint more."""
+        self._yielded = None
         self._silence()
         self._goal_ned_m = None
         behaviour, outcome = self._behaviour, Outcome(False, why)
@@ -546,6 +559,7 @@ class Guidance:
 
     def _release(self) -> None:
         """Not in command any more."""
+        self._yielded = None
         self._drop_request()
         self._silence()
         self._authority.release()

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.heard_state import HeardState
+from companion.vehicle.manners import HOME_POSITION_ID
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.state import FlightMode
 from companion.vehicle.telemetry_fold import Fields
@@ -16,6 +17,7 @@ _MODE_FLAG_CUSTOM = 1
 _DO_SET_MODE = 176
 _NAV_TAKEOFF = 22
 _COMPONENT_ARM_DISARM = 400
+_REQUEST_MESSAGE = 512
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 
 
@@ -103,7 +105,8 @@ class FlightCommands:
         heard = self._heard
         if not (math.isfinite(altitude_m) and altitude_m > 0.0):
             raise CommandRefusedError(f"a take-off altitude must be above 0 m, got {altitude_m}")
-        await heard.until(lambda: heard.state.home_altitude_amsl_m is not None, _SHOWN_TIMEOUT_S)
+        if heard.manners.takes_off_by_home:
+            await self._hear_home()
         result = await self._command(_NAV_TAKEOFF, *heard.manners.takeoff_parameters(altitude_m, heard.state))
         if result != ACCEPTED:
             raise CommandRefusedError(
@@ -111,3 +114,19 @@ class FlightCommands:
             )
         for told, fields in heard.manners.takes_off():
             heard.take_in(told, fields)
+
+    async def _hear_home(self) -> None:
+        """Let home be told as it is now: PX4 moves it when it arms, and tells it every two seconds only."""
+        heard, told = self._heard, False
+
+        def watch(name: str, _fields: Fields) -> None:
+            nonlocal told
+            told |= name == "HOME_POSITION"
+
+        async with heard.watching(watch):
+            result = await self._command(_REQUEST_MESSAGE, HOME_POSITION_ID)
+            if not await heard.until(lambda: told, _SHOWN_TIMEOUT_S):
+                raise CommandRefusedError(
+                    "take-off needs home's altitude, and the vehicle has not told it "
+                    f"({result_name(result)}; no position yet?)"
+                )

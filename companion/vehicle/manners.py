@@ -26,12 +26,14 @@ class Manners(ABC):
         name: for people. rates_hz: what is read, by message id, and the rate that control needs.
         requested: messages that are asked for once while home is not known.
         parameters_bytewise: integer parameters travel as their bytes; else as numbers.
+        takes_off_by_home: a take-off is commanded as an altitude AMSL, which home's altitude is needed for.
     """
 
     name: str
     rates_hz: dict[int, float]
     requested: tuple[int, ...] = (HOME_POSITION_ID,)
     parameters_bytewise: bool
+    takes_off_by_home: bool
 
     def heard(self, name: str, fields: Fields, state: VehicleState) -> list[tuple[str, Fields]]:
         """A message of the autopilot in PX4's terms: what is to be taken in for it, often itself."""
@@ -65,6 +67,7 @@ class Px4Manners(Manners):
 
     name = "PX4"
     parameters_bytewise = True
+    takes_off_by_home = True
     rates_hz = {  # noqa: RUF012 - a table, never changed
         31: 50.0,  # ATTITUDE_QUATERNION
         32: 30.0,  # LOCAL_POSITION_NED

@@ -89,8 +89,8 @@ class PymavlinkDriver(AutopilotDriver):
             if not autopilots and frame.message_id != _GIMBAL_ATTITUDE_ID:
                 continue
             if frame.message_id == CURRENT_MODE_ID:
-                custom_mode, _ = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
-                self._heard.handle("CURRENT_MODE", {"custom_mode": custom_mode})
+                shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
+                self._heard.handle("CURRENT_MODE", {"custom_mode": shown, "intended_custom_mode": intended})
             elif frame.message_id in _DECODED_IDS:
                 try:
                     message = self._codec.decode(bytearray(frame.raw))

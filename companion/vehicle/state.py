@@ -64,6 +64,9 @@ class VehicleState:
         battery_fraction: 0..1, None when unknown.
         ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
         failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
+        intended_mode: what the pilot or a command chose last. A failsafe changes `mode` alone.
+        intended_beside: the `mode` that was shown when the intended one was told. Both are UNKNOWN on an
+            autopilot that does not tell it (CURRENT_MODE: PX4 1.15 and newer).
         clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until it has told its time.
         gimbal: where it looks and who may move it; None until one was heard.
     """
@@ -79,6 +82,8 @@ class VehicleState:
     landed: LandedState = LandedState.UNKNOWN
     ready_to_arm: bool = False
     failsafe: bool = False
+    intended_mode: FlightMode = FlightMode.UNKNOWN
+    intended_beside: FlightMode = FlightMode.UNKNOWN
     position_ned_m: Vector3 | None = None
     velocity_ned_mps: Vector3 | None = None
     attitude: Quaternion | None = None

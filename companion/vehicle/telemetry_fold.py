@@ -51,7 +51,14 @@ def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState
 
 def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
     mode = _mode(fields)
-    return state if mode in (state.mode, FlightMode.UNKNOWN) else replace(state, mode=mode)
+    if mode is FlightMode.UNKNOWN:
+        return state
+    intended, beside = state.intended_mode, state.intended_beside
+    if "intended_custom_mode" in fields:
+        intended, beside = mode_of_custom_mode(fields["intended_custom_mode"]), mode
+    if (mode, intended, beside) == (state.mode, state.intended_mode, state.intended_beside):
+        return state
+    return replace(state, mode=mode, intended_mode=intended, intended_beside=beside)
 
 
 def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:

@@ -19,7 +19,7 @@ from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
 from companion.vehicle.mavsdk_driver import MavsdkDriver
 from companion.vehicle.state import FlightMode
-from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_until
+from tests.companion.vehicle.fake_autopilot import FakeAutopilot, state_shows, wait_until
 
 pytestmark = pytest.mark.usefixtures("short_measurement")
 
@@ -84,6 +84,22 @@ async def test_takeoff_goes_to_a_height_above_home(driver: Driver, autopilot: Fa
     (message,) = [m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 22]
     assert message.param7 == 492.5
     assert all(math.isnan(getattr(message, f"param{number}")) for number in range(1, 7))
+
+
+async def test_takeoff_takes_home_as_it_is_after_arming(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.home(488.85)
+    await state_shows(driver, lambda state: state.home_altitude_amsl_m == 488.85)
+
+    def moved(message: Any) -> None:
+        """Home has moved by what the height drifted on the ground; it is not told unasked."""
+        autopilot.acknowledge(message.command)
+        if (message.command, message.param1) == (512, 242):
+            autopilot.home(489.58)
+
+    autopilot.answers["COMMAND_LONG"] = moved
+    await driver.takeoff(5.0)
+    (message,) = [m for m in autopilot.heard_named("COMMAND_LONG") if m.command == 22]
+    assert message.param7 == pytest.approx(494.58, abs=1e-3)
 
 
 async def test_takeoff_without_a_known_home_is_refused_here(

@@ -1,0 +1,91 @@
+"""A failsafe of the autopilot is told as one, a pilot's change of mode as a pilot's; guidance yields to both."""
+
+from dataclasses import replace
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight, plain_settings
+from companion.guidance.behaviour import Outcome
+from companion.guidance.core import REASON_WAIT_S
+from companion.guidance.interface import GuidanceInput
+from companion.guidance.orbit import OrbitBehaviour
+from companion.vehicle.state import FlightMode
+from mavlink_sim.px4.modes import Mode
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying
+
+
+@pytest.mark.parametrize(
+    ("parameters", "fault", "mode"),
+    [
+        ({"GF_ACTION": 2.0, "GF_MAX_HOR_DIST": 10.0}, None, "hold"),
+        ({"GF_ACTION": 3.0, "GF_MAX_HOR_DIST": 10.0}, None, "hold"),  # for COM_FAIL_ACT_T
+        ({"GF_ACTION": 3.0, "GF_MAX_HOR_DIST": 10.0, "COM_FAIL_ACT_T": 0.0}, None, "return"),
+        ({}, "battery critical", "hold"),
+        ({"COM_FAIL_ACT_T": 0.0}, "battery critical", "return"),
+        ({"COM_FAIL_ACT_T": 0.0}, "battery emergency", "land"),
+    ],
+)
+def test_a_failsafe_of_the_simulated_px4_is_not_a_pilot(
+    parameters: dict[str, float], fault: str | None, mode: str
+) -> None:
+    settings = plain_settings({"guidance.min_battery_percent": "0"})
+    flight = LockstepFlight.airborne(seed=4, settings=settings)
+    for name, value in parameters.items():
+        flight.vehicle.vehicle.parameters.set(name, value)
+    identifier = flight.command("goto 45 0")
+    flight.run(2.0)
+    if fault is not None:
+        flight.vehicle.vehicle.faults.begin(fault)
+    assert flight.run_until(lambda: flight.outcome(identifier), 30.0)
+    assert flight.outcome(identifier) == Outcome(False, f"autopilot failsafe: {mode} mode")
+
+
+def test_a_mode_that_somebody_else_chooses_is_a_pilot() -> None:
+    flight = LockstepFlight.airborne(seed=4)
+    identifier = flight.command("goto 30 0")
+    flight.run(3.0)
+    flight.vehicle.vehicle.autopilot.set_mode(Mode.HOLD)
+    flight.run(2.0)
+    assert flight.outcome(identifier) == Outcome(False, "the pilot took over: hold mode")
+
+
+@pytest.mark.parametrize(
+    ("intended", "reason"),
+    [
+        (FlightMode.OFFBOARD, "autopilot failsafe: return mode"),
+        (FlightMode.RETURN, "the pilot took over: return mode"),
+    ],
+)
+@pytest.mark.parametrize("late_s", [0.0, 0.1, 2.0])
+def test_a_heartbeat_that_comes_first_stops_the_setpoints_and_waits_for_the_reason(
+    intended: FlightMode, reason: str, late_s: float
+) -> None:
+    changed_ns: list[int] = []
+
+    def tell(inputs: GuidanceInput) -> GuidanceInput:
+        """CURRENT_MODE, `late_s` after HEARTBEAT."""
+        state = inputs.state
+        told = state.mode is FlightMode.RETURN and state.heartbeat_ns - changed_ns[0] >= late_s * 1e9
+        return replace(
+            inputs,
+            state=replace(
+                state,
+                intended_mode=intended if told else FlightMode.OFFBOARD,
+                intended_beside=state.mode if told else FlightMode.OFFBOARD,
+            ),
+        )
+
+    harness = GuidanceHarness(flying(), inputs=tell)
+    future = engaged(harness, OrbitBehaviour())
+    harness.autopilot.change_mode(FlightMode.RETURN)
+    changed_ns.append(harness.vehicle.now_ns)
+    harness.run(0.02)
+    sent = len(harness.autopilot.setpoints)
+    harness.run(max(late_s, 0.02))
+    if late_s > REASON_WAIT_S:  # it was never told: whoever it was, it was not us
+        reason = "the pilot took over: return mode"
+    assert future.result() == Outcome(False, reason)
+    assert len(harness.autopilot.setpoints) == sent
+    harness.autopilot.change_mode(FlightMode.OFFBOARD)
+    harness.run(2.0)
+    assert len(harness.autopilot.setpoints) == sent
