@@ -1,4 +1,4 @@
-"""A failsafe of the autopilot is told as one, a pilot's change of mode as a pilot's; guidance yields to both."""
+"""A failsafe of the autopilot is told as one, a pilot's change of mode as a pilot's."""
 
 from dataclasses import replace
 
