@@ -21,6 +21,7 @@ class CopterVehicle(Vehicle):
 
     Attributes:
         own_intervals: by link, the messages whose interval was set one by one.
+        unsaved_rates: the values in storage of the rates that REQUEST_DATA_STREAM has set over them.
 
     Raises:
         ValueError: a gimbal, an obstacle sensor or a release of PX4 was asked for.
@@ -40,6 +41,7 @@ class CopterVehicle(Vehicle):
                 "an ArduPilot vehicle has no collision prevention here: leave --obstacle-sensor out"
             )
         self.own_intervals: dict[str, set[str]] = {}
+        self.unsaved_rates: dict[str, float] = {}
         super().__init__(**options)
 
     modes = CopterMode
@@ -106,11 +108,9 @@ class CopterVehicle(Vehicle):
         self._was_armed = False
 
     def reboot(self) -> None:
-        """See Vehicle. What was asked of the streams one by one is forgotten."""
+        """See Vehicle. What was asked of the streams by messages is forgotten."""
         super().reboot()
-        for link in self.links.values():
-            self.own_intervals[link.name].clear()
-            streams.follow_parameters(self, link)
+        streams.forget_requests(self)
 
     def _tell_parameters(self) -> None:
         """Nothing is told unasked."""

@@ -54,6 +54,7 @@ def set_parameter(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     except ValueError as error:
         logger.info("PARAM_SET is passed over: %s", error)
         return
+    vehicle.unsaved_rates.pop(name, None)
     for each in vehicle.links.values():
         if name.startswith(streams.prefix(vehicle, each)):
             streams.follow_parameters(vehicle, each)

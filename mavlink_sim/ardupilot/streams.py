@@ -2,7 +2,8 @@
 SET_MESSAGE_INTERVAL ask for.
 
 The groups have a rate each, in the parameters SR0_* (the ground station's link) and SR1_* (the companion's);
-REQUEST_DATA_STREAM sets those. An interval set for one message stands above its group's rate.
+REQUEST_DATA_STREAM sets those until the next reboot. An interval set for one message stands above its group's
+rate, until anybody on the link asks for that group by REQUEST_DATA_STREAM, and until the next reboot.
 """
 
 from __future__ import annotations
@@ -81,11 +82,23 @@ def set_interval(vehicle: CopterVehicle, link: Link, name: str, interval_us: flo
     link.streams.set_interval(name, interval, vehicle.boot_us)
 
 
+def forget_requests(vehicle: CopterVehicle) -> None:
+    """A reboot: what was asked for by messages is gone, what was set as a parameter stays."""
+    for name, rate in vehicle.unsaved_rates.items():
+        vehicle.parameters.set(name, rate)
+    vehicle.unsaved_rates.clear()
+    for link in vehicle.links.values():
+        vehicle.own_intervals[link.name].clear()
+        follow_parameters(vehicle, link)
+
+
 def request_data_stream(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     """REQUEST_DATA_STREAM: the rate of one group or of all; it replaces what was set for single messages."""
     rate = min(int(message.req_message_rate), int(MAX_RATE_HZ)) if message.start_stop else 0
     for group, (identifier, names) in GROUPS.items():
         if message.req_stream_id in (ALL_STREAMS, identifier):
-            vehicle.parameters.set(prefix(vehicle, link) + group, rate)
+            name = prefix(vehicle, link) + group
+            vehicle.unsaved_rates.setdefault(name, vehicle.parameters.number(name))
+            vehicle.parameters.set(name, rate)
             vehicle.own_intervals[link.name].difference_update(names)
     follow_parameters(vehicle, link)

@@ -97,6 +97,18 @@ def test_next_to_nothing_comes_unasked_and_streams_come_by_group_or_one_by_one(
     assert set(kinds(copter, 3.0)) <= {"HEARTBEAT", "TIMESYNC", "EXTENDED_SYS_STATE"}
 
 
+def test_a_reboot_drops_the_rates_asked_for_and_keeps_those_set(copter: LockstepVehicle) -> None:
+    copter.send(dialect.MAVLink_param_set_message(1, 1, b"SR1_EXTRA2", 4, 9))
+    copter.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 2, 1))
+    copter.command(511, 31, 50_000)
+    assert kinds(copter, 4.0)["VFR_HUD"] == 8
+    copter.vehicle.faults.begin("reboot 1")
+    copter.step(2.0)
+    counted = kinds(copter, 4.0)
+    assert set(counted) <= {"HEARTBEAT", "TIMESYNC", "VFR_HUD"}
+    assert counted["VFR_HUD"] == 16
+
+
 def test_parameters_travel_as_numbers_in_the_order_of_the_list_without_a_hash(
     copter: LockstepVehicle,
 ) -> None:
