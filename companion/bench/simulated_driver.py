@@ -21,7 +21,7 @@ from companion.guidance.interface import (
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
-from companion.vehicle.manners import HOME_POSITION_ID, PX4, Px4Manners
+from companion.vehicle.manners import PX4, Px4Manners
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
@@ -33,10 +33,9 @@ START_NS = 1_000_000_000_000
 # As the drivers wait.
 SHOWN_TIMEOUT_S = 3.0
 GIMBAL_INFORMATION_ID = 280
-# What the drivers ask of an autopilot, home, and the same where there is a gimbal (`gimbal_commands`).
+# What the drivers ask of an autopilot, and the same where there is a gimbal (`gimbal_commands`).
 RATES_HZ = {
     **{dialect.mavlink_map[number].msgname: rate_hz for number, rate_hz in Px4Manners.rates_hz.items()},
-    dialect.mavlink_map[HOME_POSITION_ID].msgname: 0.5,
     "HEARTBEAT": 1.0,
 }
 GIMBAL_RATES_HZ = {"GIMBAL_DEVICE_ATTITUDE_STATUS": 50.0, "GIMBAL_MANAGER_STATUS": 5.0}

@@ -40,6 +40,7 @@ def status_message(
             "mode": state.mode.value,
             "armed": state.armed,
             "failsafe": state.failsafe,
+            "missing_streams": list(state.missing_streams),
         },
         "pilot": {
             "in_command": guidance.in_command,

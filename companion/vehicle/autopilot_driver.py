@@ -12,7 +12,6 @@ import logging
 import struct
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -31,7 +30,7 @@ from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
-from companion.vehicle.stream_requests import ask_for_streams
+from companion.vehicle.stream_requests import StreamRequests
 from companion.vehicle.telemetry_fold import Fields
 
 logger = logging.getLogger(__name__)
@@ -46,6 +45,8 @@ _HEARTBEAT = struct.Struct(
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
 _FRAME_LOCAL_NED = 1
 _TIMESYNC_ID = 111
+_SYSTEM_TIME_ID = 2
+_SYSTEM_TIME = struct.Struct("<QI")  # time_unix_usec, time_boot_ms
 _SETPOINT_ID = 84  # SET_POSITION_TARGET_LOCAL_NED
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
@@ -88,7 +89,7 @@ class AutopilotDriver(ABC):
         self._asked_ns = 0
         self._first_heard = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
-        self._received_count: Counter[int] = Counter()
+        self._streams: StreamRequests | None = None
         self._sequence = 0
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -144,8 +145,10 @@ class AutopilotDriver(ABC):
             await self.close()
             raise
         logger.info("%s: %s, system %s, answers", self.url, self._heard.manners.name, self._system_id)
+        self._streams = StreamRequests(self.url, self._heard, self._command)
         for loop, what in (
-            (self._keep(), "keeper"),
+            (self._keep(self._streams), "keeper"),
+            (self._streams.keep(), "streams"),
             (self._synchronise(), "clock"),
             (self._gimbal_commands.keep(), "gimbal"),
         ):
@@ -198,9 +201,13 @@ class AutopilotDriver(ABC):
             if frame.system_id == self._system_id and source == self._source:
                 ours.append(frame)
                 if frame.component_id == AUTOPILOT_COMPONENT:
-                    self._received_count[frame.message_id] += 1
+                    if self._streams is not None:
+                        self._streams.monitor.received(frame.message_id)
                     if frame.message_id == _TIMESYNC_ID:
                         self._time_from(frame)
+                    elif frame.message_id == _SYSTEM_TIME_ID:
+                        _, boot_ms = _SYSTEM_TIME.unpack(frame.padded(_SYSTEM_TIME.size))
+                        self._heard.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
         if ours and self._autopilot_kind in self.flown_autopilots:
             self._take_frames(ours)
 
@@ -237,12 +244,10 @@ class AutopilotDriver(ABC):
         boot_ns, asked_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
         # Older autopilots do not say whom they answer; our own stamp tells.
         for_us = (system, component) in ((0, 0), (self._own_system_id, self._own_component_id))
-        if (
-            boot_ns > 0
-            and asked_ns == self._asked_ns
-            and for_us
-            and self._heard.clock.answer(asked_ns, boot_ns, now_ns)
-        ):
+        if not (boot_ns > 0 and asked_ns == self._asked_ns and for_us):
+            return
+        self._heard.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
+        if self._heard.clock.answer(asked_ns, boot_ns, now_ns):
             self._heard.state = replace(self._heard.state, clock=self._heard.clock.offset(now_ns))
 
     def _note_other(self, sender: tuple[Any, ...], text: str) -> None:
@@ -394,10 +399,11 @@ class AutopilotDriver(ABC):
 
     # --- keeping the link ---------------------------------------------------------------------------
 
-    async def _keep(self) -> None:
-        """Ask for the streams we need, and say when the autopilot goes silent and when it comes back."""
+    async def _keep(self, streams: StreamRequests) -> None:
+        """Say when the autopilot goes silent, restarts and comes back, and ask for its streams anew then."""
         while True:
-            await ask_for_streams(self.url, self._heard, self._received_count, self._command)
+            self._heard.restarted.clear()
+            streams.restart()
             self._gimbal_commands.look_for_one()
             if not await self._silence():
                 logger.warning("%s: system %s has restarted", self.url, self._system_id)

@@ -22,6 +22,9 @@ _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
 # A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
 _SETBACKS_OF_TWO = 3
 _TWO_CLOCKS_S = 2.0
+_BOOTING = 1  # MAV_STATE_BOOT
+# They tell the autopilot's clock; of others TIMESYNC and SYSTEM_TIME are watched by the driver.
+_CLOCKED = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION")
 _OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION", ATTITUDE_STATUS)
 # PX4 keeps this from when it was first told: its stamp is as old as that, and no fault of the clock.
 _OF_LONG_AGO = "GIMBAL_MANAGER_INFORMATION"
@@ -54,7 +57,8 @@ class HeardState:
         self.clock = ClockSync()
         self.mode_ns = 0
         self.restarted = asyncio.Event()
-        self._boot_ms = 0
+        self._boot_ms: dict[str, int] = {}
+        self._booting = False
         self._setbacks_ns: deque[int] = deque(maxlen=_SETBACKS_OF_TWO)
         self._two_heard_ns = 0
 
@@ -72,8 +76,10 @@ class HeardState:
     def take_in(self, name: str, fields: Fields) -> None:
         """One message in PX4's terms."""
         now_ns = time.monotonic_ns()
-        if name == "LOCAL_POSITION_NED":
-            self._watch_clock(fields["time_boot_ms"], now_ns)
+        if name in _CLOCKED:
+            self.watch_clock(name, fields["time_boot_ms"], now_ns)
+        elif name == "HEARTBEAT":
+            self._watch_booting(fields["system_status"] == _BOOTING)
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             self.mode_ns = now_ns
         if name in _OF_ITS_PLACE and self.two_autopilots(now_ns):
@@ -91,9 +97,15 @@ class HeardState:
                 except Exception:  # a subscriber's fault must not stop the vehicle's state
                     logger.exception("%s: a subscriber of the state failed", self._url)
 
-    def _watch_clock(self, boot_ms: int, now_ns: int) -> None:
-        """The autopilot's clock goes back: it has restarted, or another one speaks with its id by turns."""
-        if boot_ms < self._boot_ms - _BOOT_TOLERANCE_MS:
+    def watch_clock(self, source: str, boot_ms: int, now_ns: int) -> None:
+        """The autopilot's clock goes back: it has restarted, or another one speaks with its id by turns.
+
+        Args:
+            source: which message tells its time. Not all of one autopilot need go by the same clock.
+            boot_ms: since it booted. now_ns: CLOCK_MONOTONIC.
+        """
+        if boot_ms < self._boot_ms.get(source, 0) - _BOOT_TOLERANCE_MS:
+            again = bool(self._setbacks_ns) and now_ns - self._setbacks_ns[-1] < _TWO_CLOCKS_S * 1e9
             self._setbacks_ns.append(now_ns)
             first_ns = self._setbacks_ns[0]
             if len(self._setbacks_ns) == _SETBACKS_OF_TWO and now_ns - first_ns < _TWO_CLOCKS_S * 1e9:
@@ -102,18 +114,30 @@ class HeardState:
                 self._two_heard_ns = now_ns
                 self.restarted.clear()
             else:
-                self.restarted.set()
-                # What held before the restart is not known to hold now, home least of all.
-                self.clock.forget()
-                self.state = replace(
-                    self.state,
-                    ready_to_arm=False,
-                    home_altitude_amsl_m=None,
-                    home_position_ned_m=None,
-                    clock=None,
-                    gimbal=None,
-                )
-        self._boot_ms = boot_ms
+                self._forget_what_held()
+                if not again:  # nothing restarts twice so soon: perhaps these are two
+                    self.restarted.set()
+        self._boot_ms[source] = boot_ms
+
+    def _watch_booting(self, booting: bool) -> None:
+        """A heartbeat that says so for the first time is a restart, even where no message tells the time."""
+        if booting and not self._booting and self.state.heartbeat_ns > 0:
+            self._forget_what_held()
+            self.restarted.set()
+        self._booting = booting
+
+    def _forget_what_held(self) -> None:
+        """What held before a restart is not known to hold now, home least of all."""
+        self._boot_ms.clear()
+        self.clock.forget()
+        self.state = replace(
+            self.state,
+            ready_to_arm=False,
+            home_altitude_amsl_m=None,
+            home_position_ned_m=None,
+            clock=None,
+            gimbal=None,
+        )
 
     def two_autopilots(self, now_ns: int) -> bool:
         """Two of the same id were heard a moment ago: their states cannot be told apart."""

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from companion.vehicle.driver import CommandRefusedError
@@ -23,14 +25,18 @@ class Manners(ABC):
     """One autopilot's ways. Whoever is asked for a mode or a take-off may remember it (`forget` undoes it).
 
     Attributes:
-        name: for people. rates_hz: what is read, by message id, and the rate that control needs.
-        requested: messages that are asked for once while home is not known.
+        name: for people. rates_hz: what is read, by message id, and the rate that is asked for.
+        expected_hz: the rate that comes of it, where that is another one.
+        optional: of these the messages that not every version has.
+        requested: messages that are requested besides while home is not known.
         parameters_bytewise: integer parameters travel as their bytes; else as numbers.
         takes_off_by_home: a take-off is commanded as an altitude AMSL, which home's altitude is needed for.
     """
 
     name: str
     rates_hz: dict[int, float]
+    expected_hz: Mapping[int, float] = MappingProxyType({})
+    optional: tuple[int, ...] = ()
     requested: tuple[int, ...] = (HOME_POSITION_ID,)
     parameters_bytewise: bool
     takes_off_by_home: bool
@@ -75,7 +81,10 @@ class Px4Manners(Manners):
         1: 2.0,  # SYS_STATUS
         245: 5.0,  # EXTENDED_SYS_STATE
         CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late; this comes when it changes
+        HOME_POSITION_ID: 0.5,
     }
+    expected_hz = MappingProxyType({CURRENT_MODE_ID: 2.0})  # PX4 repeats it every 0.5 s, not more often
+    optional = (CURRENT_MODE_ID,)  # PX4 has it since 1.15
 
     def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
         main, sub = request_of_mode(mode)

@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.ardupilot_manners import ArduPilotManners
 from companion.vehicle.ardupilot_modes import custom_mode_of_mode, mode_of_custom_mode
+from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
@@ -115,6 +116,30 @@ async def test_a_pilots_mode_is_seen_and_guided_by_somebody_else_shows_as_offboa
         FlightMode.POSITION,
         FlightMode.OFFBOARD,  # not ours any more
     ]
+
+
+async def test_a_quick_reboot_is_noticed_by_timesync_and_streams_come_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with copter(2.0) as (driver, simulator):
+        assert isinstance(driver, AutopilotDriver)
+        # A restart is a clock that goes back by more than messages overtake each other.
+        await wait_until(lambda: driver._heard._boot_ms.get("TIMESYNC", 0) > 6_000, 10.0)
+        simulator.fault("reboot 1.2")
+        await wait_until(lambda: "has restarted" in caplog.text, 10.0)
+        assert "LOCAL_POSITION_NED" not in driver._heard._boot_ms  # it has not come again yet
+        await state_shows(driver, known)
+        assert "is silent" not in caplog.text
+
+
+async def test_streams_that_somebody_stops_come_again() -> None:
+    async with copter() as (driver, _):
+        assert isinstance(driver, AutopilotDriver)
+        stop = {"req_stream_id": mavlink.MAV_DATA_STREAM_ALL, "req_message_rate": 0, "start_stop": 0}
+        driver._send_message("REQUEST_DATA_STREAM", {"target_system": 1, "target_component": 1, **stop})
+        await state_shows(driver, lambda s: not s.position_fresh(time.monotonic_ns()))
+        await state_shows(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
+        await state_shows(driver, known)
 
 
 def test_modes_go_by_what_they_do_and_what_is_not_there_cannot_be_asked_for() -> None:

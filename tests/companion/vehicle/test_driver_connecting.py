@@ -124,7 +124,36 @@ async def test_an_autopilot_that_restarted_is_asked_for_its_streams_anew(
     autopilot.say(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
     await wait_until(lambda: asked() == 1, 10.0)
     autopilot.say(mavlink.MAVLink_local_position_ned_message(500, 0, 0, 0, 0, 0, 0))
-    await wait_until(lambda: asked() == 2, 10.0)
+    began_s, before = time.monotonic(), asked()
+    await wait_until(lambda: asked() > before, 10.0)
+    assert time.monotonic() - began_s < 1.9  # the pause after the first request is 2 s
+
+
+@pytest.mark.parametrize("message_id", [2, 33])  # SYSTEM_TIME, GLOBAL_POSITION_INT
+async def test_a_restart_is_noticed_by_any_message_that_tells_the_time(
+    driver: Driver, autopilot: FakeAutopilot, message_id: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    for boot_ms in (60_000, 500):
+        if message_id == 2:
+            autopilot.say(mavlink.MAVLink_system_time_message(0, boot_ms))
+        else:
+            autopilot.say(mavlink.MAVLink_global_position_int_message(boot_ms, 0, 0, 0, 0, 0, 0, 0, 0))
+    await wait_until(lambda: "has restarted" in caplog.text, 5.0)
+
+
+async def test_a_heartbeat_that_says_it_boots_is_a_restart(
+    driver: Driver, autopilot: FakeAutopilot, caplog: pytest.LogCaptureFixture
+) -> None:
+    autopilot.system_status = mavlink.MAV_STATE_BOOT
+    await wait_until(lambda: "has restarted" in caplog.text, 5.0)
+    seen_ns = driver.state.heartbeat_ns
+    await wait_until(lambda: driver.state.heartbeat_ns > seen_ns, 5.0)
+    assert caplog.text.count("has restarted") == 1
+
+
+async def test_what_never_comes_is_shown_as_missing(driver: Driver, autopilot: FakeAutopilot) -> None:
+    await wait_until(lambda: "LOCAL_POSITION_NED" in driver.state.missing_streams, 5.0)
+    assert "CURRENT_MODE" in driver.state.missing_streams
 
 
 async def test_two_drivers_fly_two_vehicles_at_once(

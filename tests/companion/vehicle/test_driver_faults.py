@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager, asynccontextmanager
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver
@@ -172,6 +173,18 @@ async def test_with_heartbeats_alone_the_vehicle_is_connected_but_its_position_i
             assert driver.state.connected(time.monotonic_ns())
 
 
+async def test_a_stream_that_somebody_stopped_is_asked_for_until_it_comes(kind: DriverKind) -> None:
+    with simulated() as simulator:
+        async with connected(kind, simulator) as driver:
+            await ready(driver)
+            never = -1.0
+            await driver._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32, never)
+            await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
+            await state_shows(driver, lambda s: "LOCAL_POSITION_NED" in s.missing_streams)
+            await state_shows(driver, lambda s: s.position_fresh(time.monotonic_ns()))
+            await state_shows(driver, lambda s: not s.missing_streams)
+
+
 async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(
     kind: DriverKind, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -182,7 +195,7 @@ async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(
             before = driver.state.home_altitude_amsl_m
             await driver.arm()
             # A restart is a clock that goes back by more than datagrams overtake each other.
-            await wait_until(lambda: driver._heard._boot_ms > 6_000, 10.0)
+            await wait_until(lambda: driver._heard._boot_ms.get("LOCAL_POSITION_NED", 0) > 6_000, 10.0)
             simulator.fault("reboot 2")
             await state_shows(driver, lambda s: not s.armed)
             await wait_until(lambda: "has restarted" in caplog.text, 10.0)
@@ -202,7 +215,7 @@ async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(
             await ready(driver)
             simulator.fault("time_jump 1000")
             # A message that was still on its way from before would not do.
-            await wait_until(lambda: driver._heard._boot_ms > 1_000_000, 10.0)
+            await wait_until(lambda: driver._heard._boot_ms.get("LOCAL_POSITION_NED", 0) > 1_000_000, 10.0)
             seen_ns = driver.state.position_ns
             await wait_until(lambda: driver.state.position_ns > seen_ns, 5.0)
             simulator.fault("end all")

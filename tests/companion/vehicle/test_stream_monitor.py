@@ -1,0 +1,163 @@
+"""Which streams are missing and when they are asked for: by stamps, and of a Copter in lockstep."""
+
+from __future__ import annotations
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.ardupilot_manners import ArduPilotManners
+from companion.vehicle.stream_monitor import StreamMonitor
+from mavlink_sim import LockstepVehicle
+from mavlink_sim.wire.messages import dialect
+
+ATTITUDE, POSITION, MODE, HOME = 31, 32, 436, 242
+STEP_S = 0.1
+
+
+def ns(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+class Listener:
+    """Messages at even rates into a monitor; keeps when what was asked for."""
+
+    def __init__(self, monitor: StreamMonitor) -> None:
+        self.monitor, self.now_s = monitor, 0.0
+        self.asked: list[tuple[float, int]] = []
+
+    def run(self, seconds: float, rates_hz: dict[int, float]) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            before_s, self.now_s = self.now_s, round(self.now_s + STEP_S, 6)
+            for message_id, rate_hz in rates_hz.items():
+                for _ in range(int(self.now_s * rate_hz + 1e-6) - int(before_s * rate_hz + 1e-6)):
+                    self.monitor.received(message_id)
+            for message_id in self.monitor.due(ns(self.now_s)):
+                self.asked.append((self.now_s, message_id))
+                self.monitor.asked(message_id, ns(self.now_s))
+
+
+def test_what_comes_at_more_than_half_its_rate_is_not_asked_for() -> None:
+    listener = Listener(StreamMonitor({ATTITUDE: 50.0, HOME: 0.5}, 0))
+    listener.run(60.0, {ATTITUDE: 26.0, HOME: 0.5})
+    assert listener.asked == []
+    assert not listener.monitor.missing
+
+
+def test_half_a_rate_for_two_seconds_is_asked_for_again() -> None:
+    listener = Listener(StreamMonitor({ATTITUDE: 50.0, POSITION: 30.0}, 0))
+    listener.run(10.0, {ATTITUDE: 50.0, POSITION: 30.0})
+    listener.run(3.1, {ATTITUDE: 24.0, POSITION: 30.0})
+    assert [message_id for _, message_id in listener.asked] == [ATTITUDE]
+    assert listener.monitor.missing == (ATTITUDE,)
+    listener.run(2.1, {ATTITUDE: 50.0, POSITION: 30.0})
+    assert not listener.monitor.missing
+    assert len(listener.asked) == 1
+
+
+def test_pauses_double_to_eight_seconds_and_begin_anew_when_it_came() -> None:
+    listener = Listener(StreamMonitor({POSITION: 30.0}, 0, first_window_s=1.5))
+    listener.run(40.0, {})
+    times_s = [when_s for when_s, _ in listener.asked]
+    assert times_s == [1.5, 3.5, 7.5, 15.5, 23.5, 31.5, 39.5]
+    listener.run(4.0, {POSITION: 30.0})
+    listener.asked.clear()
+    since_s = listener.now_s
+    listener.run(8.0, {})
+    first, second, *_ = (when_s - since_s for when_s, _ in listener.asked)
+    assert first <= 3.0
+    assert second - first < 2.1
+
+
+def test_a_restart_forgets_the_pause_and_what_was_missing() -> None:
+    listener = Listener(StreamMonitor({POSITION: 30.0}, 0))
+    listener.run(20.0, {})
+    listener.asked.clear()
+    listener.monitor.restart(ns(listener.now_s))
+    assert not listener.monitor.missing
+    listener.run(2.0, {})
+    assert [message_id for _, message_id in listener.asked] == [POSITION]
+
+
+def test_an_optional_stream_that_is_refused_is_not_missing_a_needed_one_is() -> None:
+    monitor = StreamMonitor({POSITION: 30.0, MODE: 2.0}, 0, optional=(MODE,))
+    assert monitor.due(ns(2.0)) == [POSITION, MODE]
+    for message_id in (POSITION, MODE):
+        monitor.asked(message_id, ns(2.0))
+        monitor.refused(message_id)
+    assert monitor.missing == (POSITION,)
+    assert monitor.due(ns(30.0)) == [POSITION]
+    monitor.restart(ns(30.0))
+    assert MODE in monitor.due(ns(32.0))
+
+
+class CopterClient:
+    """Asks a Copter in lockstep for its streams, as the drivers do."""
+
+    def __init__(self) -> None:
+        self.copter = LockstepVehicle(autopilot="ardupilot", seed=1, ready_after_s=0.0)
+        self.manners = ArduPilotManners()
+        self.monitor = StreamMonitor(self.manners.rates_hz, 0)
+        self.deaf = False
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.copter.step(STEP_S)
+            for message in self.copter.receive():
+                self.monitor.received(message.get_msgId())
+            now_ns = ns(self.copter.vehicle.faults.now_s)
+            for message_id in self.monitor.due(now_ns):
+                self.monitor.asked(message_id, now_ns)
+                if not self.deaf:
+                    interval_us = round(1e6 / self.manners.rates_hz[message_id])
+                    self.copter.send(
+                        dialect.MAVLink_command_long_message(
+                            1,
+                            1,
+                            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+                            0,
+                            message_id,
+                            interval_us,
+                            0,
+                            0,
+                            0,
+                            0,
+                            0,
+                        )
+                    )
+
+
+def test_a_copter_that_was_deaf_for_six_seconds_sends_all_streams() -> None:
+    client = CopterClient()
+    client.deaf = True
+    client.run(6.0)
+    assert POSITION in client.monitor.missing
+    client.deaf = False
+    client.run(12.0)
+    assert not client.monitor.missing
+
+
+def test_streams_come_again_after_a_quick_reboot_of_a_copter() -> None:
+    client = CopterClient()
+    client.run(15.0)
+    assert not client.monitor.missing
+    client.copter.vehicle.faults.begin("reboot 1")
+    client.run(15.0)
+    assert not client.monitor.missing
+    client.copter.receive()
+    client.copter.step(1.0)
+    counted = [message.get_type() for message in client.copter.receive()]
+    assert counted.count("LOCAL_POSITION_NED") >= 25
+
+
+def test_streams_come_again_after_somebody_stopped_or_slowed_them() -> None:
+    client = CopterClient()
+    client.run(15.0)
+    for rate_hz, start in ((2, 1), (0, 0)):
+        client.copter.send(
+            dialect.MAVLink_request_data_stream_message(1, 1, mavlink.MAV_DATA_STREAM_ALL, rate_hz, start)
+        )
+        client.run(6.0)
+        assert not client.monitor.missing
+        client.copter.receive()
+        client.copter.step(1.0)
+        counted = [message.get_type() for message in client.copter.receive()]
+        assert counted.count("LOCAL_POSITION_NED") >= 25
