@@ -42,7 +42,8 @@ class Health:
         if linked != self._linked:
             self._linked = linked
             if linked:
-                self._on_event("info", "autopilot heartbeat received")
+                autopilot, library = self._driver.state.autopilot, self._driver.library
+                self._on_event("info", f"autopilot heartbeat received: {autopilot}, {library} driver")
             else:
                 self._on_event("error", "autopilot heartbeat lost")
         if now_ns >= self._heartbeat_due_ns:

@@ -157,7 +157,7 @@ class Service:
             now_ns,
             uptime_s=(now_ns - self._started_ns) / 1e9,
             healthy=self._health.healthy(now_ns),
-            state=self.driver.state,
+            driver=self.driver,
             guidance=self.guidance,
             streamer=self.streamer,
             views=self.views,

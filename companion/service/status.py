@@ -9,6 +9,7 @@ from companion.bus.session import Bus
 from companion.guidance.core import Guidance
 from companion.perception.views import WorkerView
 from companion.service.inputs import InputAssembler
+from companion.vehicle.driver import Driver
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 
@@ -18,7 +19,7 @@ def status_message(
     *,
     uptime_s: float,
     healthy: bool,
-    state: VehicleState,
+    driver: Driver,
     guidance: Guidance,
     streamer: Streamer,
     views: Sequence[WorkerView],
@@ -30,13 +31,15 @@ def status_message(
     Args:
         now_ns: CLOCK_MONOTONIC. uptime_s: since the service began.
     """
-    steering = inputs.steering
+    steering, state = inputs.steering, driver.state
     return {
         "stamp_ns": now_ns,
         "uptime_s": round(uptime_s, 1),
         "healthy": healthy,
         "vehicle": {
             "connected": state.connected(now_ns),
+            "autopilot": state.autopilot,
+            "driver": driver.library,
             "mode": state.mode.value,
             "armed": state.armed,
             "failsafe": state.failsafe,

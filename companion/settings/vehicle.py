@@ -15,8 +15,8 @@ class VehicleSection(Section):
 
     url: VehicleUrl = "udpin://127.0.0.1:14540"
     """where the autopilot is: udpin:// (listen), udpout:// or tcp://HOST:PORT, or serial:///dev/ttyAMA0:921600"""
-    driver: Literal["mavsdk", "pymavlink"] = "mavsdk"
-    """the library that speaks MAVLink"""
+    driver: Literal["auto", "mavsdk", "pymavlink"] = "auto"
+    """the library that speaks MAVLink; auto takes mavsdk for PX4, pymavlink for ArduPilot"""
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     """the autopilot's MAVLink system id"""
     name: KeyWord = "vehicle1"

@@ -55,6 +55,7 @@ _TIMESYNC_PERIOD_S = 0.5
 class AutopilotDriver(ABC):
     """The part of a driver above the encoding. See `companion.vehicle.driver.Driver` for the promises."""
 
+    library: str
     flown_autopilots: frozenset[int] = frozenset({PX4})  # MAV_AUTOPILOT
 
     def __init__(
@@ -127,10 +128,15 @@ class AutopilotDriver(ABC):
 
     async def connect(self, timeout_s: float) -> None:
         """See Driver. A UDP listener stays silent; on other links our heartbeat asks for an answer."""
+        deadline = time.monotonic() + timeout_s
+        await self.listen(timeout_s)
+        await self.start(max(deadline - time.monotonic(), 1.0))
+
+    async def listen(self, timeout_s: float) -> int | None:
+        """The first half of `connect`: open the link and wait for a heartbeat. Its MAV_AUTOPILOT."""
         if self._link is not None:
             raise LinkError(f"{self.url}: this driver is connected already")
         self._reset()
-        deadline = time.monotonic() + timeout_s
         try:
             async with asyncio.timeout(timeout_s):
                 self._link = await open_link(self.url, self._received)
@@ -138,13 +144,38 @@ class AutopilotDriver(ABC):
             raise LinkError(f"{self.url}: no answer to opening it within {timeout_s:g} s") from error
         try:
             await self._first_heartbeat(timeout_s)
-            if self._autopilot_kind not in self.flown_autopilots:
-                raise LinkError(why_not_flown(self.url, self._system_id, self._autopilot_kind))
-            await self._attach(max(deadline - time.monotonic(), 1.0))
         except BaseException:
             await self.close()
             raise
-        logger.info("%s: %s, system %s, answers", self.url, self._heard.manners.name, self._system_id)
+        return self._autopilot_kind
+
+    def take_over(self, other: AutopilotDriver) -> None:
+        """Go on with the link on which another driver, which listened, has heard the autopilot."""
+        self._reset()
+        link, other._link = other._link, None
+        if link is None or other._newest_heartbeat is None:
+            raise LinkError(f"{self.url}: the driver that listened has heard no autopilot")
+        self._link, link.received = link, self._received
+        self._framer, self._signer, self._others = other._framer, other._signer, other._others
+        self._sequence = other._sequence
+        self.share_subscribers(other)
+        self._heartbeat_from(other._newest_heartbeat, other._source)
+
+    def share_subscribers(self, other: AutopilotDriver) -> None:
+        """Call back whoever has subscribed to the state of another driver."""
+        self._heard.share_subscribers(other._heard)
+
+    async def start(self, timeout_s: float) -> None:
+        """The second half of `connect`: exchange messages with the autopilot that was heard."""
+        try:
+            if self._autopilot_kind not in self.flown_autopilots:
+                raise LinkError(why_not_flown(self.url, self._system_id, self._autopilot_kind))
+            await self._attach(timeout_s)
+        except BaseException:
+            await self.close()
+            raise
+        name = self._heard.manners.name
+        logger.info("%s: %s, system %s, answers: %s driver", self.url, name, self._system_id, self.library)
         self._streams = StreamRequests(self.url, self._heard, self._command)
         for loop, what in (
             (self._keep(self._streams), "keeper"),
@@ -224,6 +255,7 @@ class AutopilotDriver(ABC):
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
             self._heard.manners = manners_of(autopilot)
+            self._heard.state = replace(self._heard.state, autopilot=self._heard.manners.name)
         elif source != self._source and self._heard.state.connected(time.monotonic_ns()):
             # Obeying whoever spoke last would fly two vehicles by turns.
             self._note_other(

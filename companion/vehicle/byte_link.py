@@ -36,9 +36,10 @@ _REST_S = 0.3
 
 
 class ByteLink(Protocol):
-    """An open link. `received(data, source)` was given when it was opened."""
+    """An open link. `received(data, source)` is given when it is opened, and may be replaced."""
 
     datagrams: bool
+    received: Received
     dropped_count: int
 
     def send(self, data: bytes) -> None:
@@ -112,7 +113,7 @@ class _UdpLink:
     def __init__(self, url: LinkUrl, endpoint: socket.socket, received: Received, peer: Source) -> None:
         self._url = url
         self._socket = endpoint
-        self._received = received
+        self.received = received
         self._peer = peer
         self._peer_is_fixed = peer is not None
         self._in_trouble = False
@@ -131,7 +132,7 @@ class _UdpLink:
             except OSError as error:  # an ICMP answer to what we sent: nobody listens there yet
                 logger.debug("%s: %s", self._url, error)
                 continue
-            self._received(data, source)
+            self.received(data, source)
 
     def send(self, data: bytes) -> None:
         if self._peer is None or self._socket.fileno() < 0:
@@ -166,7 +167,7 @@ class _StreamLink:
 
     def __init__(self, url: LinkUrl, received: Received) -> None:
         self._url = url
-        self._received = received
+        self.received = received
         self._loop = asyncio.get_running_loop()
         self._descriptor = -1
         self._unsent = b""  # the rest of a frame of which a part has left
@@ -189,7 +190,7 @@ class _StreamLink:
             self._lost(_reason(error))
             return
         if data:
-            self._received(data, None)
+            self.received(data, None)
         else:
             self._lost("the other end closed it")
 

@@ -49,6 +49,6 @@ def why_not_flown(url: LinkUrl, system_id: int | None, kind: int | None) -> str:
     if kind == ARDUPILOT:
         return (
             f"{url}: the mavsdk driver flies PX4 alone, and system {system_id} is {name}; "
-            'set vehicle.driver = "pymavlink"'
+            'set vehicle.driver = "pymavlink" or "auto"'
         )
     return f"{url}: only PX4 and ArduPilot are flown, and system {system_id} is {name}"

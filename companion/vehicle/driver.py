@@ -38,6 +38,10 @@ class Driver(Protocol):
     or `serial:///dev/ttyAMA0:921600`.
     """
 
+    @property
+    def library(self) -> str:
+        """Which library speaks MAVLink: "mavsdk", "pymavlink", or "auto" while that is not chosen yet."""
+
     async def connect(self, timeout_s: float) -> None:
         """Open the link and wait for the autopilot's first heartbeat.
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from companion.vehicle.driver import Driver
 from companion.vehicle.link_url import parse_link_url
 
-DriverKind = Literal["mavsdk", "pymavlink"]
+if TYPE_CHECKING:
+    from companion.vehicle.autopilot_driver import AutopilotDriver
+
+DriverKind = Literal["auto", "mavsdk", "pymavlink"]
 
 
 def open_driver(
@@ -22,7 +25,8 @@ def open_driver(
     """A driver, not connected yet.
 
     Args:
-        kind: which library speaks MAVLink. Both keep the same contract.
+        kind: which library speaks MAVLink. Both keep the same contract; "auto" takes the one that fits the
+            autopilot that answers.
         url: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT` or `serial:///dev/X:BAUD`.
         system_id: the autopilot's MAVLink system id; None takes the first autopilot heard.
         own_system_id, own_component_id: whom our messages say they are from; 191 is
@@ -41,8 +45,9 @@ def open_driver(
     if not 1 <= own_component_id <= 255:
         raise ValueError(f"own_component_id must be 1..255, got {own_component_id}")
     link_url = parse_link_url(url)
+
     # Imported here: each library takes its time to load, and one of them is enough.
-    if kind == "mavsdk":
+    def mavsdk_driver() -> AutopilotDriver:
         from companion.vehicle.mavsdk_driver import MavsdkDriver
 
         return MavsdkDriver(
@@ -52,12 +57,20 @@ def open_driver(
             own_component_id=own_component_id,
             signing_key=signing_key,
         )
+
+    if kind == "mavsdk":
+        return mavsdk_driver()
     from companion.vehicle.pymavlink_driver import PymavlinkDriver
 
-    return PymavlinkDriver(
+    driver = PymavlinkDriver(
         link_url,
         system_id=system_id,
         own_system_id=own_system_id,
         own_component_id=own_component_id,
         signing_key=signing_key,
     )
+    if kind == "pymavlink":
+        return driver
+    from companion.vehicle.auto_driver import AutoDriver
+
+    return AutoDriver(driver, mavsdk_driver)

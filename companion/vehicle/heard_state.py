@@ -149,6 +149,10 @@ class HeardState:
         self._subscribers[key] = callback
         return lambda: self._subscribers.pop(key, None) and None
 
+    def share_subscribers(self, other: HeardState) -> None:
+        """Call back whoever has subscribed to another one, and whoever will."""
+        self._subscribers = other._subscribers
+
     @contextlib.asynccontextmanager
     async def watching(self, watcher: Callable[[str, Fields], None]) -> AsyncIterator[None]:
         """Call back with every message for as long as this is entered."""

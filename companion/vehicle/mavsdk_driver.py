@@ -53,6 +53,7 @@ _PARAM_REASONS = {
 class MavsdkDriver(AutopilotDriver):
     """See `companion.vehicle.driver.Driver`."""
 
+    library = "mavsdk"
     _mavsdk: mavsdk.Mavsdk | None = None
     _search: ctypes.c_void_p | None = None
     _direct: MavlinkDirect | None = None

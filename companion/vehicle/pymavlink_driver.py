@@ -55,6 +55,7 @@ _PARAM_ERRORS = {
 class PymavlinkDriver(AutopilotDriver):
     """See `companion.vehicle.driver.Driver`."""
 
+    library = "pymavlink"
     flown_autopilots = frozenset({PX4, ARDUPILOT})
 
     def __init__(

@@ -69,6 +69,7 @@ class VehicleState:
             autopilot that does not tell it (CURRENT_MODE: PX4 1.15 and newer).
         clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until it has told its time.
         gimbal: where it looks and who may move it; None until one was heard.
+        autopilot: "PX4" or "ArduPilot", None until it was heard.
         missing_streams: names of the messages that are needed and come below half of their rate.
     """
 
@@ -97,6 +98,7 @@ class VehicleState:
     battery_fraction: float | None = None
     clock: ClockOffset | None = None
     gimbal: GimbalState | None = None
+    autopilot: str | None = None
     missing_streams: tuple[str, ...] = ()
 
     @property

@@ -193,7 +193,7 @@ async def test_a_vehicle_that_waits_to_be_spoken_to_is_spoken_to(kind: DriverKin
 
 
 def test_a_driver_that_does_not_exist_and_bad_urls_and_ids_are_refused_when_opened() -> None:
-    with pytest.raises(ValueError, match="there is no driver 'dronekit'; there are: mavsdk, pymavlink"):
+    with pytest.raises(ValueError, match="there is no driver 'dronekit'; there are: auto, mavsdk, pymav"):
         open_driver("dronekit", "udpin://0.0.0.0:14540")  # type: ignore[arg-type]  # what is refused
     with pytest.raises(ValueError, match="is not a link url"):
         open_driver("mavsdk", "14540")
