@@ -36,7 +36,7 @@ from companion.guidance.refusal import refusal
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
-from companion.vehicle.state import FlightMode, Vector3
+from companion.vehicle.state import FlightMode, Vector3, VehicleState
 from companion.vehicle.streamer import SILENCE_S, StreamState
 
 logger = logging.getLogger(__name__)
@@ -286,7 +286,7 @@ class Guidance:
 
     def _update(self, situation: Situation, inputs: GuidanceInput, paused_s: float) -> None:
         assert self._behaviour is not None
-        why = self._silent(inputs.stream.state, paused_s) or self._authority.lost(
+        why = self._silent(inputs.stream.state, situation.state, paused_s) or self._authority.lost(
             situation.state,
             situation.now_ns,
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
@@ -407,7 +407,7 @@ class Guidance:
         self._out.event(EventKind.BATTERY, behaviour.name, message, warning=True)
         self._queue.supersede(f"an event ({message})", self._out)
 
-    def _silent(self, stream: StreamState, paused_s: float) -> str | None:
+    def _silent(self, stream: StreamState, state: VehicleState, paused_s: float) -> str | None:
         """Why our setpoints failed to go out, if they did.
 
         PX4 would take OFFBOARD up again by itself if setpoints came back; only an operator may.
@@ -417,7 +417,7 @@ class Guidance:
         if paused_s > SILENCE_S:
             return f"our own guidance stood still for {paused_s:.1f} s"
         if stream is StreamState.EXPIRED:
-            return "no setpoint left for too long, the autopilot's failsafe has the vehicle"
+            return f"no setpoint left for too long: {state.without_setpoints}"
         return None
 
     def _position_known(self, situation: Situation) -> bool:

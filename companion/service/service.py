@@ -209,7 +209,7 @@ class Service:
                 if flying and self.driver.state.connected(time.monotonic_ns()):
                     await self.driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
             except CommandRefusedError as error:
-                self._event("error", f"leaving: {error}; the autopilot's offboard-loss failsafe acts")
+                self._event("error", f"leaving: {error}; {self.driver.state.without_setpoints}")
             finally:
                 await self._loop.until_released()
 

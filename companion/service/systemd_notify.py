@@ -1,7 +1,7 @@
 """Tell systemd how the service is: sd_notify(3)'s protocol, a datagram to the socket in NOTIFY_SOCKET.
 
 The watchdog is fed from the guidance loop itself, never from a timer of its own: when that loop hangs,
-systemd ends the service and starts it again, and the autopilot has been in its failsafe since.
+systemd ends the service and starts it again, and the autopilot has been without setpoints since.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class GuidanceSection(Section):
     setpoint_lifetime_s: Annotated[float, Field(ge=0.02, le=2)] = 0.3
     """a setpoint older than this is not sent any more, seconds"""
     brake_s: Annotated[float, Field(ge=0, le=5)] = 0.5
-    """after that a brake is sent for so long, then nothing, and the autopilot's failsafe acts; seconds"""
+    """after that a brake is sent for so long, then nothing: PX4 leaves OFFBOARD, ArduPilot stands; seconds"""
     min_battery_percent: Annotated[float, Field(ge=0, le=100)] = 15.0
     """no flight begins with less charge than this, and one ends below it; percent, 0: not watched"""
     low_battery: Literal["rtl", "land", "hold"] = "rtl"

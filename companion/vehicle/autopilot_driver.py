@@ -17,10 +17,10 @@ from dataclasses import replace
 from typing import Any
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
-from companion.vehicle.connection_advice import why_no_autopilot, why_not_flown
-from companion.vehicle.driver import CommandRefusedError, LinkError, SystemStatus
+from companion.vehicle.connection_advice import why_no_answer, why_no_autopilot, why_not_flown
+from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
-from companion.vehicle.framing import Frame, Framer, pack_frame
+from companion.vehicle.framing import Frame, Framer, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.heard_state import HeardState
@@ -90,6 +90,8 @@ class AutopilotDriver(ABC):
         self._asked_ns = 0
         self._first_heard = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
+        self._signs = False  # the autopilot's frames are signed
+        self._only_heartbeats = True
         self._streams: StreamRequests | None = None
         self._sequence = 0
         self._tasks: list[asyncio.Task[None]] = []
@@ -232,6 +234,10 @@ class AutopilotDriver(ABC):
             if frame.system_id == self._system_id and source == self._source:
                 ours.append(frame)
                 if frame.component_id == AUTOPILOT_COMPONENT:
+                    self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
+                    if is_signed(frame.raw) and not self._signs:
+                        self._signs = True
+                        self._warn_unsigned()
                     if self._streams is not None:
                         self._streams.monitor.received(frame.message_id)
                     if frame.message_id == _TIMESYNC_ID:
@@ -269,6 +275,21 @@ class AutopilotDriver(ABC):
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
         self._heard.handle("HEARTBEAT", fields)
         self._first_heard.set()
+
+    def _warn_unsigned(self) -> None:
+        """Once, when the first signed frame has come."""
+        if self._signer is None:
+            logger.error("%s: %s", self.url, self._advice())
+
+    def _advice(self) -> str:
+        return why_no_answer(
+            signs=self._signs, has_key=self._signer is not None, only_heartbeats=self._only_heartbeats
+        )
+
+    def _no_answer(self, text: str) -> NoAnswerError:
+        """The error for a command or a parameter that the autopilot has not answered."""
+        advice = self._advice()
+        return NoAnswerError(f"{text}; {advice}" if advice else text)
 
     def _time_from(self, frame: Frame) -> None:
         """An answer to `_synchronise`; the autopilot's own questions have no `tc1`."""

@@ -1,4 +1,4 @@
-"""Why a driver is not connected, in one line for the person who set it up."""
+"""Why a driver is not connected or not answered, in one line for the person who set it up."""
 
 from __future__ import annotations
 
@@ -41,6 +41,27 @@ def why_no_autopilot(
     else:
         advice = "nothing came at all; check that the vehicle is on, and the address or device"
     return f"no {which} answered on {url} within {timeout_s:g} s: {advice}"
+
+
+def why_no_answer(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
+    """What may be behind an autopilot that is heard and does not answer; empty where nothing tells.
+
+    Args:
+        signs: its messages are signed. has_key: ours are. only_heartbeats: nothing else of it has come.
+    """
+    if signs and not has_key:
+        return (
+            "the autopilot signs its messages and ignores unsigned ones: "
+            "set vehicle.signing_key_file to a file with its key"
+        )
+    if not only_heartbeats:
+        return ""
+    if has_key:
+        return "nothing but heartbeats comes from the autopilot: check that it hears this link"
+    return (
+        "nothing but heartbeats comes from the autopilot: check that it hears this link, and whether it "
+        "wants signed messages (vehicle.signing_key_file)"
+    )
 
 
 def why_not_flown(url: LinkUrl, system_id: int | None, kind: int | None) -> str:

@@ -24,6 +24,10 @@ class CommandRefusedError(RuntimeError):
     """The vehicle refused, or did not do in time, what was asked. The message says what and why."""
 
 
+class NoAnswerError(CommandRefusedError):
+    """The vehicle is heard, and has not answered. The message says what may be the reason."""
+
+
 class SystemStatus(IntEnum):
     """MAV_STATE of our own heartbeat."""
 

@@ -182,9 +182,7 @@ class MavsdkDriver(AutopilotDriver):
         )
         result, ack = await answered
         if result != MavlinkDirectResult.SUCCESS:
-            raise CommandRefusedError(
-                f"the vehicle does not answer command {command} ({result.name.lower()})"
-            )
+            raise self._no_answer(f"the vehicle does not answer command {command} ({result.name.lower()})")
         return int(json.loads(ack.fields_json)["result"])
 
     async def get_parameter(self, name: str) -> float:
@@ -217,6 +215,8 @@ class MavsdkDriver(AutopilotDriver):
         except ParamError as error:
             if error.result in (ParamResult.WRONG_TYPE, ParamResult.TYPE_MISMATCH):
                 raise _WrongTypeError(f"parameter {name}: its type is another one") from error
+            if error.result is ParamResult.TIMEOUT:
+                raise self._no_answer(f"parameter {name}: {_PARAM_REASONS[error.result]}") from error
             reason = _PARAM_REASONS.get(error.result, error.result.name.lower())
             raise CommandRefusedError(f"parameter {name}: {reason}") from error
 

@@ -135,7 +135,7 @@ class PymavlinkDriver(AutopilotDriver):
                         )
                 if result is not None:
                     return result
-        raise CommandRefusedError(
+        raise self._no_answer(
             f"the vehicle does not answer command {command} ({_ATTEMPTS} times asked, {_ATTEMPT_S:g} s apart)"
         )
 
@@ -183,7 +183,7 @@ class PymavlinkDriver(AutopilotDriver):
             name, lambda: self._send_message("PARAM_REQUEST_READ", request), lambda _: True
         )
         if fields is None:
-            raise CommandRefusedError(
+            raise self._no_answer(
                 f"the vehicle does not answer for parameter {name}: no such parameter, or the link is down"
             )
         kind = fields["param_type"]

@@ -16,6 +16,10 @@ Quaternion = tuple[float, float, float, float]
 TELEMETRY_MAX_AGE_S = 0.5
 # HEARTBEAT comes once a second; three missing is the usual sign of a lost link.
 HEARTBEAT_MAX_AGE_S = 3.0
+_WITHOUT_SETPOINTS = {
+    "PX4": "PX4 leaves OFFBOARD after COM_OF_LOSS_T and does what COM_OBL_RC_ACT says",
+    "ArduPilot": "ArduPilot stands after GUID_TIMEOUT and stays in GUIDED",
+}
 
 
 class FlightMode(StrEnum):
@@ -116,6 +120,11 @@ class VehicleState:
             return None
         home_down = self.home_position_ned_m[2] if self.home_position_ned_m else 0.0
         return home_down - self.position_ned_m[2]
+
+    @property
+    def without_setpoints(self) -> str:
+        """What the autopilot does when setpoints stop, in words."""
+        return _WITHOUT_SETPOINTS.get(self.autopilot or "", "the autopilot does what it is set to do")
 
     def connected(self, now_ns: int) -> bool:
         """A heartbeat came within `HEARTBEAT_MAX_AGE_S`."""

@@ -1,8 +1,9 @@
 """The dead-man: sends the newest setpoint at a steady rate while, and only while, it is fresh.
 
-Fresh → the setpoint. Expired → a braking setpoint for `brake_s`. Then silence, so that the autopilot's own
-loss-of-offboard failsafe acts (PX4: COM_OF_LOSS_T, COM_OBL_RC_ACT). The streamer lives in the same loop as
-everything else: when that loop hangs or the process is stopped, nothing is sent and the failsafe acts too.
+Fresh → the setpoint. Expired → a braking setpoint for `brake_s`. Then silence, so that PX4's own
+loss-of-offboard failsafe acts (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduPilot has none: it stands, in GUIDED. The
+streamer lives in the same loop as everything else: when that loop hangs or the process is stopped, nothing is
+sent, and the autopilot acts in the same way.
 
 Silence is final: PX4 goes back to OFFBOARD by itself when setpoints return, so after a silence as long as its
 failsafe may take, whatever caused it, nothing is sent until `stop()` and a new beginning.
@@ -143,5 +144,5 @@ class Streamer:
         if state is StreamState.BRAKING:
             logger.warning("setpoint expired: braking")
         elif state is StreamState.EXPIRED:
-            logger.error("no fresh setpoint: sending stopped, the autopilot's failsafe takes over")
+            logger.error("no fresh setpoint: sending stopped, the autopilot is on its own")
         self._state = state

@@ -181,5 +181,5 @@ def test_a_stream_that_fell_silent_ends_the_command_with_its_reason() -> None:
     harness.streaming = True
     harness.run(0.1)
     assert future.result() == Outcome(
-        False, "no setpoint left for too long, the autopilot's failsafe has the vehicle"
+        False, "no setpoint left for too long: the autopilot does what it is set to do"
     )

@@ -8,7 +8,7 @@ import time
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, SystemStatus
+from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID
 from companion.vehicle.setpoint import Setpoint
@@ -201,3 +201,15 @@ def test_a_driver_that_does_not_exist_and_bad_urls_and_ids_are_refused_when_open
         open_driver("mavsdk", "udpin://0.0.0.0:14540", system_id=0)
     with pytest.raises(ValueError, match=r"own_component_id must be 1\.\.255"):
         open_driver("pymavlink", "udpin://0.0.0.0:14540", own_component_id=256)
+
+
+async def test_an_autopilot_that_sends_heartbeats_alone_and_does_not_answer_is_named_so(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
+    autopilot.answers.clear()
+    with pytest.raises(NoAnswerError, match=r"nothing but heartbeats .*vehicle\.signing_key_file"):
+        await driver.arm()
+    autopilot.say(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
+    await wait_until(lambda: driver.state.position_ned_m is not None, 5.0)
+    with pytest.raises(NoAnswerError, match=r"does not answer command 400 \([^;]*$"):
+        await driver.arm()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.settings.reading import load_settings, to_toml
-from companion.vehicle.driver import CommandRefusedError, LinkError
+from companion.vehicle.driver import LinkError, NoAnswerError
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import Frame, Framer
 from companion.vehicle.signing import FrameSigner, SigningKeyError, read_key
@@ -135,10 +135,13 @@ def test_neither_the_settings_nor_a_log_show_the_key(
     assert read_key(path).hex() not in told
 
 
-async def test_a_signed_link_is_flown_and_another_key_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("personality", ["px4", "ardupilot"])
+async def test_a_signed_link_is_flown_and_another_key_is_named(
+    tmp_path: Path, personality: str, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "simulator.key"
     path.write_bytes(KEY)
-    with running_simulator(signing_key=path, ready_after=0.0, speed=4.0) as simulator:
+    with running_simulator(autopilot=personality, signing_key=path, ready_after=0.0, speed=4.0) as simulator:
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         other = open_driver("pymavlink", url, signing_key=os.urandom(32))
         with pytest.raises(LinkError, match=r"refused by signing .*wrong signature.*the same key"):
@@ -147,7 +150,8 @@ async def test_a_signed_link_is_flown_and_another_key_is_named(tmp_path: Path) -
         await driver.connect(20.0)
         try:
             await state_shows(driver, lambda state: state.ready_to_arm)
-            assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
+            name = "COM_OF_LOSS_T" if personality == "px4" else "GUID_TIMEOUT"
+            assert await driver.get_parameter(name) > 0.0
             await driver.arm()
             await driver.disarm()
         finally:
@@ -155,7 +159,8 @@ async def test_a_signed_link_is_flown_and_another_key_is_named(tmp_path: Path) -
         unsigned = open_driver("pymavlink", url)
         await unsigned.connect(20.0)
         try:
-            with pytest.raises(CommandRefusedError, match="does not answer"):
+            assert "signs its messages" in caplog.text
+            with pytest.raises(NoAnswerError, match=r"does not answer .*set vehicle\.signing_key_file"):
                 await unsigned.arm()
         finally:
             await unsigned.close()

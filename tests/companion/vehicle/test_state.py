@@ -57,3 +57,11 @@ def test_a_position_is_fresh_only_with_position_and_attitude(late: str) -> None:
     assert not VehicleState(**stamps | {late: 10 * S - 1}, **known).position_fresh(now_ns)
     for missing in known:
         assert not VehicleState(**stamps, **known | {missing: None}).position_fresh(now_ns)
+
+
+def test_no_failsafe_is_claimed_that_the_autopilot_does_not_have() -> None:
+    assert "COM_OBL_RC_ACT" in VehicleState(autopilot="PX4").without_setpoints
+    of_ardupilot = VehicleState(autopilot="ArduPilot").without_setpoints
+    assert "GUID_TIMEOUT" in of_ardupilot
+    assert "COM_" not in of_ardupilot
+    assert "COM_" not in VehicleState().without_setpoints
