@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 from companion.perception.views import WorkerView
 from companion.service.status import hud_lines
 from companion.service.systemd_notify import SystemdNotifier
-from companion.vehicle.driver import Driver, SystemStatus
+from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 
 HEARTBEAT_PERIOD_S = 1.0
 HUD_PERIOD_S = 0.2
+# ArduPilot's default, for which a velocity is flown on; 1 s is advised (docs/safety.md).
+LONG_GUIDED_TIMEOUT_S = 3.0
 
 
 class Health:
@@ -35,6 +37,21 @@ class Health:
     def healthy(self, now_ns: int) -> bool:
         """Every camera delivers, and the autopilot is there."""
         return all(view.seeing(now_ns) for view in self._views) and self._driver.state.connected(now_ns)
+
+    async def check(self) -> None:
+        """Once, after the link has opened: read what a person should have set in the autopilot."""
+        if self._driver.state.autopilot != "ArduPilot":
+            return
+        try:
+            timeout_s = await self._driver.get_parameter("GUID_TIMEOUT")
+        except CommandRefusedError as error:
+            self._on_event("warning", f"GUID_TIMEOUT is not known: {error}")
+            return
+        if timeout_s >= LONG_GUIDED_TIMEOUT_S:
+            self._on_event(
+                "warning",
+                f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long without us; set it to 1",
+            )
 
     def after_step(self, now_ns: int, status: str) -> None:
         """Once for every step. `status`: guidance's, in words."""

@@ -109,8 +109,8 @@ class Service:
                 metrics = MetricsServer(self.settings.metrics.listen, lambda: self._status)
                 self._event("info", f"metrics on port {metrics.port}")
             await self._start()
-            vehicle = self._publisher.publish_vehicle(self.guidance, self.streamer, self.views)
-            loops = [self._loop.run(), self.streamer.run(), vehicle, self._publish_status()]
+            loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.check()]
+            loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.views))
             if self._console and all(terminal_is_free(view.settings.source.uri) for view in self.views):
                 loops.append(run_console(self.command, self.stop, grammar.describe(), self._event))
             tasks = [asyncio.create_task(loop) for loop in loops]

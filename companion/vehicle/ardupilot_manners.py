@@ -10,7 +10,7 @@ What differs, and what is made of it:
 * **There is no failsafe that leaves GUIDED when setpoints stop.** A velocity is flown for GUID_TIMEOUT (3 s)
   more, then the vehicle stands still, in GUIDED; a position is flown to and held for ever. So the braking
   setpoint that our streamer sends before it falls silent is what stops the vehicle, and RTL or LAND on our
-  silence is for FS_GCS_ENABLE with SYSID_MYGCS set to our system id.
+  silence is for FS_GCS_ENABLE with SYSID_MYGCS (MAV_GCS_SYSID since 4.7) set to our system id.
 * A setpoint without any yaw turns the nose into the direction of flight (WP_YAW_BEHAVIOR); ours keep the
   heading, so they go out with a yaw rate of zero.
 * HOME_POSITION's local position is always zero; it is computed from GPS_GLOBAL_ORIGIN.

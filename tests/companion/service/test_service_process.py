@@ -48,6 +48,24 @@ def fly(service: ServiceProcess) -> None:
     assert service.command("hold") == {"command": "hold", "success": True, "reason": "in progress"}
 
 
+def test_an_ardupilot_is_flown_by_default_and_its_guided_timeout_warned_of(
+    seeing: list[str], tmp_path: Path
+) -> None:
+    with (
+        running_simulator(autopilot="ardupilot") as simulator,
+        running_service(simulator.onboard_port, seeing, cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        listen(session, "status", lambda _key, text: received.put(json.loads(text)))
+        service.wait_for_line("GUID_TIMEOUT is 3 s")
+        service.wait_for_line("heartbeat received: ArduPilot, pymavlink driver")
+        vehicle = received.get(timeout=10)["vehicle"]
+        assert (vehicle["autopilot"], vehicle["driver"]) == ("ArduPilot", "pymavlink")
+        while vehicle["missing_streams"]:
+            vehicle = received.get(timeout=10)["vehicle"]
+
+
 @pytest.mark.parametrize("driver", ["mavsdk", "pymavlink"])
 def test_a_flight_by_commands_while_a_subscriber_receives_every_detection_message(
     driver: str, seeing: list[str], tmp_path: Path
