@@ -7,6 +7,8 @@ this explains was chosen by someone else, and someone else always wins.
 
 from __future__ import annotations
 
+from companion.vehicle.px4_modes import among_modes
+from companion.vehicle.report import Report, words_of
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 
 # A heartbeat's period and some: so long may the vehicle show an old mode after it acknowledged a new one.
@@ -14,6 +16,9 @@ SHOW_DELAY_S = 2.0
 # PX4 ends a take-off inside NAV_MC_ALT_RAD (0.8 m); heights measured in two ways differ by some more. A hold
 # that appears lower than this below the wanted height was asked for by a pilot.
 TAKEOFF_SHORT_M = 1.3
+# What the autopilot says of a failsafe comes so shortly before or after its change of mode.
+SAID_S = 1.0
+_LASTING_FAILSAFES = ("commander_failsafe_enter", "commander_failsafe_enter_generic")
 GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN, FlightMode.PRECISION_LAND)
 
 
@@ -89,21 +94,42 @@ class Authority:
             return f"autopilot failsafe: {_shown(state.mode)}"
         if not explained:
             # A pilot's change moves the intended mode along, a failsafe leaves it as we asked for it.
-            if state.intended_beside is state.mode and state.intended_mode is self._mode:
-                return f"autopilot failsafe: {_shown(state.mode)}"
-            return f"the pilot took over: {_shown(state.mode)}"
+            by_itself = state.intended_beside is state.mode and state.intended_mode is self._mode
+            who = "autopilot failsafe" if by_itself else "the pilot took over"
+            return f"{who}: {_shown(state.mode)}"
         self._was_armed |= state.armed
         if self._was_armed and not state.armed and self._mode not in GOING_DOWN:
             return "the vehicle was disarmed"
         return None
 
-    def reason_is_told(self, state: VehicleState) -> bool:
+    def reason_is_told(self, state: VehicleState, now_ns: int) -> bool:
         """Whether what `lost` said is all that the autopilot will say of it.
 
-        A HEARTBEAT may show a new mode a moment before CURRENT_MODE tells whose it was.
+        A HEARTBEAT may show a new mode a moment before CURRENT_MODE tells whose it was, and either before
+        the autopilot says in words what it does.
         """
-        told = state.intended_beside is not FlightMode.UNKNOWN
-        return not told or state.failsafe or state.intended_beside is state.mode
+        if state.mode is self._mode:
+            return True  # not for a mode
+        silent = not state.reports or bool(self.said_of_it(state, now_ns))
+        whose = state.intended_beside in (FlightMode.UNKNOWN, state.mode) or state.failsafe
+        return whose and (silent or state.intended_mode is state.mode)
+
+    def said_of_it(self, state: VehicleState, now_ns: int) -> str:
+        """What the autopilot warned of when it took command, in its own words; empty if it did not."""
+        warnings = _warnings(state, now_ns)
+        return words_of(one for one in warnings if self._mode is None or among_modes(self._mode, one.modes))
+
+    def chose_hold(self, state: VehicleState, now_ns: int) -> bool:
+        """A failsafe took it out of OFFBOARD into a hold that is meant to last.
+
+        Not one that waits for COM_FAIL_ACT_T before what PX4 does in earnest: its events have other names.
+        """
+        return (
+            self._mode is FlightMode.OFFBOARD
+            and state.mode is state.intended_beside is FlightMode.HOLD
+            and state.intended_mode is FlightMode.OFFBOARD
+            and any(one.name in _LASTING_FAILSAFES for one in _warnings(state, now_ns))
+        )
 
     def _explained(self, state: VehicleState, now_ns: int) -> bool:
         if state.mode is self._mode:
@@ -126,3 +152,7 @@ class Authority:
 
 def _shown(mode: FlightMode) -> str:
     return f"{mode.value.replace('_', ' ')} mode"
+
+
+def _warnings(state: VehicleState, now_ns: int) -> list[Report]:
+    return state.warnings_since(now_ns - round(SAID_S * 1e9))

@@ -519,9 +519,14 @@ class Guidance:
         since_ns, first = self._yielded or (situation.now_ns, why or "")
         self._yielded = (since_ns, why or first)
         self._silence()
-        waited_s = (situation.now_ns - since_ns) / 1e9
-        if why is None or waited_s >= REASON_WAIT_S or self._authority.reason_is_told(situation.state):
-            self._lose(self._yielded[1])
+        state, now_ns = situation.state, situation.now_ns
+        waited_s = (now_ns - since_ns) / 1e9
+        if why is None or waited_s >= REASON_WAIT_S or self._authority.reason_is_told(state, now_ns):
+            said = self._authority.said_of_it(state, now_ns)
+            if self._authority.chose_hold(state, now_ns):
+                # PX4 would take our silence for lost setpoints, and leave its hold for a return after 1.2 s.
+                self._out.request(SetMode(FlightMode.HOLD))
+            self._lose(f"{self._yielded[1]} ({said})" if said else self._yielded[1])
 
     def _lose(self, why: str) -> None:
         """Command was taken from us: not one setpoint more."""

@@ -22,12 +22,16 @@ from companion.missions.mission_file import mission_behaviour
 from companion.perception.views import View
 from companion.perception.views_markers import MarkerWatch
 from companion.settings import Settings
+from companion.vehicle.px4_modes import among_modes
+from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode, VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
 
 # Of the line of a command; the longest that is of use is a path of hundreds of points.
 LONGEST_LINE = 8000
+# A text of the autopilot's that comes again and again is told so often, and so many texts are remembered.
+TELL_AGAIN_S, MOST_TOLD = 10.0, 100
 
 
 class InputAssembler:
@@ -54,13 +58,31 @@ class InputAssembler:
         self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
+        self._on_event = on_event
+        self._reported: tuple[Report, ...] = ()
+        self._told_ns: dict[str, int] = {}
 
     def on_state(self, state: VehicleState) -> None:
         """A new snapshot of the vehicle."""
+        if state.reports is not self._reported:
+            self._tell_reports(state)
         if (state.mode, state.armed) != self._shown:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1
         self.history.add(state)
+
+    def _tell_reports(self, state: VehicleState) -> None:
+        """What the autopilot warns of, if it is about the mode that is flown."""
+        last_ns = self._reported[-1].stamp_ns if self._reported else 0
+        self._reported = state.reports
+        for one in state.warnings_since(last_ns + 1):
+            told_ns = self._told_ns.get(one.text)
+            again = told_ns is None or one.stamp_ns - told_ns >= TELL_AGAIN_S * 1e9
+            if again and among_modes(state.mode, one.modes):
+                self._told_ns[one.text] = one.stamp_ns
+                self._on_event("warning", f"autopilot: {one.text}")
+        if len(self._told_ns) > MOST_TOLD:
+            self._told_ns.clear()
 
     def on_result(self, view: View, result: PerceptionResult, now_ns: int) -> dict[str, Any] | None:
         """What a view saw in one frame. Returns the message about its markers, where some are looked for."""

@@ -44,6 +44,7 @@ def status_message(
             "armed": state.armed,
             "failsafe": state.failsafe,
             "missing_streams": list(state.missing_streams),
+            "said": [one.text for one in state.reports],
         },
         "pilot": {
             "in_command": guidance.in_command,

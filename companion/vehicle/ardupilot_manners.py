@@ -41,6 +41,7 @@ class ArduPilotManners(Manners):
     name = "ArduPilot"
     parameters_bytewise = False
     takes_off_by_home = False
+    has_events = False
     requested = (HOME_POSITION_ID, GPS_GLOBAL_ORIGIN_ID)
     rates_hz = {  # noqa: RUF012 - a table, never changed
         0: 5.0,  # HEARTBEAT: there is no other word of the mode

@@ -27,6 +27,7 @@ from companion.vehicle.heard_state import HeardState
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
+from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
@@ -93,6 +94,13 @@ class AutopilotDriver(ABC):
         self._signs = False  # the autopilot's frames are signed
         self._only_heartbeats = True
         self._streams: StreamRequests | None = None
+        self._reports = ReportReader(
+            self.url,
+            self._heard,
+            self._transmit_payload,
+            self._command,
+            lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
+        )
         self._sequence = 0
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -184,6 +192,7 @@ class AutopilotDriver(ABC):
             (self._streams.keep(), "streams"),
             (self._synchronise(), "clock"),
             (self._gimbal_commands.keep(), "gimbal"),
+            *([(self._reports.learn_events(), "events")] if self._heard.manners.has_events else []),
         ):
             self._tasks.append(asyncio.create_task(loop, name=f"{what} of {self.url}"))
 
@@ -232,12 +241,10 @@ class AutopilotDriver(ABC):
             if frame.message_id == HEARTBEAT_ID:
                 self._heartbeat_from(frame, source)
             if frame.system_id == self._system_id and source == self._source:
-                ours.append(frame)
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
-                    if is_signed(frame.raw) and not self._signs:
-                        self._signs = True
-                        self._warn_unsigned()
+                    # PX4 signs what it sends and takes unsigned messages all the same.
+                    self._signs |= is_signed(frame.raw)
                     if self._streams is not None:
                         self._streams.monitor.received(frame.message_id)
                     if frame.message_id == _TIMESYNC_ID:
@@ -245,6 +252,9 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == _SYSTEM_TIME_ID:
                         _, boot_ms = _SYSTEM_TIME.unpack(frame.padded(_SYSTEM_TIME.size))
                         self._heard.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
+                    elif self._reports.take(frame):
+                        continue
+                ours.append(frame)
         if ours and self._autopilot_kind in self.flown_autopilots:
             self._take_frames(ours)
 
@@ -276,19 +286,10 @@ class AutopilotDriver(ABC):
         self._heard.handle("HEARTBEAT", fields)
         self._first_heard.set()
 
-    def _warn_unsigned(self) -> None:
-        """Once, when the first signed frame has come."""
-        if self._signer is None:
-            logger.error("%s: %s", self.url, self._advice())
-
-    def _advice(self) -> str:
-        return why_no_answer(
-            signs=self._signs, has_key=self._signer is not None, only_heartbeats=self._only_heartbeats
-        )
-
     def _no_answer(self, text: str) -> NoAnswerError:
         """The error for a command or a parameter that the autopilot has not answered."""
-        advice = self._advice()
+        has_key = self._signer is not None
+        advice = why_no_answer(signs=self._signs, has_key=has_key, only_heartbeats=self._only_heartbeats)
         return NoAnswerError(f"{text}; {advice}" if advice else text)
 
     def _time_from(self, frame: Frame) -> None:

@@ -51,7 +51,7 @@ def why_no_answer(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
     """
     if signs and not has_key:
         return (
-            "the autopilot signs its messages and ignores unsigned ones: "
+            "the autopilot signs its messages and may ignore unsigned ones: "
             "set vehicle.signing_key_file to a file with its key"
         )
     if not only_heartbeats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Awaitable, Callable
@@ -10,6 +11,8 @@ from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.heard_state import HeardState
 from companion.vehicle.manners import HOME_POSITION_ID
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
+from companion.vehicle.px4_modes import among_modes
+from companion.vehicle.report import words_of
 from companion.vehicle.state import FlightMode
 from companion.vehicle.telemetry_fold import Fields
 
@@ -18,6 +21,8 @@ _DO_SET_MODE = 176
 _NAV_TAKEOFF = 22
 _COMPONENT_ARM_DISARM = 400
 _REQUEST_MESSAGE = 512
+_RUN_PREARM_CHECKS = 401
+_REASONS_S = 0.5  # so long what it says of its checks is waited for
 _SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT comes once a second
 
 
@@ -49,10 +54,13 @@ class FlightCommands:
                 f"{self._url}: two autopilots answer as system {system_id}, so neither is armed; "
                 "give each an id of its own (MAV_SYS_ID)"
             )
+        asked_ns = time.monotonic_ns()
         result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
         if result != ACCEPTED:
             if not armed:
                 reason = f"it is {heard.state.landed.replace('_', ' ')}"
+            elif checks := await self._failing_checks(asked_ns):
+                reason = checks
             elif heard.state.ready_to_arm:
                 reason = f"in mode {heard.state.mode}"
             else:
@@ -62,6 +70,17 @@ class FlightCommands:
             raise CommandRefusedError(
                 f"the vehicle accepted to {word} but does not show it after {_SHOWN_TIMEOUT_S:g} s"
             )
+
+    async def _failing_checks(self, asked_ns: int) -> str:
+        """What keeps it from arming, in its own words; empty if it does not say."""
+        heard = self._heard
+        if heard.manners.has_events:
+            # PX4 tells its checks when they change, and all of them when it is asked to run them.
+            with contextlib.suppress(CommandRefusedError):
+                await self._command(_RUN_PREARM_CHECKS)
+        await heard.until(lambda: False, _REASONS_S)
+        said, mode = heard.state.warnings_since(asked_ns), heard.state.mode
+        return words_of(one for one in said if one.of_a_check and among_modes(mode, one.modes))
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
         """Return when the vehicle shows the mode."""

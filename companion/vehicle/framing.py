@@ -17,10 +17,16 @@ SIGNATURE_LENGTH = 13  # link id, 48-bit timestamp, 48 bits of SHA-256
 _HEADER_V1, _HEADER_V2, _CHECKSUM, _SIGNATURE = 6, 10, 2, SIGNATURE_LENGTH
 _FLAG_SIGNED = 0x01
 
-# MAVLink common, 436, sent by PX4 >= 1.15. Not in pymavlink 2.4.50's "common".
+# MAVLink common, not in pymavlink 2.4.50's "common". 436 is sent by PX4 >= 1.15.
+COMPONENT_METADATA_ID = 397
+EVENT_ID, CURRENT_EVENT_SEQUENCE_ID, REQUEST_EVENT_ID = 410, 411, 412
 CURRENT_MODE_ID = 436
 CRC_EXTRA: dict[int, int] = {
     **{message_id: message.crc_extra for message_id, message in mavlink.mavlink_map.items()},
+    COMPONENT_METADATA_ID: 182,
+    EVENT_ID: 160,
+    CURRENT_EVENT_SEQUENCE_ID: 106,
+    REQUEST_EVENT_ID: 33,
     CURRENT_MODE_ID: 193,
 }
 

@@ -13,11 +13,13 @@ from dataclasses import replace
 from companion.vehicle.clock_sync import ClockSync
 from companion.vehicle.gimbal_fold import ATTITUDE_STATUS, from_gimbal_device
 from companion.vehicle.manners import Manners, Px4Manners
+from companion.vehicle.report import Report
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, VehicleState
 from companion.vehicle.telemetry_fold import Fields, fold
 
 logger = logging.getLogger(__name__)
 
+REPORTS_KEPT = 20
 _BOOT_TOLERANCE_MS = 1000  # datagrams may overtake each other
 # A restart sets the clock back once; so many times within so long are two clocks, heard by turns.
 _SETBACKS_OF_TWO = 3
@@ -87,6 +89,16 @@ class HeardState:
         stamped = "time_boot_ms" in fields and name != _OF_LONG_AGO
         stamp_ns = self.clock.stamp(fields["time_boot_ms"], now_ns) if stamped else now_ns
         state = fold(self.state, name, fields, stamp_ns)
+        self._show(state, name, fields)
+
+    def take_report(self, report: Report | None) -> None:
+        """Something it said in words; None: nothing."""
+        if report is not None:
+            reports = (*self.state.reports, report)[-REPORTS_KEPT:]
+            self._show(replace(self.state, reports=reports), "REPORT", {"report": report})
+
+    def _show(self, state: VehicleState, name: str, fields: Fields) -> None:
+        """The state after a message, to whoever waits for it."""
         changed, self.state = state is not self.state, state
         for watcher in list(self._watchers.values()):
             watcher(name, fields)

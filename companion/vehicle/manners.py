@@ -31,6 +31,7 @@ class Manners(ABC):
         requested: messages that are requested besides while home is not known.
         parameters_bytewise: integer parameters travel as their bytes; else as numbers.
         takes_off_by_home: a take-off is commanded as an altitude AMSL, which home's altitude is needed for.
+        has_events: it speaks by EVENT, with metadata; else by STATUSTEXT alone.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Manners(ABC):
     requested: tuple[int, ...] = (HOME_POSITION_ID,)
     parameters_bytewise: bool
     takes_off_by_home: bool
+    has_events: bool
 
     def heard(self, name: str, fields: Fields, state: VehicleState) -> list[tuple[str, Fields]]:
         """A message of the autopilot in PX4's terms: what is to be taken in for it, often itself."""
@@ -74,6 +76,7 @@ class Px4Manners(Manners):
     name = "PX4"
     parameters_bytewise = True
     takes_off_by_home = True
+    has_events = True
     rates_hz = {  # noqa: RUF012 - a table, never changed
         31: 50.0,  # ATTITUDE_QUATERNION
         32: 30.0,  # LOCAL_POSITION_NED

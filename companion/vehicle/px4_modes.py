@@ -46,3 +46,27 @@ def request_of_mode(mode: FlightMode) -> tuple[int, int]:
     if mode not in _REQUESTS:
         raise ValueError(f"{mode!s} is not a mode that can be asked for; known: {', '.join(_REQUESTS)}")
     return _REQUESTS[mode]
+
+
+# PX4: msg/VehicleStatus.msg, NAVIGATION_STATE_*
+_NAVIGATION_STATES = {
+    FlightMode.MANUAL: 0,
+    FlightMode.ALTITUDE: 1,
+    FlightMode.POSITION: 2,
+    FlightMode.MISSION: 3,
+    FlightMode.HOLD: 4,
+    FlightMode.RETURN: 5,
+    FlightMode.ACRO: 10,
+    FlightMode.OFFBOARD: 14,
+    FlightMode.STABILIZED: 15,
+    FlightMode.TAKEOFF: 17,
+    FlightMode.LAND: 18,
+    FlightMode.FOLLOW: 19,
+    FlightMode.PRECISION_LAND: 20,
+}
+
+
+def among_modes(mode: FlightMode, modes: int) -> bool:
+    """Whether a mode is among those of a `Report`; one that has no number here always is."""
+    state = _NAVIGATION_STATES.get(mode)
+    return state is None or bool(modes >> state & 1)

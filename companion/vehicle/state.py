@@ -8,6 +8,7 @@ from enum import StrEnum
 
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.gimbal import GimbalState
+from companion.vehicle.report import WARNING, Report
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -73,6 +74,7 @@ class VehicleState:
             autopilot that does not tell it (CURRENT_MODE: PX4 1.15 and newer).
         clock: the autopilot's boot clock against CLOCK_MONOTONIC; None until it has told its time.
         gimbal: where it looks and who may move it; None until one was heard.
+        reports: the newest things it said, the newest last.
         autopilot: "PX4" or "ArduPilot", None until it was heard.
         missing_streams: names of the messages that are needed and come below half of their rate.
     """
@@ -102,6 +104,7 @@ class VehicleState:
     battery_fraction: float | None = None
     clock: ClockOffset | None = None
     gimbal: GimbalState | None = None
+    reports: tuple[Report, ...] = ()
     autopilot: str | None = None
     missing_streams: tuple[str, ...] = ()
 
@@ -139,3 +142,7 @@ class VehicleState:
             and now_ns - self.position_ns <= limit_ns
             and now_ns - self.attitude_ns <= limit_ns
         )
+
+    def warnings_since(self, stamp_ns: int) -> list[Report]:
+        """What it warned of, or worse, from a moment on (CLOCK_MONOTONIC)."""
+        return [one for one in self.reports if one.stamp_ns >= stamp_ns and one.level <= WARNING]

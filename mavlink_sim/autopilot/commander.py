@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 
-from mavlink_sim.autopilot import position_failsafe
+from mavlink_sim.autopilot import arming_checks, position_failsafe
 from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M, GroundContact, asks_to_rise
 from mavlink_sim.autopilot.home import Home
 from mavlink_sim.autopilot.supervision import REASONS, Supervision
@@ -196,6 +196,7 @@ class Autopilot:
             if not self.sensors_ready:
                 self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
             self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
+            self.tell_checks()
             return TEMPORARILY_REJECTED
         self.armed = True
         self.ground.arm(self.now_s)
@@ -204,6 +205,10 @@ class Autopilot:
         self._on_event("armed")
         self._start_task()
         return ACCEPTED
+
+    def tell_checks(self) -> None:
+        """RUN_PREARM_CHECKS, and a refusal to arm: the checks that fail, by their events."""
+        self.texts.extend(arming_checks.failing_checks(self))
 
     def disarm(self, force: bool = False, by: str = "external command") -> int:
         """MAV_RESULT of a disarming request; `force` stops the motors in the air too."""

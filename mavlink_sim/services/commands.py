@@ -172,6 +172,12 @@ def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
     return ACCEPTED
 
 
+def _run_prearm_checks(vehicle: Vehicle, link: Link, command: Command) -> int:
+    if not vehicle.autopilot.armed:
+        vehicle.autopilot.tell_checks()
+    return ACCEPTED
+
+
 def _mission_start(vehicle: Vehicle, link: Link, command: Command) -> int:
     return mission_start(vehicle.autopilot, command.parameters[0])
 
@@ -274,7 +280,7 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
     245: _preflight_storage,  # PREFLIGHT_STORAGE
     300: _mission_start,
     ARM_DISARM: _arm,
-    401: _accept,  # RUN_PREARM_CHECKS
+    401: _run_prearm_checks,
     GET_MESSAGE_INTERVAL: _get_message_interval,
     SET_MESSAGE_INTERVAL: _set_message_interval,
     REQUEST_MESSAGE: _request_message,

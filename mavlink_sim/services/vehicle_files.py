@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.px4.parameters import INT32, Parameter, Parameters, default_parameters, is_volatile
 from mavlink_sim.services.file_system import FileSystem
 from mavlink_sim.services.file_transfer import checksum
-from mavlink_sim.wire import announcements
+from mavlink_sim.wire.event_texts import events_metadata
 from mavlink_sim.wire.messages import component_metadata
 
 if TYPE_CHECKING:
@@ -119,22 +119,7 @@ def parameter_metadata() -> bytes:
 @cache
 def event_metadata() -> bytes:
     """JSON by MAVLink's events schema: what the vehicle's events are called and say."""
-    events = {
-        str(identifier & 0xFFFFFF): {
-            "name": name,
-            "message": message,
-            **({"arguments": arguments} if arguments else {}),
-        }
-        for identifier, name, message, arguments in announcements.EVENT_TEXTS
-    }
-    return _json(
-        {
-            "version": 2,
-            "components": {
-                "1": {"namespace": "px4", "event_groups": {"default": {"events": events}}},
-            },
-        }
-    )
+    return _json(events_metadata())
 
 
 @cache

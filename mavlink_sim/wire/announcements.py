@@ -38,37 +38,6 @@ DISARMED_EVENT = 0x01F46777
 ARMING_DENIED_EVENT = (0x0102089D, 0x62, b"")
 DEFAULT_ALTITUDE_EVENT = 0x013B2FC7
 
-# What the events metadata says of them: identifier, name, message, arguments.
-EVENT_TEXTS: tuple[tuple[int, str, str, list[dict[str, str]]], ...] = (
-    (
-        ARMED_EVENT[0],
-        "commander_armed_by",
-        "Armed, calling reason {1}",
-        [{"type": "uint8_t", "name": "reason"}],
-    ),
-    (TAKEOFF_EVENT[0], "land_detector_takeoff", "Takeoff detected", []),
-    (LANDING_EVENT[0], "navigator_mode_land", "Landing at current position", []),
-    (LANDED_EVENT[0], "land_detector_landed", "Landing detected", []),
-    (
-        DISARMED_EVENT,
-        "commander_disarmed_by",
-        "Disarmed, calling reason {1}",
-        [{"type": "uint8_t", "name": "reason"}],
-    ),
-    (
-        ARMING_DENIED_EVENT[0],
-        "commander_arm_denied",
-        "Arming denied: Resolve system health failures first",
-        [],
-    ),
-    (
-        DEFAULT_ALTITUDE_EVENT,
-        "navigator_takeoff_min_alt",
-        "Using default takeoff altitude: {1:.2m_v}",
-        [{"type": "float", "name": "takeoff_min_alt"}],
-    ),
-)
-
 # command, confirmation, its seven parameters
 GimbalCommand = tuple[int, int, tuple[float, float, float, float, float, float, float]]
 # What PX4 sends at a landing to look after a gimbal: (seconds since it began, command as above).

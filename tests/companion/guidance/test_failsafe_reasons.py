@@ -1,5 +1,6 @@
 """A failsafe of the autopilot is told as one, a pilot's change of mode as a pilot's."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -9,6 +10,7 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.core import REASON_WAIT_S
 from companion.guidance.interface import GuidanceInput
 from companion.guidance.orbit import OrbitBehaviour
+from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode
 from mavlink_sim.px4.modes import Mode
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying
@@ -89,3 +91,45 @@ def test_a_heartbeat_that_comes_first_stops_the_setpoints_and_waits_for_the_reas
     harness.autopilot.change_mode(FlightMode.OFFBOARD)
     harness.run(2.0)
     assert len(harness.autopilot.setpoints) == sent
+
+
+def said(name: str, text: str) -> Callable[[GuidanceInput], GuidanceInput]:
+    """A failsafe of PX4's that shows HOLD, and the event with which PX4 says so."""
+
+    def tell(inputs: GuidanceInput) -> GuidanceInput:
+        state = inputs.state
+        offboard = FlightMode.OFFBOARD
+        reports: tuple[Report, ...] = (Report(state.heartbeat_ns - 5_000_000_000, 4, "Low battery"),)
+        if state.mode is FlightMode.HOLD:
+            reports += (
+                Report(state.heartbeat_ns, 3, "No manual control input", "arming_check", modes=0b111),
+                Report(state.heartbeat_ns, 2, text, "default", name),
+            )
+        told = replace(state, intended_mode=offboard, intended_beside=state.mode, reports=reports)
+        return replace(inputs, state=told)
+
+    return tell
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "asks"),
+    [
+        ("commander_failsafe_enter_generic", "Failsafe activated: switching to Hold", ["hold"]),
+        ("commander_failsafe_enter_generic_hold", "Failsafe activated: switching to RTL in 5 seconds", []),
+    ],
+)
+def test_a_hold_that_px4_means_to_keep_is_confirmed_and_one_before_a_return_is_not(
+    name: str, text: str, asks: list[str]
+) -> None:
+    """PX4 leaves its hold for a return when setpoints cease, unless hold is what was asked for last."""
+    harness = GuidanceHarness(flying(), inputs=said(name, text))
+    future = harness.command(OrbitBehaviour(radius_m=5.0))
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    harness.run(0.2)
+    harness.autopilot.requests.clear()
+    harness.autopilot.change_mode(FlightMode.HOLD)
+    harness.run(0.1)
+    assert future.result() == Outcome(False, f"autopilot failsafe: hold mode ({text})")
+    harness.run(3.0)
+    assert harness.autopilot.requests == asks
+    assert not harness.guidance.in_command

@@ -29,7 +29,8 @@ PITCH_RAD, HEADING_RAD = -0.9, 1.2
 
 
 def service_of(**settings: str) -> Service:
-    return Service(load_settings(os.devnull, {key.replace("__", "."): v for key, v in settings.items()}, {}))
+    changes = {key.replace("__", "."): value for key, value in settings.items()}
+    return Service(load_settings(os.devnull, {"vehicle.driver": "pymavlink", **changes}, {}))
 
 
 def state_at(now_ns: int, gimbal: GimbalState | None) -> VehicleState:

@@ -1,0 +1,92 @@
+"""PX4's events in words, by the metadata that an autopilot serves."""
+
+import json
+import struct
+
+import pytest
+
+from companion.vehicle.event_catalogue import Event, EventCatalogue
+from companion.vehicle.report import ALL_MODES, Report
+
+ERROR, INFO, PROTOCOL = 0x63, 0x66, 0x68
+
+
+def catalogue() -> EventCatalogue:
+    def event(message: str, *kinds: str, **more: str) -> dict[str, object]:
+        arguments = [{"name": f"arg{number}", "type": kind} for number, kind in enumerate(kinds)]
+        return {"name": "an_event", "message": message, "arguments": arguments, **more}
+
+    default = {
+        "1": event("{3}: switching to {2}", "uint32_t", "px4::failsafe_action_t", "px4::failsafe_cause_t"),
+        "2": event("RTL: {1m_v} above, {2:.1m/s}, {3:.3}", "int32_t", "float", "double_t"),
+        "3": event("Airspeed max \\< 5 m/s, <param>FW_AIRSPD_MAX</param> set"),
+        "4": event("parts: {1}", "parts_t"),
+        "5": {"message": "Landing detected"},
+    }
+    checks = {
+        "6": event("No valid data from Compass {3}", "navigation_mode_group_t", "uint8_t", "uint8_t"),
+        "7": event("summary", "uint8_t", type="summary"),
+    }
+    enums = {
+        "failsafe_action_t": {"type": "uint8_t", "entries": {"6": {"name": "rtl", "description": "RTL"}}},
+        "failsafe_cause_t": {"type": "uint8_t", "entries": {"3": {"name": "low", "description": ""}}},
+        "parts_t": {
+            "type": "uint16_t",
+            "is_bitfield": True,
+            "entries": {"1": {"name": "a", "description": "gyro"}, "4": {"name": "b", "description": "baro"}},
+        },
+        "navigation_mode_group_t": {"type": "uint32_t", "is_bitfield": True, "entries": {}},
+    }
+    groups = {"default": {"events": default}, "arming_check": {"events": checks}}
+    px4 = {"namespace": "px4", "enums": enums, "event_groups": groups}
+    return EventCatalogue(json.dumps({"version": 2, "components": {"1": px4}}).encode())
+
+
+def said(number: int, arguments: bytes = b"", levels: int = ERROR) -> Report | None:
+    return catalogue().report(Event(1 << 24 | number, 9, levels, arguments.ljust(40, b"\0")), 5)
+
+
+@pytest.mark.parametrize(
+    ("number", "arguments", "text"),
+    [
+        (1, struct.pack("<IBB", 0, 6, 3), "low: switching to RTL"),
+        (1, struct.pack("<IBB", 0, 9, 3), "low: switching to 9"),  # newer than its metadata
+        (2, struct.pack("<if", -3, 1.25), "RTL: -3 m above, 1.2 m/s, ?"),  # an argument of an unknown type
+        (3, b"", "Airspeed max < 5 m/s, FW_AIRSPD_MAX set"),
+        (4, struct.pack("<H", 5), "parts: gyro, baro"),
+        (4, struct.pack("<H", 0), "parts: none"),
+        (5, b"", "Landing detected"),
+        (9, b"", "event 0x01000009, which its metadata does not name"),
+    ],
+)
+def test_an_event_in_words(number: int, arguments: bytes, text: str) -> None:
+    report = said(number, arguments)
+    assert report is not None
+    assert (report.text, report.level, report.stamp_ns, report.modes) == (text, 3, 5, ALL_MODES)
+
+
+def test_a_check_tells_its_group_and_which_modes_it_is_about() -> None:
+    report = said(6, struct.pack("<IBB", 0x4000, 0, 2))
+    assert report == Report(5, 3, "No valid data from Compass 2", "arming_check", "an_event", 0x4000)
+    assert report is not None
+    assert report.of_a_check
+    hint = said(6, struct.pack("<IBB", 0x4000, 0, 2), INFO)
+    assert hint is not None
+    assert not hint.of_a_check  # it does not keep the vehicle from arming
+
+
+def test_what_is_not_for_people_is_not_told() -> None:
+    assert said(7) is None
+    assert said(5, levels=PROTOCOL) is None
+
+
+def test_without_metadata_events_have_numbers() -> None:
+    report = EventCatalogue(None).report(Event(0x01ABCDEF, 1, INFO, bytes(40)), 5)
+    assert report is not None
+    assert report.text == "event 0x01abcdef, which its metadata does not name"
+
+
+@pytest.mark.parametrize("metadata", [b"", b"{", b"[]", b'{"components": 3}', b'{"components": {"1": 3}}'])
+def test_what_is_no_metadata_is_refused(metadata: bytes) -> None:
+    with pytest.raises(ValueError, match=r"metadata|JSON|Expecting"):
+        EventCatalogue(metadata)
