@@ -79,8 +79,13 @@ class FlightCommands:
             with contextlib.suppress(CommandRefusedError):
                 await self._command(_RUN_PREARM_CHECKS)
         await heard.until(lambda: False, _REASONS_S)
-        said, mode = heard.state.warnings_since(asked_ns), heard.state.mode
-        return words_of(one for one in said if one.of_a_check and among_modes(mode, one.modes))
+        state = heard.state
+        said = [
+            one for one in state.reports if one.stamp_ns >= asked_ns and among_modes(state.mode, one.modes)
+        ]
+        # PX4 tells as information what keeps it from some modes alone, such as a missing mission.
+        failing = [one for one in said if one.of_a_check] or [one for one in said if one.of_some_modes]
+        return words_of(failing)
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
         """Return when the vehicle shows the mode."""

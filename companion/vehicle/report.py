@@ -36,6 +36,11 @@ class Report:
         """It tells what keeps the vehicle from arming."""
         return self.level <= WARNING and (self.group in _CHECK_GROUPS or self.text.startswith(_CHECK_TEXTS))
 
+    @property
+    def of_some_modes(self) -> bool:
+        """It is of a check, whatever its level, that not every mode needs."""
+        return self.group in _CHECK_GROUPS and self.modes != ALL_MODES
+
 
 def words_of(reports: Iterable[Report]) -> str:
     """Their texts, each once, in their order."""

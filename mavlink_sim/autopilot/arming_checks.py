@@ -13,7 +13,9 @@ from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
 if TYPE_CHECKING:
     from mavlink_sim.autopilot.commander import Autopilot
 
-_LEVELS = 0x63  # INFO to the log, ERROR to ground stations
+_ERROR, _INFO = 0x33, 0x66  # log levels: to the vehicle's own log and to ground stations
+# PX4's health_component_t, as the argument counts them
+_NO_COMPONENT, _MANUAL_CONTROL, _SYSTEM = 0, 7, 20
 _ALL_MODES = 0xFFFF_FFFF
 # PX4's NAVIGATION_STATE of each mode: its bit in the events' `modes`
 _NAVIGATION_STATES = {
@@ -33,23 +35,26 @@ _NAVIGATION_STATES = {
     Mode.PRECLAND: 20,
     Mode.ORBIT: 21,
 }
+_ALTITUDE_CRUISE = 1 << 8  # of the manual modes; this vehicle does not have it
 
 
 def failing_checks(autopilot: Autopilot) -> list[Text]:
     """An event for each check that fails, whatever the mode; without a text of its own."""
     with_position = [mode for mode in Mode if position_failsafe.needs_position(mode)]
+    in_wrong_mode = autopilot.mode in MODES_PREVENTING_ARMING
+    mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks
     checks = (
-        ("check_estimator_heading_not_stable", not autopilot.sensors_ready, None),
-        ("check_modes_local_pos", not autopilot.position_valid, with_position),
-        ("check_gf_violation_max_hor_dist", autopilot.navigator.is_breached, None),
-        ("check_modes_mission", not autopilot.navigator.mission.valid, [Mode.MISSION]),
-        ("check_modes_offboard_signal", not autopilot.has_setpoints, [Mode.OFFBOARD]),
-        ("check_modes_manual_control", not autopilot.pilot_has_sticks, MANUAL_MODES),
-        ("check_modes_cannot_takeoff", True, MODES_PREVENTING_ARMING),
+        ("check_estimator_heading_not_stable", not autopilot.sensors_ready, _ERROR, None, _NO_COMPONENT),
+        ("check_modes_local_pos", not autopilot.position_valid, _ERROR, with_position, _NO_COMPONENT),
+        ("check_gf_violation_max_hor_dist", autopilot.navigator.is_breached, _ERROR, None, _NO_COMPONENT),
+        ("check_modes_mission", not mission.valid, _INFO, [Mode.MISSION], _SYSTEM),
+        ("check_modes_offboard_signal", not autopilot.has_setpoints, _ERROR, [Mode.OFFBOARD], _SYSTEM),
+        ("check_modes_manual_control", not sticks, _ERROR, MANUAL_MODES, _MANUAL_CONTROL),
+        ("check_modes_cannot_takeoff", in_wrong_mode, _ERROR, MODES_PREVENTING_ARMING, _SYSTEM),
     )
     return [
-        Text(CRITICAL, "", (event_identifier(name), _LEVELS, struct.pack("<IB", _bits(modes), 0)))
-        for name, fails, modes in checks
+        Text(CRITICAL, "", (event_identifier(name), levels, struct.pack("<IB", _bits(modes), component)))
+        for name, fails, levels, modes, component in checks
         if fails
     ]
 
@@ -58,4 +63,5 @@ def _bits(modes: Collection[Mode] | None) -> int:
     """Of all modes for None."""
     if modes is None:
         return _ALL_MODES
-    return sum(1 << state for mode, state in _NAVIGATION_STATES.items() if mode in modes)
+    bits = sum(1 << state for mode, state in _NAVIGATION_STATES.items() if mode in modes)
+    return bits | _ALTITUDE_CRUISE if Mode.ALTCTL in modes else bits
