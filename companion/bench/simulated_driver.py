@@ -18,14 +18,16 @@ from companion.guidance.interface import (
     TakeGimbal,
     TakeOff,
 )
+from companion.vehicle.ardupilot_manners import ArduPilotManners
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
-from companion.vehicle.manners import PX4, Px4Manners
+from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+from mavlink_sim.ardupilot.copter import CopterVehicle
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 
@@ -38,6 +40,7 @@ RATES_HZ = {
     **{dialect.mavlink_map[number].msgname: rate_hz for number, rate_hz in Px4Manners.rates_hz.items()},
     "HEARTBEAT": 1.0,
 }
+COPTER_STREAMS_S = 2.5  # until even the slowest stream has come
 GIMBAL_RATES_HZ = {"GIMBAL_DEVICE_ATTITUDE_STATUS": 50.0, "GIMBAL_MANAGER_STATUS": 5.0}
 
 
@@ -84,14 +87,17 @@ class SimulatedDriver:
     """The built-in vehicle. A request is answered as `companion.vehicle.flight_commands` answers it.
 
     Args:
-        vehicle: PX4-like, with the streams of `RATES_HZ` on its first link.
+        vehicle: with the streams of `RATES_HZ` on its first link, if it is PX4-like; an ArduPilot's are asked
+            for here.
         boot_ns: the flight's clock when the vehicle booted.
     """
 
     def __init__(self, vehicle: LockstepVehicle, boot_ns: int = START_NS) -> None:
         self.vehicle, self._boot_ns = vehicle, boot_ns
-        self._state = VehicleState()
-        self._manners = Px4Manners()
+        copter = isinstance(vehicle.vehicle, CopterVehicle)
+        self._kind = ARDUPILOT if copter else PX4
+        self._manners: Manners = ArduPilotManners() if copter else Px4Manners()
+        self._state = VehicleState(autopilot=self._manners.name)
         self._mode_ns = 0
         self._pending: list[_Pending] = []
         self._answers: list[Answer] = []
@@ -99,6 +105,10 @@ class SimulatedDriver:
             # As the drivers do when a link opens.
             self.vehicle.send(self._long(dialect.MAV_CMD_REQUEST_MESSAGE, GIMBAL_INFORMATION_ID))
             self.vehicle.step(0.1)
+        if copter:
+            for number, rate_hz in self._manners.rates_hz.items():
+                self.vehicle.send(self._long(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz))
+            self.vehicle.step(COPTER_STREAMS_S)
         self.receive()
 
     @property
@@ -110,10 +120,15 @@ class SimulatedDriver:
         return self._state
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
-        self.vehicle.send(setpoint_message(setpoint, self.vehicle.vehicle.system_id))
+        moved = setpoint.moved(self._state.reset_offset_ned_m)
+        message = setpoint_message(moved, self.vehicle.vehicle.system_id)
+        fields = message.to_dict()
+        del fields["mavpackettype"]
+        self.vehicle.send(type(message)(**self._manners.setpoint_fields(fields)))
 
     def send_landing_target(self, target: LandingTarget) -> None:
-        self.vehicle.send(dialect.MAVLink_landing_target_message(**landing_target_fields(target, PX4)))
+        fields = landing_target_fields(target, self._kind, self._state.reset_offset_ned_m)
+        self.vehicle.send(dialect.MAVLink_landing_target_message(**fields))
 
     def start(self, request: Request) -> None:
         mav, state = dialect, self._state
@@ -186,12 +201,13 @@ class SimulatedDriver:
         now_ns = self.now_ns
         for message in self.vehicle.receive():
             name = message.get_type()
-            if name in FOLDED_MESSAGES:
-                if name in ("HEARTBEAT", "CURRENT_MODE"):
-                    self._mode_ns = now_ns
-                self._state = fold(self._state, name, message.to_dict(), now_ns)
-            elif name == "COMMAND_ACK":
+            if name == "COMMAND_ACK":
                 self._acknowledge(message)
+            elif name in FOLDED_MESSAGES or self._kind == ARDUPILOT:
+                for told, fields in self._manners.heard(name, message.to_dict(), self._state):
+                    if told in ("HEARTBEAT", "CURRENT_MODE"):
+                        self._mode_ns = now_ns
+                    self._state = fold(self._state, told, fields, now_ns)
         for pending in list(self._pending):
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)
@@ -229,7 +245,7 @@ class SimulatedDriver:
         self._answers.append(Answer(pending.identifier, refused))
 
 
-def setpoint_message(setpoint: Setpoint, system_id: int = 1) -> object:
+def setpoint_message(setpoint: Setpoint, system_id: int = 1) -> Any:
     """SET_POSITION_TARGET_LOCAL_NED as the drivers send it."""
     zero = (0.0, 0.0, 0.0)  # the type mask says what counts
     return dialect.MAVLink_set_position_target_local_ned_message(

@@ -22,7 +22,7 @@ from vision.obstacle_sectors import ObstacleSectors
 class Requirement(StrEnum):
     """What a behaviour cannot do without. A missing one is a refusal that names it."""
 
-    POSITION = "position"  # fresh local position and attitude
+    POSITION = "position"  # fresh and valid local position and attitude
     IN_AIR = "in_air"
     ON_GROUND = "on_ground"
     PERCEPTION = "perception"  # a perception worker that delivers

@@ -187,6 +187,7 @@ class Guidance:
             self._begin_command(command, situation)
         if self._behaviour is not None:
             paused_s = 0.0 if before is None else (now_ns - before.now_ns) / 1e9
+            self._tell_reset(self._behaviour, before, situation)
             self._update(situation, inputs, paused_s)
         self._answer_endless(inputs)
         self.gimbal.update(now_ns, inputs.state, self._behaviour, out)
@@ -374,6 +375,14 @@ class Guidance:
             else:
                 self._out.event(EventKind.BLIND, behaviour.name, f"braking: {blind}", warning=True)
 
+    def _tell_reset(self, behaviour: Behaviour, before: Situation | None, situation: Situation) -> None:
+        """Tell that the estimate was reset. Goals stay on the ground where they are (`vehicle.state`)."""
+        if before is not None and situation.state.reset_count > before.state.reset_count:
+            words = situation.state.reset_words(before.state)
+            self._out.event(
+                EventKind.NOTED, behaviour.name, f"position estimate {words}; goals moved with it"
+            )
+
     def _conclude(self, outcome: Outcome, situation: Situation, sent_count: int) -> None:
         """It ended by itself: hold where setpoints are flown, else leave it to the autopilot."""
         self._end(outcome)
@@ -422,14 +431,15 @@ class Guidance:
 
     def _position_known(self, situation: Situation) -> bool:
         """False: brake for now; for too long: give the command up."""
-        if situation.state.position_fresh(situation.now_ns):
+        fault = situation.state.position_fault(situation.now_ns)
+        if fault is None:
             self._position_lost_ns = None
             return True
         if self._position_lost_ns is None:
-            logger.warning("position or attitude is too old: braking")
+            logger.warning("no position or attitude to fly by (%s): braking", fault)
             self._position_lost_ns = situation.now_ns
         if situation.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
-            self._lose(f"position or attitude has been missing for {POSITION_LOSS_S:g} s")
+            self._lose(f"no position or attitude to fly by for {POSITION_LOSS_S:g} s ({fault})")
         elif self.phase is Phase.OFFBOARD:
             self._brake(situation)
         return False

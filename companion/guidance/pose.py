@@ -109,7 +109,7 @@ class Pose:
 
 def global_problem(state: VehicleState, now_ns: int) -> str | None:
     """Why the vehicle does not know where on earth it is; None: it does."""
-    if not state.position_fresh(now_ns) or state.velocity_ned_mps is None:
+    if state.position_fault(now_ns) is not None or state.velocity_ned_mps is None:
         return "its own position is not known"
     if not all(map(math.isfinite, (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m))):
         return "its own latitude and longitude are not known"

@@ -43,8 +43,8 @@ def refusal(
     missing = []
     for requirement in sorted(behaviour.requirements):
         match requirement:
-            case Requirement.POSITION if not state.position_fresh(now_ns):
-                missing.append(f"position ({_position_age(situation)})")
+            case Requirement.POSITION if (fault := state.position_fault(now_ns)) is not None:
+                missing.append(f"position ({fault})")
             case Requirement.IN_AIR if not (state.armed and state.landed in AIRBORNE):
                 missing.append(f"to be in the air ({_where(situation)})")
             case Requirement.ON_GROUND if state.landed is not LandedState.ON_GROUND:
@@ -79,14 +79,6 @@ def _where(situation: Situation) -> str:
     armed = "armed" if situation.state.armed else "disarmed"
     landed = situation.state.landed.value.replace("_", " ")
     return f"{armed}, {'not known where' if landed == 'unknown' else landed}"
-
-
-def _position_age(situation: Situation) -> str:
-    state = situation.state
-    if state.position_ned_m is None or state.attitude is None:
-        return "none came yet"
-    oldest_ns = min(state.position_ns, state.attitude_ns)
-    return f"{(situation.now_ns - oldest_ns) / 1e9:.1f} s old"
 
 
 def _perceiving(situation: Situation) -> bool:

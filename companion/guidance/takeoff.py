@@ -78,7 +78,7 @@ class TakeoffBehaviour(Behaviour):
             )
         if self._top is None:
             still_s = 0.0 if self._still_since_ns is None else (now_ns - self._still_since_ns) / 1e9
-            if there or still_s < SETTLE_S or not state.position_fresh(now_ns):
+            if there or still_s < SETTLE_S or state.position_fault(now_ns) is not None:
                 return ModeRequest(FlightMode.TAKEOFF, self._altitude_m, arm=True)
             self._top, self._yaw_rad = self._above(state, missing_m), state.yaw_rad
         velocity = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)

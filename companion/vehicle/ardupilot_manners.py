@@ -14,6 +14,8 @@ What differs, and what is made of it:
 * A setpoint without any yaw turns the nose into the direction of flight (WP_YAW_BEHAVIOR); ours keep the
   heading, so they go out with a yaw rate of zero.
 * HOME_POSITION's local position is always zero; it is computed from GPS_GLOBAL_ORIGIN.
+* EKF_STATUS_REPORT says what PX4's ESTIMATOR_STATUS says, with the same flags. No message counts resets of
+  the estimate: they are found by the jump of the position.
 * Hardly any stream comes unasked; parameters travel as numbers, whatever their type.
 """
 
@@ -24,6 +26,7 @@ from typing import Any
 
 from companion.vehicle.ardupilot_modes import GUIDED, custom_mode_of_mode, mode_of_custom_mode
 from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.manners import HOME_POSITION_ID, Manners
 from companion.vehicle.setpoint import IGNORE_YAW, IGNORE_YAW_RATE
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -52,7 +55,9 @@ class ArduPilotManners(Manners):
         245: 5.0,  # EXTENDED_SYS_STATE
         HOME_POSITION_ID: 0.5,
         GPS_GLOBAL_ORIGIN_ID: 0.5,
+        EKF_STATUS_REPORT_ID: 5.0,
     }
+    optional = (EKF_STATUS_REPORT_ID,)
 
     def __init__(self) -> None:
         self._use = FlightMode.OFFBOARD  # what GUIDED is for
@@ -70,6 +75,8 @@ class ArduPilotManners(Manners):
             self._origin = fields
         elif name == "HOME_POSITION":
             return [(name, {**fields, **self._local(fields)})]
+        elif name == "EKF_STATUS_REPORT":
+            return [("ESTIMATOR_STATUS", fields)]
         return [(name, fields)]
 
     def _mode(self, custom_mode: int) -> FlightMode:

@@ -374,6 +374,7 @@ class AutopilotDriver(ABC):
         if setpoint.expired(time.monotonic_ns()):
             self._say_late()
             return
+        setpoint = setpoint.moved(self._heard.state.reset_offset_ned_m)
         zero = (0.0, 0.0, 0.0)  # the type mask says what counts
         kinematics = (*(setpoint.position_ned_m or zero), *(setpoint.velocity_ned_mps or zero), *zero)
         self._send_message(
@@ -397,7 +398,9 @@ class AutopilotDriver(ABC):
     def send_landing_target(self, target: LandingTarget) -> None:
         """See Driver."""
         if self._link is not None and self._system_id is not None:
-            self._send_message("LANDING_TARGET", landing_target_fields(target, self._autopilot_kind or 0))
+            offset = self._heard.state.reset_offset_ned_m
+            fields = landing_target_fields(target, self._autopilot_kind or 0, offset)
+            self._send_message("LANDING_TARGET", fields)
 
     # --- commands -----------------------------------------------------------------------------------
 

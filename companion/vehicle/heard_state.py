@@ -27,7 +27,7 @@ _TWO_CLOCKS_S = 2.0
 _BOOTING = 1  # MAV_STATE_BOOT
 # They tell the autopilot's clock; of others TIMESYNC and SYSTEM_TIME are watched by the driver.
 _CLOCKED = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION")
-_OF_ITS_PLACE = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION", ATTITUDE_STATUS)
+_OF_ITS_PLACE = (*_CLOCKED, "ODOMETRY", "ESTIMATOR_STATUS", ATTITUDE_STATUS)
 # PX4 keeps this from when it was first told: its stamp is as old as that, and no fault of the clock.
 _OF_LONG_AGO = "GIMBAL_MANAGER_INFORMATION"
 
@@ -89,7 +89,21 @@ class HeardState:
         stamped = "time_boot_ms" in fields and name != _OF_LONG_AGO
         stamp_ns = self.clock.stamp(fields["time_boot_ms"], now_ns) if stamped else now_ns
         state = fold(self.state, name, fields, stamp_ns)
+        if (
+            state.reset_count != self.state.reset_count
+            or state.position_valid is not self.state.position_valid
+        ):
+            self._tell_estimate(state)
         self._show(state, name, fields)
+
+    def _tell_estimate(self, state: VehicleState) -> None:
+        """Into the log: the estimate was reset, or is valid or not from now on."""
+        if state.reset_count != self.state.reset_count:
+            logger.warning("%s: the position estimate was %s", self._url, state.reset_words(self.state))
+        elif state.position_valid is False:
+            logger.warning("%s: the position estimate is not valid", self._url)
+        elif self.state.position_valid is False:
+            logger.info("%s: the position estimate is valid again", self._url)
 
     def take_report(self, report: Report | None) -> None:
         """Something it said in words; None: nothing."""
@@ -147,6 +161,8 @@ class HeardState:
             ready_to_arm=False,
             home_altitude_amsl_m=None,
             home_position_ned_m=None,
+            position_valid=None,
+            odometry=None,
             clock=None,
             gimbal=None,
         )

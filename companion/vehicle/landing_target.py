@@ -43,8 +43,13 @@ class LandingTarget:
             raise ValueError(f"every value of a landing target must be finite, got {values}")
 
 
-def landing_target_fields(target: LandingTarget, autopilot: int) -> dict[str, int | float | list[float]]:
-    """The message's fields for an autopilot (MAV_AUTOPILOT); any but ArduPilot is told what PX4 takes."""
+def landing_target_fields(
+    target: LandingTarget, autopilot: int, offset_ned_m: Vector3 = (0.0, 0.0, 0.0)
+) -> dict[str, int | float | list[float]]:
+    """The message's fields for an autopilot (MAV_AUTOPILOT); any but ArduPilot is told what PX4 takes.
+
+    `offset_ned_m` is `VehicleState.reset_offset_ned_m`: the message has the autopilot's own coordinates.
+    """
     forward, right, down = target.offset_frd_m
     distance_m = math.hypot(forward, right, down)
     fields: dict[str, int | float | list[float]] = {
@@ -60,7 +65,8 @@ def landing_target_fields(target: LandingTarget, autopilot: int) -> dict[str, in
         "type": TYPE_VISION_FIDUCIAL,
         "position_valid": 1,
     }
-    place = target.position_ned_m
+    north, east, down_m = (p + o for p, o in zip(target.position_ned_m, offset_ned_m, strict=True))
+    place = (north, east, down_m)
     if autopilot == AUTOPILOT_ARDUPILOT:
         place = target.offset_frd_m
         fields["frame"] = FRAME_BODY_FRD

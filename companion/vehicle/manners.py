@@ -19,6 +19,8 @@ from companion.vehicle.telemetry_fold import Fields
 
 PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
 HOME_POSITION_ID = 242
+ESTIMATOR_STATUS_ID = 230
+ODOMETRY_ID = 331
 
 
 class Manners(ABC):
@@ -85,9 +87,11 @@ class Px4Manners(Manners):
         245: 5.0,  # EXTENDED_SYS_STATE
         CURRENT_MODE_ID: 10.0,  # HEARTBEAT alone shows a mode up to 1 s late; this comes when it changes
         HOME_POSITION_ID: 0.5,
+        ESTIMATOR_STATUS_ID: 5.0,
+        ODOMETRY_ID: 5.0,  # for its reset_counter
     }
     expected_hz = MappingProxyType({CURRENT_MODE_ID: 2.0})  # PX4 repeats it every 0.5 s, not more often
-    optional = (CURRENT_MODE_ID,)  # PX4 has it since 1.15
+    optional = (CURRENT_MODE_ID, ESTIMATOR_STATUS_ID, ODOMETRY_ID)  # PX4 has CURRENT_MODE since 1.15
 
     def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
         main, sub = request_of_mode(mode)

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.framing import CURRENT_MODE_ID, Frame
+from companion.vehicle.framing import CURRENT_MODE_ID, EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.manners import ARDUPILOT, PX4
 from companion.vehicle.mav_result import IN_PROGRESS
@@ -25,6 +25,7 @@ _PARAM_VALUE_ID, _PARAM_SET_ID = 22, 23
 _GIMBAL_ATTITUDE_ID = 285
 # By the wire's order: the value's bytes as they are, not through a float.
 _PARAM_SET = struct.Struct("<4sBB16sB")
+_EKF_STATUS_REPORT = struct.Struct("<5fH")  # five variances, flags; airspeed_variance is not read
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
 _DECODED_IDS = {
     message_id
@@ -92,6 +93,9 @@ class PymavlinkDriver(AutopilotDriver):
             if frame.message_id == CURRENT_MODE_ID:
                 shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
                 self._heard.handle("CURRENT_MODE", {"custom_mode": shown, "intended_custom_mode": intended})
+            elif frame.message_id == EKF_STATUS_REPORT_ID:
+                *_, flags = _EKF_STATUS_REPORT.unpack(frame.padded(_EKF_STATUS_REPORT.size))
+                self._heard.handle("EKF_STATUS_REPORT", {"flags": flags})
             elif frame.message_id in _DECODED_IDS:
                 try:
                     message = self._codec.decode(bytearray(frame.raw))

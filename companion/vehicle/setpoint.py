@@ -109,6 +109,13 @@ class Setpoint:
         latest_ns = now_ns + round(LEAVES_WITHIN_S * 1e9)
         return self if self.deadline_ns <= latest_ns else replace(self, deadline_ns=latest_ns)
 
+    def moved(self, by_ned_m: Vector3) -> Setpoint:
+        """The same with its position, if it has one, moved by so much."""
+        if self.position_ned_m is None or by_ned_m == (0.0, 0.0, 0.0):
+            return self
+        north, east, down = (p + d for p, d in zip(self.position_ned_m, by_ned_m, strict=True))
+        return replace(self, position_ned_m=(north, east, down))
+
     def with_velocity(self, velocity_ned_mps: Vector3) -> Setpoint:
         """The same with another velocity (of a velocity setpoint)."""
         return replace(self, velocity_ned_mps=velocity_ned_mps)

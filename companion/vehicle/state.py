@@ -1,4 +1,12 @@
-"""What is known of the vehicle at one moment. World frame: local NED. Body frame: FRD."""
+"""What is known of the vehicle at one moment. World frame: local NED. Body frame: FRD.
+
+A reset of the autopilot's estimator changes its local coordinates of every place on the ground at once. Here,
+and in everything above the drivers, local NED is the frame in which the vehicle was first heard:
+`telemetry_fold` takes the sum of all resets (`VehicleState.reset_offset_ned_m`) off every position that is
+received, and a driver adds it to every position that it sends. So goals, paths, targets, tracks and the
+history of poses stay where they are on the ground, and none of them handles resets. The autopilot keeps home
+in its own coordinates, so here home moves at a reset.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +62,22 @@ class LandedState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Odometry:
+    """The newest ODOMETRY, to measure a reset by.
+
+    Attributes:
+        time_us: the message's own stamp. reset_counter: 0..255.
+        position_ned_m: without `VehicleState.reset_offset_ned_m` of that moment.
+        velocity_ned_mps: the newest of LOCAL_POSITION_NED.
+    """
+
+    time_us: int
+    reset_counter: int
+    position_ned_m: Vector3
+    velocity_ned_mps: Vector3
+
+
+@dataclass(frozen=True, slots=True)
 class VehicleState:
     """A snapshot. Every group of values has the stamp of its newest message (CLOCK_MONOTONIC ns, 0: never).
 
@@ -61,6 +85,13 @@ class VehicleState:
 
     Attributes:
         position_ned_m: metres from the local origin, north, east, down.
+        position_boot_ms: the autopilot's own stamp of it.
+        position_valid: whether the estimator says that position and velocity can be flown by, as it said
+            last; None on an autopilot that does not tell (ESTIMATOR_STATUS, EKF_STATUS_REPORT).
+        reset_count: how often the estimate was reset by more than its own wander.
+        reset_offset_ned_m: what those resets have added up to in the autopilot's local coordinates. Its own
+            position is `position_ned_m` plus this.
+        odometry: to measure the next reset by; None while no ODOMETRY comes.
         velocity_ned_mps: metres a second, north, east, down.
         attitude: (w, x, y, z), turns body FRD into NED.
         angular_velocity_frd_radps: body rates.
@@ -101,6 +132,11 @@ class VehicleState:
     altitude_amsl_m: float = math.nan
     home_altitude_amsl_m: float | None = None
     home_position_ned_m: Vector3 | None = None
+    position_boot_ms: int = 0
+    position_valid: bool | None = None
+    reset_count: int = 0
+    reset_offset_ned_m: Vector3 = (0.0, 0.0, 0.0)
+    odometry: Odometry | None = None
     battery_fraction: float | None = None
     clock: ClockOffset | None = None
     gimbal: GimbalState | None = None
@@ -142,6 +178,23 @@ class VehicleState:
             and now_ns - self.position_ns <= limit_ns
             and now_ns - self.attitude_ns <= limit_ns
         )
+
+    def position_fault(self, now_ns: int) -> str | None:
+        """Why position and attitude cannot be flown by, in words; None: they can. Fresh is not valid."""
+        if self.position_ned_m is None or self.attitude is None:
+            return "none came yet"
+        if not self.position_fresh(now_ns):
+            return f"{(now_ns - min(self.position_ns, self.attitude_ns)) / 1e9:.1f} s old"
+        if self.position_valid is False:
+            return "the autopilot's estimator reports it as not valid"
+        return None
+
+    def reset_words(self, before: VehicleState) -> str:
+        """By how much the estimate was reset since another snapshot, for people."""
+        north, east, down = (
+            now - then for now, then in zip(self.reset_offset_ned_m, before.reset_offset_ned_m, strict=True)
+        )
+        return f"reset by {north:.1f} m north, {east:.1f} m east, {down:.1f} m down"
 
     def warnings_since(self, stamp_ns: int) -> list[Report]:
         """What it warned of, or worse, from a moment on (CLOCK_MONOTONIC)."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.framing import CURRENT_MODE_ID
+from companion.vehicle.framing import CURRENT_MODE_ID, EKF_STATUS_REPORT_ID
 from companion.vehicle.heard_state import HeardState
 from companion.vehicle.mav_result import ACCEPTED, result_name
 from companion.vehicle.stream_monitor import StreamMonitor
@@ -22,6 +22,8 @@ _SET_MESSAGE_INTERVAL = 511
 _REQUEST_MESSAGE = 512
 _MEASURE_S = 1.5
 _CHECK_S = 0.2
+# Messages that pymavlink's "common" does not have.
+_NAMES = {CURRENT_MODE_ID: "CURRENT_MODE", EKF_STATUS_REPORT_ID: "EKF_STATUS_REPORT"}
 
 
 class StreamRequests:
@@ -112,7 +114,7 @@ class StreamRequests:
 
 def message_name(message_id: int) -> str:
     """MAVLink's name of a message, as people know it."""
-    if message_id == CURRENT_MODE_ID:
-        return "CURRENT_MODE"
+    if message_id in _NAMES:
+        return _NAMES[message_id]
     message = mavlink.mavlink_map.get(message_id)
     return f"message {message_id}" if message is None else str(message.msgname)

@@ -9,13 +9,25 @@ from typing import Any
 
 from companion.vehicle.gimbal_fold import GIMBAL_STEPS
 from companion.vehicle.px4_modes import mode_of_custom_mode
-from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, Odometry, Vector3, VehicleState
 
 Fields = Mapping[str, Any]
 
 _SAFETY_ARMED = 128  # MAV_MODE_FLAG
 _STATE_CRITICAL, _STATE_EMERGENCY = 5, 6  # MAV_STATE
 _PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
+_LOCAL_NED = 1  # MAV_FRAME
+# ESTIMATOR_STATUS_FLAGS; EKF_STATUS_REPORT has the same bits. CONST_POS_MODE (128) is no fault: PX4 sets it
+# at rest with a valid position.
+_VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT = 2, 8 | 16, 32 | 64
+# A position this far from where the one before and the mean velocity lead is a reset; an estimate of PX4 in
+# its own simulation was 0.03 m from there at most. Over a gap, accelerations of up to 10 m/s2 that neither
+# velocity shows are allowed for; over more than a second no reset can be measured.
+_JUMP_M = 0.5
+_JUMP_MPS2 = 2.5
+_LONGEST_GAP_S = 1.0
+# Of a reset that the counter tells: what is less is the estimate's own wander.
+_LEAST_RESET_M = 0.2
 _LANDED = {
     1: LandedState.ON_GROUND,
     2: LandedState.IN_AIR,
@@ -80,7 +92,76 @@ def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> Veh
     position, velocity = _vector(fields, "x", "y", "z"), _vector(fields, "vx", "vy", "vz")
     if position is None or velocity is None:
         return state
-    return replace(state, position_ns=now_ns, position_ned_m=position, velocity_ned_mps=velocity)
+    boot_ms = fields["time_boot_ms"]
+    dt_s = (boot_ms - state.position_boot_ms) * 1e-3
+    told = _less(position, state.reset_offset_ned_m)
+    if state.position_ned_m is not None and state.velocity_ned_mps is not None:
+        jump = _jump(state.position_ned_m, state.velocity_ned_mps, told, velocity, dt_s)
+        if jump is not None and math.hypot(*jump) > _JUMP_M + _JUMP_MPS2 * dt_s * dt_s:
+            state, told = _reset_by(state, jump), _less(told, jump)
+    return replace(
+        state,
+        position_ns=now_ns,
+        position_boot_ms=boot_ms,
+        position_ned_m=told,
+        velocity_ned_mps=velocity,
+    )
+
+
+def _odometry(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    """A changed counter tells of a reset that a position alone does not show, or not yet.
+
+    LOCAL_POSITION_NED may have shown it before: what that made of it is in the offset, and nothing is left.
+    """
+    position, velocity = _vector(fields, "x", "y", "z"), state.velocity_ned_mps
+    if position is None or velocity is None or fields["frame_id"] != _LOCAL_NED:
+        return state
+    told = _less(position, state.reset_offset_ned_m)
+    seen = Odometry(fields["time_usec"], fields["reset_counter"], told, velocity)
+    last, state = state.odometry, replace(state, odometry=seen)
+    if last is None or last.reset_counter == seen.reset_counter:
+        return state
+    dt_s = (seen.time_us - last.time_us) * 1e-6
+    jump = _jump(last.position_ned_m, last.velocity_ned_mps, told, velocity, dt_s)
+    if jump is None or math.hypot(*jump) < _LEAST_RESET_M:
+        return state
+    return _reset_by(replace(state, odometry=replace(seen, position_ned_m=_less(told, jump))), jump)
+
+
+def _jump(
+    before: Vector3, velocity: Vector3, after: Vector3, velocity_after: Vector3, dt_s: float
+) -> Vector3 | None:
+    """What of the way between two positions their velocities do not explain; None after too long a gap."""
+    if abs(dt_s) > _LONGEST_GAP_S:
+        return None
+    north, east, down = (
+        b - a - (u + v) / 2.0 * dt_s
+        for a, u, b, v in zip(before, velocity, after, velocity_after, strict=True)
+    )
+    return (north, east, down)
+
+
+def _reset_by(state: VehicleState, jump: Vector3) -> VehicleState:
+    """The autopilot's coordinates of every place are other ones; those of home are still the same."""
+    north, east, down = (o + j for o, j in zip(state.reset_offset_ned_m, jump, strict=True))
+    home = state.home_position_ned_m
+    return replace(
+        state,
+        reset_count=state.reset_count + 1,
+        reset_offset_ned_m=(north, east, down),
+        home_position_ned_m=None if home is None else _less(home, jump),
+    )
+
+
+def _less(place: Vector3, offset: Vector3) -> Vector3:
+    return (place[0] - offset[0], place[1] - offset[1], place[2] - offset[2])
+
+
+def _estimator_status(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    """It holds until the next one: age does not make it untrue, and a missing stream is asked for."""
+    flags = fields["flags"]
+    valid = all(flags & group for group in (_VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT))
+    return state if valid is state.position_valid else replace(state, position_valid=valid)
 
 
 def _global_position_int(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
@@ -97,7 +178,7 @@ def _home_position(state: VehicleState, fields: Fields, _now_ns: int) -> Vehicle
     home = replace(state, home_altitude_amsl_m=fields["altitude"] * 1e-3)
     local = _vector(fields, "x", "y", "z")
     if local is not None:
-        home = replace(home, home_position_ned_m=local)
+        home = replace(home, home_position_ned_m=_less(local, state.reset_offset_ned_m))
     return state if home == state else home
 
 
@@ -136,6 +217,8 @@ _STEPS: dict[str, Callable[[VehicleState, Fields, int], VehicleState]] = {
     "EXTENDED_SYS_STATE": _extended_sys_state,
     "ATTITUDE_QUATERNION": _attitude_quaternion,
     "LOCAL_POSITION_NED": _local_position_ned,
+    "ODOMETRY": _odometry,
+    "ESTIMATOR_STATUS": _estimator_status,
     "GLOBAL_POSITION_INT": _global_position_int,
     "HOME_POSITION": _home_position,
     "SYS_STATUS": _sys_status,

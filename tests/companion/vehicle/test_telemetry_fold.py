@@ -68,7 +68,7 @@ def test_the_landed_state_is_named(number: int, landed: LandedState) -> None:
 @pytest.mark.parametrize("field", ["x", "y", "z", "vx", "vy", "vz"])
 def test_a_position_with_a_hole_is_not_taken_and_does_not_look_fresh(field: str, bad: float | None) -> None:
     """NaN by pymavlink; null in MAVSDK's JSON."""
-    whole = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 1.0)
+    whole = dict.fromkeys(("time_boot_ms", "x", "y", "z", "vx", "vy", "vz"), 1.0)
     before = fold(VehicleState(), "LOCAL_POSITION_NED", whole, 5)
     assert fold(before, "LOCAL_POSITION_NED", whole | {field: bad}, 9) is before
 
