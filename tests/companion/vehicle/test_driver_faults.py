@@ -284,3 +284,22 @@ async def test_setpoints_that_come_late_and_with_gaps_keep_the_vehicle_in_offboa
                 await asyncio.to_thread(
                     simulator.wait_for_event, "failsafe: offboard setpoints lost", since=before
                 )
+
+
+@pytest.mark.parametrize(
+    ("kind", "autopilot"), [("pymavlink", "px4"), ("mavsdk", "px4"), ("pymavlink", "ardupilot")]
+)
+async def test_a_reset_of_the_estimate_and_its_loss_are_known(kind: DriverKind, autopilot: str) -> None:
+    with simulated(autopilot=autopilot, speed=4.0) as simulator:
+        async with connected(kind, simulator) as driver:
+            await state_shows(driver, lambda s: s.position_valid is True and s.position_ned_m is not None)
+            before = driver.state.position_ned_m
+            simulator.fault("ekf_reset 5 3 -1")
+            await state_shows(driver, lambda s: s.reset_count == 1)
+            assert driver.state.reset_offset_ned_m == pytest.approx((5.0, 3.0, -1.0), abs=0.3)
+            assert driver.state.position_ned_m == pytest.approx(before, abs=0.6)
+            simulator.fault("gps_loss")
+            await state_shows(driver, lambda s: s.position_valid is False, 20.0)
+            assert driver.state.position_fresh(time.monotonic_ns())
+            fault = driver.state.position_fault(time.monotonic_ns())
+            assert fault == "the autopilot's estimator reports it as not valid"

@@ -122,3 +122,72 @@ def test_no_content_of_a_message_breaks_the_fold(name: str, payload: bytes) -> N
         assert vector is None or all(math.isfinite(value) for value in vector)
     if state.gimbal is not None and state.gimbal.attitude is not None:
         assert math.hypot(*state.gimbal.attitude) == pytest.approx(1.0)
+
+
+def at(boot_ms: int, north_m: float, velocity_mps: float = 3.0) -> dict[str, float]:
+    moved = {"x": north_m, "y": 0.0, "z": -5.0, "vx": velocity_mps, "vy": 0.0, "vz": 0.0}
+    return {"time_boot_ms": boot_ms, **moved}
+
+
+def odometry(time_us: int, north_m: float, counter: int) -> dict[str, float]:
+    return {"time_usec": time_us, "reset_counter": counter, "frame_id": 1, "x": north_m, "y": 0.0, "z": -5.0}
+
+
+def test_a_jump_of_the_position_is_a_reset_and_leaves_every_place_where_it_was() -> None:
+    home = {"altitude": 10_000, "x": 1.0, "y": 0.0, "z": 0.0}
+    state = fold(VehicleState(), "HOME_POSITION", home, 0)
+    for boot_ms in range(0, 200, 20):
+        state = fold(state, "LOCAL_POSITION_NED", at(boot_ms, 0.003 * boot_ms), boot_ms)
+    state = fold(state, "LOCAL_POSITION_NED", at(200, 0.6 + 7.0), 200)
+    assert state.position_ned_m == pytest.approx((0.6, 0.0, -5.0))
+    assert state.reset_offset_ned_m == pytest.approx((7.0, 0.0, 0.0))
+    assert state.reset_count == 1
+    # The autopilot's own home has not moved in its coordinates: it is another place now.
+    assert state.home_position_ned_m == pytest.approx((-6.0, 0.0, 0.0))
+    state = fold(state, "HOME_POSITION", {**home, "x": 8.0}, 210)
+    assert state.home_position_ned_m == pytest.approx((1.0, 0.0, 0.0))
+    state = fold(state, "LOCAL_POSITION_NED", at(220, 0.66 + 7.0), 220)
+    assert state.position_ned_m == pytest.approx((0.66, 0.0, -5.0))
+    assert state.reset_count == 1
+
+
+def test_a_gap_is_no_reset() -> None:
+    """Of less than a second as far as velocities explain the way; over a longer one none can be measured."""
+    state = fold(VehicleState(), "LOCAL_POSITION_NED", at(0, 0.0), 0)
+    state = fold(state, "LOCAL_POSITION_NED", at(900, 2.7), 1)
+    state = fold(state, "LOCAL_POSITION_NED", at(9000, 80.0), 2)
+    assert state.reset_count == 0
+
+
+@pytest.mark.parametrize("first", ["LOCAL_POSITION_NED", "ODOMETRY"])
+def test_a_reset_that_both_messages_show_is_counted_once(first: str) -> None:
+    state = fold(VehicleState(), "LOCAL_POSITION_NED", at(100, 0.3), 0)
+    state = fold(state, "ODOMETRY", odometry(100_000, 0.3, 5), 0)
+    new = [("LOCAL_POSITION_NED", at(120, 4.36)), ("ODOMETRY", odometry(120_000, 4.36, 6))]
+    for name, fields in new if first == "LOCAL_POSITION_NED" else reversed(new):
+        state = fold(state, name, fields, 1)
+    assert state.reset_count == 1
+    assert state.position_ned_m == pytest.approx((0.36, 0.0, -5.0))
+
+
+def test_a_small_reset_is_known_by_its_counter_alone() -> None:
+    state = fold(VehicleState(), "LOCAL_POSITION_NED", at(100, 0.3), 0)
+    state = fold(state, "ODOMETRY", odometry(100_000, 0.3, 255), 0)
+    jumped = fold(state, "ODOMETRY", odometry(120_000, 0.36 + 0.4, 0), 1)
+    assert jumped.reset_offset_ned_m == pytest.approx((0.4, 0.0, 0.0))
+    assert fold(state, "ODOMETRY", odometry(120_000, 0.36 + 0.4, 255), 1).reset_count == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "valid"),
+    [
+        pytest.param(895, True, id="PX4 in flight"),
+        pytest.param(831, True, id="ArduPilot in flight"),
+        pytest.param(1 | 4 | 32 | 64 | 128, False, id="no horizontal aiding"),
+        pytest.param(164, False, id="PX4 starting"),
+        pytest.param(1 | 2 | 4 | 8 | 32, True, id="optical flow: relative position"),
+    ],
+)
+def test_flags_of_the_estimator_say_whether_a_position_is_one(flags: int, valid: bool) -> None:
+    state = fold(VehicleState(), "ESTIMATOR_STATUS", {"flags": flags}, 1)
+    assert state.position_valid is valid

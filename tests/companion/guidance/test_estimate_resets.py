@@ -1,0 +1,129 @@
+"""Resets of the autopilot's position estimate, and an estimate that is not valid, in flight."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight, plain_settings
+from companion.bench.simulated_driver import SimulatedDriver
+from companion.guidance.interface import EventKind, GuidanceInput
+from mavlink_sim.lockstep import LockstepVehicle
+from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying
+
+RESET_NED_M = (5.0, 3.0, -1.0)
+RESET = "ekf_reset 5 3 -1"
+
+
+def airborne(autopilot: str) -> LockstepFlight:
+    if autopilot == "px4":
+        return LockstepFlight.airborne(seed=4)
+    vehicle = LockstepVehicle(autopilot="ardupilot", seed=4)
+    vehicle.take_off(5.0)
+    return LockstepFlight(SimulatedDriver(vehicle), plain_settings())
+
+
+def distance_m(flight: LockstepFlight, place_ned_m: tuple[float, ...]) -> float:
+    return math.dist(flight.vehicle.truth.position_ned_m, place_ned_m)
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("reset_s", [3.0, 0.5])
+def test_a_goal_stays_where_it_is_on_the_ground_when_the_estimate_is_reset(
+    autopilot: str, reset_s: float
+) -> None:
+    flight = airborne(autopilot)
+    goal = (25.0, 4.0, flight.vehicle.truth.position_ned_m[2])
+    identifier = flight.command("goto 25 4")
+    flight.run(reset_s)
+    before = flight.state
+    flight.vehicle.vehicle.faults.begin(RESET)
+    fastest_mps = 0.0
+
+    def arrived() -> bool:
+        nonlocal fastest_mps
+        assert flight.state.velocity_ned_mps is not None
+        fastest_mps = max(fastest_mps, math.hypot(*flight.state.velocity_ned_mps[:2]))
+        return flight.outcome(identifier) is not None
+
+    assert flight.run_until(arrived, 40.0)
+    outcome = flight.outcome(identifier)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert distance_m(flight, goal) < 1.0  # in the autopilot's new coordinates the goal is 5.9 m from there
+    assert fastest_mps < 5.5
+    assert flight.state.reset_count == before.reset_count + 1
+    assert flight.state.reset_offset_ned_m == pytest.approx(RESET_NED_M, abs=0.4)
+    told = [event for event in flight.events if "position estimate" in event.message]
+    assert [event.kind for event in told] == [EventKind.NOTED]
+    assert "goals moved with it" in told[0].message
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_a_hold_stays_in_its_place_through_a_reset_and_the_one_back(autopilot: str) -> None:
+    flight = airborne(autopilot)
+    flight.command("hold")
+    flight.run(3.0)
+    place = flight.vehicle.truth.position_ned_m
+    number = flight.vehicle.vehicle.faults.begin(RESET)
+    for _ in range(40):
+        flight.run(0.1)
+        assert distance_m(flight, place) < 0.8
+    flight.vehicle.vehicle.faults.end(number)
+    for _ in range(40):
+        flight.run(0.1)
+        assert distance_m(flight, place) < 0.8
+    assert flight.state.reset_count == 2
+    assert flight.state.reset_offset_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_hard_manoeuvres_are_no_resets(autopilot: str) -> None:
+    flight = airborne(autopilot)
+    for command in ("goto 20 0 speed=5", "goto 0 0 speed=5", "orbit radius=6 speed=3", "stop"):
+        flight.command(command)
+        flight.run(8.0)
+    assert flight.state.reset_count == 0
+    assert flight.state.reset_offset_ned_m == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_without_gps_a_standing_position_is_not_believed(autopilot: str) -> None:
+    """LOCAL_POSITION_NED still comes; its flags say that it is none."""
+    flight = airborne(autopilot)
+    identifier = flight.command("goto 40 0 speed=1")
+    flight.run(2.0)
+    flight.vehicle.vehicle.faults.begin("gps_loss")
+    assert flight.run_until(lambda: flight.outcome(identifier), 20.0)
+    outcome = flight.outcome(identifier)
+    assert outcome is not None
+    assert not outcome.success
+    assert flight.state.position_fresh(flight.now_ns)
+    assert flight.state.position_valid is False
+    again = flight.command("goto 10 0")
+    flight.run(0.5)
+    refused = flight.outcome(again)
+    assert refused is not None
+    assert "position (the autopilot's estimator reports it as not valid)" in refused.reason
+
+
+def test_an_estimate_that_is_not_valid_brakes_and_then_ends_the_command() -> None:
+    """Where the autopilot itself stays in offboard mode."""
+
+    def invalid(inputs: GuidanceInput) -> GuidanceInput:
+        return replace(inputs, state=replace(inputs.state, position_valid=not lost))
+
+    lost = False
+    harness = GuidanceHarness(flying(), inputs=invalid)
+    pending = engaged(harness)
+    lost = True
+    harness.run(0.5)
+    assert not pending.done()
+    setpoint = harness.outputs[-1].setpoint
+    assert setpoint is not None
+    assert setpoint.velocity_ned_mps == (0.0, 0.0, 0.0)
+    reason = harness.outcome(pending).reason
+    assert reason.startswith("no position or attitude to fly by for ")
+    assert "the autopilot's estimator reports it as not valid" in reason
