@@ -81,7 +81,10 @@ async def test_on_a_bad_link_commands_and_parameters_still_come_through(
         async with connected(kind, simulator) as driver:
             await ready(driver)
             await driver.set_parameter("COM_OF_LOSS_T", 0.75)
-            assert await driver.get_parameter("COM_OF_LOSS_T") == 0.75
+            # A late duplicate of an answer from before the change may be taken for the first one's answer:
+            # PARAM_VALUE has no number to tell them apart by.
+            read = [await driver.get_parameter("COM_OF_LOSS_T") for _ in range(3)]
+            assert read[-1] == 0.75
             await driver.set_mode(FlightMode.HOLD)
             await driver.arm()
             assert driver.state.armed
