@@ -17,12 +17,13 @@ Setpoint = TrajectorySetpoint | AttitudeSetpoint | RatesSetpoint
 
 # Share of the acceleration limit that the planned braking uses, so that the vehicle can follow it.
 BRAKING_SHARE = 0.6
-# Climb towards the take-off altitude slows down with the height left; tuned to the recorded 6.5-9 s to HOLD.
-TAKEOFF_APPROACH_PER_S = 0.3
-# On the ramp the planned height must not run away from a vehicle that may not follow it yet.
-TAKEOFF_LEAD_M = 0.3
+# Measured on PX4 after the ramp of a take-off: the climb begins that much later, and gains speed so much
+# faster than the ramp's acceleration (MPC_TKO_SPEED in MPC_TKO_RAMP_T), by which it loses speed again.
+CLIMB_LAG_S = 0.75
+CLIMB_GAIN = 2.2
+SLOWEST_CLIMB_MPS = 0.25  # so that a take-off ends
 # Measured: a take-off to 2.5 m is over at 1.8-2.2 m, a little inside NAV_MC_ALT_RAD.
-TAKEOFF_ACCEPTANCE = 0.8
+TAKEOFF_ACCEPTANCE = 0.82
 
 
 class Trajectory:
@@ -36,10 +37,10 @@ class Trajectory:
         self.yaw_rad = airframe.yaw_rad
         self.cruise_mps = NAN  # in place of MPC_XY_CRUISE, if above zero
 
-    def keep_within(self, lead_m: float) -> None:
-        """Let the planned height lead the vehicle's by at most this much."""
-        x, y, z = self.position
-        self.position = (x, y, max(z, self._airframe.position[2] - lead_m))
+    def keep_height(self) -> None:
+        """Plan on from the vehicle's own height: on the ramp of a take-off it may not follow yet."""
+        x, y, _ = self.position
+        self.position = (x, y, self._airframe.position[2])
 
     def stopping_point(self) -> Vector:
         """Where the vehicle comes to rest if it brakes now."""
@@ -149,16 +150,33 @@ class Takeoff(Task):
         self._airframe = airframe
         self._parameters = parameters
         self._trajectory = Trajectory(airframe, parameters)
+        self._climb_mps = -airframe.velocity[2]
+        if airframe.on_ground:
+            value = parameters.number
+            waits_s = value("COM_SPOOLUP_TIME") + value("MPC_TKO_RAMP_T") + CLIMB_LAG_S
+            self._climb_mps = -CLIMB_GAIN * self._ramp_mps2() * waits_s
         x, y, z = airframe.position
         self.goal = (x, y, min(down_m, z))
 
     def update(self, dt_s: float) -> TrajectorySetpoint:
         assert self.goal is not None
         left = self._airframe.position[2] - self.goal[2]
-        climb = min(self._parameters.number("MPC_TKO_SPEED"), max(0.25, TAKEOFF_APPROACH_PER_S * abs(left)))
         self.finished = abs(left) < TAKEOFF_ACCEPTANCE * self._parameters.number("NAV_MC_ALT_RAD")
-        self._trajectory.keep_within(TAKEOFF_LEAD_M)
-        return self._trajectory.towards(self.goal, dt_s, max_up_mps=climb)
+        self._trajectory.keep_height()
+        return self._trajectory.towards(self.goal, dt_s, max_up_mps=self._climb(dt_s, max(left, 0.0)))
+
+    def _ramp_mps2(self) -> float:
+        return self._parameters.positive("MPC_TKO_SPEED") / self._parameters.positive("MPC_TKO_RAMP_T")
+
+    def _climb(self, dt_s: float, left_m: float) -> float:
+        """The speed to climb at, m/s, with so much left to climb; braking as PX4 does below MPC_LAND_ALT1."""
+        ramp = self._ramp_mps2()
+        # PX4's greatest speed from which it can stop within a distance, at a limited jerk
+        lag = 4.0 * ramp * ramp / self._parameters.positive("MPC_JERK_AUTO")
+        braking = 0.5 * (math.sqrt(lag * lag + 8.0 * ramp * left_m) - lag)
+        top = self._parameters.number("MPC_TKO_SPEED")
+        self._climb_mps = min(top, braking, self._climb_mps + CLIMB_GAIN * ramp * dt_s)
+        return max(self._climb_mps, SLOWEST_CLIMB_MPS)
 
 
 class Land(TrajectoryTask):
@@ -200,10 +218,10 @@ class Land(TrajectoryTask):
 
 
 class Return(Task):
-    """RTL of type 0: climb to the return altitude, fly home, descend to RTL_DESCEND_ALT, land.
+    """RTL of type 0: climb to the return altitude, fly home, land from there.
 
-    It flies nose first and turns to `yaw_rad` there, or at once within RTL_MIN_DIST; with WV_EN, or to NaN,
-    it does not turn.
+    With RTL_LAND_DELAY it descends to RTL_DESCEND_ALT before it lands. It flies nose first and turns to
+    `yaw_rad` there, or at once within RTL_MIN_DIST; with WV_EN, or to NaN, it does not turn.
     """
 
     def __init__(
@@ -253,8 +271,9 @@ class Return(Task):
                 yaw = math.atan2(home_y - y, home_x - x)
             if distance < 1.0:
                 self._phase = "descend"
-                descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
-                self.goal = (home_x, home_y, home_z - descend)
+                if value("RTL_LAND_DELAY"):
+                    descend = min(value("RTL_DESCEND_ALT"), home_z - self.goal[2])
+                    self.goal = (home_x, home_y, home_z - descend)
         if self._phase == "descend":
             yaw = self._yaw_rad
         if self._phase == "descend" and self.goal[2] - z < value("NAV_MC_ALT_RAD"):

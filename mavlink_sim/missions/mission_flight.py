@@ -89,7 +89,7 @@ class MissionFlight(flight.Task):
             return setpoint
         self.landing = False
         if self._navigator.landed:
-            self._trajectory.keep_within(flight.TAKEOFF_LEAD_M)
+            self._trajectory.keep_height()
         self._trajectory.cruise_mps = self._navigator.cruise_mps
         return self._trajectory.towards(self._aim(), dt_s, self._heading(), **self._climb_speed())
 

@@ -205,6 +205,26 @@ def test_returning_lands_with_the_state_landing_only_on_its_descent(make_cockpit
     assert states == {2}
 
 
+@pytest.mark.parametrize(("delay_s", "lands_at_m"), [(0.0, 30.0), (1.0, 10.0)])
+def test_a_return_lands_from_its_altitude_without_a_delay(
+    make_cockpit: type[Cockpit], delay_s: float, lands_at_m: float
+) -> None:
+    """PX4: LANDING at 20.9 s, as the descent from 30 m begins, which takes 32 s with the landing."""
+    cockpit = make_cockpit(parameters={"RTL_LAND_DELAY": delay_s})
+    cockpit.take_off(6.0)
+    cockpit.command_int(192, (-1, 1, 0, NAN), 473980100, 85455942, 495.4)
+    cockpit.fly(15.0)
+    cockpit.command(20)
+    returned_s = cockpit.now_s
+    cockpit.until(lambda: cockpit.vehicle.autopilot.landed_state == 4, 60.0)
+    assert cockpit.height_m == pytest.approx(lands_at_m, abs=1.0)
+    if not delay_s:
+        assert cockpit.now_s - returned_s == pytest.approx(20.9, abs=1.5)
+        landing_s = cockpit.now_s
+        cockpit.until(lambda: not cockpit.armed, 60.0)
+        assert cockpit.now_s - landing_s == pytest.approx(31.0, abs=2.0)
+
+
 def test_the_capabilities_are_those_measured(cockpit: Cockpit) -> None:
     cockpit.fly(0.1)
     cockpit.command(512, 148)

@@ -51,6 +51,17 @@ def test_in_moving_air_too_hold_begins_after_6_5_to_9_s_at_1_8_to_2_2_m(
     assert 1.8 <= cockpit.height_m <= 2.2
 
 
+@pytest.mark.parametrize(("height_m", "least_s", "most_s"), [(4.0, 7.2, 8.0), (5.0, 7.8, 8.7)])
+def test_a_higher_take_off_holds_as_soon_as_measured(
+    cockpit: Cockpit, height_m: float, least_s: float, most_s: float
+) -> None:
+    cockpit.wait_ready()
+    cockpit.command(400, 1)
+    cockpit.command(22, NAN, 0, 0, NAN, NAN, NAN, 489.4 + height_m)
+    assert cockpit.mode == "TAKEOFF"
+    assert least_s <= cockpit.until(lambda: cockpit.mode == "HOLD") + 0.04 <= most_s
+
+
 def test_it_is_in_air_as_hold_begins_and_not_before(cockpit: Cockpit) -> None:
     cockpit.wait_ready()
     cockpit.command(400, 1)
