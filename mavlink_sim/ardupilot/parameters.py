@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 from mavlink_sim.px4.parameters import REAL32, Parameter, Parameters
 
+TAKEOFF_RAMP_S = 1.5  # from the first thrust to leaving the ground
 INT8, INT16, INT32 = 2, 4, 6  # MAV_PARAM_TYPE
 _RANGES = {INT8: (-(2**7), 2**7 - 1), INT16: (-(2**15), 2**15 - 1), INT32: (-(2**31), 2**31 - 1)}
 
@@ -131,6 +132,7 @@ _LOOPS: dict[str, Callable[[Parameters], float]] = {
     "MPC_LAND_SPEED": _hundredth("LAND_SPEED"),
     "MPC_XY_ERR_MAX": lambda own: 4.0,  # ArduPilot runs faster, and its target leads farther
     "MPC_TKO_SPEED": _hundredth("WPNAV_SPEED_UP"),
+    "MPC_TKO_RAMP_T": lambda own: TAKEOFF_RAMP_S,
     "MPC_TILTMAX_AIR": _hundredth("ANGLE_MAX"),
     "MPC_YAWRAUTO_MAX": _hundredth("ATC_SLEW_YAW"),
     "SIH_WIND_N": _wind(math.cos),
