@@ -6,14 +6,16 @@ stops it too. Nothing but the motion shows any of this.
 
 The measured velocity is compared with those of vehicles that follow. The fastest one has the velocity that
 was sent; the slowest approaches it with the time constant `SLOWEST_S`. Whatever lies between the two follows.
-The residual is the distance from there, so a step, a reversal or a delay of the setpoint leaves none. A badly
-tuned vehicle overshoots and swings about what was sent; that is a residual, but it accelerates towards the
-setpoint all the time. So a residual counts only where it lasts and that acceleration is missing.
+The same holds for what was sent `DELAY_S` before. The residual is the distance from there, so a step, a
+reversal or a delay of the setpoint leaves none. A badly tuned vehicle overshoots and swings about what was
+sent; that is a residual, but it accelerates towards the setpoint all the time. So a residual counts only where
+it lasts and that acceleration is missing.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 from companion.vehicle.setpoint import Setpoint
@@ -22,15 +24,17 @@ from companion.vehicle.state import LandedState, Vector3, VehicleState
 # Time constant of the slowest vehicle that counts as one that follows. PX4 in its SIH simulation takes 0.5 to
 # 1 s for the first nine tenths of a step.
 SLOWEST_S = 2.0
+# Telemetry, transport, the autopilot's shaping of a setpoint and its tilt: with 0.2 s of additional delay.
+DELAY_S = 0.5
 # (residual m/s, lasting s). The second one is for slow setpoints. Set by flights in lockstep, in wind up to
 # 3 m/s with gusts of 0.6 m/s (docs/safety.md has their margin).
 RULES = ((0.8, 1.0), (0.4, 4.0))
 # The residual is at least this part of the commanded speed: a vehicle that flies the right way, slower than it
 # should (wind, a speed limit of the autopilot's), follows.
-RELATIVE = 0.6
+RELATIVE = 0.7
 # A vehicle that follows gains at least 1/RESPONSE_S m/s in the direction of the error for each m/s and second
 # of it. Errors whose directions cancel by more than half are swinging.
-RESPONSE_S = 4.0
+RESPONSE_S = 8.0
 STEADY = 0.5
 # Speed towards a position setpoint for each metre left (PX4: MPC_XY_P 0.95; Copter: PSC_POSXY_P 1).
 POSITION_GAIN_PER_S = 0.95
@@ -78,6 +82,7 @@ class SetpointMonitor:
         self._reset_count = 0
         self._goal: Vector3 | None = None
         self._slow = self._feed_forward = ZERO
+        self._recent: deque[tuple[int, Vector3]] = deque()
         self._lasting: list[_Lasting | None] = [None] * len(RULES)
 
     def update(self, sent: Setpoint | None, state: VehicleState, *, landing: bool = False) -> str | None:
@@ -104,15 +109,21 @@ class SetpointMonitor:
         if not continuous:
             self._clear()
             self._slow, self._feed_forward, self._goal = velocity, ZERO, sent.position_ned_m
+            self._recent.clear()
             return None
         settled = self._settled(sent, state, dt_s)
         self._slow = _filtered(self._slow, settled[0], dt_s / SLOWEST_S)
+        self._recent.append((stamp_ns, settled[0]))
+        while stamp_ns - self._recent[0][0] > DELAY_S * 1e9:
+            self._recent.popleft()
         if landing and -CONTACT_MPS < velocity[2] < settled[0][2]:
             if math.hypot(*velocity) < CONTACT_MPS:
                 self._clear()
                 return None
             velocity = (velocity[0], velocity[1], settled[0][2])
-        self.residual_mps, goal = min((_distance(velocity, self._slow, one), one) for one in settled)
+        self.residual_mps, goal = min(
+            (_distance(velocity, self._slow, one), one) for one in (*settled, self._recent[0][1])
+        )
         self.commanded_mps = max(math.hypot(*settled[0]), math.hypot(*self._slow))
         if not self._judge(stamp_ns, velocity, _minus(goal, velocity), dt_s):
             return None

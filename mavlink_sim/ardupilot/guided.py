@@ -201,7 +201,7 @@ class Guided(flight.Task):
         if stale or (target.velocity is None and target.acceleration is None):
             wanted = ZERO
         elif target.velocity is not None:
-            wanted = target.velocity
+            wanted = self._avoid(target.velocity)
         else:
             assert target.acceleration is not None
             ax, ay, az = target.acceleration
@@ -209,7 +209,7 @@ class Guided(flight.Task):
             wanted = (vx + ax * dt_s, vy + ay * dt_s, vz + az * dt_s)
         trajectory.velocity = velocity = _towards(
             trajectory.velocity,
-            _within(self._avoid(wanted), value("MPC_XY_CRUISE"), value("MPC_Z_V_AUTO_UP"), value("MPC_Z_V_AUTO_DN")),
+            _within(wanted, value("MPC_XY_CRUISE"), value("MPC_Z_V_AUTO_UP"), value("MPC_Z_V_AUTO_DN")),
             self._parameters.positive("MPC_ACC_HOR") * dt_s,
             self._parameters.positive("MPC_ACC_DOWN_MAX") * dt_s,
         )

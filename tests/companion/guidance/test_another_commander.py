@@ -21,9 +21,7 @@ PAUSE, CONTINUE = 0.0, 1.0
 
 def airborne(autopilot: str, seed: int = 1) -> LockstepFlight:
     """In wind and gusts, 6 m above home."""
-    return LockstepFlight.airborne(
-        seed=seed, height_m=6.0, wind_mps=2.0, gusts_mps=0.4, autopilot=autopilot
-    )
+    return LockstepFlight.airborne(seed=seed, height_m=6.0, wind_mps=2.0, gusts_mps=0.4, autopilot=autopilot)
 
 
 def pause_or_continue(flight: LockstepFlight, choice: float) -> None:
@@ -123,9 +121,7 @@ def test_one_reposition_is_flown_over_and_ends_nothing() -> None:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_a_flight_in_gusts_is_followed(autopilot: str) -> None:
     """The largest residual that lasted, far below what ends a command."""
-    flight = LockstepFlight.airborne(
-        seed=4, height_m=6.0, wind_mps=3.0, gusts_mps=0.6, autopilot=autopilot
-    )
+    flight = LockstepFlight.airborne(seed=4, height_m=6.0, wind_mps=3.0, gusts_mps=0.6, autopilot=autopilot)
     for command in ("goto forward=20 right=10 speed=4", "orbit radius=6 speed=2", "hold"):
         flight.command(command)
         flight.run(12.0)
