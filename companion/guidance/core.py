@@ -4,8 +4,9 @@ One behaviour is active at a time. Guidance engages OFFBOARD for it, keeps its s
 and yields to the pilot. There is no asyncio, no clock and no I/O here: the service, the campaigns and the
 tests call this one function, and nothing else drives a behaviour.
 
-When the vehicle shows a mode that was not requested, or does not move as the setpoints say, our command ends
-at once and nothing is streamed any more until an operator's next command, even if OFFBOARD comes back by itself.
+When the vehicle shows a mode that was not requested, or does not move as the setpoints say, our command
+ends at once and nothing is streamed any more until an operator's next command, even if OFFBOARD comes back by
+itself.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from companion.guidance.refusal import refusal
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
-from companion.vehicle.state import FlightMode, Vector3, VehicleState
+from companion.vehicle.state import FlightMode, Vector3
 from companion.vehicle.streamer import StreamState
 
 logger = logging.getLogger(__name__)

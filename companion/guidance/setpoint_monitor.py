@@ -8,8 +8,8 @@ The measured velocity is compared with those of vehicles that follow. The fastes
 was sent; the slowest approaches it with the time constant `SLOWEST_S`. Whatever lies between the two follows.
 The same holds for what was sent `DELAY_S` before. The residual is the distance from there, so a step, a
 reversal or a delay of the setpoint leaves none. A badly tuned vehicle overshoots and swings about what was
-sent; that is a residual, but it accelerates towards the setpoint all the time. So a residual counts only where
-it lasts and that acceleration is missing.
+sent; that is a residual, but it accelerates towards the setpoint all the time. So a residual counts only
+where it lasts and that acceleration is missing.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ DELAY_S = 0.5
 # (residual m/s, lasting s). The second one is for slow setpoints. Set by flights in lockstep, in wind up to
 # 3 m/s with gusts of 0.6 m/s (docs/safety.md has their margin).
 RULES = ((0.8, 1.0), (0.4, 4.0))
-# The residual is at least this part of the commanded speed: a vehicle that flies the right way, slower than it
-# should (wind, a speed limit of the autopilot's), follows.
+# The residual is at least this part of the commanded speed: a vehicle that flies the right way, slower than
+# it should (wind, a speed limit of the autopilot's), follows.
 RELATIVE = 0.7
 # A vehicle that follows gains at least 1/RESPONSE_S m/s in the direction of the error for each m/s and second
 # of it. Errors whose directions cancel by more than half are swinging.
@@ -51,7 +51,12 @@ ZERO: Vector3 = (0.0, 0.0, 0.0)
 
 @dataclass(slots=True)
 class _Lasting:
-    """A residual above a rule's threshold: since when, the velocity then, and the error (m) gathered since."""
+    """A residual above a rule's threshold.
+
+    Attributes:
+        since_ns, velocity_mps: when it began, and the velocity then.
+        error_m, error_length_m: the integral of the velocity error since, and of its size.
+    """
 
     since_ns: int
     velocity_mps: Vector3
@@ -121,9 +126,8 @@ class SetpointMonitor:
                 self._clear()
                 return None
             velocity = (velocity[0], velocity[1], settled[0][2])
-        self.residual_mps, goal = min(
-            (_distance(velocity, self._slow, one), one) for one in (*settled, self._recent[0][1])
-        )
+        goals = (*settled, self._recent[0][1])
+        self.residual_mps, goal = min((_distance(velocity, self._slow, one), one) for one in goals)
         self.commanded_mps = max(math.hypot(*settled[0]), math.hypot(*self._slow))
         if not self._judge(stamp_ns, velocity, _minus(goal, velocity), dt_s):
             return None

@@ -1,4 +1,4 @@
-"""The comparison of what was sent with how the vehicle moves, on sequences as they were flown and measured."""
+"""The comparison of what was sent with how the vehicle moves, on sequences as they are flown."""
 
 from __future__ import annotations
 
