@@ -2,14 +2,18 @@
 
 What we asked for is known, but not when it shows: a HEARTBEAT comes once a second, a request takes its time,
 and the autopilot moves on by itself (take-off ends in hold, landing ends disarmed). Every mode that none of
-this explains was chosen by someone else, and someone else always wins.
+this explains was chosen by someone else, and someone else always wins. So does one who steers the vehicle
+without a change of mode (`setpoint_monitor`).
 """
 
 from __future__ import annotations
 
+from companion.guidance.setpoint_monitor import SetpointMonitor
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report, words_of
+from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.streamer import SILENCE_S, StreamState
 
 # A heartbeat's period and some: so long may the vehicle show an old mode after it acknowledged a new one.
 SHOW_DELAY_S = 2.0
@@ -23,9 +27,14 @@ GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN, FlightMode.PRECISION_LAND)
 
 
 class Authority:
-    """Follows the modes of one vehicle while we are in command of it."""
+    """Follows the modes and the motion of one vehicle while we are in command of it.
+
+    Attributes:
+        monitor: compares its motion with our setpoints.
+    """
 
     def __init__(self) -> None:
+        self.monitor = SetpointMonitor()
         self._mode: FlightMode | None = None
         self._leaving: set[FlightMode] = set()
         self._leaving_until_ns: float = 0
@@ -81,8 +90,22 @@ class Authority:
         self._mode = mode
         self._leaving = set()
 
-    def lost(self, state: VehicleState, now_ns: int, *, flying_by_setpoint: bool) -> str | None:
-        """Why we are not in command any more; None while we are."""
+    def lost(
+        self,
+        state: VehicleState,
+        now_ns: int,
+        *,
+        flying_by_setpoint: bool,
+        sent: Setpoint | None = None,
+        landing: bool = False,
+    ) -> str | None:
+        """Why we are not in command any more; None while we are. Call it once for every step.
+
+        Args:
+            sent: the setpoint that the vehicle is to fly now; None: none. landing: it leads to the ground.
+        """
+        shown = sent if state.mode is self._mode else None
+        ignored = self.monitor.update(shown, state, landing=landing)
         if self._mode is None:
             return None
         if not state.connected(now_ns):
@@ -100,7 +123,7 @@ class Authority:
         self._was_armed |= state.armed
         if self._was_armed and not state.armed and self._mode not in GOING_DOWN:
             return "the vehicle was disarmed"
-        return None
+        return ignored
 
     def reason_is_told(self, state: VehicleState, now_ns: int) -> bool:
         """Whether what `lost` said is all that the autopilot will say of it.
@@ -148,6 +171,18 @@ class Authority:
             short_m = self._takeoff_altitude_m - (state.altitude_m or 0.0)
             return short_m <= TAKEOFF_SHORT_M
         return False
+
+
+def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | None:
+    """Why our setpoints failed to go out, if they did. `paused_s`: since the step of guidance before.
+
+    PX4 would take OFFBOARD up again by itself if setpoints came back; only an operator may.
+    """
+    if paused_s > SILENCE_S:
+        return f"our own guidance stood still for {paused_s:.1f} s"
+    if stream is StreamState.EXPIRED:
+        return f"no setpoint left for too long: {state.without_setpoints}"
+    return None
 
 
 def _shown(mode: FlightMode) -> str:

@@ -4,8 +4,9 @@ One behaviour is active at a time. Guidance engages OFFBOARD for it, keeps its s
 and yields to the pilot. There is no asyncio, no clock and no I/O here: the service, the campaigns and the
 tests call this one function, and nothing else drives a behaviour.
 
-When the vehicle shows a mode that was not requested, our command ends at once and nothing is streamed any
-more until an operator's next command, even if OFFBOARD comes back by itself.
+When the vehicle shows a mode that was not requested, or does not move as the setpoints say, our command
+ends at once and nothing is streamed any more until an operator's next command, even if OFFBOARD comes back by
+itself.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import logging
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from companion.guidance.authority import Authority
+from companion.guidance.authority import Authority, silence
 from companion.guidance.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryWatch
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
 from companion.guidance.command_queue import CommandQueue
@@ -36,8 +37,8 @@ from companion.guidance.refusal import refusal
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
-from companion.vehicle.state import FlightMode, Vector3, VehicleState
-from companion.vehicle.streamer import SILENCE_S, StreamState
+from companion.vehicle.state import FlightMode, Vector3
+from companion.vehicle.streamer import StreamState
 
 logger = logging.getLogger(__name__)
 
@@ -287,10 +288,15 @@ class Guidance:
 
     def _update(self, situation: Situation, inputs: GuidanceInput, paused_s: float) -> None:
         assert self._behaviour is not None
-        why = self._silent(inputs.stream.state, situation.state, paused_s) or self._authority.lost(
+        fresh = inputs.stream.state is StreamState.FRESH
+        why = (
+            silence(inputs.stream.state, situation.state, paused_s) if self._streaming else None
+        ) or self._authority.lost(
             situation.state,
             situation.now_ns,
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
+            sent=self.sent if fresh and self.phase is Phase.OFFBOARD else None,
+            landing=self._behaviour.flown.landing,
         )
         if why is not None or self._yielded is not None:
             self._yield(why, situation)
@@ -415,19 +421,6 @@ class Guidance:
     def _battery_event(self, behaviour: Behaviour, message: str) -> None:
         self._out.event(EventKind.BATTERY, behaviour.name, message, warning=True)
         self._queue.supersede(f"an event ({message})", self._out)
-
-    def _silent(self, stream: StreamState, state: VehicleState, paused_s: float) -> str | None:
-        """Why our setpoints failed to go out, if they did.
-
-        PX4 would take OFFBOARD up again by itself if setpoints came back; only an operator may.
-        """
-        if not self._streaming:
-            return None
-        if paused_s > SILENCE_S:
-            return f"our own guidance stood still for {paused_s:.1f} s"
-        if stream is StreamState.EXPIRED:
-            return f"no setpoint left for too long: {state.without_setpoints}"
-        return None
 
     def _position_known(self, situation: Situation) -> bool:
         """False: brake for now; for too long: give the command up."""

@@ -319,7 +319,7 @@ class CopterAutopilot(Autopilot):
         self.attitude.release()
         by_sticks = _BY_STICKS.get(mode)
         if mode is CopterMode.GUIDED:
-            self.task = Guided(airframe, parameters)
+            self.task = Guided(airframe, parameters, self.watch.avoid_fence)
         elif by_sticks is not None:
             self.task = manual_flight.task_of(by_sticks, airframe, parameters, self.supervision.read_sticks)
         elif mode is CopterMode.LAND:

@@ -46,6 +46,7 @@ FORCE_ARM = 2989.0
 NAV_LOITER_UNLIM = 17
 CONDITION_YAW = 115
 DO_SET_HOME = 179
+DO_PAUSE_CONTINUE = 193
 GET_HOME_POSITION = 410
 CHANGE_MODE = 1  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 CLIMB_SPEED, DESCENT_SPEED = 2, 3  # SPEED_TYPE; airspeed and ground speed are one here
@@ -172,6 +173,17 @@ def _reposition(vehicle: CopterVehicle, link: Link, command: Command, frame: int
     return ACCEPTED
 
 
+def _pause_or_continue(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
+    """DO_PAUSE_CONTINUE, in GUIDED alone here."""
+    guided, choice = vehicle.copter.guided, command.parameters[0]
+    if choice not in (0.0, 1.0):
+        return DENIED
+    if guided is None:
+        return FAILED
+    guided.paused = choice == 0.0
+    return ACCEPTED
+
+
 def _place(vehicle: CopterVehicle, command: Command, frame: int) -> Vector | None:
     latitude, longitude, altitude = command.parameters[4:7]
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and math.isfinite(altitude)):
@@ -260,6 +272,7 @@ _HANDLERS: dict[int, Handler] = {
     DO_SET_HOME: _set_home,
     185: _flight_termination,
     DO_REPOSITION: _reposition,
+    DO_PAUSE_CONTINUE: _pause_or_continue,
     ARM_DISARM: _arm,
     401: _run_prearm_checks,
     GET_HOME_POSITION: _get_home,

@@ -1,12 +1,14 @@
 """GUIDED: take-off, and what the newest target asks for; what is not renewed for GUID_TIMEOUT ends in a stop.
 
 A position is flown to and kept, however old it is. A velocity, an acceleration or an attitude that is older
-than GUID_TIMEOUT seconds becomes zero, and the vehicle stands still; it stays in GUIDED.
+than GUID_TIMEOUT seconds becomes zero, and the vehicle stands still; it stays in GUIDED. Paused
+(DO_PAUSE_CONTINUE) it stands still too, whatever new targets come.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from mavlink_sim.ardupilot.targets import STOP, GuidedTarget
 from mavlink_sim.flight import tasks as flight
@@ -91,11 +93,25 @@ class Takeoff(flight.Takeoff):
 
 
 class Guided(flight.Task):
-    """The task of GUIDED. It begins by stopping where it is."""
+    """The task of GUIDED. It begins by stopping where it is.
 
-    def __init__(self, airframe: Multirotor, parameters: Parameters) -> None:
+    Args:
+        avoid: what ArduPilot's avoidance leaves of a commanded velocity.
+
+    Attributes:
+        paused: stands still, and goes on with the newest target when this is over.
+    """
+
+    def __init__(
+        self,
+        airframe: Multirotor,
+        parameters: Parameters,
+        avoid: Callable[[Vector], Vector] = lambda velocity: velocity,
+    ) -> None:
         self._airframe = airframe
         self._parameters = parameters
+        self._avoid = avoid
+        self.paused = False
         self._trajectory = flight.Trajectory(airframe, parameters)
         self._followed = self._trajectory.velocity
         self._takeoff: Takeoff | None = None
@@ -175,9 +191,11 @@ class Guided(flight.Task):
         self._age_s += dt_s
         stale = self._age_s > self._parameters.number("GUID_TIMEOUT")
         if self._attitude is not None:
-            return self._by_attitude(self._attitude, stale)
-        if self._takeoff is not None:
+            return self._by_attitude(self._attitude, stale or self.paused)
+        if self._takeoff is not None and not self.paused:
             setpoint = self._takeoff.update(dt_s)
+        elif self.paused:
+            setpoint = self._by_velocity(dt_s, stale=True)
         elif self._target.position is None:
             setpoint = self._by_velocity(dt_s, stale)
         elif self._target.velocity is None:
@@ -205,7 +223,7 @@ class Guided(flight.Task):
         if stale or (target.velocity is None and target.acceleration is None):
             wanted = ZERO
         elif target.velocity is not None:
-            wanted = target.velocity
+            wanted = self._avoid(target.velocity)
         else:
             assert target.acceleration is not None
             ax, ay, az = target.acceleration

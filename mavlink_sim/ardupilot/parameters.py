@@ -78,6 +78,7 @@ _DEFAULTS: tuple[tuple[str, int, float], ...] = (
     ("FENCE_ALT_MAX", REAL32, 100.0),
     ("FENCE_RADIUS", REAL32, 300.0),
     ("FENCE_MARGIN", REAL32, 2.0),
+    ("AVOID_ENABLE", INT8, 3),
     ("PLND_ENABLED", INT8, 0),
     ("PLND_TYPE", INT8, 0),
     ("PLND_XY_DIST_MAX", REAL32, 2.5),

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from mavlink_sim.ardupilot.modes import WITHOUT_POSITION, CopterMode
+from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, Text
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 WARNING = 4  # MAV_SEVERITY_WARNING
 POSITION_LOST_S = 1.0
 FENCE_ALTITUDE, FENCE_CIRCLE = 1, 2  # bits of FENCE_TYPE
+STOP_AT_FENCE = 1  # a bit of AVOID_ENABLE
+# Speed towards the circle, less FENCE_MARGIN, for each metre left.
+AVOIDANCE_GAIN_PER_S = 1.0
 # FS_GCS_ENABLE: 1 RTL, 2 AUTO or RTL, 3 and 4 SMART_RTL, 5 LAND, 7 BRAKE or LAND. There is no SMART_RTL here.
 _GCS_MODES = {
     1: CopterMode.RTL,
@@ -63,6 +67,22 @@ class FailsafeWatch:
         self._watch_position()
         self._watch_fence()
         self._autopilot.failsafe = self._gcs_lost or self._ekf_lost
+
+    def avoid_fence(self, velocity: Vector) -> Vector:
+        """A commanded velocity without what would carry the vehicle over the circle; along it all is left."""
+        value, autopilot = self._parameters.number, self._autopilot
+        circle = value("FENCE_ENABLE") and int(value("FENCE_TYPE")) & FENCE_CIRCLE
+        if not circle or not int(value("AVOID_ENABLE")) & STOP_AT_FENCE:
+            return velocity
+        north, east, _ = (
+            place - home for place, home in zip(autopilot.position, autopilot.home.position, strict=True)
+        )
+        distance_m = max(math.hypot(north, east), 1e-6)
+        north, east = north / distance_m, east / distance_m
+        left_m = value("FENCE_RADIUS") - value("FENCE_MARGIN") - distance_m
+        outwards_mps = north * velocity[0] + east * velocity[1]
+        too_fast_mps = max(0.0, outwards_mps - max(0.0, AVOIDANCE_GAIN_PER_S * left_m))
+        return (velocity[0] - too_fast_mps * north, velocity[1] - too_fast_mps * east, velocity[2])
 
     def _watch_ground_station(self) -> None:
         autopilot, value = self._autopilot, self._parameters.number

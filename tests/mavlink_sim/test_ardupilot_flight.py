@@ -12,7 +12,7 @@ from mavlink_sim.lockstep import CommandRefusedError
 from mavlink_sim.physics.quaternions import inverse, product
 from mavlink_sim.wire.messages import dialect
 
-ARM, TAKEOFF, SET_MODE = 400, 22, 176
+ARM, TAKEOFF, SET_MODE, PAUSE_CONTINUE = 400, 22, 176, 193
 POSITION, VELOCITY, ACCELERATION = 0b110111111000, 0b110111000111, 0b110000111111
 KEEP_HEADING = 0b010000000000  # clears the ignore bit of the yaw rate, which is zero
 
@@ -327,6 +327,31 @@ def test_the_fence_is_watched(flying: LockstepVehicle) -> None:
     flying.run_until(lambda truth: truth.mode == "RTL", 20.0)
     assert flying.truth.position_ned_m[0] == pytest.approx(12.0, abs=0.5)
     assert (2, "Circle fence breached") in texts(flying)
+
+
+def test_velocity_targets_stop_before_the_fence(flying: LockstepVehicle) -> None:
+    """Measured on Copter 4.7: it holds at 28 m of 30, in GUIDED."""
+    for name, value in (("FENCE_ENABLE", 1), ("FENCE_RADIUS", 30)):
+        flying.vehicle.parameters.set(name, value)
+    flying.repeat(target(VELOCITY, (3.0, 0.0, 0.0)), 10.0)
+    flying.step(25.0)
+    assert flying.truth.position_ned_m[0] == pytest.approx(28.0, abs=0.5)
+    assert flying.truth.mode == "GUIDED"
+
+
+def test_a_pause_stands_still_whatever_targets_come(flying: LockstepVehicle) -> None:
+    flying.repeat(target(VELOCITY, (3.0, 0.0, 0.0)), 10.0)
+    flying.step(4.0)
+    assert flying.command(PAUSE_CONTINUE, 2) == "DENIED"
+    assert flying.command(PAUSE_CONTINUE, 0) == "ACCEPTED"
+    flying.step(6.0)
+    assert abs(flying.truth.velocity_ned_mps[0]) < 0.4
+    assert flying.truth.mode == "GUIDED"
+    assert flying.command(PAUSE_CONTINUE, 1) == "ACCEPTED"
+    flying.step(4.0)
+    assert flying.truth.velocity_ned_mps[0] > 2.0
+    flying.set_mode("LOITER")
+    assert flying.command(PAUSE_CONTINUE, 0) == "FAILED"
 
 
 def landing_target(north: float, east: float, vehicle: LockstepVehicle, *, frame: int, valid: int) -> Any:

@@ -1,0 +1,128 @@
+"""Somebody else steers the vehicle without a change of its mode, in lockstep: our command ends."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight
+from companion.guidance.core import Phase
+from companion.guidance.interface import EventKind
+from companion.guidance.setpoint_monitor import REASON
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode
+from companion.vehicle.streamer import StreamState
+from mavlink_sim.wire.messages import dialect
+
+STATION = (255, 190)
+PAUSE, CONTINUE = 0.0, 1.0
+
+
+def airborne(autopilot: str, seed: int = 1) -> LockstepFlight:
+    """In wind and gusts, 6 m above home."""
+    return LockstepFlight.airborne(seed=seed, height_m=6.0, wind_mps=2.0, gusts_mps=0.4, autopilot=autopilot)
+
+
+def pause_or_continue(flight: LockstepFlight, choice: float) -> None:
+    """DO_PAUSE_CONTINUE of a ground station."""
+    number = dialect.MAV_CMD_DO_PAUSE_CONTINUE
+    message = dialect.MAVLink_command_long_message(1, 1, number, 0, choice, *[0.0] * 6)
+    flight.vehicle.send(message, source=STATION)
+
+
+def speed_mps(flight: LockstepFlight) -> float:
+    return math.hypot(*flight.vehicle.truth.velocity_ned_mps)
+
+
+def lost(flight: LockstepFlight) -> bool:
+    """Command was lost because the vehicle does not follow, and nothing leaves any more."""
+    told = [event for event in flight.events if event.kind is EventKind.LOST]
+    if not told:
+        return False
+    assert REASON in told[-1].message
+    assert flight.guidance.phase is Phase.IDLE
+    flight.run(0.1)
+    assert flight.streamer.state is StreamState.SILENT
+    return True
+
+
+@pytest.mark.parametrize("command", ["orbit radius=8 speed=2", "goto forward=60 right=0", "figure-eight"])
+def test_a_pause_of_a_ground_station_ends_our_command(command: str) -> None:
+    flight = airborne("ardupilot")
+    flight.command(command)
+    flight.run(8.0)
+    assert flight.guidance.busy
+    pause_or_continue(flight, PAUSE)
+    paused_ns = flight.now_ns
+    assert flight.run_until(lambda: lost(flight), 6.0)
+    assert (flight.now_ns - paused_ns) / 1e9 < 4.0
+    assert flight.state.mode is FlightMode.OFFBOARD
+
+
+def test_after_a_pause_and_its_end_nothing_is_flown() -> None:
+    """It flew on at 3 m/s."""
+    flight = airborne("ardupilot")
+    flight.command("orbit radius=8 speed=3")
+    flight.run(8.0)
+    pause_or_continue(flight, PAUSE)
+    assert flight.run_until(lambda: lost(flight), 6.0)
+    flight.run(4.0)  # GUID_TIMEOUT
+    pause_or_continue(flight, CONTINUE)
+    flight.run(1.0)
+    for _ in range(30):
+        flight.run(0.1)
+        assert speed_mps(flight) < 1.0
+
+
+def test_an_orbit_that_an_autopilots_fence_stops_ends() -> None:
+    flight = airborne("ardupilot")
+    for name, value in (("FENCE_ENABLE", 1), ("FENCE_RADIUS", 30)):
+        flight.vehicle.vehicle.parameters.set(name, value)
+    flight.fly("goto forward=20 right=0", 30.0)
+    identifier = flight.command("orbit radius=15 speed=2 laps=1")
+    assert flight.run_until(lambda: lost(flight), 90.0)
+    outcome = flight.outcome(identifier)
+    assert outcome is not None
+    assert not outcome.success
+    north, east, _ = flight.vehicle.truth.position_ned_m
+    assert 26.0 < math.hypot(north, east) < 29.0  # FENCE_MARGIN is 2
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_setpoints_of_another_commander_end_our_hold(autopilot: str) -> None:
+    flight = airborne(autopilot)
+    flight.command("hold")
+    flight.run(6.0)
+    assert flight.guidance.phase is Phase.OFFBOARD
+    setpoint = Setpoint.velocity((3.0, 0.0, 0.0), 0)
+    message = dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, dialect.MAV_FRAME_LOCAL_NED, setpoint.type_mask, *[0.0] * 3, 3.0, *[0.0] * 7
+    )
+    flight.vehicle.repeat(message, 150.0, source=STATION)
+    assert flight.run_until(lambda: lost(flight), 6.0)
+
+
+def test_one_reposition_is_flown_over_and_ends_nothing() -> None:
+    flight = airborne("ardupilot")
+    flight.command("orbit radius=8 speed=2")
+    flight.run(6.0)
+    state = flight.state
+    message = dialect.MAVLink_command_int_message(
+        1, 1, 5, dialect.MAV_CMD_DO_REPOSITION, 0, 0, -1.0, 1.0, 0.0, 0.0,
+        round(state.latitude_deg * 1e7) + 3000, round(state.longitude_deg * 1e7), state.altitude_amsl_m,
+    )  # fmt: skip
+    flight.vehicle.send(message, source=STATION)
+    flight.run(6.0)
+    assert flight.guidance.busy
+    assert flight.guidance.phase is Phase.OFFBOARD
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_a_flight_in_gusts_is_followed(autopilot: str) -> None:
+    """The largest residual that lasted, far below what ends a command."""
+    flight = LockstepFlight.airborne(seed=4, height_m=6.0, wind_mps=3.0, gusts_mps=0.6, autopilot=autopilot)
+    for command in ("goto forward=20 right=10 speed=4", "orbit radius=6 speed=2", "hold"):
+        flight.command(command)
+        flight.run(12.0)
+    assert not [event for event in flight.events if event.kind is EventKind.LOST]

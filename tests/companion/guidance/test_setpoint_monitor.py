@@ -1,0 +1,193 @@
+"""The comparison of what was sent with how the vehicle moves, on sequences as they are flown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+from companion.guidance.setpoint_monitor import REASON, SetpointMonitor
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import LandedState, Vector3, VehicleState
+
+PERIOD_S = 0.03  # LOCAL_POSITION_NED at 33 Hz
+Velocity = Callable[[float], Vector3]
+
+
+@dataclass
+class Sequence:
+    """Measurements of one flight: at which second the monitor said that the vehicle does not follow."""
+
+    monitor: SetpointMonitor = field(default_factory=SetpointMonitor)
+    state: VehicleState = field(
+        default_factory=lambda: VehicleState(landed=LandedState.IN_AIR, position_ned_m=(0.0, 0.0, -5.0))
+    )
+    seconds: float = 0.0
+    largest_mps: float = 0.0
+
+    def fly(
+        self, sent: Velocity | Setpoint, flown: Velocity, lasting_s: float, *, landing: bool = False
+    ) -> float | None:
+        """Until the monitor says so (seconds since the beginning of this part) or the time is over (None)."""
+        for index in range(round(lasting_s / PERIOD_S)):
+            part_s = index * PERIOD_S
+            self.seconds += PERIOD_S
+            velocity, position = flown(part_s), self.state.position_ned_m
+            assert position is not None
+            north, east, down = (p + v * PERIOD_S for p, v in zip(position, velocity, strict=True))
+            self.state = replace(
+                self.state,
+                position_ns=round(self.seconds * 1e9),
+                velocity_ned_mps=velocity,
+                position_ned_m=(north, east, down),
+            )
+            setpoint = sent if isinstance(sent, Setpoint) else Setpoint.velocity(sent(part_s), 0)
+            why = self.monitor.update(setpoint, self.state, landing=landing)
+            self.largest_mps = max(self.largest_mps, self.monitor.residual_mps)
+            if why is not None:
+                assert why.startswith(REASON)
+                return part_s
+        return None
+
+
+def still(seconds: float) -> Vector3:
+    return (0.0, 0.0, 0.0)
+
+
+def north(speed_mps: float) -> Velocity:
+    return lambda seconds: (speed_mps, 0.0, 0.0)
+
+
+def rising(speed_mps: float, within_s: float, delay_s: float = 0.0) -> Velocity:
+    """A first-order answer to a step."""
+    return lambda seconds: (speed_mps * (1 - math.exp(-max(0.0, seconds - delay_s) / within_s)), 0.0, 0.0)
+
+
+@pytest.mark.parametrize("speed_mps", [1.0, 2.0, 5.0])
+def test_a_vehicle_that_is_stopped_in_flight_does_not_follow(speed_mps: float) -> None:
+    sequence = Sequence()
+    assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
+    braking = lambda seconds: (max(0.0, speed_mps - 3.0 * seconds), 0.0, 0.0)  # noqa: E731
+    seen_s = sequence.fly(north(speed_mps), braking, 5.0)
+    assert seen_s is not None
+    assert 1.0 <= seen_s <= 1.0 + speed_mps / 3.0 + 0.2
+
+
+@pytest.mark.parametrize("speed_mps", [1.0, 3.0])
+def test_a_vehicle_that_never_starts_does_not_follow(speed_mps: float) -> None:
+    seen_s = Sequence().fly(north(speed_mps), still, 10.0)
+    assert seen_s is not None
+    assert seen_s < 4.5
+
+
+def test_a_vehicle_that_flies_off_a_hold_does_not_follow() -> None:
+    sequence = Sequence()
+    assert sequence.fly(still, still, 5.0) is None
+    seen_s = sequence.fly(still, rising(2.0, 0.6), 5.0)
+    assert seen_s is not None
+    assert seen_s < 2.0
+
+
+def test_a_vehicle_that_flies_elsewhere_does_not_follow() -> None:
+    sequence = Sequence()
+    assert sequence.fly(north(2.0), north(2.0), 3.0) is None
+    seen_s = sequence.fly(north(2.0), lambda seconds: (0.0, 2.0, 0.0), 5.0)
+    assert seen_s is not None
+    assert seen_s < 1.5
+
+
+@pytest.mark.parametrize(("speed_mps", "noticed"), [(0.6, True), (0.3, False)])
+def test_a_slow_setpoint_takes_the_long_rule(speed_mps: float, noticed: bool) -> None:
+    sequence = Sequence()
+    assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
+    assert (sequence.fly(north(speed_mps), still, 6.0) is not None) is noticed
+
+
+@pytest.mark.parametrize("within_s", [0.3, 1.0, 1.7])
+def test_steps_and_reversals_of_the_setpoint_are_followed(within_s: float) -> None:
+    """From 3 m/s to -3 m/s, by a vehicle that answers 0.2 s late."""
+    sequence = Sequence()
+    assert sequence.fly(north(3.0), rising(3.0, within_s, 0.2), 8.0) is None
+    turning = lambda seconds: (3.0 - 2.0 * rising(3.0, within_s, 0.2)(seconds)[0], 0.0, 0.0)  # noqa: E731
+    assert sequence.fly(north(-3.0), turning, 8.0) is None
+    assert sequence.largest_mps < 0.7
+
+
+def test_px4s_slow_rise_to_3_mps_is_followed() -> None:
+    """Measured in its SIH simulation: 2.65 m/s after 6 s."""
+    sequence = Sequence()
+    assert sequence.fly(north(3.0), rising(2.65, 1.2), 20.0) is None
+    assert sequence.largest_mps < 0.5
+
+
+def test_half_the_speed_in_the_right_direction_is_followed() -> None:
+    assert Sequence().fly(north(5.0), north(2.5), 20.0) is None
+
+
+def test_a_vehicle_that_swings_about_the_setpoint_is_followed() -> None:
+    """A badly tuned hold: 1.6 m/s to and fro, against setpoints that are a quarter of a period late."""
+    turn = lambda seconds: 1.9 * seconds  # noqa: E731
+    flown = lambda seconds: (1.6 * math.cos(turn(seconds)), 1.6 * math.sin(turn(seconds)), 0.0)  # noqa: E731
+    sent = lambda seconds: (-math.sin(turn(seconds)), math.cos(turn(seconds)), 0.0)  # noqa: E731
+    sequence = Sequence()
+    assert sequence.fly(sent, flown, 20.0) is None
+    assert sequence.largest_mps > 0.8
+
+
+def test_a_reset_of_the_estimate_begins_again() -> None:
+    sequence = Sequence()
+    assert sequence.fly(north(3.0), north(3.0), 3.0) is None
+    assert sequence.fly(north(3.0), still, 0.9) is None
+    sequence.state = replace(sequence.state, reset_count=1)
+    assert sequence.fly(north(3.0), still, 1.5) is None
+
+
+def test_a_gap_in_the_telemetry_begins_again() -> None:
+    sequence = Sequence()
+    assert sequence.fly(north(3.0), north(3.0), 3.0) is None
+    assert sequence.fly(north(3.0), still, 0.9) is None
+    sequence.seconds += 1.0
+    assert sequence.fly(north(3.0), still, 1.5) is None
+
+
+@pytest.mark.parametrize("landed", [LandedState.ON_GROUND, LandedState.TAKING_OFF, LandedState.LANDING])
+def test_nothing_is_compared_on_the_ground(landed: LandedState) -> None:
+    sequence = Sequence()
+    sequence.state = replace(sequence.state, landed=landed)
+    assert sequence.fly(north(3.0), still, 10.0) is None
+
+
+def test_nothing_is_compared_by_an_invalid_estimate() -> None:
+    sequence = Sequence()
+    sequence.state = replace(sequence.state, position_valid=False)
+    assert sequence.fly(north(3.0), still, 10.0) is None
+
+
+def test_standing_on_the_ground_at_a_landing_is_allowed() -> None:
+    """The autopilot takes seconds to tell that it has landed."""
+    down = lambda seconds: (0.2, 0.1, 0.7)  # noqa: E731
+    sequence = Sequence()
+    assert sequence.fly(down, lambda seconds: (0.1, 0.1, 0.7), 3.0, landing=True) is None
+    assert sequence.fly(down, still, 10.0, landing=True) is None
+
+
+def test_a_landing_that_is_carried_off_is_noticed() -> None:
+    down = lambda seconds: (0.0, 0.0, 0.7)  # noqa: E731
+    assert Sequence().fly(down, rising(3.0, 0.5), 5.0, landing=True) is not None
+
+
+def test_a_moving_position_setpoint_is_followed_with_and_without_lag() -> None:
+    """PX4 lags by 1 s times the speed; with feed-forward there is hardly any lag."""
+    for lag_m in (3.2, 0.3):
+        sequence = Sequence()
+        sequence.state = replace(sequence.state, position_ned_m=(-lag_m, 0.0, -5.0))
+        for index in range(500):
+            place = Setpoint.position((3.0 * (index + 1) * PERIOD_S, 0.0, -5.0), 0)
+            assert sequence.fly(place, north(3.0), PERIOD_S) is None
+        assert sequence.largest_mps < 1.0
+
+
+def test_standing_away_from_a_position_setpoint_is_noticed() -> None:
+    assert Sequence().fly(Setpoint.position((4.0, 0.0, -5.0), 0), still, 5.0) is not None
