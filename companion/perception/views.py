@@ -21,6 +21,7 @@ from companion.perception.keeper import PerceptionKeeper, PerceptionStartError, 
 from companion.perception.messages import Preview
 from companion.perception.pulse import START_S
 from companion.settings import DetectorSection, Section, Settings
+from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
 
@@ -138,10 +139,16 @@ class WorkerView(View):
         return self.keeper.class_names or None
 
     def seeing(self, now_ns: int) -> bool:
-        return self.keeper.state is PerceptionState.FINISHED or super().seeing(now_ns)
+        return (
+            self.settings.source.uri == NO_SOURCE
+            or self.keeper.state is PerceptionState.FINISHED
+            or super().seeing(now_ns)
+        )
 
     async def start(self) -> None:
         """Start the worker. Raises PerceptionStartError; the view's name is in its message."""
+        if self.settings.source.uri == NO_SOURCE:
+            return
         try:
             await self.keeper.start()
         except PerceptionStartError as error:
