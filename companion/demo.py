@@ -1,8 +1,9 @@
 """The whole way in one command: a vehicle, its camera, our weights, and a flight to a car.
 
 The vehicle is the built-in one, or an autopilot that runs elsewhere. The simulator and the perception worker
-are processes of their own, the detections are counted by a zenoh subscriber that knows nothing of the service,
-and what is claimed is measured from the simulator's truth, or from the position that the autopilot reports.
+are processes of their own, the detections are counted by a zenoh subscriber that knows nothing of the
+service, and what is claimed is measured from the simulator's truth, or from the position that the autopilot
+reports.
 """
 
 from __future__ import annotations

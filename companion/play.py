@@ -161,7 +161,10 @@ def _services(
     """A service for each vehicle; all but the first without a camera."""
     name = f"companion-play-{os.getpid()}"
     first = session_settings(vehicle.port, name, chosen=settings, lens=scene.camera, driver="auto")
-    several = [first] if options.vehicles == 1 else [_with(first, vehicle={"system_id": 1})]
+    if options.vehicle_url is None:
+        # Those of the settings are of another vehicle.
+        first = _with(first, vehicle={"system_id": 1, "signing_key_file": None})
+    several = [first]
     for number in range(2, options.vehicles + 1):
         zenoh = first.zenoh
         if zenoh.mode == "peer":
