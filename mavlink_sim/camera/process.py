@@ -43,6 +43,8 @@ POSE = struct.Struct("=3d4dqd3dq")
 """Position NED in metres, quaternion (w, x, y, z) of `ned_from_body`, CLOCK_MONOTONIC nanoseconds, the
 scene's time in seconds, the camera's roll, pitch, yaw on the body (not numbers: as it is mounted), and the
 number of the other aircraft's poses (-1: there are none)."""
+OUTPUT_FAILED = 2
+"""Exit code of the process: one of its outputs could not be opened."""
 EARLY_SHARE = 0.3
 """A pose that comes this share of a period early is drawn at once: the poses' own rhythm jitters."""
 
@@ -55,12 +57,14 @@ def run_camera(
     poses: Connection,
     ready: Event,
     shared_poses: SharedPoses | None = None,
+    written: Event | None = None,
 ) -> None:
     """Draw a frame for the newest pose, at most `rate_hz` times a second, until `poses` closes.
 
     The frames' `captured_ns` is the stamp of the pose that they were drawn from. The outputs open when the
     ground has been painted and the first frame can be drawn without delay. `shared_poses` holds the poses of
-    the other aircraft; None if there are none.
+    the other aircraft; None if there are none. `written` is set when the first frame is at its outputs. An
+    output that cannot be opened is one line on standard error and exit code 2.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: painting does not look at the pipe
@@ -71,13 +75,17 @@ def run_camera(
     camera = SimulatedCamera(scene)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # from here on outputs have to be closed: the pipe it is
     with ExitStack() as resources:
-        sinks = [open_output(address, model.width, model.height, rate_hz) for address in outputs]
-        for sink in sinks:
-            resources.callback(sink.close)
-        lines = None
-        if truth is not None:
-            lines = TruthFile(truth)
-            resources.callback(lines.close)
+        sinks, lines = [], None
+        try:
+            for address in outputs:
+                sinks.append(open_output(address, model.width, model.height, rate_hz))
+                resources.callback(sinks[-1].close)
+            if truth is not None:
+                lines = TruthFile(truth)
+                resources.callback(lines.close)
+        except (OSError, ValueError, ModuleNotFoundError) as error:
+            print(f"camera: {error}", file=sys.stderr, flush=True)
+            sys.exit(OUTPUT_FAILED)
         ready.set()
         period_s = 1.0 / rate_hz
         due_s = time.monotonic()
@@ -89,6 +97,8 @@ def run_camera(
                 captured = on_the_way.popleft()
                 for sink in sinks:
                     sink.write(captured.frame)
+                if written is not None:
+                    written.set()
                 if lines is not None:
                     why = lines.write(truth_line(captured))
                     if why is not None:
@@ -176,11 +186,20 @@ class CameraProcess:
         self._receiving, self._sending = context.Pipe(duplex=False)
         # A camera that hangs must not hang the vehicle: a full pipe drops the pose instead.
         os.set_blocking(self._sending.fileno(), False)
-        self._ready = context.Event()
+        self._ready, self._written = context.Event(), context.Event()
         self._shared_poses = SharedPoses(context, most_others) if most_others > 0 else None
         self._process = context.Process(
             target=run_camera,
-            args=(scene, rate_hz, addresses, truth, self._receiving, self._ready, self._shared_poses),
+            args=(
+                scene,
+                rate_hz,
+                addresses,
+                truth,
+                self._receiving,
+                self._ready,
+                self._shared_poses,
+                self._written,
+            ),
             name="mavlink-sim camera",
             daemon=True,
         )
@@ -207,6 +226,16 @@ class CameraProcess:
     def ready(self) -> bool:
         """Whether its outputs are open and the first frame can be drawn without delay."""
         return self._ready.is_set()
+
+    @property
+    def written(self) -> bool:
+        """Whether the first frame is at its outputs."""
+        return self._written.is_set()
+
+    @property
+    def exit_code(self) -> int | None:
+        """Of the process; None while it runs. `OUTPUT_FAILED`: it said which output cannot be opened."""
+        return self._process.exitcode
 
     @property
     def pid(self) -> int | None:
