@@ -26,7 +26,7 @@ from companion.sim_session import (
     with_services,
 )
 from mavlink_sim.camera.scene import Scene
-from mavlink_sim.camera.scene_file import scene_or_demo
+from mavlink_sim.camera.scene_file import SceneError, scene_or_demo
 from mavlink_sim.testing import free_port
 
 Say = Callable[[str], None]
@@ -63,11 +63,15 @@ def play(settings: Settings, options: PlayOptions, say: Say) -> None:
     """Start all, print what to type, and take commands until SIGINT, SIGTERM or `quit`.
 
     Raises:
-        SimSessionError: it cannot start; the message is one line. SimulationLostError: it ended meanwhile.
-        SceneError: there is no such scene. LinkError, PerceptionStartError, BusError: as `Service.run`.
+        SimSessionError: it cannot start, for example without such a scene.
+        SimulationLostError: the simulator ended while it was in use.
+        LinkError, PerceptionStartError, BusError: as `Service.run`.
     """
     _check_zenoh_ports(settings)
-    scene = scene_or_demo(options.scene, options.seed)
+    try:
+        scene = scene_or_demo(options.scene, options.seed)
+    except SceneError as error:
+        raise SimSessionError(str(error)) from error
     asyncio.run(_play(settings, options, scene, say))
 
 
@@ -160,10 +164,11 @@ def _services(
 ) -> list[Service]:
     """A service for each vehicle; all but the first without a camera."""
     name = f"companion-play-{os.getpid()}"
-    first = session_settings(vehicle.port, name, chosen=settings, lens=scene.camera, driver="auto")
+    first = session_settings(
+        vehicle.port, name, chosen=settings, lens=scene.camera, driver="auto", system_id=vehicle.system_id
+    )
     if options.vehicle_url is None:
-        # Those of the settings are of another vehicle.
-        first = _with(first, vehicle={"system_id": 1, "signing_key_file": None})
+        first = _with(first, vehicle={"signing_key_file": None})  # that of the settings is another vehicle's
     several = [first]
     for number in range(2, options.vehicles + 1):
         zenoh = first.zenoh

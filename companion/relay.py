@@ -95,7 +95,7 @@ class Relay:
             if link is not None:
                 await link.close()
 
-    async def check_autopilot(self) -> None:
+    async def check_autopilot(self) -> AutopilotHeartbeat:
         """Wait for the autopilot and check that it is one multirotor, disarmed.
 
         Raises:
@@ -121,6 +121,7 @@ class Relay:
             raise ValueError(f"{self.url}: system {system_id} is a {name}; expected a multirotor")
         if base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
             raise ValueError(f"{self.url}: system {system_id} is armed; it must be disarmed on the ground")
+        return self.heartbeat
 
     def _from_vehicle(self, data: bytes, source: Source) -> None:
         heartbeat = _heartbeat_in(data)

@@ -40,7 +40,8 @@ STOP_DISTANCE_M, RANGE_TOLERANCE_M = 5.0, 0.5
 # The open field of the built-in world needs no 30 m on the way home (PX4's default).
 SIMULATOR_PARAMETERS = {"RTL_RETURN_ALT": 5.0}
 
-_SIMULATOR_START_S = 20.0
+# An autopilot that has just started has no position for up to a minute; `mavlink-sim camera` waits for it.
+_SIMULATOR_START_S = 90.0
 _SIMULATOR_END_S = 5.0
 _ARMABLE_S = 20.0
 _LINES_KEPT = 40
@@ -85,10 +86,13 @@ class SimProcess:
     Attributes:
         port: the UDP port on loopback at which a service finds the vehicle; of a fleet the first of
             consecutive ones.
+        system_id: MAVLink system id of the vehicle; of a fleet the first one's.
     """
 
-    def __init__(self, process: asyncio.subprocess.Process, port: int, log_path: Path | None) -> None:
-        self.port = port
+    def __init__(
+        self, process: asyncio.subprocess.Process, port: int, log_path: Path | None, system_id: int = 1
+    ) -> None:
+        self.port, self.system_id = port, system_id
         self._process = process
         self._lines: deque[str] = deque(maxlen=_LINES_KEPT)
         self._ready, self._lost = asyncio.Event(), asyncio.Event()
@@ -181,11 +185,13 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
     relay = await Relay.open(url, (service_port, camera_port))
     try:
         try:
-            await relay.check_autopilot()
+            autopilot = await relay.check_autopilot()
         except ValueError as error:
             raise SimSessionError(str(error)) from error
         arguments = ["camera", "--vehicle-url", f"udpin://127.0.0.1:{camera_port}"]
-        process = SimProcess(await _spawn(arguments, options), service_port, options.log_path)
+        process = SimProcess(
+            await _spawn(arguments, options), service_port, options.log_path, autopilot.system_id
+        )
         try:
             yield process
         finally:
@@ -231,6 +237,7 @@ def session_settings(
     video: Path | None = None,
     video_rate_hz: float = 7.5,
     driver: str = "mavsdk",
+    system_id: int = 1,
 ) -> Settings:
     """Settings for a vehicle on a port of loopback and a simulated camera.
 
@@ -250,7 +257,8 @@ def session_settings(
         detector.setdefault("image_size", 320)
     values["detector"] = detector
     values["guidance"].pop("view", None)
-    values["vehicle"] = {"driver": driver, **values.get("vehicle", {}), "url": f"udpin://127.0.0.1:{port}"}
+    values["vehicle"] = {"driver": driver, **values.get("vehicle", {})}
+    values["vehicle"] |= {"url": f"udpin://127.0.0.1:{port}", "system_id": system_id}
     # The worker is started together with the simulator, and the first frame takes some seconds.
     values["source"] = {"uri": f"shm://{camera}", "open_timeout_s": _SIMULATOR_START_S}
     values["camera"] = _camera_section(lens or CameraSettings())

@@ -58,7 +58,6 @@ def play(
         from companion.play import play as start
         from companion.sim_session import SimSessionError
         from companion.vehicle.driver import LinkError
-        from mavlink_sim.camera.scene_file import SceneError
 
     level = settings.log.level.upper() if "log.level" in given else "WARNING"
     logging.basicConfig(level=level, format="companion: %(message)s", stream=sys.stderr)
@@ -67,7 +66,7 @@ def play(
     service.propagate = False
     service.addHandler(logging.NullHandler())
     options = PlayOptions(scene, seed, vehicles, url, autopilot)
-    errors = (SimSessionError, SceneError, LinkError, PerceptionStartError, BusError, MetricsError)
+    errors = (SimSessionError, LinkError, PerceptionStartError, BusError, MetricsError)
     with plain_errors(*errors):
         try:
             start(

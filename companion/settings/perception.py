@@ -27,7 +27,7 @@ class SourceSection(Section):
     """Where frames come from."""
 
     uri: Annotated[str, Field(min_length=1)] = "/dev/video0"
-    """a video file, a folder of images, /dev/video0, a FIFO, - (standard input), rtsp://, http://, udp://; or none"""
+    """video file, folder of images, /dev/video0, FIFO, - (standard input), rtsp://, http://, udp://; none"""
     width: Annotated[int | None, Field(ge=16, le=16384)] = None
     """of a frame, pixels; asked of a camera, and needed for raw frames from a pipe"""
     height: Annotated[int | None, Field(ge=16, le=16384)] = None

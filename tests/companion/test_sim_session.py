@@ -1,4 +1,4 @@
-"""What a rehearsal's caller hears of it."""
+"""How a service and the work with it end each other."""
 
 from __future__ import annotations
 
