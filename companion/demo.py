@@ -158,26 +158,40 @@ async def _fly(
                 say(event.text)
 
             service = Service(settings, on_event=on_event)
-            watching = asyncio.create_task(_watch(vehicle, flight, say))
             try:
-                async with asyncio.timeout(limit_s):
-                    await with_service(service, lambda: _watched_mission(service, flight))
-            except TimeoutError:
-                flight.failure = flight.failure or f"not finished in {limit_s:g} s"
+                await _until_flown(service, vehicle, flight, limit_s, say)
             finally:
-                watching.cancel()
                 flight.published = service.bus.published[DETECTIONS.name]
                 flight.frames = service.perception.status.frames
     return flight
 
 
-async def _watch(vehicle: SimProcess, flight: _Flight, say: Say) -> None:
-    """A simulator or camera that ends is the failure; the mission goes on to bring the vehicle home."""
+async def _until_flown(
+    service: Service, vehicle: SimProcess, flight: _Flight, limit_s: float, say: Say
+) -> None:
+    """Until the mission has ended, or the time is up.
+
+    A simulator or camera that ends in flight is a failure; the mission goes on, to bring the vehicle home.
+    """
+    deadline_s = time.monotonic() + limit_s
+    flying = asyncio.create_task(with_service(service, lambda: _watched_mission(service, flight)))
+    lost = asyncio.create_task(vehicle.until_lost())
     try:
-        await vehicle.until_lost()
-    except SimSessionError as error:
-        flight.failure = flight.failure or str(error)
-        say(str(error))
+        await asyncio.wait({flying, lost}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
+        if lost.done() and not flying.done():
+            flight.failure = str(lost.exception())
+            say(flight.failure)
+            if not service.ready:
+                raise SimSessionError(flight.failure)
+            await asyncio.wait({flying}, timeout=max(deadline_s - time.monotonic(), 0.0))
+        if not flying.done():
+            flight.failure = flight.failure or f"not finished in {limit_s:g} s"
+    finally:
+        for task in (flying, lost):
+            task.cancel()
+        ended = (await asyncio.gather(flying, lost, return_exceptions=True))[0]
+    if isinstance(ended, Exception):
+        raise ended
 
 
 async def _watched_mission(service: Service, flight: _Flight) -> None:

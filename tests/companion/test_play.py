@@ -30,8 +30,8 @@ def playing(folder: Path, *flags: str) -> Iterator[ServiceProcess]:
         [sys.executable, "-m", "companion.cli", "play", "--zenoh-listen", endpoint, *flags],
         cwd=folder,
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
     )
     running = ServiceProcess(process, endpoint)
     try:
@@ -39,8 +39,8 @@ def playing(folder: Path, *flags: str) -> Iterator[ServiceProcess]:
         yield running
     finally:
         running.stop()
-        assert process.stderr is not None
-        process.stderr.close()
+        assert process.stdout is not None
+        process.stdout.close()
 
 
 def descendants(pid: int) -> set[int]:
