@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import math
 import os
 import signal
 import socket
@@ -129,18 +128,10 @@ def rehearsal_settings(
     port: int, camera: str, *, video: Path | None = None, video_rate_hz: float = 7.5, driver: str = "mavsdk"
 ) -> Settings:
     """Settings for the built-in vehicle and its camera, whatever is configured on this machine."""
-    from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
-
-    fov_deg = math.degrees(2 * math.atan(DEFAULT_CAMERA.width / 2 / DEFAULT_CAMERA.fx))
     overrides = {
         "vehicle.url": f"udpin://127.0.0.1:{port}",
         "vehicle.driver": driver,
         "source.uri": f"shm://{camera}",
-        "camera.horizontal_fov_deg": f"{fov_deg:.6f}",
-        "camera.mount_pitch_deg": f"{math.degrees(DEFAULT_MOUNT.pitch_rad):.6f}",
-        "camera.mount_forward_m": str(DEFAULT_MOUNT.forward_m),
-        "camera.mount_right_m": str(DEFAULT_MOUNT.right_m),
-        "camera.mount_down_m": str(DEFAULT_MOUNT.down_m),
         "detector.threads": "1",
         # The size at which the bundled model was trained; see docs/models.md.
         "detector.image_size": "320",
