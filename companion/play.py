@@ -164,9 +164,7 @@ def _services(
 ) -> list[Service]:
     """A service for each vehicle; all but the first without a camera."""
     name = f"companion-play-{os.getpid()}"
-    first = session_settings(
-        vehicle.port, name, chosen=settings, lens=scene.camera, driver="auto", system_id=vehicle.system_id
-    )
+    first = session_settings(vehicle.port, name, chosen=settings, driver="auto", system_id=vehicle.system_id)
     if options.vehicle_url is None:
         first = _with(first, vehicle={"signing_key_file": None})  # that of the settings is another vehicle's
     several = [first]

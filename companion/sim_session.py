@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import math
 import signal
 import socket
 import subprocess
@@ -24,9 +23,11 @@ from typing import Any, NoReturn
 from companion.relay import Relay
 from companion.service import Service
 from companion.settings import Settings
+from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import DEFAULT_MODEL
 from mavlink_sim.camera.scene import CameraSettings
 from mavlink_sim.testing import free_port, free_udp_port_range
+from vision.camera_model import CameraCalibration
 
 # High enough to see far, low enough that a car at 5 m is in the picture.
 ALTITUDE_M = 4.0
@@ -233,18 +234,16 @@ def session_settings(
     camera: str,
     *,
     chosen: Settings | None = None,
-    lens: CameraSettings | None = None,
     video: Path | None = None,
     video_rate_hz: float = 7.5,
     driver: str = "mavsdk",
     system_id: int = 1,
 ) -> Settings:
-    """Settings for a vehicle on a port of loopback and a simulated camera.
+    """Settings for a vehicle on a port of loopback and a simulated camera, whose frames bring lens and mount.
 
     Args:
         chosen: settings that are kept but for vehicle, source, camera and views; None: whatever is configured
             on this machine, defaults, and zenoh on a free port.
-        lens: the camera's; None: the demo world's.
     """
     values: dict[str, Any] = {} if chosen is None else chosen.model_dump(exclude_unset=True)
     for section in ("source", "camera", "views"):
@@ -261,7 +260,6 @@ def session_settings(
     values["vehicle"] |= {"url": f"udpin://127.0.0.1:{port}", "system_id": system_id}
     # The worker is started together with the simulator, and the first frame takes some seconds.
     values["source"] = {"uri": f"shm://{camera}", "open_timeout_s": _SIMULATOR_START_S}
-    values["camera"] = _camera_section(lens or CameraSettings())
     if chosen is None:
         values["zenoh"] = {"listen": (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",)}
     if video is not None:
@@ -269,23 +267,11 @@ def session_settings(
     return Settings.model_validate(values)
 
 
-def _camera_section(lens: CameraSettings) -> dict[str, Any]:
-    model, mount = lens.model, lens.mount
-    return {
-        "fx_px": model.fx,
-        "fy_px": model.fy,
-        "cx_px": model.cx,
-        "cy_px": model.cy,
-        "calibrated_width": model.width,
-        "calibrated_height": model.height,
-        "distortion": tuple(model.distortion),
-        "mount_roll_deg": math.degrees(mount.roll_rad),
-        "mount_pitch_deg": math.degrees(mount.pitch_rad),
-        "mount_yaw_deg": math.degrees(mount.yaw_rad),
-        "mount_forward_m": mount.forward_m,
-        "mount_right_m": mount.right_m,
-        "mount_down_m": mount.down_m,
-    }
+def with_lens(settings: Settings, camera: CameraSettings = CameraSettings()) -> Settings:  # noqa: B008 - frozen
+    """The settings with a simulated camera's lens and mount, for where its frames do not bring them along."""
+    calibration = CameraCalibration(camera.model, camera.mount)
+    adopted = adopt_calibration(settings.camera, calibration).camera
+    return settings.model_copy(update={"camera": adopted})
 
 
 async def with_service(service: Service, work: Callable[[], Coroutine[Any, Any, None]]) -> None:

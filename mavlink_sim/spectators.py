@@ -99,6 +99,7 @@ class Spectators:
             outputs=options.camera_outputs,
             truth=options.camera_truth,
             most_others=self._flock.size - 1,
+            on_gimbal=self._vehicle.gimbal is not None,
         )
         resources.callback(self._camera.stop)
         self._camera.start()

@@ -27,7 +27,14 @@ from companion.bus.client import client_settings, listen, open_client, send_comm
 from companion.bus.topics import command_key
 from companion.settings import Settings
 from companion.settings.reading import to_toml
-from companion.sim_session import ALTITUDE_M, SimOptions, SimSessionError, session_settings, simulator
+from companion.sim_session import (
+    ALTITUDE_M,
+    SimOptions,
+    SimSessionError,
+    session_settings,
+    simulator,
+    with_lens,
+)
 
 SPEED_MPS = 2.0
 # The speed has begun to fall below this share of the median of the second before; standing is below this.
@@ -137,7 +144,7 @@ async def _measure(fault: Fault, seed: int) -> Reaction:
         truth = folder / "truth.jsonl"
         async with simulator(SimOptions(camera, seed, truth_path=truth)) as vehicle:
             await vehicle.until_ready()
-            settings = session_settings(vehicle.port, camera)
+            settings = with_lens(session_settings(vehicle.port, camera))
             (folder / "companion.toml").write_text(to_toml(settings))
             with (folder / "service.log").open("wb") as log:
                 service = await asyncio.create_subprocess_exec(

@@ -33,6 +33,7 @@ from companion.sim_session import (
     STOP_DISTANCE_M,
     TARGET_CLASS,
     session_settings,
+    with_lens,
 )
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo
@@ -75,8 +76,8 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     Args:
         synthetic: detections are made of the truth instead of drawn and looked for.
     """
-    settings = session_settings(14540, "lockstep")
     scene = scene_or_demo(None, seed)
+    settings = with_lens(session_settings(14540, "lockstep"), scene.camera)
     vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, parameters=dict(SIMULATOR_PARAMETERS))
     camera: Camera
     if synthetic:

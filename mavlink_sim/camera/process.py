@@ -33,7 +33,7 @@ from mavlink_sim.camera.video_outputs import check_output, open_output
 from mavlink_sim.world.aircraft import Aircraft
 from mavlink_sim.world.truth_file import TruthFile
 from mavlink_sim.world.world import World
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 from vision.shared_frame import remove_leavings
 
@@ -58,13 +58,15 @@ def run_camera(
     ready: Event,
     shared_poses: SharedPoses | None = None,
     written: Event | None = None,
+    on_gimbal: bool = False,
 ) -> None:
     """Draw a frame for the newest pose, at most `rate_hz` times a second, until `poses` closes.
 
     The frames' `captured_ns` is the stamp of the pose that they were drawn from. The outputs open when the
     ground has been painted and the first frame can be drawn without delay. `shared_poses` holds the poses of
-    the other aircraft; None if there are none. `written` is set when the first frame is at its outputs. An
-    output that cannot be opened is one line on standard error and exit code 2.
+    the other aircraft; None if there are none. `written` is set when the first frame is at its outputs.
+    `on_gimbal`: the poses say where the camera looks, and readers get the mount of a camera on a gimbal.
+    An output that cannot be opened is one line on standard error and exit code 2.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: painting does not look at the pipe
@@ -75,11 +77,14 @@ def run_camera(
     camera = SimulatedCamera(scene)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # from here on outputs have to be closed: the pipe it is
     with ExitStack() as resources:
+        level = replace(mount, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, on_gimbal=True)
+        calibration = CameraCalibration(model, level if on_gimbal else mount)
         sinks, lines = [], None
         try:
             for address in outputs:
-                sinks.append(open_output(address, model.width, model.height, rate_hz))
-                resources.callback(sinks[-1].close)
+                sink = open_output(address, model.width, model.height, rate_hz, calibration=calibration)
+                sinks.append(sink)
+                resources.callback(sink.close)
             if truth is not None:
                 lines = TruthFile(truth)
                 resources.callback(lines.close)
@@ -158,6 +163,7 @@ class CameraProcess:
         outputs: further addresses of `video_outputs`.
         truth: a file for what is really in each frame, a line of JSON each.
         most_others: how many other aircraft there can be to see.
+        on_gimbal: every pose comes with the camera's angles (`camera_rpy_rad`).
 
     Raises:
         ValueError: a rate or an address that cannot be, or no output at all.
@@ -173,6 +179,7 @@ class CameraProcess:
         outputs: Sequence[str] = (),
         truth: Path | None = None,
         most_others: int = 0,
+        on_gimbal: bool = False,
     ) -> None:
         if not rate_hz > 0.0:
             raise ValueError(f"the camera's rate must be positive, got {rate_hz} Hz")
@@ -199,6 +206,7 @@ class CameraProcess:
                 self._ready,
                 self._shared_poses,
                 self._written,
+                on_gimbal,
             ),
             name="mavlink-sim camera",
             daemon=True,

@@ -144,7 +144,7 @@ class PoseHistory:
             self._attitudes.add(stamp_ns, values)
 
     def _local(self, message: Any) -> tuple[float, ...]:
-        """Position NED in metres from the first fix, on a sphere: exact to 0.1 % over kilometres; velocity."""
+        """Position NED in metres from the first fix, on a sphere; velocity NED in m/s."""
         if self._fix is None:
             self._fix = (message.lat, message.lon, message.alt)
         lat, lon, alt_mm = self._fix
