@@ -139,10 +139,8 @@ async def _fly(
         log_path=output / "simulator.log",
     )
     opened = simulator(options) if vehicle_url is None else camera_of_autopilot(vehicle_url, options)
+    rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_FILM_RATE_HZ
     async with opened as vehicle:
-        await vehicle.until_ready()
-        say("the vehicle and its camera are running")
-        rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_FILM_RATE_HZ
         settings = session_settings(
             vehicle.port,
             options.camera,
@@ -157,7 +155,10 @@ async def _fly(
                 events.write(json.dumps(asdict(event)) + "\n")
                 say(event.text)
 
+            # Made while the camera starts: what it imports would hold up the relay's messages later.
             service = Service(settings, on_event=on_event)
+            await vehicle.until_ready()
+            say("the vehicle and its camera are running")
             try:
                 await _until_flown(service, vehicle, flight, limit_s, say)
             finally:
@@ -220,7 +221,10 @@ async def _mission(service: Service, flight: _Flight) -> None:
         if step["title"] == STAND and step["success"]:
             # The range is taken at the end of the hold, when all is still.
             flight.reached_ns = step["ended_ns"]
-    flight.ended = not service.driver.state.armed
+    state = service.driver.state
+    flight.ended = not state.armed
+    if flight.failure is not None and state.armed:
+        flight.failure += f"; the vehicle is left armed, in {state.mode.value} mode"
 
 
 def _range_at(truth_path: Path, stamp_ns: int, seed: int) -> float | None:

@@ -115,7 +115,7 @@ async def _until_stopped(
     settings: Settings, options: PlayOptions, scene: Scene, say: Say, stop: asyncio.Event
 ) -> None:
     async with _opened(options) as vehicle:
-        services = _services(settings, options, scene, vehicle, say)
+        services = _services(settings, options, vehicle, say)
         ready = False
 
         async def work() -> None:
@@ -159,9 +159,7 @@ def _opened(options: PlayOptions) -> AbstractAsyncContextManager[SimProcess]:
     return camera_of_autopilot(options.vehicle_url, camera)
 
 
-def _services(
-    settings: Settings, options: PlayOptions, scene: Scene, vehicle: SimProcess, say: Say
-) -> list[Service]:
+def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say: Say) -> list[Service]:
     """A service for each vehicle; all but the first without a camera."""
     name = f"companion-play-{os.getpid()}"
     first = session_settings(vehicle.port, name, chosen=settings, driver="auto", system_id=vehicle.system_id)

@@ -54,7 +54,7 @@ class Relay:
 
     Attributes:
         url: where the autopilot sends to.
-        heartbeat: the newest of the autopilot; None before the first.
+        heartbeat: the newest of the autopilot until it is checked; None before the first.
         others: addresses of further autopilots, whose messages are dropped.
     """
 
@@ -64,6 +64,7 @@ class Relay:
         self.others: set[Source] = set()
         self._source: Source = None
         self._received_s = 0.0
+        self._checked = False
         self._first_heartbeat = asyncio.Event()
         self._vehicle: ByteLink | None = None
         self._programs: list[ByteLink] = []
@@ -121,10 +122,14 @@ class Relay:
             raise ValueError(f"{self.url}: system {system_id} is a {name}; expected a multirotor")
         if base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
             raise ValueError(f"{self.url}: system {system_id} is armed; it must be disarmed on the ground")
+        self._checked = True
         return self.heartbeat
 
     def _from_vehicle(self, data: bytes, source: Source) -> None:
-        heartbeat = _heartbeat_in(data)
+        if source == self._source and self._checked:
+            heartbeat = None  # reading every message would take the service's time
+        else:
+            heartbeat = _heartbeat_in(data)
         if heartbeat is not None and source != self._source:
             self._on_new_sender(source)
         if source != self._source:

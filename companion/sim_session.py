@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+import importlib
 import signal
 import socket
 import subprocess
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -183,6 +184,8 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
         SimSessionError: no autopilot, or not one that can be flown from here: see `Relay.check_autopilot`.
     """
     service_port, camera_port = free_port(), free_port()
+    # It takes a second to load, which would hold up the relay's messages.
+    await asyncio.to_thread(_load_driver_for_px4)
     relay = await Relay.open(url, (service_port, camera_port))
     try:
         try:
@@ -199,6 +202,11 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
             await process.end()
     finally:
         await relay.close()
+
+
+def _load_driver_for_px4() -> None:
+    with suppress(ImportError, OSError):  # the driver "auto" says so, and takes the other one
+        importlib.import_module("companion.vehicle.mavsdk_driver")
 
 
 async def _spawn(arguments: Sequence[str], options: SimOptions) -> asyncio.subprocess.Process:
