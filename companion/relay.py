@@ -126,10 +126,9 @@ class Relay:
         return self.heartbeat
 
     def _from_vehicle(self, data: bytes, source: Source) -> None:
-        if source == self._source and self._checked:
-            heartbeat = None  # reading every message would take the service's time
-        else:
-            heartbeat = _heartbeat_in(data)
+        # Reading the messages of the chosen one would take the service's time.
+        known = source == self._source and self._checked
+        heartbeat = None if known else _heartbeat_in(data)
         if heartbeat is not None and source != self._source:
             self._on_new_sender(source)
         if source != self._source:
