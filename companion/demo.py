@@ -1,7 +1,9 @@
-"""The whole way in one command: the built-in vehicle, its camera, our weights, and a flight to a car.
+"""The whole way in one command: a vehicle, its camera, our weights, and a flight to a car.
 
-The simulator and the perception worker are processes of their own, the detections are counted by a zenoh
-subscriber that knows nothing of the service, and what is claimed is measured from the simulator's truth.
+The vehicle is the built-in one, or an autopilot that runs elsewhere. The simulator and the perception worker
+are processes of their own, the detections are counted by a zenoh subscriber that knows nothing of the
+service, and what is claimed is measured from the simulator's truth, or from the position that the autopilot
+reports.
 """
 
 from __future__ import annotations
@@ -17,20 +19,23 @@ from typing import Any
 
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
-from companion.rehearsal import (
+from companion.service import Event, Service
+from companion.sim_session import (
     FIND,
     MISSION,
     RANGE_TOLERANCE_M,
     STAND,
     STOP_DISTANCE_M,
     TARGET_CLASS,
-    rehearsal_settings,
+    SimOptions,
+    SimProcess,
+    SimSessionError,
+    camera_of_autopilot,
+    session_settings,
     simulator,
     until_ready_to_arm,
     with_service,
 )
-from companion.service import Event, Service
-from mavlink_sim.testing import free_port
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import demo_world
 from vision.video_encoders import has_pyav
@@ -45,7 +50,10 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What happened. Ranges and landing are the simulator's truth, not our own estimate."""
+    """What happened. Ranges and landing are the simulator's truth, not our own estimate.
+
+    Of an autopilot that is not built in they are its own position and state (`truth` is "autopilot").
+    """
 
     success: bool
     found: bool
@@ -56,22 +64,26 @@ class Summary:
     detections_published: int
     detections_received: int
     seed: int
+    truth: str
     duration_s: float
     video: str
     failure: str | None
 
 
-def run_demo(output: Path, *, seed: int, limit_s: float, say: Say) -> Summary:
+def run_demo(output: Path, *, seed: int, limit_s: float, say: Say, vehicle_url: str | None = None) -> Summary:
     """Fly it. Leaves `flight.webm`, `summary.json`, `events.jsonl` and `truth.jsonl` in `output`.
 
+    Args:
+        vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the built-in vehicle.
+
     Raises:
-        RehearsalError: the simulator did not start, or its vehicle never became ready.
+        SimSessionError: the simulator did not start, or there is no vehicle that can be flown.
     """
     output.mkdir(parents=True, exist_ok=True)
     truth_path = output / "truth.jsonl"
     truth_path.unlink(missing_ok=True)
     started = time.monotonic()
-    flight = asyncio.run(_fly(output, truth_path, seed=seed, limit_s=limit_s, say=say))
+    flight = asyncio.run(_fly(output, truth_path, vehicle_url, seed=seed, limit_s=limit_s, say=say))
     final_range_m = _range_at(truth_path, flight.reached_ns, seed) if flight.reached_ns else None
     reached = final_range_m is not None and abs(final_range_m - STOP_DISTANCE_M) <= RANGE_TOLERANCE_M
     landed = flight.ended and _landed(truth_path)
@@ -93,6 +105,7 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say) -> Summary:
         detections_published=flight.published,
         detections_received=flight.received,
         seed=seed,
+        truth="simulator" if vehicle_url is None else "autopilot",
         duration_s=round(time.monotonic() - started, 1),
         video=VIDEO_NAME,
         failure=failure,
@@ -114,31 +127,72 @@ class _Flight:
     failure: str | None = None
 
 
-async def _fly(output: Path, truth_path: Path, *, seed: int, limit_s: float, say: Say) -> _Flight:
+async def _fly(
+    output: Path, truth_path: Path, vehicle_url: str | None, *, seed: int, limit_s: float, say: Say
+) -> _Flight:
     flight = _Flight()
-    camera = f"companion-demo-{os.getpid()}"
-    port = free_port()
-    log_path = output / "simulator.log"
-    async with simulator(port, camera, truth_path, seed, log_path, camera_rate_hz=_CAMERA_RATE_HZ):
-        say("the vehicle and its camera are running")
-        rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_FILM_RATE_HZ
-        settings = rehearsal_settings(port, camera, video=output / VIDEO_NAME, video_rate_hz=rate_hz)
+    options = SimOptions(
+        camera=f"companion-demo-{os.getpid()}",
+        seed=seed,
+        camera_rate_hz=_CAMERA_RATE_HZ,
+        truth_path=truth_path,
+        log_path=output / "simulator.log",
+    )
+    opened = simulator(options) if vehicle_url is None else camera_of_autopilot(vehicle_url, options)
+    rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_FILM_RATE_HZ
+    async with opened as vehicle:
+        settings = session_settings(
+            vehicle.port,
+            options.camera,
+            video=output / VIDEO_NAME,
+            video_rate_hz=rate_hz,
+            driver="mavsdk" if vehicle_url is None else "auto",
+            system_id=vehicle.system_id,
+        )
         with (output / "events.jsonl").open("w") as events:
 
             def on_event(event: Event) -> None:
                 events.write(json.dumps(asdict(event)) + "\n")
                 say(event.text)
 
+            # Made while the camera starts: what it imports would hold up the relay's messages later.
             service = Service(settings, on_event=on_event)
+            await vehicle.until_ready()
+            say("the vehicle and its camera are running")
             try:
-                async with asyncio.timeout(limit_s):
-                    await with_service(service, lambda: _watched_mission(service, flight))
-            except TimeoutError:
-                flight.failure = flight.failure or f"not finished in {limit_s:g} s"
+                await _until_flown(service, vehicle, flight, limit_s, say)
             finally:
                 flight.published = service.bus.published[DETECTIONS.name]
                 flight.frames = service.perception.status.frames
     return flight
+
+
+async def _until_flown(
+    service: Service, vehicle: SimProcess, flight: _Flight, limit_s: float, say: Say
+) -> None:
+    """Until the mission has ended, or the time is up.
+
+    A simulator or camera that ends in flight is a failure; the mission goes on, to bring the vehicle home.
+    """
+    deadline_s = time.monotonic() + limit_s
+    flying = asyncio.create_task(with_service(service, lambda: _watched_mission(service, flight)))
+    lost = asyncio.create_task(vehicle.until_lost())
+    try:
+        await asyncio.wait({flying, lost}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
+        if lost.done() and not flying.done():
+            flight.failure = str(lost.exception())
+            say(flight.failure)
+            if not service.ready:
+                raise SimSessionError(flight.failure)
+            await asyncio.wait({flying}, timeout=max(deadline_s - time.monotonic(), 0.0))
+        if not flying.done():
+            flight.failure = flight.failure or f"not finished in {limit_s:g} s"
+    finally:
+        for task in (flying, lost):
+            task.cancel()
+        ended = (await asyncio.gather(flying, lost, return_exceptions=True))[0]
+    if isinstance(ended, Exception):
+        raise ended
 
 
 async def _watched_mission(service: Service, flight: _Flight) -> None:
@@ -161,13 +215,16 @@ async def _mission(service: Service, flight: _Flight) -> None:
     await until_ready_to_arm(service)
     reply = await service.command(f"mission {MISSION}")
     if not reply["success"]:
-        flight.failure = reply["reason"]
+        flight.failure = flight.failure or reply["reason"]
     for step in reply.get("steps", ()):
         flight.found = flight.found or (step["title"] == FIND and step["success"])
         if step["title"] == STAND and step["success"]:
             # The range is taken at the end of the hold, when all is still.
             flight.reached_ns = step["ended_ns"]
-    flight.ended = not service.driver.state.armed
+    state = service.driver.state
+    flight.ended = not state.armed
+    if flight.failure is not None and state.armed:
+        flight.failure += f"; the vehicle is left armed, in {state.mode.value} mode"
 
 
 def _range_at(truth_path: Path, stamp_ns: int, seed: int) -> float | None:

@@ -81,7 +81,11 @@ def _check(name: str, value: float, low: float, high: float) -> None:
         _fail(f"--{name} {value:g}: expected {low:g} to {high:g}")
 
 
-@app.command()
+@app.command(
+    epilog="Further commands: mavlink-sim camera (the built-in world seen from any autopilot's vehicle), "
+    "mavlink-sim dataset (labelled pictures for training), mavlink-sim bench (speed of this machine). "
+    "Each has --help."
+)
 def simulate(
     onboard_port: Annotated[int, typer.Option(help="UDP port the onboard link sends to.")] = 14540,
     onboard_bind: Annotated[
@@ -320,6 +324,10 @@ def main() -> None:
             from mavlink_sim.datasets.cli import app as dataset_app
 
             code = dataset_app(sys.argv[2:], prog_name="mavlink-sim dataset", standalone_mode=False)
+        elif sys.argv[1:2] == ["camera"]:
+            from mavlink_sim.camera.cli import app as camera_app
+
+            code = camera_app(sys.argv[2:], prog_name="mavlink-sim camera", standalone_mode=False)
         elif sys.argv[1:2] == ["bench"]:
             from mavlink_sim.bench import app as bench_app
 

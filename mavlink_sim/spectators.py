@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flock import Flock, place_in_world
 from mavlink_sim.world.aircraft import identifier_offset
-from mavlink_sim.world.truth_file import TruthFile
+from mavlink_sim.world.truth_file import TruthFile, object_truth
 from vision.attitude import euler_from_quaternion
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from mavlink_sim.physics.contact import Collision
     from mavlink_sim.simulation import SimulationOptions
     from mavlink_sim.vehicle import Vehicle
-    from mavlink_sim.world.world import WorldObject
 
 TRUTH_RATE_HZ = 20.0
 CAMERA_CHECK_S = 0.5
@@ -100,6 +99,7 @@ class Spectators:
             outputs=options.camera_outputs,
             truth=options.camera_truth,
             most_others=self._flock.size - 1,
+            on_gimbal=self._vehicle.gimbal is not None,
         )
         resources.callback(self._camera.stop)
         self._camera.start()
@@ -163,7 +163,7 @@ class Spectators:
     def _objects(self, scene: Scene, simulated_s: float, stamp_ns: int) -> list[dict[str, Any]]:
         here = place_in_world(self._vehicle)
         others = self._flock.objects(self._vehicle, self._identifier_offset, stamp_ns)
-        return [_object_truth(thing, here) for thing in (*scene.objects_at(simulated_s), *others)]
+        return [object_truth(thing, here) for thing in (*scene.objects_at(simulated_s), *others)]
 
 
 def _collision_truth(collision: Collision | None) -> dict[str, Any] | None:
@@ -177,17 +177,3 @@ def _collision_truth(collision: Collision | None) -> dict[str, Any] | None:
         "standing": collision.standing,
         "crashed": collision.crashed,
     }
-
-
-def _object_truth(thing: WorldObject, position_ned_m: Vector) -> dict[str, Any]:
-    from mavlink_sim.world.world import range_to
-
-    entry: dict[str, Any] = {
-        "identifier": thing.identifier,
-        "class_name": thing.class_name,
-        "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
-        "range_m": round(float(range_to(thing, position_ned_m)), 3),
-    }
-    if thing.system_id is not None:
-        entry["system_id"] = thing.system_id
-    return entry

@@ -16,13 +16,15 @@ FLOORS = {
     "settings": 1,
     "vehicle": 2,
     "bus": 3,
+    "relay": 3,
     "guidance": 3,
     "operator": 4,
     "missions": 4,
     "perception": 4,
     "service": 5,
-    "rehearsal": 6,
+    "sim_session": 6,
     "demo": 7,
+    "play": 7,
     "detect": 7,
     "evaluate": 7,
     "models": 7,
@@ -54,7 +56,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.rotation",
     "vision.shared_frame",
 }
-MAY_IMPORT_SIMULATOR = {"rehearsal", "demo", "train", "bench", "models"}
+MAY_IMPORT_SIMULATOR = {"sim_session", "demo", "play", "train", "bench", "models"}
 
 
 @cache
@@ -108,7 +110,7 @@ def test_the_simulator_imports_only_geometry_and_frames_of_vision() -> None:
             assert strangers <= SIMULATOR_MAY_IMPORT | {"vision"}, f"{name} imports {strangers}"
 
 
-def test_only_rehearsal_demonstration_training_and_benchmarks_know_the_simulator() -> None:
+def test_only_sim_session_demonstration_training_and_benchmarks_know_the_simulator() -> None:
     for name, path in modules().items():
         if name.startswith("companion.") and any(m.startswith("mavlink_sim") for m in imports_of(name, path)):
             assert room(name) in MAY_IMPORT_SIMULATOR, f"{name} imports the simulator"

@@ -168,6 +168,14 @@ class CameraMount:
         return ned_from_body @ self._parent_from_optical
 
 
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """What a camera says of itself: its lens, and how it is mounted; None: it does not know that."""
+
+    model: CameraModel
+    mount: CameraMount | None = None
+
+
 @lru_cache(maxsize=16)
 def _parent_from_optical(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
     """Read-only: every camera that is mounted like this has it, several times a frame."""

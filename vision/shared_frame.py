@@ -19,6 +19,12 @@ Layout, in 64-bit words of the host's byte order; the slots begin at the second 
 | 8 | heartbeat: monotonic nanoseconds of the last write | |
 | 9 | 1 when the writer has closed | |
 | 10 | the writer's process number | |
+| 11 | calibration, bits: 1 lens, 2 mount, 4 stabilized, 8 on a gimbal | |
+| 12 | number of distortion coefficients: 0, 4 or 5 | |
+| 13 to 16 | fx, fy, cx, cy in pixels (float64, as all below) | |
+| 17 to 21 | distortion k1, k2, p1, p2, k3 (Brown–Conrady, OpenCV's order) | |
+| 22 to 24 | mount: forward, right, down of the body (FRD) in metres | |
+| 25 to 27 | mount: roll, pitch, yaw in radians | |
 
 A slot's image starts 64 bytes into it, its depth after the image, at a multiple of 64. The slot's lock is a
 sequence lock (Lameter 2005, "Effective synchronization on Linux/NUMA systems"): a reader copies and then
@@ -39,11 +45,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.frame import Frame
 
 SHARED_MEMORY_DIRECTORY = Path("/dev/shm")
 MAGIC = 0x4D43_4652_414D_4531
-VERSION = 1
+VERSION = 2
 PAGE = 4096
 SLOT_HEADER_BYTES = 64
 MAX_ATTEMPTS = 50
@@ -52,6 +59,9 @@ LOOK_FOR_SUCCESSOR_NS = 100_000_000
 _MAGIC, _VERSION, _WIDTH, _HEIGHT, _DEPTH, _SLOTS, _SLOT_BYTES, _WRITTEN, _HEARTBEAT, _CLOSED, _PID = range(
     11
 )
+_CALIBRATION, _COEFFICIENTS = 11, 12
+_LENS, _DISTORTION, _POSITION, _ROTATION = slice(13, 17), slice(17, 22), slice(22, 25), slice(25, 28)
+_HAS_LENS, _HAS_MOUNT, _STABILIZED, _ON_GIMBAL = 1, 2, 4, 8
 _LOCK, _SEQUENCE, _CAPTURED = range(3)
 
 Words = NDArray[np.uint64]
@@ -98,15 +108,64 @@ def slot_bytes(width: int, height: int, depth: bool) -> int:
     return _up(SLOT_HEADER_BYTES + _up(3 * pixels, 64) + (4 * pixels if depth else 0), PAGE)
 
 
+def _write_calibration(header: Words, calibration: CameraCalibration) -> None:
+    model, mount = calibration.model, calibration.mount
+    numbers = header.view(np.float64)
+    flags = _HAS_LENS
+    numbers[_LENS] = (model.fx, model.fy, model.cx, model.cy)
+    header[_COEFFICIENTS] = len(model.distortion)
+    numbers[_DISTORTION][: len(model.distortion)] = model.distortion
+    if mount is not None:
+        flags |= _HAS_MOUNT | (mount.levelled and _STABILIZED) | (mount.on_gimbal and _ON_GIMBAL)
+        numbers[_POSITION] = (mount.forward_m, mount.right_m, mount.down_m)
+        numbers[_ROTATION] = (mount.roll_rad, mount.pitch_rad, mount.yaw_rad)
+    header[_CALIBRATION] = flags
+
+
+def _read_calibration(header: Words, width: int, height: int) -> CameraCalibration | None:
+    """Raises ValueError for what no camera can be."""
+    flags, count = int(header[_CALIBRATION]), int(header[_COEFFICIENTS])
+    if not flags & _HAS_LENS:
+        return None
+    numbers = header.view(np.float64)
+    if not np.isfinite(numbers[_LENS.start : _ROTATION.stop]).all():
+        raise ValueError("the calibration has numbers that are not finite")
+    fx, fy, cx, cy = numbers[_LENS].tolist()
+    distortion = tuple(numbers[_DISTORTION].tolist()[:count])
+    mount = None
+    if flags & _HAS_MOUNT:
+        forward_m, right_m, down_m = numbers[_POSITION].tolist()
+        roll_rad, pitch_rad, yaw_rad = numbers[_ROTATION].tolist()
+        stabilized, on_gimbal = bool(flags & _STABILIZED), bool(flags & _ON_GIMBAL)
+        mount = CameraMount(forward_m, right_m, down_m, roll_rad, pitch_rad, yaw_rad, stabilized, on_gimbal)
+    return CameraCalibration(CameraModel(width, height, fx, fy, cx, cy, distortion), mount)
+
+
 class SharedFrameWriter:
     """Writes frames of one size under a name. One writer a name; the last one's leavings are taken over.
+
+    Args:
+        calibration: the camera's lens, of this size, and its mount, for whoever reads; None: not known.
 
     Raises:
         FileExistsError: another writer of that name is alive.
         ValueError: the name or a size cannot be.
     """
 
-    def __init__(self, name: str, width: int, height: int, depth: bool, slots: int = 4) -> None:
+    def __init__(
+        self,
+        name: str,
+        width: int,
+        height: int,
+        depth: bool,
+        slots: int = 4,
+        calibration: CameraCalibration | None = None,
+    ) -> None:
+        if calibration is not None and (calibration.model.width, calibration.model.height) != (width, height):
+            raise ValueError(
+                f"the calibration is of {calibration.model.width}x{calibration.model.height} pixels, "
+                f"the frames have {width}x{height}"
+            )
         if width <= 0 or height <= 0:
             raise ValueError(f"shared frames need a positive size, got {width}x{height}")
         if slots < 2:
@@ -126,6 +185,8 @@ class SharedFrameWriter:
             header = self._views.header
             header[[_VERSION, _WIDTH, _HEIGHT, _DEPTH]] = (VERSION, width, height, int(depth))
             header[[_SLOTS, _SLOT_BYTES, _PID]] = (slots, stride, os.getpid())
+            if calibration is not None:
+                _write_calibration(header, calibration)
             header[_HEARTBEAT] = time.monotonic_ns()
             header[_MAGIC] = MAGIC
             _move_into_place(draft, self._path)
@@ -253,6 +314,7 @@ class SharedFrameReader:
     Attributes:
         torn_reads: copies thrown away because the writer overtook them.
         reopened: how often a new writer's segment was taken up.
+        calibration: the lens and mount of the camera that writes; None: the writer does not know them.
     """
 
     def __init__(self, name: str) -> None:
@@ -273,10 +335,12 @@ class SharedFrameReader:
                 raise ValueError(f"{self._path} is no segment of shared frames: only {size} bytes")
             memory = mmap.mmap(file, size, prot=mmap.PROT_READ)
             header: list[int] = np.frombuffer(memory, np.uint64, PAGE // 8)[: _PID + 1].tolist()
-            if header[_MAGIC] != MAGIC or header[_VERSION] != VERSION:
+            if header[_MAGIC] != MAGIC:
+                raise ValueError(f"{self._path} is no segment of shared frames (magic {header[_MAGIC]:#x})")
+            if header[_VERSION] != VERSION:
                 raise ValueError(
-                    f"{self._path} is no segment of shared frames of version {VERSION} "
-                    f"(magic {header[_MAGIC]:#x}, version {header[_VERSION]})"
+                    f"{self._path} has layout version {header[_VERSION]}, expected {VERSION}: its writer "
+                    f"(process {header[_PID]}) is of another release; restart it with this one"
                 )
             width, height, depth, slots = (
                 header[_WIDTH],
@@ -290,6 +354,10 @@ class SharedFrameReader:
                     f"{self._path} is damaged: {size} bytes do not hold {slots} slots of {stride}"
                 )
             self._views = _Slots(memory, width, height, depth, slots)
+            try:
+                self.calibration = _read_calibration(self._views.header, width, height)
+            except ValueError as error:
+                raise ValueError(f"{self._path} is damaged: {error}") from error
         except BaseException:
             os.close(file)
             raise

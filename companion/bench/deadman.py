@@ -25,10 +25,16 @@ from rich.table import Table
 
 from companion.bus.client import client_settings, listen, open_client, send_command
 from companion.bus.topics import command_key
-from companion.rehearsal import ALTITUDE_M, RehearsalError, rehearsal_settings, simulator
 from companion.settings import Settings
 from companion.settings.reading import to_toml
-from mavlink_sim.testing import free_port
+from companion.sim_session import (
+    ALTITUDE_M,
+    SimOptions,
+    SimSessionError,
+    session_settings,
+    simulator,
+    with_lens,
+)
 
 SPEED_MPS = 2.0
 # The speed has begun to fall below this share of the median of the second before; standing is below this.
@@ -99,7 +105,7 @@ def measure_deadman(runs: int, faults: Sequence[Fault] = FAULTS) -> dict[str, di
     """Fly every fault so many times: its name → `braking_s`, `standing_s`, `failsafe_s` of each flight.
 
     Raises:
-        RehearsalError: the vehicle did not get as far as the fault.
+        SimSessionError: the vehicle did not get as far as the fault.
     """
     told: dict[str, dict[str, list[float | None]]] = {}
     for fault in faults:
@@ -133,11 +139,12 @@ def _longest(values: Sequence[float | None]) -> str:
 
 async def _measure(fault: Fault, seed: int) -> Reaction:
     with tempfile.TemporaryDirectory(prefix="companion-bench-") as name:
-        folder, port = Path(name), free_port()
+        folder = Path(name)
         camera = f"companion-bench-{os.getpid()}-{seed}"
         truth = folder / "truth.jsonl"
-        async with simulator(port, camera, truth, seed, folder / "simulator.log"):
-            settings = rehearsal_settings(port, camera)
+        async with simulator(SimOptions(camera, seed, truth_path=truth)) as vehicle:
+            await vehicle.until_ready()
+            settings = with_lens(session_settings(vehicle.port, camera))
             (folder / "companion.toml").write_text(to_toml(settings))
             with (folder / "service.log").open("wb") as log:
                 service = await asyncio.create_subprocess_exec(
@@ -173,7 +180,7 @@ def _fly_into(fault: Fault, settings: Settings, service_pid: int, truth: Path) -
         deadline_s = time.monotonic() + _COMMAND_S
         while not (statuses and _steady(truth)):
             if time.monotonic() > deadline_s:
-                raise RehearsalError(f"{fault.flown!r} was not flown steadily within {_COMMAND_S:g} s")
+                raise SimSessionError(f"{fault.flown!r} was not flown steadily within {_COMMAND_S:g} s")
             time.sleep(0.1)
         pid = service_pid if fault.process == "service" else statuses[-1]["perception"]["pid"]
         fault_ns = time.monotonic_ns()
@@ -189,7 +196,7 @@ def _command(session: zenoh.Session, settings: Settings, text: str, *, patient: 
         if reply["success"]:
             return
         if not patient or time.monotonic() > deadline_s:
-            raise RehearsalError(f"cannot measure in flight: {text}: {reply['reason']}")
+            raise SimSessionError(f"cannot measure in flight: {text}: {reply['reason']}")
         time.sleep(0.5)
 
 

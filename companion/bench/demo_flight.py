@@ -22,7 +22,8 @@ from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.sequence import SequenceBehaviour
-from companion.rehearsal import (
+from companion.settings import Settings
+from companion.sim_session import (
     FIND,
     MISSION,
     RANGE_TOLERANCE_M,
@@ -31,9 +32,9 @@ from companion.rehearsal import (
     STAND,
     STOP_DISTANCE_M,
     TARGET_CLASS,
-    rehearsal_settings,
+    session_settings,
+    with_lens,
 )
-from companion.settings import Settings
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo
 from mavlink_sim.lockstep import LockstepVehicle
@@ -75,8 +76,8 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     Args:
         synthetic: detections are made of the truth instead of drawn and looked for.
     """
-    settings = rehearsal_settings(14540, "lockstep")
     scene = scene_or_demo(None, seed)
+    settings = with_lens(session_settings(14540, "lockstep"), scene.camera)
     vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, parameters=dict(SIMULATOR_PARAMETERS))
     camera: Camera
     if synthetic:

@@ -12,17 +12,17 @@ from pathlib import Path
 
 from companion.bench.percentiles import percentiles
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
-from companion.rehearsal import (
+from companion.service import Service
+from companion.sim_session import (
     ALTITUDE_M,
-    RehearsalError,
-    rehearsal_settings,
+    SimOptions,
+    SimSessionError,
+    session_settings,
     simulator,
     until_ready_to_arm,
     with_service,
 )
-from companion.service import Service
 from companion.vehicle.setpoint import Setpoint
-from mavlink_sim.testing import free_port
 from vision.pipeline import PerceptionResult
 
 
@@ -61,7 +61,7 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
     until guidance has it, and `steer`, from there until the setpoint has left.
 
     Raises:
-        RehearsalError: the vehicle did not get into the air.
+        SimSessionError: the vehicle did not get into the air.
     """
     with tempfile.TemporaryDirectory(prefix="companion-bench-") as folder:
         return asyncio.run(_measure(Path(folder), seconds, driver))
@@ -70,14 +70,14 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
 async def _measure(folder: Path, seconds: float, driver: str) -> dict[str, object]:
     figures = _Figures()
     camera = f"companion-bench-{os.getpid()}"
-    port = free_port()
-    async with simulator(port, camera, folder / "truth.jsonl", 1, folder / "simulator.log"):
-        settings = rehearsal_settings(port, camera, driver=driver)
+    async with simulator(SimOptions(camera, seed=1)) as vehicle:
+        await vehicle.until_ready()
+        settings = session_settings(vehicle.port, camera, driver=driver)
         service = Service(settings)
         _measure_sent(service, figures)
         await with_service(service, lambda: _fly(service, seconds, figures))
     if not figures.latency_ms:
-        raise RehearsalError("no setpoint followed a detection message")
+        raise SimSessionError("no setpoint followed a detection message")
     return {
         "driver": driver,
         "setpoints": len(figures.latency_ms),
@@ -91,7 +91,7 @@ async def _fly(service: Service, seconds: float, figures: _Figures) -> None:
     await until_ready_to_arm(service)
     reply = await service.command(f"takeoff {ALTITUDE_M:g}")
     if not reply["success"]:
-        raise RehearsalError(f"cannot measure in flight: {reply['reason']}")
+        raise SimSessionError(f"cannot measure in flight: {reply['reason']}")
     figures.clear()
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):

@@ -71,11 +71,11 @@ def bench_latency(
     from companion.bench.latency import measure_latency
     from companion.bus.session import BusError
     from companion.perception.keeper import PerceptionStartError
-    from companion.rehearsal import RehearsalError
     from companion.settings.reading import ConfigurationError
+    from companion.sim_session import SimSessionError
     from companion.vehicle.driver import LinkError
 
-    with plain_errors(RehearsalError, ConfigurationError, LinkError, PerceptionStartError, BusError):
+    with plain_errors(SimSessionError, ConfigurationError, LinkError, PerceptionStartError, BusError):
         _print_figures(measure_latency(seconds, driver=driver), as_json)
 
 
@@ -103,9 +103,9 @@ def bench_deadman(
     from companion.bench.deadman import deadman_table, measure_deadman
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError
-    from companion.rehearsal import RehearsalError
+    from companion.sim_session import SimSessionError
 
-    with plain_errors(RehearsalError, BusError, NoAnswerError):
+    with plain_errors(SimSessionError, BusError, NoAnswerError):
         figures = measure_deadman(runs)
     if as_json:
         typer.echo(json.dumps(figures))

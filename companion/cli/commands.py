@@ -1,4 +1,4 @@
-"""The command line: `companion run|demo|detect|models|evaluate|send|mission|echo|config|train|bench`.
+"""The command line: `companion run|play|demo|detect|models|evaluate|send|mission|echo|config|train|bench`.
 
 Heavy parts are imported when their command runs, so that `companion send` starts at once.
 What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
@@ -25,8 +25,9 @@ from companion.cli.evaluate import evaluate
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors, settings_command
 from companion.cli.mission import mission
 from companion.cli.models import models
+from companion.cli.play import play
 from companion.settings import Settings
-from companion.settings.perception import DEFAULT_MODEL
+from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from vision.loading import uncollected
 
 if TYPE_CHECKING:
@@ -44,9 +45,11 @@ app = typer.Typer(
 app.add_typer(models, name="models")
 app.command()(evaluate)
 settings_command(app)(mission)
+settings_command(app)(play)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
+_DEMO_S, _DEMO_ELSEWHERE_S = 150.0, 300.0
 
 
 def _say_version(wanted: bool) -> None:
@@ -100,7 +103,8 @@ def _warn_drawn_scenes_only(looked_at: Iterable[tuple[str, str]]) -> None:
         looked_at: (address of a source, model) of each detector. The simulator's camera is read from shared
             memory; what comes from anywhere else may be a photograph.
     """
-    if any(model == DEFAULT_MODEL and not uri.startswith("shm://") for uri, model in looked_at):
+    real = [model for uri, model in looked_at if uri != NO_SOURCE and not uri.startswith("shm://")]
+    if DEFAULT_MODEL in real:
         typer.echo(
             f"companion: the bundled model '{DEFAULT_MODEL}' knows only scenes drawn by mavlink-sim and is "
             "wrong about real pictures; for those run `companion models pull yolo11n`, then use "
@@ -132,9 +136,16 @@ async def _run_until_signal(settings: Settings, make: type[Service]) -> None:
 
 @app.command()
 def demo(
-    duration: Annotated[float, typer.Option(min=20, help="give up after so many seconds")] = 150.0,
+    duration: Annotated[
+        float | None,
+        typer.Option(min=20, help="give up after so many seconds; default: 150, with --vehicle-url 300"),
+    ] = None,
     output: Annotated[Path, typer.Option(help="where the video and summary.json go")] = Path("demo-output"),
     seed: Annotated[int, typer.Option(min=0, help="of the world: where the car stands, the wind")] = 1,
+    vehicle_url: Annotated[
+        str | None,
+        typer.Option(help="fly the autopilot that sends to this UDP port instead: udpin://127.0.0.1:14540"),
+    ] = None,
     seeds: Annotated[
         str | None, typer.Option(help="fly many in lockstep instead, without a video: 1..50, or 3,7,9..12")
     ] = None,
@@ -144,14 +155,21 @@ def demo(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="with --seeds: one JSON object")] = False,
 ) -> None:
-    """Fly the built-in vehicle to a car it has to find: the whole way, from frames to landing."""
+    """Fly a vehicle to a car it has to find: the whole way, from frames to landing.
+
+    The vehicle is the built-in one. With --vehicle-url it is another autopilot, disarmed on the ground, and
+    the camera is drawn from the position it reports; its parameters are not changed.
+    """
+    if seeds is not None and vehicle_url is not None:
+        typer.echo("companion: --seeds flies the built-in vehicle; leave out --vehicle-url", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
     if seeds is not None:
         _fly_seeds(seeds, processes, synthetic=synthetic, as_json=as_json)
         return
     from companion.bus.session import BusError
     from companion.demo import run_demo
     from companion.perception.keeper import PerceptionStartError
-    from companion.rehearsal import RehearsalError
+    from companion.sim_session import SimSessionError
     from companion.vehicle.driver import LinkError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
@@ -159,13 +177,16 @@ def demo(
     service = logging.getLogger("companion.service")
     service.propagate = False
     service.addHandler(logging.NullHandler())
-    with plain_errors(RehearsalError, LinkError, PerceptionStartError, BusError, OSError):
-        summary = run_demo(output, seed=seed, limit_s=duration, say=_say_with_time())
+    with plain_errors(SimSessionError, LinkError, PerceptionStartError, BusError, OSError):
+        # PX4 comes home at 30 m (RTL_RETURN_ALT), and nobody's parameters are set unasked.
+        limit_s = duration or (_DEMO_S if vehicle_url is None else _DEMO_ELSEWHERE_S)
+        summary = run_demo(output, seed=seed, limit_s=limit_s, say=_say_with_time(), vehicle_url=vehicle_url)
     if not summary.success:
         typer.echo(f"the demonstration failed: {summary.failure}; see {output}", err=True)
         raise typer.Exit(EXIT_FAILED)
+    source = "simulator's truth" if summary.truth == "simulator" else "autopilot's own position"
     typer.echo(
-        f"found, reached (stopped {summary.final_range_m} m from the car, by the simulator's truth), landed; "
+        f"found, reached (stopped {summary.final_range_m} m from the car, by the {source}), landed; "
         f"{summary.detections_published} detection messages. Video: {output / summary.video}"
     )
 

@@ -45,7 +45,8 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
 def settings_command(app: typer.Typer) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a function a command of `app` that takes `--config` and every setting as a flag.
 
-    Its first parameter, `settings`, is what they come to, checked; the others are its own.
+    Its first parameter, `settings`, is what they come to, checked; `given`, if it has that, is what was given
+    as flags, key → text; the others are its own.
     """
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
@@ -80,12 +81,14 @@ def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
         overrides = {key: text for key, text in given.items() if text is not None}
         with plain_errors(ConfigurationError):
             settings = load_settings(config_file, overrides)
+        if "given" in own.parameters:
+            values["given"] = overrides
         command(settings, **values)
 
     parameters = [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
         for name, parameter in own.parameters.items()
-        if name != "settings"
+        if name not in ("settings", "given")
     ]
     parameters.append(
         _option("config_file", Path | None, "--config", help="settings file; else ./companion.toml")

@@ -65,10 +65,13 @@ class GimbalController:
 
     Args:
         own: system and component id of our messages.
+
+    Attributes:
+        mounting: may be replaced: a camera can bring its own mount, after the start.
     """
 
     def __init__(self, own: Address, mounting: GimbalMounting) -> None:
-        self._mounting = mounting
+        self.mounting = mounting
         self._control = GimbalControl(own)
         self._asked: tuple[int, GimbalAsk, int] | None = None
         self._find: int | None = None
@@ -88,21 +91,21 @@ class GimbalController:
         """What behaviours see of the gimbal, besides its state."""
         elsewhere = self._control.elsewhere(state.gimbal)
         undirected = ""
-        if self._mounting.carries_steering:
+        if self.mounting.carries_steering:
             why = "no gimbal answers" if state.gimbal is None else state.gimbal.why_not_looking(now_ns)
             undirected = "" if why is None else f"the gimbal that carries it: {why}"
         return GimbalSight(
-            self._mounting.carries_steering,
+            self.mounting.carries_steering,
             undirected,
             "" if elsewhere is None or self._control.holds(now_ns, state.gimbal) else address_text(elsewhere),
             self._control.problem if self._point is None else "",
-            self._mounting.camera_pitch_rad,
+            self.mounting.camera_pitch_rad,
         )
 
     def status(self, now_ns: int, state: VehicleState) -> dict[str, Any] | None:
         """For `status`; None where there is no gimbal and none is expected."""
         gimbal = state.gimbal
-        if gimbal is None and not self._mounting.carries_camera:
+        if gimbal is None and not self.mounting.carries_camera:
             return None
         pitch_rad = None if gimbal is None else gimbal.pitch_rad
         primary = None if gimbal is None else gimbal.primary_control
@@ -232,7 +235,7 @@ class GimbalController:
 
     def _watch(self, now_ns: int, state: VehicleState, out: OutputCollector) -> None:
         """Tell whether it is known where a camera's gimbal looks, and look for one that does not answer."""
-        if not self._mounting.carries_camera:
+        if not self.mounting.carries_camera:
             return
         gimbal = state.gimbal
         looking = gimbal is not None and gimbal.why_not_looking(now_ns) is None

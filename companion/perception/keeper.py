@@ -39,6 +39,7 @@ from companion.perception.timing import StageTimes
 from companion.perception.tracks import LiveTracks
 from companion.settings import Settings
 from vision.attitude import Quaternion
+from vision.camera_model import CameraCalibration
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -87,6 +88,7 @@ class PerceptionKeeper:
         on_result: called with every result. Its sequence numbers go on when a worker is replaced.
         on_event: called with a level (`info`, `warning`, `error`) and a line for people.
         on_preview: called with pictures, while `watch(True)`.
+        on_calibration: called when a worker is ready, with what its camera brings; None: nothing.
     """
 
     def __init__(
@@ -96,8 +98,10 @@ class PerceptionKeeper:
         on_result: Callable[[PerceptionResult], None],
         on_event: Callable[[str, str], None],
         on_preview: Callable[[Preview], None] = lambda _: None,
+        on_calibration: Callable[[CameraCalibration | None], None] = lambda _: None,
     ) -> None:
         self._settings = settings
+        self._on_calibration = on_calibration
         self._on_preview = on_preview
         self._watched = False
         self._on_result = on_result
@@ -424,6 +428,7 @@ class PerceptionKeeper:
     def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
         self._ready = ready
         self._state = PerceptionState.RUNNING
+        self._on_calibration(ready.calibration)
         self.send_hud(self._hud.lines, self._hud.highlight)
         process.watch(self._watched)
         if self._lost_s is not None:

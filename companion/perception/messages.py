@@ -16,6 +16,7 @@ from typing import Any
 
 from companion.settings import Settings
 from vision.attitude import Quaternion
+from vision.camera_model import CameraCalibration
 from vision.pipeline import PerceptionResult
 
 _LENGTH = struct.Struct(">I")
@@ -79,7 +80,7 @@ class Ready:
     """The model is loaded and the source has given its first frame.
 
     `model`, `precision`, which the network computes in, and `runtime`, what computes it, are None without a
-    detector. `reason`: why these, in words.
+    detector. `reason`: why these, in words. `calibration`: of the camera, where it brings one.
     """
 
     source: str
@@ -88,6 +89,7 @@ class Ready:
     precision: str | None
     runtime: str | None = None
     reason: str = ""
+    calibration: CameraCalibration | None = None
 
 
 @dataclass(frozen=True, slots=True)

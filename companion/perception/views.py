@@ -21,7 +21,10 @@ from companion.perception.keeper import PerceptionKeeper, PerceptionStartError, 
 from companion.perception.messages import Preview
 from companion.perception.pulse import START_S
 from companion.settings import DetectorSection, Section, Settings
+from companion.settings.calibration import adopt_calibration
+from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
+from vision.camera_model import CameraCalibration
 from vision.pipeline import PerceptionResult
 
 logger = logging.getLogger(__name__)
@@ -35,7 +38,7 @@ class View:
 
     Attributes:
         name: None for the first.
-        settings: with this view's own sections.
+        settings: with this view's own sections; `camera` as the camera brings it, where it does.
         newest: the newest result; None before the first.
         targets: where the newest result's objects are, after `place`.
         unplaced: why they have no place; empty if they have.
@@ -121,8 +124,12 @@ class WorkerView(View):
         on_result: Callable[[WorkerView, PerceptionResult], None],
         on_preview: Callable[[WorkerView, Preview], None],
         on_event: Callable[[str, str], None],
+        on_calibration: Callable[[], None],
     ) -> None:
         super().__init__(settings, name)
+        self._given = settings.camera
+        self._calibration: CameraCalibration | None = None
+        self._on_calibration = on_calibration
         self._on_result = on_result
         self._on_event = on_event
         self._gimbal_ns = 0
@@ -131,6 +138,7 @@ class WorkerView(View):
             on_result=self._on_report,
             on_event=self._tell,
             on_preview=lambda preview: on_preview(self, preview),
+            on_calibration=self._adopt,
         )
 
     @property
@@ -138,10 +146,16 @@ class WorkerView(View):
         return self.keeper.class_names or None
 
     def seeing(self, now_ns: int) -> bool:
-        return self.keeper.state is PerceptionState.FINISHED or super().seeing(now_ns)
+        return (
+            self.settings.source.uri == NO_SOURCE
+            or self.keeper.state is PerceptionState.FINISHED
+            or super().seeing(now_ns)
+        )
 
     async def start(self) -> None:
         """Start the worker. Raises PerceptionStartError; the view's name is in its message."""
+        if self.settings.source.uri == NO_SOURCE:
+            return
         try:
             await self.keeper.start()
         except PerceptionStartError as error:
@@ -170,6 +184,21 @@ class WorkerView(View):
             logger.exception("a detection message could not be used")
             self.targets, self.unplaced = (), f"{type(error).__name__}: {error}"
 
+    def _adopt(self, calibration: CameraCalibration | None) -> None:
+        """Go by what the camera brings; the worker does the same with its own copy of the settings."""
+        if calibration == self._calibration:
+            return
+        self._calibration = calibration
+        camera = self._given
+        if calibration is not None:
+            adopted = adopt_calibration(self._given, calibration)
+            camera = adopted.camera
+            if adopted.conflict:
+                key = "camera" if self.name is None else f"views.{self.name}.camera"
+                self._tell("warning", f"{key}: settings win over what the camera brings: {adopted.conflict}")
+        self.settings = self.settings.model_copy(update={"camera": camera})
+        self._on_calibration()
+
     def _tell(self, level: str, text: str) -> None:
         self._on_event(level, text if self.name is None else f"view {self.name}: {text}")
 
@@ -180,8 +209,12 @@ def open_views(
     on_result: Callable[[WorkerView, PerceptionResult], None],
     on_preview: Callable[[WorkerView, Preview], None],
     on_event: Callable[[str, str], None],
+    on_calibration: Callable[[], None],
 ) -> tuple[WorkerView, ...]:
-    """Every view there is, the first one first. None is started yet."""
+    """Every view there is, the first one first. None is started yet.
+
+    `on_calibration` is called after a view's `settings.camera` changed to what its camera brings.
+    """
     own_settings = {name: settings.of_view(name) for name in (None, *settings.views)}
     threads = threads_each([own.detector for own in own_settings.values()])
     shared = {f"shm://{source.share}" for source in settings.sources().values() if source.share}
@@ -195,7 +228,16 @@ def open_views(
             patient_s = own.source.open_timeout_s + START_S
             changes["source"] = own.source.model_copy(update={"open_timeout_s": patient_s})
         own = own.model_copy(update=changes)
-        views.append(WorkerView(own, name, on_result=on_result, on_preview=on_preview, on_event=on_event))
+        views.append(
+            WorkerView(
+                own,
+                name,
+                on_result=on_result,
+                on_preview=on_preview,
+                on_event=on_event,
+                on_calibration=on_calibration,
+            )
+        )
     return tuple(views)
 
 

@@ -39,6 +39,7 @@ from companion.perception.messages import (
 from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.preview import PreviewEncoder
 from companion.settings import Settings
+from companion.settings.calibration import adopt_calibration
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.pipeline import PerceptionResult, Pipeline
@@ -176,6 +177,9 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
         gc.collect()
         gc.freeze()
         outbox.put(_ready(settings, perception))
+        if perception.source.calibration is not None:
+            adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
+            settings = settings.model_copy(update={"camera": adopted})
         pipeline = build_pipeline(
             settings,
             perception.source,
@@ -233,9 +237,9 @@ def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Pe
 
 
 def _ready(settings: Settings, perception: Perception) -> Ready:
-    detector = perception.detector
+    detector, calibration = perception.detector, perception.source.calibration
     if detector is None:
-        return Ready(perception.source.uri, None, (), None)
+        return Ready(perception.source.uri, None, (), None, calibration=calibration)
     return Ready(
         perception.source.uri,
         settings.detector.model,
@@ -243,6 +247,7 @@ def _ready(settings: Settings, perception: Perception) -> Ready:
         detector.precision,
         detector.runtime,
         f"{detector.runtime_reason}; {detector.precision}: {detector.precision_reason}",
+        calibration,
     )
 
 

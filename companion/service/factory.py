@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from companion.guidance.battery import BatteryMinimum
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.envelope import Limits
 from companion.guidance.gimbal_controller import GimbalMounting
 from companion.guidance.obstacles import ObstacleRules
-from companion.settings import Settings
+from companion.settings import CameraSection, Settings
 from companion.vehicle.driver import Driver
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.gimbal import Address
@@ -36,7 +36,6 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
     """What guidance keeps to. `own_address`: system and component id of our messages."""
     guidance = settings.guidance
     cameras = [settings.of_view(name).camera for name in (None, *settings.views)]
-    steering = settings.of_view(guidance.view).camera
     return GuidanceOptions(
         limits=limits_of(settings),
         own_address=own_address,
@@ -44,11 +43,16 @@ def guidance_options(settings: Settings, own_address: Address) -> GuidanceOption
         battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
         obstacles=ObstacleRules(guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps),
         perception_max_age_s=guidance.perception_max_age_s,
-        gimbal=GimbalMounting(
-            carries_camera=any(camera.gimbal for camera in cameras),
-            carries_steering=steering.gimbal,
-            camera_pitch_rad=steering.mount().pitch_rad,
-        ),
+        gimbal=gimbal_mounting(cameras, settings.of_view(guidance.view).camera),
+    )
+
+
+def gimbal_mounting(cameras: Sequence[CameraSection], steering: CameraSection) -> GimbalMounting:
+    """How the gimbal stands to the cameras of all views and to the one that steers."""
+    return GimbalMounting(
+        carries_camera=any(camera.gimbal for camera in cameras),
+        carries_steering=steering.gimbal,
+        camera_pitch_rad=steering.mount().pitch_rad,
     )
 
 

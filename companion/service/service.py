@@ -22,7 +22,7 @@ from companion.operator.metrics import MetricsServer
 from companion.perception.keeper import PerceptionKeeper
 from companion.perception.views import WorkerView, open_views
 from companion.service.event import Event
-from companion.service.factory import driver_of, guidance_options, streamer_of
+from companion.service.factory import driver_of, gimbal_mounting, guidance_options, streamer_of
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
@@ -66,6 +66,7 @@ class Service:
             on_result=self._on_result,
             on_preview=lambda view, preview: self._publisher.publish_preview(view, preview),
             on_event=self._event,
+            on_calibration=self._on_calibration,
         )
         self.inputs = InputAssembler(settings, self.views, self._event)
         self.bus = Bus(
@@ -224,6 +225,10 @@ class Service:
         self.inputs.on_state(state)
         for view in self.views:
             view.send_state(state, self.inputs.history)
+
+    def _on_calibration(self) -> None:
+        cameras = [view.settings.camera for view in self.views]
+        self.guidance.gimbal.mounting = gimbal_mounting(cameras, self.inputs.steering.settings.camera)
 
     def _on_result(self, view: WorkerView, result: PerceptionResult) -> None:
         """Work out where what a view saw is; publish it, when it has been steered by."""

@@ -6,8 +6,16 @@ after the room they are for.
 """
 
 from companion.settings.bus import ZenohSection
-from companion.settings.perception import DetectorSection, PreviewSection, SourceSection
+from companion.settings.perception import CameraSection, DetectorSection, PreviewSection, SourceSection
 from companion.settings.section import Section
 from companion.settings.settings import Settings
 
-__all__ = ["DetectorSection", "PreviewSection", "Section", "Settings", "SourceSection", "ZenohSection"]
+__all__ = [
+    "CameraSection",
+    "DetectorSection",
+    "PreviewSection",
+    "Section",
+    "Settings",
+    "SourceSection",
+    "ZenohSection",
+]

@@ -19,13 +19,15 @@ from vision.tracking.tracks import TrackerSettings
 
 # What `vision.detector` calls the bundled model. Named here too, as settings are read without a detector.
 DEFAULT_MODEL = "default"
+# As `source.uri`: there is no camera, and no perception worker.
+NO_SOURCE = "none"
 
 
 class SourceSection(Section):
     """Where frames come from."""
 
     uri: Annotated[str, Field(min_length=1)] = "/dev/video0"
-    """a video file, a folder of images, /dev/video0, a FIFO or - (standard input), rtsp://, http:// or udp://"""
+    """video file, folder of images, /dev/video0, FIFO, - (standard input), rtsp://, http://, udp://; none"""
     width: Annotated[int | None, Field(ge=16, le=16384)] = None
     """of a frame, pixels; asked of a camera, and needed for raw frames from a pipe"""
     height: Annotated[int | None, Field(ge=16, le=16384)] = None

@@ -33,7 +33,7 @@ from mavlink_sim.camera.video_outputs import check_output, open_output
 from mavlink_sim.world.aircraft import Aircraft
 from mavlink_sim.world.truth_file import TruthFile
 from mavlink_sim.world.world import World
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 from vision.shared_frame import remove_leavings
 
@@ -43,6 +43,8 @@ POSE = struct.Struct("=3d4dqd3dq")
 """Position NED in metres, quaternion (w, x, y, z) of `ned_from_body`, CLOCK_MONOTONIC nanoseconds, the
 scene's time in seconds, the camera's roll, pitch, yaw on the body (not numbers: as it is mounted), and the
 number of the other aircraft's poses (-1: there are none)."""
+OUTPUT_FAILED = 2
+"""Exit code of the process: one of its outputs could not be opened."""
 EARLY_SHARE = 0.3
 """A pose that comes this share of a period early is drawn at once: the poses' own rhythm jitters."""
 
@@ -55,12 +57,16 @@ def run_camera(
     poses: Connection,
     ready: Event,
     shared_poses: SharedPoses | None = None,
+    written: Event | None = None,
+    on_gimbal: bool = False,
 ) -> None:
     """Draw a frame for the newest pose, at most `rate_hz` times a second, until `poses` closes.
 
     The frames' `captured_ns` is the stamp of the pose that they were drawn from. The outputs open when the
     ground has been painted and the first frame can be drawn without delay. `shared_poses` holds the poses of
-    the other aircraft; None if there are none.
+    the other aircraft; None if there are none. `written` is set when the first frame is at its outputs.
+    `on_gimbal`: the poses say where the camera looks, and readers get the mount of a camera on a gimbal.
+    An output that cannot be opened is one line on standard error and exit code 2.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process stops this one, by the pipe
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # or by this: painting does not look at the pipe
@@ -71,13 +77,20 @@ def run_camera(
     camera = SimulatedCamera(scene)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # from here on outputs have to be closed: the pipe it is
     with ExitStack() as resources:
-        sinks = [open_output(address, model.width, model.height, rate_hz) for address in outputs]
-        for sink in sinks:
-            resources.callback(sink.close)
-        lines = None
-        if truth is not None:
-            lines = TruthFile(truth)
-            resources.callback(lines.close)
+        level = replace(mount, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, on_gimbal=True)
+        calibration = CameraCalibration(model, level if on_gimbal else mount)
+        sinks, lines = [], None
+        try:
+            for address in outputs:
+                sink = open_output(address, model.width, model.height, rate_hz, calibration=calibration)
+                sinks.append(sink)
+                resources.callback(sink.close)
+            if truth is not None:
+                lines = TruthFile(truth)
+                resources.callback(lines.close)
+        except (OSError, ValueError, ModuleNotFoundError) as error:
+            print(f"camera: {error}", file=sys.stderr, flush=True)
+            sys.exit(OUTPUT_FAILED)
         ready.set()
         period_s = 1.0 / rate_hz
         due_s = time.monotonic()
@@ -89,6 +102,8 @@ def run_camera(
                 captured = on_the_way.popleft()
                 for sink in sinks:
                     sink.write(captured.frame)
+                if written is not None:
+                    written.set()
                 if lines is not None:
                     why = lines.write(truth_line(captured))
                     if why is not None:
@@ -148,6 +163,7 @@ class CameraProcess:
         outputs: further addresses of `video_outputs`.
         truth: a file for what is really in each frame, a line of JSON each.
         most_others: how many other aircraft there can be to see.
+        on_gimbal: every pose comes with the camera's angles (`camera_rpy_rad`).
 
     Raises:
         ValueError: a rate or an address that cannot be, or no output at all.
@@ -163,6 +179,7 @@ class CameraProcess:
         outputs: Sequence[str] = (),
         truth: Path | None = None,
         most_others: int = 0,
+        on_gimbal: bool = False,
     ) -> None:
         if not rate_hz > 0.0:
             raise ValueError(f"the camera's rate must be positive, got {rate_hz} Hz")
@@ -176,11 +193,21 @@ class CameraProcess:
         self._receiving, self._sending = context.Pipe(duplex=False)
         # A camera that hangs must not hang the vehicle: a full pipe drops the pose instead.
         os.set_blocking(self._sending.fileno(), False)
-        self._ready = context.Event()
+        self._ready, self._written = context.Event(), context.Event()
         self._shared_poses = SharedPoses(context, most_others) if most_others > 0 else None
         self._process = context.Process(
             target=run_camera,
-            args=(scene, rate_hz, addresses, truth, self._receiving, self._ready, self._shared_poses),
+            args=(
+                scene,
+                rate_hz,
+                addresses,
+                truth,
+                self._receiving,
+                self._ready,
+                self._shared_poses,
+                self._written,
+                on_gimbal,
+            ),
             name="mavlink-sim camera",
             daemon=True,
         )
@@ -207,6 +234,16 @@ class CameraProcess:
     def ready(self) -> bool:
         """Whether its outputs are open and the first frame can be drawn without delay."""
         return self._ready.is_set()
+
+    @property
+    def written(self) -> bool:
+        """Whether the first frame is at its outputs."""
+        return self._written.is_set()
+
+    @property
+    def exit_code(self) -> int | None:
+        """Of the process; None while it runs. `OUTPUT_FAILED`: it said which output cannot be opened."""
+        return self._process.exitcode
 
     @property
     def pid(self) -> int | None:

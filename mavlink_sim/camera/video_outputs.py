@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
+    from vision.camera_model import CameraCalibration
     from vision.frame import Frame
 
 SCHEMES = ("shm://NAME", "pipe:PATH", "pipe:-", "http://HOST:PORT", "rtp://HOST:PORT")
@@ -59,13 +60,22 @@ def _host_and_port(address: str) -> tuple[str, int]:
     return parts.hostname, port
 
 
-def open_output(address: str, width: int, height: int, rate_hz: float, *, depth: bool = True) -> FrameOutput:
+def open_output(
+    address: str,
+    width: int,
+    height: int,
+    rate_hz: float,
+    *,
+    depth: bool = True,
+    calibration: CameraCalibration | None = None,
+) -> FrameOutput:
     """The output at an address (see the module's table).
 
     Args:
         width, height: of the frames to come.
         rate_hz: how many a second, as an encoder needs to know.
         depth: whether the frames bear depth; only shared memory carries it on.
+        calibration: the camera's lens and mount; only shared memory carries them on.
 
     Raises:
         ValueError: an address that cannot be.
@@ -77,7 +87,9 @@ def open_output(address: str, width: int, height: int, rate_hz: float, *, depth:
     if parts.scheme == "shm":
         from vision.shared_frame import SharedFrameWriter
 
-        return SharedFrameWriter(parts.netloc + parts.path, width, height, depth=depth)
+        return SharedFrameWriter(
+            parts.netloc + parts.path, width, height, depth=depth, calibration=calibration
+        )
     if parts.scheme == "pipe":
         from mavlink_sim.camera.pipe_output import PipeOutput
 

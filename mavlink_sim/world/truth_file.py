@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mavlink_sim.world.world import WorldObject
 
 
 class TruthFile:
@@ -36,3 +40,18 @@ class TruthFile:
         if file is not None:
             with suppress(OSError):  # what is left in its buffer has nowhere to go
                 file.close()
+
+
+def object_truth(thing: WorldObject, position_ned_m: Sequence[float]) -> dict[str, Any]:
+    """An object as the truth tells it, with its horizontal range from a vehicle at (3,) NED metres."""
+    from mavlink_sim.world.world import range_to
+
+    entry: dict[str, Any] = {
+        "identifier": thing.identifier,
+        "class_name": thing.class_name,
+        "position_ned_m": [round(float(value), 3) for value in thing.position_ned_m],
+        "range_m": round(float(range_to(thing, position_ned_m)), 3),
+    }
+    if thing.system_id is not None:
+        entry["system_id"] = thing.system_id
+    return entry

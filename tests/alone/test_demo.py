@@ -9,19 +9,58 @@ from pathlib import Path
 
 import cv2
 import pytest
+from pymavlink import mavutil
+
+from mavlink_sim.testing import running_simulator, vehicle
+
+URL_LIMIT_S = 150
 
 
-@pytest.mark.timeout(240)
-def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path) -> None:
-    output = tmp_path / "demo"
-    done = subprocess.run(
-        [sys.executable, "-m", "companion.cli", "demo", "--output", str(output), "--duration", "150"],
-        cwd=tmp_path,
+def demo(output: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    """`companion demo` as a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "companion.cli", "demo", "--output", str(output), *flags],
+        cwd=output.parent,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
         check=False,
     )
+
+
+@pytest.mark.timeout(240)
+def test_demonstration_flies_an_autopilot_at_a_url(tmp_path: Path) -> None:
+    """Any autopilot: here a built-in vehicle that has no camera of its own, with system id 7."""
+    output = tmp_path / "demo"
+    parameters = {"RTL_RETURN_ALT": 5.0}
+    with running_simulator(seed=3, system_id=7, parameters=parameters) as simulator:
+        url = f"udpin://127.0.0.1:{simulator.onboard_port}"
+        done = demo(output, "--vehicle-url", url, "--duration", str(URL_LIMIT_S))
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = json.loads((output / "summary.json").read_text())
+    assert summary["success"]
+    assert summary["truth"] == "autopilot"
+    assert abs(summary["final_range_m"] - 5.0) <= 0.5
+    assert (output / summary["video"]).stat().st_size > 100_000
+
+
+def test_demonstration_refuses_an_armed_autopilot(tmp_path: Path) -> None:
+    with vehicle(parameters={"COM_DISARM_PRFLT": -1.0}) as simulator:
+        gcs = mavutil.mavlink_connection(simulator.gcs_pymavlink_device, source_system=245)
+        gcs.wait_heartbeat()
+        gcs.arducopter_arm()
+        gcs.motors_armed_wait()
+        done = demo(tmp_path / "demo", "--vehicle-url", f"udpin://127.0.0.1:{simulator.onboard_port}")
+        gcs.close()
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "armed" in line
+
+
+@pytest.mark.timeout(240)
+def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Path) -> None:
+    output = tmp_path / "demo"
+    done = demo(output, "--duration", "150")
     assert done.returncode == 0, done.stdout + done.stderr
     # What the service warns of (a film with gaps, on a busy machine) is said once, with its time.
     told = [line for line in done.stdout.splitlines() if "missing" in line]

@@ -26,13 +26,14 @@ LINES_NOTED = 40
 
 
 class ServiceProcess:
-    """A running `companion run`. `lines` is what it said on standard error so far."""
+    """A running `companion run` or `play`. `lines` is what it printed so far, where standard error goes."""
 
     def __init__(self, process: subprocess.Popen[bytes], endpoint: str) -> None:
         self.process = process
         self.endpoint = endpoint
         self.lines: list[str] = []
         self._queue: queue.Queue[str | None] = queue.Queue()
+        self.output = process.stderr or process.stdout
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -41,8 +42,8 @@ class ServiceProcess:
         return self.process.pid
 
     def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
+        assert self.output is not None
+        for line in self.output:
             self._queue.put(line.decode(errors="replace").rstrip("\n"))
         self._queue.put(None)
 

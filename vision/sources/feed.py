@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.camera_model import CameraCalibration
 from vision.sources.source import EndOfStream
 
 
@@ -46,12 +47,14 @@ class Feed(ABC):
         unreadable: pictures that could not be decoded so far.
         silence_is_loss: whether opening it again may help when nothing comes for a while.
         interval_s: between two pictures of a recording, where there are no two to tell.
+        calibration: the camera's lens and mount, where it brings them.
     """
 
     total_frames: int | None = None
     unreadable: int = 0
     silence_is_loss: bool = True
     interval_s: float = 1 / 30
+    calibration: CameraCalibration | None = None
 
     @abstractmethod
     def read(self, timeout_s: float) -> Picture | None:

@@ -13,7 +13,14 @@ from dataclasses import replace
 
 from vision.frame import Frame
 from vision.sources.feed import Feed, FeedLost, OpenFeed, Picture
-from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
+from vision.sources.source import (
+    CameraChangedError,
+    EndOfStream,
+    Source,
+    SourceError,
+    SourceSettings,
+    SourceStatistics,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -174,7 +181,7 @@ class LatestSource(Source):
                 came_back = self._lost_since_s is None and self._opened
                 self._say_lost(str(end) or "it ended")
             except SourceError as error:
-                if not self._opened:
+                if not self._opened or isinstance(error, CameraChangedError):
                     raise
                 self._say_lost(str(error))
             if came_back:
@@ -204,6 +211,11 @@ class LatestSource(Source):
         with self._changed:
             self._feed = feed
         try:
+            if self._opened and feed.calibration != self.calibration:
+                raise CameraChangedError(
+                    f"{self.uri}: the camera came back with another lens or mount; open the source again"
+                )
+            self.calibration = feed.calibration
             self._pump(feed)
         finally:
             with self._changed:

@@ -34,12 +34,18 @@ class SharedFrameFeed(Feed):
             raise FeedLost(f"no frames in the shared memory {name!r} ({error})") from error
         self._stale_ns = round(settings.read_timeout_s * 1e9)
         self._after: int | None = None
+        self.calibration = self._reader.calibration
 
     def read(self, timeout_s: float) -> Picture | None:
         deadline_s = time.monotonic() + timeout_s
         while True:
             looked_ns = time.monotonic_ns()
-            frame = self._reader.latest(self._after)
+            try:
+                frame = self._reader.latest(self._after)
+            except ValueError as error:  # a new writer of another release
+                raise FeedLost(str(error)) from error
+            if self._reader.calibration != self.calibration:
+                raise FeedLost("another camera writes there now")
             if frame is not None and self._after is None and self._is_stale(frame):
                 # What a dead writer left behind is no sign of life.
                 self._after = frame.sequence

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 
 RAW_PIXEL_FORMATS = {"bgr24": 3, "rgb24": 3, "gray8": 1}
@@ -18,6 +19,10 @@ PIPE_PIXEL_FORMATS = (*RAW_PIXEL_FORMATS, "y4m", "mjpeg")
 
 class SourceError(Exception):
     """A source that cannot be opened, or cannot go on. The text is one line that says what to do."""
+
+
+class CameraChangedError(SourceError):
+    """The source goes on with another lens or mount than it began with; open it again to use that."""
 
 
 class EndOfStream(Exception):  # noqa: N818 - an end, not an error
@@ -110,11 +115,14 @@ class Source(ABC):
         live: True where the newest frame wins; False where every frame is given.
         total_frames: how many frames there will be, None where nobody knows. A video file's own claim may be
             a little off.
+        calibration: lens and mount, where the camera brings them (shared memory can); it never changes while
+            the source is open.
     """
 
     uri: str
     live: bool
     total_frames: int | None = None
+    calibration: CameraCalibration | None = None
 
     @abstractmethod
     def read(self, timeout_s: float = 1.0) -> Frame | None:

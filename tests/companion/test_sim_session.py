@@ -1,4 +1,4 @@
-"""What a rehearsal's caller hears of it."""
+"""How a service and the work with it end each other."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import pytest
 
-from companion.rehearsal import RehearsalError, with_service
 from companion.service import Service
+from companion.sim_session import SimSessionError, with_service
 
 
 class ServiceThatEnds:
@@ -53,9 +53,9 @@ async def test_a_service_that_fails_while_it_ends_is_no_success() -> None:
 
 async def test_what_failed_first_is_what_is_told() -> None:
     async def work() -> None:
-        raise RehearsalError("the vehicle was not ready to arm")
+        raise SimSessionError("the vehicle was not ready to arm")
 
-    with pytest.raises(RehearsalError, match="not ready to arm"):
+    with pytest.raises(SimSessionError, match="not ready to arm"):
         await flown(ServiceThatEnds(OSError("the disk is full")), work)
 
 
@@ -63,7 +63,7 @@ async def test_a_service_that_ends_too_early_ends_the_work() -> None:
     async def work() -> None:
         await asyncio.Event().wait()
 
-    with pytest.raises(RehearsalError, match="the service ended before its work was done"):
+    with pytest.raises(SimSessionError, match="the service ended before its work was done"):
         await flown(ServiceThatEnds(None, early=True), work)
     with pytest.raises(OSError, match="no such bus"):
         await flown(ServiceThatEnds(OSError("no such bus"), early=True), work)

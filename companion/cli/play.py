@@ -1,0 +1,77 @@
+"""The command line of `companion play`."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import typer
+
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.settings import Settings
+from vision.loading import uncollected
+
+EXIT_FAILED = 1
+# What play brings itself.
+_OWN = ("source.", "camera.")
+
+
+def play(
+    settings: Settings,
+    given: Mapping[str, str],
+    scene: Annotated[
+        str | None, typer.Option(help="a scene file, or an example's name: village, obstacle_course…")
+    ] = None,
+    vehicles: Annotated[
+        int,
+        typer.Option(min=1, max=8, help="built-in vehicles, with a service each; the first has the camera"),
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="of the world and the wind")] = 1,
+    autopilot: Annotated[
+        Literal["px4", "ardupilot"], typer.Option(help="firmware that the built-in vehicle emulates")
+    ] = "px4",
+) -> None:
+    """Start a vehicle, its camera and the service together, ready for commands until Ctrl-C.
+
+    With --vehicle-url the vehicle is the autopilot that sends to that UDP port, and a camera in the built-in
+    world is drawn from its pose.
+    """
+    if taken := [key for key in given if key.startswith(_OWN)]:
+        typer.echo(f"companion: {taken[0]}: play brings its own camera; leave it out", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT)
+    url = given.get("vehicle.url")
+    if url is not None and vehicles > 1:
+        typer.echo(
+            f"companion: --vehicles {vehicles}: with --vehicle-url there is one vehicle; leave it out",
+            err=True,
+        )
+        raise typer.Exit(EXIT_BAD_INPUT)
+    started_s = time.monotonic()
+    with uncollected():
+        from companion.bus.session import BusError
+        from companion.operator.metrics import MetricsError
+        from companion.perception.keeper import PerceptionStartError
+        from companion.play import PlayOptions, SimulationLostError
+        from companion.play import play as start
+        from companion.sim_session import SimSessionError
+        from companion.vehicle.driver import LinkError
+
+    level = settings.log.level.upper() if "log.level" in given else "WARNING"
+    logging.basicConfig(level=level, format="companion: %(message)s", stream=sys.stderr)
+    # What the service logs is printed here with its time: once is enough.
+    service = logging.getLogger("companion.service")
+    service.propagate = False
+    service.addHandler(logging.NullHandler())
+    options = PlayOptions(scene, seed, vehicles, url, autopilot)
+    errors = (SimSessionError, LinkError, PerceptionStartError, BusError, MetricsError)
+    with plain_errors(*errors):
+        try:
+            start(
+                settings, options, lambda text: typer.echo(f"{time.monotonic() - started_s:6.1f} s  {text}")
+            )
+        except SimulationLostError as error:
+            typer.echo(f"companion: {error}", err=True)
+            raise typer.Exit(EXIT_FAILED) from error

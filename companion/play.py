@@ -1,0 +1,233 @@
+"""Vehicle, camera and service together, ready for commands until Ctrl-C: `companion play`."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from typing import Any
+
+from companion.guidance import grammar
+from companion.operator.console import run_console, terminal_is_free
+from companion.service import Event, Service
+from companion.settings import Settings
+from companion.settings.perception import NO_SOURCE
+from companion.sim_session import (
+    SimOptions,
+    SimProcess,
+    SimSessionError,
+    camera_of_autopilot,
+    session_settings,
+    simulator,
+    with_services,
+)
+from mavlink_sim.camera.scene import Scene
+from mavlink_sim.camera.scene_file import SceneError, scene_or_demo
+from mavlink_sim.testing import free_port
+
+Say = Callable[[str], None]
+
+MAX_VEHICLES = 8
+_GCS_PORT = 14550  # where ground stations listen
+_TCP = "tcp/"
+
+
+@dataclass(frozen=True, slots=True)
+class PlayOptions:
+    """What is started.
+
+    Attributes:
+        scene: a scene file or an example's name; None: the demo world.
+        seed: of the world, and of the built-in vehicles.
+        vehicles: number of built-in vehicles, with a service each; the first has the camera.
+        vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the built-in vehicle.
+        autopilot: firmware that the built-in vehicles emulate: px4 or ardupilot.
+    """
+
+    scene: str | None = None
+    seed: int = 1
+    vehicles: int = 1
+    vehicle_url: str | None = None
+    autopilot: str = "px4"
+
+
+class SimulationLostError(SimSessionError):
+    """The simulator or its camera ended while it was in use."""
+
+
+def play(settings: Settings, options: PlayOptions, say: Say) -> None:
+    """Start all, print what to type, and take commands until SIGINT, SIGTERM or `quit`.
+
+    Raises:
+        SimSessionError: it cannot start, for example without such a scene.
+        SimulationLostError: the simulator ended while it was in use.
+        LinkError, PerceptionStartError, BusError: as `Service.run`.
+    """
+    _check_zenoh_ports(settings)
+    try:
+        scene = scene_or_demo(options.scene, options.seed)
+    except SceneError as error:
+        raise SimSessionError(str(error)) from error
+    asyncio.run(_play(settings, options, scene, say))
+
+
+def _check_zenoh_ports(settings: Settings) -> None:
+    """Before anything is started: the usual reason why it cannot be is a `companion` that still runs."""
+    for endpoint in settings.zenoh.listen if settings.zenoh.mode == "peer" else ():
+        host, _, port = endpoint.removeprefix(_TCP).rpartition(":")
+        if not endpoint.startswith(_TCP) or not port.isdigit():
+            continue
+        family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host.strip("[]"), int(port)))
+            except OSError as error:
+                raise SimSessionError(
+                    f"{endpoint}: {error.strerror}; another companion play or companion run listens there: "
+                    "end it, or give this one --zenoh-listen tcp/127.0.0.1:PORT"
+                ) from error
+
+
+async def _play(settings: Settings, options: PlayOptions, scene: Scene, say: Say) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    starting = asyncio.create_task(_until_stopped(settings, options, scene, say, stop))
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait({starting, stopping}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        stopping.cancel()
+        if not starting.done():
+            starting.cancel()
+        ended = (await asyncio.gather(starting, return_exceptions=True))[0]
+    if isinstance(ended, Exception):
+        raise ended
+
+
+async def _until_stopped(
+    settings: Settings, options: PlayOptions, scene: Scene, say: Say, stop: asyncio.Event
+) -> None:
+    async with _opened(options) as vehicle:
+        services = _services(settings, options, vehicle, say)
+        ready = False
+
+        async def work() -> None:
+            nonlocal ready
+            await vehicle.until_ready()
+            ready = True
+            _say_what_to_type(services, scene, say)
+            if terminal_is_free(settings.source.uri):
+                await run_console(
+                    _commands_of(services), stop.set, grammar.describe(), lambda level, text: say(text)
+                )
+            await stop.wait()
+
+        running = asyncio.create_task(with_services(services, work))
+        lost = asyncio.create_task(vehicle.until_lost())
+        try:
+            await asyncio.wait({running, lost}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            # The services end first: they leave a vehicle that still flies in its hold.
+            running.cancel()
+            lost.cancel()
+            service_end, loss = await asyncio.gather(running, lost, return_exceptions=True)
+        if isinstance(loss, SimSessionError):
+            raise SimulationLostError(str(loss)) if ready else loss
+        if isinstance(service_end, Exception):
+            raise service_end
+
+
+def _opened(options: PlayOptions) -> AbstractAsyncContextManager[SimProcess]:
+    camera = SimOptions(
+        camera=f"companion-play-{os.getpid()}",
+        seed=options.seed,
+        scene=options.scene,
+        camera_rate_hz=None if options.scene else 20.0,
+        vehicles=options.vehicles,
+        autopilot=options.autopilot,
+        gcs_port=_GCS_PORT,
+    )
+    if options.vehicle_url is None:
+        return simulator(camera)
+    return camera_of_autopilot(options.vehicle_url, camera)
+
+
+def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say: Say) -> list[Service]:
+    """A service for each vehicle; all but the first without a camera."""
+    name = f"companion-play-{os.getpid()}"
+    first = session_settings(vehicle.port, name, chosen=settings, driver="auto", system_id=vehicle.system_id)
+    if options.vehicle_url is None:
+        first = _with(first, vehicle={"signing_key_file": None})  # that of the settings is another vehicle's
+    several = [first]
+    for number in range(2, options.vehicles + 1):
+        zenoh = first.zenoh
+        if zenoh.mode == "peer":
+            listen = (f"{_TCP}127.0.0.1:{free_port(socket.SOCK_STREAM)}",)
+            zenoh = zenoh.model_copy(update={"listen": listen, "connect": zenoh.listen or zenoh.connect})
+        several.append(
+            _with(
+                first,
+                vehicle={
+                    "name": f"vehicle{number}",
+                    "system_id": number,
+                    "url": f"udpin://127.0.0.1:{vehicle.port + number - 1}",
+                },
+                source={"uri": NO_SOURCE},
+                detector={"enabled": False},
+                recording={"video": None},
+                metrics={"listen": None},
+            ).model_copy(update={"zenoh": zenoh})
+        )
+    return [
+        Service(one, on_event=_printer(say, one.vehicle.name if options.vehicles > 1 else None))
+        for one in several
+    ]
+
+
+def _with(settings: Settings, **sections: dict[str, Any]) -> Settings:
+    return settings.model_copy(
+        update={name: getattr(settings, name).model_copy(update=keys) for name, keys in sections.items()}
+    )
+
+
+def _printer(say: Say, vehicle: str | None) -> Callable[[Event], None]:
+    return lambda event: say(event.text if vehicle is None else f"{vehicle}: {event.text}")
+
+
+def _commands_of(services: list[Service]) -> Callable[[str], Any]:
+    """The console's commands: `vehicle2 takeoff 5` goes to that vehicle, all others to the first."""
+    by_name = {service.settings.vehicle.name: service for service in services}
+
+    async def command(text: str) -> dict[str, Any]:
+        first_word, _, rest = text.partition(" ")
+        if rest and first_word in by_name:
+            return await by_name[first_word].command(rest.strip())
+        return await services[0].command(text)
+
+    return command
+
+
+def _say_what_to_type(services: list[Service], scene: Scene, say: Say) -> None:
+    zenoh = services[0].settings.zenoh
+    where = "" if zenoh == type(zenoh)() else f" --connect {(zenoh.listen or zenoh.connect)[0]}"
+    known = services[0].perception.status.class_names
+    classes = sorted({item.class_name for item in scene.world.objects} & set(known))
+    say(f"the scene {scene.name!r} has: {', '.join(classes) or 'nothing that the model knows'}")
+    say("ready for commands; in another terminal:")
+    for number, service in enumerate(services):
+        name = service.settings.vehicle.name
+        to = where if name == "vehicle1" else f"{where} --vehicle-name {name}"
+        camera = classes and number == 0
+        say(f'  companion send{to} "takeoff 5"{"" if len(services) == 1 else f"   # {name}"}')
+        if camera:
+            target = "car" if "car" in classes else classes[0]
+            say(f'  companion send{to} "seek {target}"')
+    say(f"  companion echo{where} detections")
+    say("Ctrl-C ends it")

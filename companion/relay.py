@@ -1,0 +1,171 @@
+"""One autopilot on a UDP port, shared by several programs of this computer: its service and its camera.
+
+Each program listens on a port of its own. What the autopilot sends goes to all of them, what they send goes
+to the autopilot. Nothing is queued: what cannot be sent at once is dropped (`companion.vehicle.byte_link`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.vehicle.byte_link import ByteLink, Source, open_link
+from companion.vehicle.driver import LinkError
+from companion.vehicle.framing import frames_of
+from companion.vehicle.link_url import LinkScheme, LinkUrl, parse_link_url
+from companion.vehicle.state import HEARTBEAT_MAX_AGE_S
+
+logger = logging.getLogger(__name__)
+
+_HEARTBEAT = struct.Struct("<IBBBBB")  # custom_mode, type, autopilot, base_mode, system_status, version
+_FIRST_HEARTBEAT_S = 10.0
+# Heartbeats come once a second: a second autopilot on the port is heard in this time.
+_LISTEN_S = 1.5
+_MULTIROTORS = frozenset(
+    {
+        mavlink.MAV_TYPE_QUADROTOR,
+        mavlink.MAV_TYPE_COAXIAL,
+        mavlink.MAV_TYPE_HELICOPTER,
+        mavlink.MAV_TYPE_HEXAROTOR,
+        mavlink.MAV_TYPE_OCTOROTOR,
+        mavlink.MAV_TYPE_TRICOPTER,
+        mavlink.MAV_TYPE_DODECAROTOR,
+        mavlink.MAV_TYPE_DECAROTOR,
+    }
+)
+
+
+class AutopilotHeartbeat(NamedTuple):
+    """What an autopilot's HEARTBEAT says: MAV_TYPE and MAV_MODE_FLAG, with its system id."""
+
+    system_id: int
+    vehicle_type: int
+    base_mode: int
+
+
+class Relay:
+    """An open relay.
+
+    Attributes:
+        url: where the autopilot sends to.
+        heartbeat: the newest of the autopilot until it is checked; None before the first.
+        others: addresses of further autopilots, whose messages are dropped.
+    """
+
+    def __init__(self, url: LinkUrl) -> None:
+        self.url = url
+        self.heartbeat: AutopilotHeartbeat | None = None
+        self.others: set[Source] = set()
+        self._source: Source = None
+        self._received_s = 0.0
+        self._checked = False
+        self._first_heartbeat = asyncio.Event()
+        self._vehicle: ByteLink | None = None
+        self._programs: list[ByteLink] = []
+
+    @classmethod
+    async def open(cls, url: str, ports: Sequence[int]) -> Relay:
+        """A relay between the autopilot that sends to `url` and programs that listen on loopback `ports`.
+
+        Raises:
+            LinkError: the url is not `udpin://HOST:PORT`, or the port is not to be had.
+        """
+        parsed = parse_link_url(url)
+        if parsed.scheme is not LinkScheme.UDP_IN:
+            raise LinkError(f"{url}: expected udpin://HOST:PORT, a UDP port that the autopilot sends to")
+        relay = cls(parsed)
+        try:
+            relay._vehicle = await open_link(parsed, relay._from_vehicle)
+            for port in ports:
+                program = LinkUrl(LinkScheme.UDP_OUT, ("127.0.0.1", port))
+                relay._programs.append(await open_link(program, relay._from_program))
+        except BaseException:
+            await relay.close()
+            raise
+        return relay
+
+    async def close(self) -> None:
+        """Release the ports."""
+        for link in (self._vehicle, *self._programs):
+            if link is not None:
+                await link.close()
+
+    async def check_autopilot(self) -> AutopilotHeartbeat:
+        """Wait for the autopilot and check that it is one multirotor, disarmed.
+
+        Raises:
+            ValueError: one line that says what was found.
+        """
+        try:
+            async with asyncio.timeout(_FIRST_HEARTBEAT_S):
+                await self._first_heartbeat.wait()
+        except TimeoutError:
+            raise ValueError(
+                f"{self.url}: no autopilot heartbeat within {_FIRST_HEARTBEAT_S:g} s; "
+                "is it running, and does it send to this port?"
+            ) from None
+        await asyncio.sleep(_LISTEN_S)
+        assert self.heartbeat is not None
+        system_id, vehicle_type, base_mode = self.heartbeat
+        if self.others:
+            senders = ", ".join(f"{host}:{port}" for host, port, *_ in (self._source, *self.others))
+            raise ValueError(f"{self.url}: two autopilots send to this port ({senders}); end one of them")
+        if vehicle_type not in _MULTIROTORS:
+            entry = mavlink.enums["MAV_TYPE"].get(vehicle_type)
+            name = f"MAV_TYPE {vehicle_type}" if entry is None else entry.name
+            raise ValueError(f"{self.url}: system {system_id} is a {name}; expected a multirotor")
+        if base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
+            raise ValueError(f"{self.url}: system {system_id} is armed; it must be disarmed on the ground")
+        self._checked = True
+        return self.heartbeat
+
+    def _from_vehicle(self, data: bytes, source: Source) -> None:
+        # Reading the messages of the chosen one would take the service's time.
+        known = source == self._source and self._checked
+        heartbeat = None if known else _heartbeat_in(data)
+        if heartbeat is not None and source != self._source:
+            self._on_new_sender(source)
+        if source != self._source:
+            return
+        if heartbeat is not None:
+            self.heartbeat = heartbeat
+            self._first_heartbeat.set()
+        self._received_s = time.monotonic()
+        for program in self._programs:
+            program.send(data)
+
+    def _on_new_sender(self, source: Source) -> None:
+        """Answer an autopilot that is the first, or the only one that still sends (it has restarted)."""
+        silent_s = time.monotonic() - self._received_s
+        if self._source is None or silent_s > HEARTBEAT_MAX_AGE_S:
+            self._source = source
+            assert self._vehicle is not None
+            self._vehicle.answer_to(source)
+        elif source not in self.others:
+            self.others.add(source)
+            logger.warning(
+                "%s: a second autopilot sends from %s:%s; its messages are dropped", self.url, *source[:2]
+            )
+
+    def _from_program(self, data: bytes, _source: Source) -> None:
+        if self._vehicle is not None:
+            self._vehicle.send(data)
+
+
+def _heartbeat_in(data: bytes) -> AutopilotHeartbeat | None:
+    """An autopilot's heartbeat in a datagram; None: there is none."""
+    for frame in frames_of(data):
+        if (
+            frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            and frame.component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
+        ):
+            _, vehicle_type, autopilot, base_mode, _, _ = _HEARTBEAT.unpack(frame.padded(_HEARTBEAT.size))
+            if autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+                return AutopilotHeartbeat(frame.system_id, vehicle_type, base_mode)
+    return None

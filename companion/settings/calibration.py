@@ -1,0 +1,96 @@
+"""The `camera` settings together with what a camera brings itself: its lens and its mount."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from companion.settings.perception import CameraSection
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+
+_LENS = frozenset(
+    ("horizontal_fov_deg", "fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height")
+)
+_SAME_SHARE, _SAME_M, _SAME_DEG, _SAME_DISTORTION = 0.005, 0.001, 0.1, 1e-4
+"""Values that differ by less agree: of the frame's width for a lens, of a mount, of a coefficient."""
+
+
+class AdoptedCamera(NamedTuple):
+    """The settings to go by, and in which values they were given otherwise than the camera has them."""
+
+    camera: CameraSection
+    conflict: str
+
+
+def adopt_calibration(section: CameraSection, calibration: CameraCalibration) -> AdoptedCamera:
+    """Take lens and mount from the camera, but for the keys that were given: those win.
+
+    The lens is one thing: with any key of it given, all of it is the settings' own. So is what the angles of
+    the mount count from (`mount_levelled`, `gimbal`); where that differs, the angles are the settings' too.
+    `conflict` names each value that was given and differs, with the camera's; empty: none.
+    """
+    given = section.model_fields_set
+    changes: dict[str, Any] = {}
+    conflicts: list[str] = []
+    _adopt_lens(section, calibration.model, given, changes, conflicts)
+    if calibration.mount is not None:
+        _adopt_mount(section, calibration.mount, given, changes, conflicts)
+    return AdoptedCamera(section.model_copy(update=changes), "; ".join(conflicts))
+
+
+def _adopt_lens(
+    section: CameraSection, lens: CameraModel, given: set[str], changes: dict[str, Any], conflicts: list[str]
+) -> None:
+    if given & _LENS:
+        own = section.model(lens.width, lens.height)
+        if any(
+            abs(getattr(own, name) - getattr(lens, name)) > _SAME_SHARE * lens.width
+            for name in ("fx", "fy", "cx", "cy")
+        ):
+            conflicts.append(f"lens {_lens_text(own)} (camera: {_lens_text(lens)})")
+    else:
+        changes |= {
+            "fx_px": lens.fx,
+            "fy_px": lens.fy,
+            "cx_px": lens.cx,
+            "cy_px": lens.cy,
+            "calibrated_width": lens.width,
+            "calibrated_height": lens.height,
+        }
+    if "distortion" not in given and not given & _LENS:
+        changes["distortion"] = lens.distortion
+        return
+    own_terms, terms = (tuple(d) + (0.0,) * (5 - len(d)) for d in (section.distortion, lens.distortion))
+    if any(abs(a - b) > _SAME_DISTORTION for a, b in zip(own_terms, terms, strict=True)):
+        conflicts.append(f"distortion {section.distortion} (camera: {lens.distortion})")
+
+
+def _lens_text(model: CameraModel) -> str:
+    across_deg = math.degrees(2 * math.atan(model.width / 2 / model.fx))
+    numbers = ", ".join(f"{value:.1f}" for value in (model.fx, model.fy, model.cx, model.cy))
+    return f"{across_deg:.1f}° across, fx fy cx cy {numbers} px"
+
+
+def _adopt_mount(
+    section: CameraSection, mount: CameraMount, given: set[str], changes: dict[str, Any], conflicts: list[str]
+) -> None:
+    own: dict[str, Any] = {
+        "mount_forward_m": mount.forward_m,
+        "mount_right_m": mount.right_m,
+        "mount_down_m": mount.down_m,
+    }
+    reference = {"mount_levelled": mount.levelled, "gimbal": mount.on_gimbal}
+    differing = [key for key, value in reference.items() if getattr(section, key) != value]
+    if differing and given & reference.keys():
+        conflicts += [f"{key} {getattr(section, key)} (camera: {reference[key]})" for key in differing]
+    else:
+        own |= reference | {
+            "mount_roll_deg": math.degrees(mount.roll_rad),
+            "mount_pitch_deg": math.degrees(mount.pitch_rad),
+            "mount_yaw_deg": math.degrees(mount.yaw_rad),
+        }
+    for key, value in own.items():
+        if key not in given:
+            changes[key] = value
+        elif abs(getattr(section, key) - value) > (_SAME_DEG if key.endswith("_deg") else _SAME_M):
+            conflicts.append(f"{key} {getattr(section, key):g} (camera: {value:.6g})")

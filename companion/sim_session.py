@@ -1,0 +1,338 @@
+"""A service with a simulated camera, on loopback: with the built-in vehicle, or with another autopilot.
+
+For `companion play`, for the demonstration and for measuring. The built-in vehicle and its camera are one
+`mavlink-sim` process. For another autopilot `mavlink-sim camera` draws what a camera on it would see, and a
+relay gives the autopilot's messages to both.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import importlib
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from contextlib import ExitStack, asynccontextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+from companion.relay import Relay
+from companion.service import Service
+from companion.settings import Settings
+from companion.settings.calibration import adopt_calibration
+from companion.settings.perception import DEFAULT_MODEL
+from mavlink_sim.camera.scene import CameraSettings
+from mavlink_sim.testing import free_port, free_udp_port_range
+from vision.camera_model import CameraCalibration
+
+# High enough to see far, low enough that a car at 5 m is in the picture.
+ALTITUDE_M = 4.0
+
+# What the demonstration flies: a mission file that comes with this package, and the steps that are judged.
+MISSION = "demo"
+FIND, REACH, STAND = "find", "reach", "stand"
+TARGET_CLASS = "car"
+# Where the mission's approach stops, and how well the simulator must agree with that after the hold.
+STOP_DISTANCE_M, RANGE_TOLERANCE_M = 5.0, 0.5
+# The open field of the built-in world needs no 30 m on the way home (PX4's default).
+SIMULATOR_PARAMETERS = {"RTL_RETURN_ALT": 5.0}
+
+# An autopilot that has just started has no position for up to a minute; `mavlink-sim camera` waits for it.
+_SIMULATOR_START_S = 90.0
+_SIMULATOR_END_S = 5.0
+_ARMABLE_S = 20.0
+_LINES_KEPT = 40
+_CAMERA_LOST = "is lost: its process ended"  # `mavlink_sim.spectators`
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+class SimSessionError(RuntimeError):
+    """The vehicle or its camera is not there, or not any more. The message is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimOptions:
+    """What is simulated.
+
+    Attributes:
+        camera: name of the shared memory that the camera's frames go to.
+        seed: of the world, and of the built-in vehicle.
+        scene: a scene file or an example's name; None: the demo world.
+        camera_rate_hz: frames per second; None: the scene's own.
+        truth_path: file for the pose, 20 rows a second; None for none.
+        log_path: file for what the process prints; None for none.
+        vehicles: a fleet of so many built-in vehicles, the first with the camera.
+        autopilot: firmware that the built-in vehicle emulates.
+        gcs_port: UDP port for a ground station; None: a free one.
+    """
+
+    camera: str
+    seed: int
+    scene: str | None = None
+    camera_rate_hz: float | None = 30.0
+    truth_path: Path | None = None
+    log_path: Path | None = None
+    vehicles: int = 1
+    autopilot: str = "px4"
+    gcs_port: int | None = None
+
+
+class SimProcess:
+    """A running `mavlink-sim`, the vehicle with its camera or the camera alone.
+
+    Attributes:
+        port: the UDP port on loopback at which a service finds the vehicle; of a fleet the first of
+            consecutive ones.
+        system_id: MAVLink system id of the vehicle; of a fleet the first one's.
+    """
+
+    def __init__(
+        self, process: asyncio.subprocess.Process, port: int, log_path: Path | None, system_id: int = 1
+    ) -> None:
+        self.port, self.system_id = port, system_id
+        self._process = process
+        self._lines: deque[str] = deque(maxlen=_LINES_KEPT)
+        self._ready, self._lost = asyncio.Event(), asyncio.Event()
+        self._reading = asyncio.create_task(self._read(log_path), name="simulator output")
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    async def until_ready(self) -> None:
+        """Wait for its ready line. Raises SimSessionError when it does not start."""
+        lost = asyncio.create_task(self.until_lost())
+        ready = asyncio.create_task(self._ready.wait())
+        try:
+            async with asyncio.timeout(_SIMULATOR_START_S):
+                await asyncio.wait({ready, lost}, return_when=asyncio.FIRST_COMPLETED)
+            if not ready.done():
+                raise SimSessionError(f"the simulator did not start: {self._last_output()}")
+        except TimeoutError as error:
+            raise SimSessionError(f"the simulator was not ready in {_SIMULATOR_START_S:g} s") from error
+        finally:
+            lost.cancel()
+            ready.cancel()
+            await asyncio.gather(lost, ready, return_exceptions=True)
+
+    async def until_lost(self) -> NoReturn:
+        """Wait until the process or its camera ends. Raises SimSessionError with what was printed last."""
+        await self._lost.wait()
+        raise SimSessionError(f"the simulator or its camera ended: {self._last_output()}")
+
+    async def end(self) -> None:
+        """End the process, by SIGTERM and if that does not help by SIGKILL; read the rest of its output."""
+        if self._process.returncode is None:
+            self._process.terminate()
+        try:
+            async with asyncio.timeout(_SIMULATOR_END_S):
+                await self._process.wait()
+        except TimeoutError:
+            self._process.kill()
+            await self._process.wait()
+        await self._reading
+
+    async def _read(self, log_path: Path | None) -> None:
+        assert self._process.stdout is not None
+        with ExitStack() as stack:
+            log = None if log_path is None else stack.enter_context(log_path.open("w"))
+            while data := await self._process.stdout.readline():
+                line = data.decode(errors="replace")
+                self._lines.append(line.strip())
+                if log is not None:
+                    log.write(line)
+                if line.startswith("ready"):
+                    self._ready.set()
+                if _CAMERA_LOST in line:
+                    self._lost.set()
+        self._lost.set()
+
+    def _last_output(self) -> str:
+        return self._lines[-1].removeprefix("mavlink-sim: ") if self._lines else "it printed nothing"
+
+
+@asynccontextmanager
+async def simulator(options: SimOptions) -> AsyncIterator[SimProcess]:
+    """The built-in vehicle and its camera as a process of its own; see `SimProcess.until_ready`."""
+    port = free_udp_port_range(options.vehicles)
+    gcs_port = free_port() if options.gcs_port is None else options.gcs_port
+    arguments = ["--onboard-port", str(port), "--onboard-bind", "0"]
+    arguments += ["--gcs-port", str(gcs_port), "--gcs-bind", "0", "--autopilot", options.autopilot]
+    if options.vehicles > 1:
+        arguments += ["--vehicles", str(options.vehicles)]
+    if options.autopilot == "px4":
+        for name, value in SIMULATOR_PARAMETERS.items():
+            arguments += ["--param", f"{name}={value:g}"]
+    process = SimProcess(await _spawn(arguments, options), port, options.log_path)
+    try:
+        yield process
+    finally:
+        await process.end()
+
+
+@asynccontextmanager
+async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[SimProcess]:
+    """What the camera of an autopilot at `url` would see, drawn from its pose. Checks the autopilot first.
+
+    Raises:
+        LinkError: the url is not `udpin://`, or its port is not to be had.
+        SimSessionError: no autopilot, or not one that can be flown from here: see `Relay.check_autopilot`.
+    """
+    service_port, camera_port = free_port(), free_port()
+    # It takes a second to load, which would hold up the relay's messages.
+    await asyncio.to_thread(_load_driver_for_px4)
+    relay = await Relay.open(url, (service_port, camera_port))
+    try:
+        try:
+            autopilot = await relay.check_autopilot()
+        except ValueError as error:
+            raise SimSessionError(str(error)) from error
+        arguments = ["camera", "--vehicle-url", f"udpin://127.0.0.1:{camera_port}"]
+        process = SimProcess(
+            await _spawn(arguments, options), service_port, options.log_path, autopilot.system_id
+        )
+        try:
+            yield process
+        finally:
+            await process.end()
+    finally:
+        await relay.close()
+
+
+def _load_driver_for_px4() -> None:
+    with suppress(ImportError, OSError):  # the driver "auto" says so, and takes the other one
+        importlib.import_module("companion.vehicle.mavsdk_driver")
+
+
+async def _spawn(arguments: Sequence[str], options: SimOptions) -> asyncio.subprocess.Process:
+    arguments = [*arguments, "--camera", options.camera, "--seed", str(options.seed)]
+    if options.camera_rate_hz is not None:
+        arguments += ["--camera-rate", f"{options.camera_rate_hz:g}"]
+    if options.scene is not None:
+        arguments += ["--scene", options.scene]
+    if options.truth_path is not None:
+        arguments += ["--truth", str(options.truth_path)]
+    return await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "mavlink_sim",
+        *arguments,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        # Ctrl-C is for the service: it must be able to leave a vehicle that still flies.
+        process_group=0,
+        preexec_fn=_end_with_us,
+    )
+
+
+def _end_with_us() -> None:
+    """Run in the new process: however we end, the simulator is told to end too (prctl(2))."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def session_settings(
+    port: int,
+    camera: str,
+    *,
+    chosen: Settings | None = None,
+    video: Path | None = None,
+    video_rate_hz: float = 7.5,
+    driver: str = "mavsdk",
+    system_id: int = 1,
+) -> Settings:
+    """Settings for a vehicle on a port of loopback and a simulated camera, whose frames bring lens and mount.
+
+    Args:
+        chosen: settings that are kept but for vehicle, source, camera and views; None: whatever is configured
+            on this machine, defaults, and zenoh on a free port.
+    """
+    values: dict[str, Any] = {} if chosen is None else chosen.model_dump(exclude_unset=True)
+    for section in ("source", "camera", "views"):
+        values.pop(section, None)
+    values["guidance"] = {"perception_max_age_s": 1.0, **values.get("guidance", {})}
+    # A laptop draws the world, looks at it and films it all at once: frames may come late.
+    detector = {"threads": 1, **values.get("detector", {})}
+    if detector.get("model", DEFAULT_MODEL) == DEFAULT_MODEL:
+        # The size at which the bundled model was trained; see docs/models.md.
+        detector.setdefault("image_size", 320)
+    values["detector"] = detector
+    values["guidance"].pop("view", None)
+    values["vehicle"] = {"driver": driver, **values.get("vehicle", {})}
+    values["vehicle"] |= {"url": f"udpin://127.0.0.1:{port}", "system_id": system_id}
+    # The worker is started together with the simulator, and the first frame takes some seconds.
+    values["source"] = {"uri": f"shm://{camera}", "open_timeout_s": _SIMULATOR_START_S}
+    if chosen is None:
+        values["zenoh"] = {"listen": (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",)}
+    if video is not None:
+        values["recording"] = {"video": str(video), "rate_hz": video_rate_hz}
+    return Settings.model_validate(values)
+
+
+def with_lens(settings: Settings, camera: CameraSettings = CameraSettings()) -> Settings:  # noqa: B008 - frozen
+    """The settings with a simulated camera's lens and mount, for where its frames do not bring them along."""
+    calibration = CameraCalibration(camera.model, camera.mount)
+    adopted = adopt_calibration(settings.camera, calibration).camera
+    return settings.model_copy(update={"camera": adopted})
+
+
+async def with_service(service: Service, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """As `with_services`, of one."""
+    await with_services([service], work)
+
+
+async def with_services(services: Sequence[Service], work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run services, and `work` once all are ready; then end the services.
+
+    What fails in a service is raised here and ends the work, and the other way round.
+
+    Raises:
+        LinkError, PerceptionStartError, BusError: as `Service.run`.
+    """
+    ready = [asyncio.Event() for _ in services]
+
+    async def when_ready() -> None:
+        for event in ready:
+            await event.wait()
+        await work()
+
+    running = [
+        asyncio.create_task(service.run(event.set)) for service, event in zip(services, ready, strict=True)
+    ]
+    working = asyncio.create_task(when_ready())
+    try:
+        await asyncio.wait({*running, working}, return_when=asyncio.FIRST_COMPLETED)
+        for task in running:
+            if task.done():
+                task.result()
+                raise SimSessionError("the service ended before its work was done")
+        working.result()
+    finally:
+        working.cancel()
+        for service, task in zip(services, running, strict=True):
+            # Before it is ready there is nothing to leave in order.
+            service.stop() if service.ready else task.cancel()
+        ended = await asyncio.gather(*running, return_exceptions=True)
+        await asyncio.gather(working, return_exceptions=True)
+    for error in ended:
+        if isinstance(error, BaseException):
+            raise error  # it went wrong after the work was done, which is no success
+
+
+async def until_ready_to_arm(service: Service) -> None:
+    """Wait for the autopilot's pre-arm checks. Raises SimSessionError if they do not pass."""
+    armable = asyncio.Event()
+    unsubscribe = service.driver.subscribe(lambda state: armable.set() if state.ready_to_arm else None)
+    try:
+        async with asyncio.timeout(_ARMABLE_S):
+            await armable.wait()
+    except TimeoutError as error:
+        raise SimSessionError(f"the vehicle was not ready to arm in {_ARMABLE_S:g} s") from error
+    finally:
+        unsubscribe()

@@ -1,0 +1,128 @@
+"""`companion play` as a person runs it: a process of its own, in real time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from companion.bus.client import send_command
+from mavlink_sim.testing import free_port
+from tests.companion.command_line import companion
+from tests.companion.service_process import ServiceProcess
+
+READY = "Ctrl-C ends it"
+
+
+@contextmanager
+def playing(folder: Path, *flags: str) -> Iterator[ServiceProcess]:
+    """A running `companion play` that is ready for commands."""
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "companion.cli", "play", "--zenoh-listen", endpoint, *flags],
+        cwd=folder,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    running = ServiceProcess(process, endpoint)
+    try:
+        running.wait_for_line(READY, 90.0)
+        yield running
+    finally:
+        running.stop()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def descendants(pid: int) -> set[int]:
+    """Every process that this one has started, and theirs."""
+    parents: dict[int, int] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(") ")[2].split()
+            except OSError:
+                continue
+            parents[int(entry.name)] = int(fields[1])
+    found: set[int] = set()
+    newest = {pid}
+    while newest:
+        newest = {child for child, parent in parents.items() if parent in newest} - found
+        found |= newest
+    return found
+
+
+def until_gone(pids: set[int], timeout_s: float = 10.0) -> set[int]:
+    deadline_s = time.monotonic() + timeout_s
+    while (left := {pid for pid in pids if Path(f"/proc/{pid}").exists()}) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    return left
+
+
+def test_play_takes_commands_and_ends_on_ctrl_c(tmp_path: Path) -> None:
+    with playing(tmp_path) as running:
+        assert any("bicycle, boat, car" in line for line in running.lines)
+        for text in ("takeoff 3", "land"):
+            sent = companion("send", "--connect", running.endpoint, text, cwd=tmp_path, timeout_s=120.0)
+            assert sent.returncode == 0, sent.stdout + sent.stderr
+        busy = companion("play", "--zenoh-listen", running.endpoint, cwd=tmp_path)
+        assert busy.returncode == 2
+        (line,) = busy.stderr.splitlines()
+        assert running.endpoint in line
+        started = descendants(running.pid)
+        assert len(started) >= 3  # the vehicle, its camera, perception
+        running.signal(signal.SIGINT)
+        assert running.process.wait(20) == 0
+        assert not until_gone(started)
+        assert not list(Path("/dev/shm").glob(f"*companion-play-{running.pid}*"))
+
+
+def test_play_in_the_air_holds_and_ends_on_ctrl_c(tmp_path: Path) -> None:
+    with playing(tmp_path, "--vehicles", "2") as running:
+        with running.client() as session:
+            for text in ("takeoff 3", "hold"):
+                reply = send_command(session, "vehicle2", text, timeout_s=60.0)
+                assert reply["success"], reply
+        started = descendants(running.pid)
+        running.signal(signal.SIGINT)
+        assert running.process.wait(20) == 0
+        assert not until_gone(started)
+
+
+def test_play_ends_with_1_when_the_simulator_dies(tmp_path: Path) -> None:
+    with playing(tmp_path) as running:
+        started = descendants(running.pid)
+        vehicle = next(pid for pid in started if b"mavlink_sim" in Path(f"/proc/{pid}/cmdline").read_bytes())
+        os.kill(vehicle, signal.SIGKILL)
+        running.wait_for_line("companion: the simulator or its camera ended", 30.0)
+        assert running.process.wait(30) == 1
+        assert not until_gone(started)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--source", "photo.jpg"), "source.uri"),
+        (("--camera-mount-pitch-deg", "-10"), "camera.mount_pitch_deg"),
+        (("--scene", "no-such-scene"), "no-such-scene"),
+        (("--vehicle-url", "tcp://127.0.0.1:5760"), "udpin://"),
+        (("--vehicle-url", "udpin://127.0.0.1:14540", "--vehicles", "2"), "--vehicles"),
+    ],
+)
+def test_play_refuses_what_it_cannot_do_in_one_line(
+    tmp_path: Path, flags: tuple[str, ...], named: str
+) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    done = companion("play", "--zenoh-listen", endpoint, *flags, cwd=tmp_path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    (line,) = done.stderr.splitlines()
+    assert named in line
