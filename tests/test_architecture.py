@@ -18,7 +18,6 @@ FLOORS = {
     "bus": 3,
     "guidance": 3,
     "operator": 4,
-    "missions": 4,
     "perception": 4,
     "service": 5,
     "rehearsal": 6,
