@@ -118,7 +118,7 @@ class GuidanceLoop:
         return output
 
     def _warn_slow(self, used_ns: int, passed_ns: int, now_ns: int) -> None:
-        """Name a behaviour that takes too long: one that blocks for good meets the deadline of its setpoint."""
+        """Name a behaviour whose update is slow. If it blocks, its setpoint's deadline ends it."""
         behaviour = self.guidance.behaviour
         if behaviour is None or (used_ns < SLOW_STEP_NS and passed_ns < STALLED_STEP_NS):
             return
