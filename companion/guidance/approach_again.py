@@ -9,7 +9,7 @@ from typing import Annotated
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.arguments import ClassName, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal_sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.gimbal_tracking import GimbalTracking, GimbalUse
 from companion.guidance.motion import position_and_yaw, stay_at
@@ -48,7 +48,7 @@ class Approach(Command):
         if self.retries != int(self.retries):
             raise GrammarError(f"approach: retries must be a whole number, got {self.retries:g}")
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         tracking = GimbalTracking() if self.gimbal == "track" else None
         return PersistentApproach(
             lambda: ApproachBehaviour(

@@ -54,7 +54,7 @@ class Command(ABC):
                 check(self.word, argument, value, default_of(field))
 
     @abstractmethod
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         """A new behaviour, ready for guidance. Raises GrammarError where the command cannot be flown."""
 
     @property

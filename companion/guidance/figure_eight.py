@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import EnumArgument, Number
 from companion.guidance.behaviour import Behaviour, Situation
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import laps_text, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
@@ -30,7 +30,7 @@ class FigureEight(Command):
     def endless(self) -> bool:
         return self.laps == 0.0
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         along = self.nose == "along"
         return FigureEightBehaviour(self.radius_m, self.speed_mps, self.laps, nose_along=along)
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from companion.guidance.arguments import ClassName, EnumArgument, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.choosing import TargetSelector
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal_tracking import GimbalTracking, GimbalUse
 from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
 from companion.guidance.moving_track import MovingTrack
@@ -65,7 +65,7 @@ class Follow(Command):
     def endless(self) -> bool:
         return self.duration_s == 0.0
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return FollowBehaviour(
             self.class_name,
             distance_m=self.distance_m,

@@ -8,7 +8,7 @@ from typing import Annotated
 from companion.geometry.points import points_from
 from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points
 from companion.guidance.behaviour import Behaviour, Situation
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import home_of, laps_text, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
@@ -41,7 +41,7 @@ class FollowPath(Command):
         """(north, east) or (north, east, height) of each point, metres from home."""
         return points_from(self.points)
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         along = self.nose == "along"
         return FollowPathBehaviour(self.places, self.speed_mps, laps=self.laps, nose_along=along)
 

@@ -17,7 +17,7 @@ from companion.geometry.formation import SHAPES, Vector3, slot_motion
 from companion.geometry.points import points_from
 from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points, Word
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.formation_group import Agreement, Group
 from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed
 from companion.guidance.neighbours import Neighbour, Neighbourhood
@@ -104,7 +104,7 @@ class Formation(Command):
         if 0.0 < self.laps < 1.0:
             raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return FormationBehaviour(
             self.shape,
             self.leader,

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal_controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.registry import behaviour
@@ -31,7 +31,7 @@ class Gimbal(Command):
         """The same in radians."""
         return GimbalAim(math.radians(self.pitch_deg), math.radians(self.yaw_deg))
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return PointGimbalBehaviour(self.aim)
 
 

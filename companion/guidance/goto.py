@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import GrammarError, Number
 from companion.guidance.behaviour import Behaviour, Situation
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.geodesy import north_east
 from companion.guidance.motion import home_of, position_and_yaw
 from companion.guidance.path import Path
@@ -54,7 +54,7 @@ class Goto(Command):
         if None in pairs[begun[0]]:
             raise GrammarError(f"goto: {begun[0]} belong together; one of them is missing")
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return GotoBehaviour(
             from_home_m=_pair(self.north_m, self.east_m),
             from_here_m=_pair(self.forward_m, self.right_m),

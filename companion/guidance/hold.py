@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import (
     HOLD_VELOCITY_GAIN,
     PositionController,
@@ -38,7 +38,7 @@ class Hold(Command):
     def endless(self) -> bool:
         return self.duration_s == 0.0
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return HoldBehaviour(self.duration_s)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 
@@ -20,13 +20,13 @@ SLOWEST_RETURN_MPS = 1.5
 
 @behaviour("land", "land here and disarm")
 class Land(Command):
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return LandBehaviour()
 
 
 @behaviour("rtl", "return to home, land and disarm")
 class Rtl(Command):
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return ReturnBehaviour()
 
 

@@ -14,7 +14,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.marker_search import MarkerSearch
 from companion.guidance.motion import correction, position_and_yaw, towards
 from companion.guidance.pad_filter import PadFilter
@@ -85,7 +85,7 @@ class LandOnMarker(Command):
         if self.method == "autopilot" and self.pad == "moving":
             raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return LandOnMarkerBehaviour(
             int(self.identifier),
             by_autopilot=self.method == "autopilot",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import (
     STOPPING_MPS2,
     correction,
@@ -76,7 +76,7 @@ class Orbit(Command):
                 f"{self.radius_m:g} m, got {self.speed_mps:g}"
             )
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         clockwise = self.direction == "clockwise"
         return OrbitBehaviour(
             self.radius_m, self.speed_mps, self.laps, clockwise=clockwise, class_name=self.class_name

@@ -11,7 +11,7 @@ from companion.geometry.points import points_from
 from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.arguments import ClassNames, EnumArgument, GrammarError, Number, Points, names_in
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
 from companion.guidance.registry import behaviour
@@ -74,7 +74,7 @@ class Patrol(Command):
         """The classes, each by itself."""
         return names_in(self.class_names)
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return PatrolBehaviour(
             self.places,
             self.names,

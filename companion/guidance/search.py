@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal_sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
 from companion.guidance.path import Path
@@ -80,7 +80,7 @@ class Seek(Command):
             if value is not None and key not in allowed:
                 raise GrammarError(f"seek: pattern={self.pattern} takes no {key}")
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         if self.pattern != "turn":
             return SearchBehaviour(
                 self.class_name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode
 
@@ -12,7 +12,7 @@ TIMEOUT_S = 5.0
 
 @behaviour("stop", "end our command; the autopilot holds its position by itself")
 class Stop(Command):
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return StopBehaviour()
 
 

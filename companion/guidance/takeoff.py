@@ -6,7 +6,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
-from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
 from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
@@ -29,7 +29,7 @@ CLIMB_MPS = 1.0
 class Takeoff(Command):
     altitude_m: Annotated[float, Number("altitude", "m", 1.0, 50.0, "height above home")] = 2.5
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         return TakeoffBehaviour(self.altitude_m)
 
 

@@ -67,7 +67,7 @@ class Mission(Command):
         str, FileName("file", "a path on the service's computer, or the name of one that came along")
     ]
 
-    def build(self, context: BuildContext = NO_CONTEXT) -> Behaviour:
+    def build(self, context: BuildContext) -> Behaviour:
         text = context.attachment
         if len(text.encode()) > LARGEST_BYTES:
             raise MissionError(f"{self.file}: a mission has at most {LARGEST_BYTES} bytes")
@@ -179,7 +179,7 @@ def plan_from(
     return Plan(
         name=table.name or Path(source).stem,
         steps=tuple(_planned(step, footprint) for step in read),
-        way_down=lambda word: parse(word).build(),
+        way_down=lambda word: parse(word).build(NO_CONTEXT),
         timeout_s=table.timeout_s,
     )
 

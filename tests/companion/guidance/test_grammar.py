@@ -19,7 +19,7 @@ from companion.guidance import (
     Takeoff,
 )
 from companion.guidance.arguments import GrammarError
-from companion.guidance.command import Command, arguments_of
+from companion.guidance.command import NO_CONTEXT, Command, arguments_of
 from companion.guidance.grammar import describe, parse
 from companion.guidance.registry import COMMANDS
 
@@ -189,7 +189,7 @@ def test_what_is_written_is_read_back(command: Command) -> None:
 
 @given(commands)
 def test_every_command_has_a_behaviour_of_its_name(command: Command) -> None:
-    behaviour = command.build()
+    behaviour = command.build(NO_CONTEXT)
     assert behaviour.name == command.word
     name = getattr(command, "class_name", "")
     assert behaviour.class_names == ((name,) if name else ())

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour, lemniscate
 from companion.guidance.follow_path import FollowPath, FollowPathBehaviour
@@ -166,7 +167,7 @@ def test_a_place_about_home_needs_to_know_home() -> None:
     vehicle = KinematicVehicle()
     state = replace(vehicle.state, home_position_ned_m=None)
     for text in ("goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"):
-        behaviour = grammar.parse(text).build()
+        behaviour = grammar.parse(text).build(NO_CONTEXT)
         behaviour.on_activate(Situation(vehicle.now_ns, state))
         step = behaviour.update(0.0, Situation(vehicle.now_ns, state))
         assert isinstance(step, Outcome)
@@ -281,7 +282,7 @@ def test_what_cannot_be_meant_is_one_line(text: str, words: str) -> None:
 def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text: str) -> None:
     command = grammar.parse(text)
     assert grammar.parse(str(command)) == command
-    assert command.build().name == command.word
+    assert command.build(NO_CONTEXT).name == command.word
     assert command.endless == ("laps=0" in text)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from companion.guidance.behaviour import Outcome
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.patrol import Patrol, PatrolBehaviour
 from companion.vehicle.state import FlightMode
@@ -158,7 +159,7 @@ def test_the_grammar_of_a_patrol() -> None:
     assert isinstance(command, Patrol)
     assert command.names == ("person", "car")
     assert parse(str(command)) == command
-    assert command.build().class_names == ("person", "car")
+    assert command.build(NO_CONTEXT).class_names == ("person", "car")
     assert command.endless
     for text, said in [
         ("patrol 0,0 classes=car", "two points"),

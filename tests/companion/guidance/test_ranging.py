@@ -7,6 +7,7 @@ import math
 import pytest
 
 from companion.guidance.behaviour import Situation
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.refusal import refusal
@@ -20,7 +21,7 @@ OTHERS = ("seek kite", "orbit", 'patrol "0,0 9,9" classes=kite')
 def why(command: str, means: RangeMeans) -> str | None:
     vehicle = KinematicVehicle()
     situation = Situation(vehicle.now_ns, vehicle.state, (), 0.05, True, ranging=means)
-    return refusal(parse(command).build(), situation, None)
+    return refusal(parse(command).build(NO_CONTEXT), situation, None)
 
 
 @pytest.mark.parametrize("command", NEEDING)

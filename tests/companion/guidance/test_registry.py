@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import describe, json_schema, markdown, parse
 from companion.guidance.registry import COMMANDS, PluginError, load_plugins
 
@@ -17,7 +18,7 @@ from typing import Annotated
 
 from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, Outcome
-from companion.guidance.command import NO_CONTEXT, Command
+from companion.guidance.command import Command
 from companion.guidance.registry import behaviour
 
 
@@ -25,7 +26,7 @@ from companion.guidance.registry import behaviour
 class Wait(Command):
     duration_s: Annotated[float, Number("duration", "s", 0.0, 60.0, "how long")] = 5.0
 
-    def build(self, context=NO_CONTEXT):
+    def build(self, context):
         return WaitBehaviour()
 
 
@@ -55,7 +56,7 @@ def test_module_that_is_named_adds_its_command(tmp_path: Path) -> None:
     load_plugins(["plugin_of_a_user"])
     command = parse("wait 7s")
     assert str(command) == "wait duration=7"
-    assert command.build().name == "wait"
+    assert command.build(NO_CONTEXT).name == "wait"
     assert "wait [duration=5]" in describe()
     assert json_schema()["$defs"]["wait"]["properties"]["duration"]["unit"] == "s"
     assert "## wait" in markdown()
