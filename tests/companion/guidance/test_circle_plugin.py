@@ -44,7 +44,7 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
         flight = LockstepFlight.airborne(seed=3, settings=settings)
         start = flight.vehicle.truth.position_ned_m
         yaw = flight.state.yaw_rad or 0.0
-        flight.command("circle radius=6 speed=1.5")
+        flight.command("circle radius=6 speed=1")
         flight.run(15.0)
         places = []
         for _ in range(25):
@@ -61,10 +61,14 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.timeout(200)
 def test_service_flies_an_installed_plugin(
-    installed: Path, vehicle: RunningSimulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    installed: Path,
+    vehicle: RunningSimulator,
+    filming: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")]))
-    flags = ["--detector-enabled", "false", "--plugins-modules", "circle"]
+    flags = [*filming, "--plugins-modules", "circle"]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         service.take_off(3.0)
         send = [
