@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
@@ -52,9 +53,13 @@ def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatc
         COMMANDS.clear()
         COMMANDS.update(before)
         sys.modules.pop("companion_circle", None)
-    centre = (sum(place[0] for place in places) / 25, sum(place[1] for place in places) / 25)
-    radii = [math.dist(place[:2], centre) for place in places]
-    assert 5.5 < min(radii) <= max(radii) < 7.0
+    # The circle that fits best: x^2 + y^2 = 2 a x + 2 b y + c (Kasa 1976).
+    points = np.array([place[:2] for place in places])
+    terms = np.column_stack([2 * points, np.ones(len(points))])
+    (north, east, rest), *_ = np.linalg.lstsq(terms, (points**2).sum(axis=1), rcond=None)
+    radius = math.sqrt(rest + north**2 + east**2)
+    assert abs(radius - 6.0) < 1.0
+    assert np.ptp(np.hypot(*(points - (north, east)).T)) < 0.6
 
 
 @pytest.mark.timeout(200)
