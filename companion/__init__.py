@@ -1,1 +1,71 @@
-"""The companion-computer service: perception in, offboard setpoints out, detections on zenoh."""
+"""The companion-computer service for PX4 and ArduPilot vehicles, as a library.
+
+A behaviour of one's own needs no more than these names; `docs/how-to/plug-ins.md` shows how.
+
+    from companion import Behaviour, Command, Number, Setpoint, behaviour
+
+They are imported when they are first used: `import companion` itself costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
+    from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+    from companion.guidance.command import BuildContext, Command
+    from companion.guidance.registry import behaviour
+    from companion.service import Service
+    from companion.settings import Settings
+    from companion.vehicle.setpoint import Setpoint
+
+_MODULES = {
+    "companion.guidance.arguments": ("ClassName", "EnumArgument", "GrammarError", "Number"),
+    "companion.guidance.behaviour": (
+        "Behaviour",
+        "ModeRequest",
+        "Outcome",
+        "Requirement",
+        "Situation",
+        "Step",
+    ),
+    "companion.guidance.command": ("BuildContext", "Command"),
+    "companion.guidance.registry": ("behaviour",),
+    "companion.service": ("Service",),
+    "companion.settings": ("Settings",),
+    "companion.vehicle.setpoint": ("Setpoint",),
+}
+_WHERE = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "Behaviour",
+    "BuildContext",
+    "ClassName",
+    "Command",
+    "EnumArgument",
+    "GrammarError",
+    "ModeRequest",
+    "Number",
+    "Outcome",
+    "Requirement",
+    "Service",
+    "Setpoint",
+    "Settings",
+    "Situation",
+    "Step",
+    "__version__",
+    "behaviour",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """PEP 562: the public names, and `__version__`."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("mavlink-companion")
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_WHERE[name]), name)

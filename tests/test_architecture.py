@@ -19,7 +19,6 @@ FLOORS = {
     "relay": 3,
     "guidance": 3,
     "operator": 4,
-    "missions": 4,
     "perception": 4,
     "service": 5,
     "sim_session": 6,

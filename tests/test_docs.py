@@ -12,7 +12,7 @@ import typer
 
 from companion.cli import app as companion_app
 from companion.guidance import grammar
-from companion.guidance.commands import COMMANDS
+from companion.guidance.registry import COMMANDS
 from mavlink_sim.bench import app as bench_app
 from mavlink_sim.cli import app as simulator_app
 from mavlink_sim.datasets.cli import app as dataset_app

@@ -21,7 +21,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.sequence import SequenceBehaviour
+from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.settings import Settings
 from companion.sim_session import (
     FIND,

@@ -75,6 +75,7 @@ def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
     with uncollected():
         from companion.bus.session import BusError
+        from companion.guidance.registry import PluginError
         from companion.operator.metrics import MetricsError
         from companion.perception.keeper import PerceptionStartError
         from companion.service import Service
@@ -83,7 +84,7 @@ def run(settings: Settings) -> None:
     logging.basicConfig(
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
-    with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError):
+    with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError):
         asyncio.run(_run_until_signal(settings, Service))
 
 
@@ -348,6 +349,22 @@ def config(settings: Settings) -> None:
     from companion.settings.reading import to_toml
 
     typer.echo(to_toml(settings), nl=False)
+
+
+@settings_command(app)
+def commands(
+    settings: Settings,
+    as_json: Annotated[bool, typer.Option("--json", help="as JSON Schema")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="as tables for documentation")] = False,
+) -> None:
+    """List what `companion send` takes, plug-ins included: words, arguments, units and ranges."""
+    from companion.guidance.grammar import describe, json_schema, markdown
+    from companion.guidance.registry import PluginError, load_plugins
+
+    with plain_errors(PluginError):
+        load_plugins(settings.plugins.modules)
+    text = json.dumps(json_schema(), indent=2) if as_json else markdown() if as_markdown else describe()
+    typer.echo(text, nl=not as_markdown)
 
 
 @settings_command(app)

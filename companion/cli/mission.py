@@ -24,10 +24,18 @@ def mission(
 ) -> None:
     """Check a mission file, send it to a running service and wait for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
-    from companion.guidance.commands import Mission
-    from companion.missions.mission_file import MissionError, describe, find_mission, plan_from, read_mission
+    from companion.guidance.missions.mission_file import (
+        Mission,
+        MissionError,
+        describe,
+        find_mission,
+        plan_from,
+        read_mission,
+    )
+    from companion.guidance.registry import PluginError, load_plugins
 
-    with plain_errors(MissionError, NoAnswerError, ValueError):
+    with plain_errors(MissionError, NoAnswerError, PluginError, ValueError):
+        load_plugins(settings.plugins.modules)
         text = read_mission(find_mission(file))
         plan = plan_from(text, file, _class_names(settings) if check else None)
         for line in describe(plan):

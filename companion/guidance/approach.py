@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.choosing import Choice
+from companion.guidance.choosing import TargetSelector
 from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.motion import (
     ARRIVED_M,
@@ -58,7 +58,7 @@ BASE_TIMEOUT_S = 45.0
 class ApproachBehaviour(Behaviour):
     """Keeps its height, turns its nose to the object and stops `distance_m` before its nearest surface.
 
-    It begins with the true object of the class before the nose (see `Choice`) and stays with it.
+    It begins with the true object of the class before the nose (see `TargetSelector`) and stays with it.
     Lost, it brakes and looks for `lost_timeout_s` before it gives up.
 
     Args:
@@ -93,7 +93,7 @@ class ApproachBehaviour(Behaviour):
         self._confidence = confidence
         self._lost_timeout_s = lost_timeout_s
         self._track: ObjectTrack | None = None
-        self._choice = Choice()
+        self._choice = TargetSelector()
         self._doubted = False
         self._down_m = 0.0
         self._seen_ns = 0
@@ -112,7 +112,7 @@ class ApproachBehaviour(Behaviour):
         self._started_ns = self._seen_ns = situation.now_ns
         self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
         self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
-        self._choice = Choice()
+        self._choice = TargetSelector()
         self._doubted = False
         self.lost_at = None
         self._arrival, self._controller = Arrival(), PositionController()

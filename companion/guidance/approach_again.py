@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Annotated
 
 from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.arguments import ClassName, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal_sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
-from companion.guidance.gimbal_tracking import GimbalTracking
+from companion.guidance.gimbal_tracking import GimbalTracking, GimbalUse
 from companion.guidance.motion import position_and_yaw, stay_at
+from companion.guidance.registry import behaviour
+from companion.guidance.search_pattern import field_of_view_rad
 from companion.guidance.seek import SeekBehaviour
 from companion.guidance.sighting import Sightings
 from companion.vehicle.gimbal import GimbalAim
@@ -21,6 +26,45 @@ LOOK_BACK_S = 3.0
 # Half a turn at the envelope's slowest useful rate.
 LOOK_BACK_LIMIT_S = 12.0
 POINTED_RAD = math.radians(6.0)
+
+
+@behaviour("approach", "fly to an object of the class, keeping the height, and stop before it")
+class Approach(Command):
+    class_name: Annotated[str, ClassName("class", "what to fly to")]
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where to stop, to its surface")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "at most")] = 2.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 60.0, "wait for a lost object this long")
+    ] = 5.0
+    retries: Annotated[
+        float,
+        Number("retries", "", 0.0, 20.0, "how often a lost object is looked for, where it was and around"),
+    ] = 2.0
+    gimbal: GimbalUse = "leave"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.retries != int(self.retries):
+            raise GrammarError(f"approach: retries must be a whole number, got {self.retries:g}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        tracking = GimbalTracking() if self.gimbal == "track" else None
+        return PersistentApproach(
+            lambda: ApproachBehaviour(
+                self.class_name,
+                distance_m=self.distance_m,
+                speed_mps=self.speed_mps,
+                confidence=self.confidence,
+                lost_timeout_s=self.lost_timeout_s,
+                tracking=tracking,
+            ),
+            self.class_name,
+            retries=int(self.retries),
+            confidence=self.confidence,
+            tracking=tracking,
+            field_rad=field_of_view_rad(context.footprint),
+        )
 
 
 class PersistentApproach(Behaviour):

@@ -38,7 +38,7 @@ class ClassName:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class EnumArgument:
     """One of a few words."""
 
     key: str
@@ -78,7 +78,7 @@ class ClassNames:
     meaning: str
 
 
-Argument = Number | ClassName | Choice | Points | FileName | ClassNames | Word
+Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word
 
 
 def names_in(text: str) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def check(word: str, argument: Argument, value: Any, default: Any) -> None:
             if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
                 shown = f"{value:g}" if isinstance(value, float) else repr(value)
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {shown}")
-        case Choice(key, words):
+        case EnumArgument(key, words):
             if value not in words:
                 raise GrammarError(f"{word}: {key} must be {' or '.join(words)}, got {value!r}")
         case Word(key):

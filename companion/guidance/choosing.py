@@ -15,7 +15,7 @@ CHOOSING_S = 0.4
 BEFORE_RAD = math.radians(10.0)
 
 
-class Choice:
+class TargetSelector:
     """Collects the true objects of the first moments and takes the nearest of those before the nose.
 
     With none before it, the one nearest to the nose. What is true in some frames and doubted in as many is

@@ -1,20 +1,51 @@
-"""What every command is: a word, a meaning, its arguments as fields; and how it is written again."""
+"""What every command is: a word, a help text, its arguments as fields, and the behaviour it becomes."""
 
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any, ClassVar, get_args, get_type_hints
 
 from companion.guidance.arguments import Argument, check
+from companion.guidance.behaviour import Behaviour
+from companion.guidance.search_pattern import Footprint
+from companion.vehicle.gimbal import GimbalAim
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
-    """What an operator asks for. `word` is how it is called, `meaning` what it does."""
+class BuildContext:
+    """What a command may need to become a behaviour.
+
+    Attributes:
+        footprint: of the steering camera; None: not known.
+        class_names: what the detector knows; None: not known.
+        attachment: the lines that came with the command (a mission's text).
+        check_requirements: guidance's own; a mission asks it at each of its steps.
+    """
+
+    footprint: Footprint | None = None
+    class_names: tuple[str, ...] | None = None
+    attachment: str = ""
+    check_requirements: Callable[[Behaviour], str | None] = lambda behaviour: None
+
+
+NO_CONTEXT = BuildContext()
+
+
+@dataclass(frozen=True)
+class Command(ABC):
+    """What an operator asks for. A subclass is made and registered by `registry.behaviour`.
+
+    Attributes:
+        word: how it is called. help: what it does, one line.
+        takes_attachment: further lines may come with it.
+    """
 
     word: ClassVar[str]
-    meaning: ClassVar[str]
+    help: ClassVar[str]
+    takes_attachment: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for field, argument in arguments_of(type(self)):
@@ -22,10 +53,19 @@ class Command:
             if value is not None or field.default is not None:
                 check(self.word, argument, value, default_of(field))
 
+    @abstractmethod
+    def build(self, context: BuildContext) -> Behaviour:
+        """A new behaviour, ready for guidance. Raises GrammarError where the command cannot be flown."""
+
     @property
     def endless(self) -> bool:
         """It goes on until another command comes."""
         return False
+
+    @property
+    def aim(self) -> GimbalAim | None:
+        """Where it points the gimbal while the active behaviour goes on; None: it has a behaviour."""
+        return None
 
     def __str__(self) -> str:
         words = [self.word]

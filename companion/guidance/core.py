@@ -153,7 +153,11 @@ class Guidance:
         """A few words for people."""
         if self._behaviour is None:
             return "not in command"
-        words = self._behaviour.status
+        try:
+            words = self._behaviour.status
+        except Exception:
+            logger.exception("%s has no status", self._behaviour.name)
+            words = self._behaviour.name
         if self.phase is Phase.ENGAGING:
             words += ", engaging offboard"
         return words if self.busy else f"{words}, no command"
@@ -186,13 +190,18 @@ class Guidance:
             self._queue.add(command, now_ns, inputs.state, self._behaviour, out)
         for command in self._queue.take_due(now_ns, inputs.state, out):
             self._begin_command(command, situation)
-        if self._behaviour is not None:
-            paused_s = 0.0 if before is None else (now_ns - before.now_ns) / 1e9
-            self._tell_reset(self._behaviour, before, situation)
-            self._update(situation, inputs, paused_s)
+        landing_target = None
+        try:
+            if self._behaviour is not None:
+                paused_s = 0.0 if before is None else (now_ns - before.now_ns) / 1e9
+                self._tell_reset(self._behaviour, before, situation)
+                self._update(situation, inputs, paused_s)
+            landing_target = self._new_landing_target()
+            self.gimbal.update(now_ns, inputs.state, self._behaviour, out)
+        except Exception as error:
+            self._behaviour_failed(error, situation, inputs.stream.sent_count)
         self._answer_endless(inputs)
-        self.gimbal.update(now_ns, inputs.state, self._behaviour, out)
-        return self._output(self._new_landing_target())
+        return self._output(landing_target)
 
     def check_requirements(self, behaviour: Behaviour) -> str | None:
         """Why this behaviour could not begin now, in words; None: it could."""
@@ -321,23 +330,15 @@ class Guidance:
         """One update of the behaviour, and what follows from it."""
         if Requirement.POSITION in behaviour.requirements and not self._position_known(situation):
             return
-        try:
-            if not self._activated:
-                self._activated, self._stepped_ns = True, None
-                behaviour.on_activate(situation)
-                if self.busy:
-                    self._goal_ned_m = None
-            dt_s = 0.0 if self._stepped_ns is None else (situation.now_ns - self._stepped_ns) / 1e9
-            step: Step = behaviour.update(dt_s, situation)
-            for note in behaviour.take_notes():
-                self._out.event(EventKind.NOTED, behaviour.name, note)
-        except Exception as error:
-            # Whatever a behaviour does wrong, the vehicle must be held; the traceback is in the log.
-            logger.exception("%s failed", behaviour.name)
-            if not self.busy:
-                self._lose(f"{behaviour.name} failed: {type(error).__name__}: {error}")
-                return
-            dt_s, step = 0.0, Outcome(False, f"{behaviour.name} failed: {type(error).__name__}: {error}")
+        if not self._activated:
+            self._activated, self._stepped_ns = True, None
+            behaviour.on_activate(situation)
+            if self.busy:
+                self._goal_ned_m = None
+        dt_s = 0.0 if self._stepped_ns is None else (situation.now_ns - self._stepped_ns) / 1e9
+        step: Step = behaviour.update(dt_s, situation)
+        for note in behaviour.take_notes():
+            self._out.event(EventKind.NOTED, behaviour.name, note)
         self._stepped_ns = situation.now_ns
         match step:
             case Outcome():
@@ -349,6 +350,16 @@ class Guidance:
                 self._limit(behaviour, step, situation, dt_s)
             case Setpoint() if self.phase is not Phase.ENGAGING:
                 self._start_engaging(situation, sent_count)
+
+    def _behaviour_failed(self, error: Exception, situation: Situation, sent_count: int) -> None:
+        """A hook of the behaviour raised: the vehicle is held. To be called where an exception is handled."""
+        name = "guidance" if self._behaviour is None else self._behaviour.name
+        logger.exception("%s failed", name)
+        why = f"{name} failed: {type(error).__name__}: {error}"
+        if self.busy:
+            self._conclude(Outcome(False, why), situation, sent_count)
+        else:
+            self._lose(why)
 
     def _limit(self, behaviour: Behaviour, setpoint: Setpoint, situation: Situation, dt_s: float) -> None:
         """What the envelope leaves of a setpoint is streamed; without the depth that it needs, a brake."""

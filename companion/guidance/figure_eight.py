@@ -3,14 +3,36 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
-from companion.guidance.behaviour import Situation
+from companion.guidance.arguments import EnumArgument, Number
+from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import laps_text, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
+from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
 
 _POINTS = 96
+
+
+@behaviour("figure-eight", "fly a level eight about this place, first towards the nose")
+class FigureEight(Command):
+    radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its middle to either end")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most; bends are slower")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, EnumArgument("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def build(self, context: BuildContext) -> Behaviour:
+        along = self.nose == "along"
+        return FigureEightBehaviour(self.radius_m, self.speed_mps, self.laps, nose_along=along)
 
 
 class FigureEightBehaviour(PathFlight):

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+from companion.guidance.arguments import ClassName, EnumArgument, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.choosing import Choice
-from companion.guidance.gimbal_tracking import GimbalTracking
+from companion.guidance.choosing import TargetSelector
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.gimbal_tracking import GimbalTracking, GimbalUse
 from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
 from companion.guidance.moving_track import MovingTrack
+from companion.guidance.registry import behaviour
 from companion.guidance.target import DOUBTED
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
@@ -31,10 +35,54 @@ SURE_OF_SPEED_MPS = 1.0
 UNSEEN_S = 0.6
 
 
+@behaviour("follow", "keep a distance and a bearing to a moving object of the class")
+class Follow(Command):
+    class_name: Annotated[str, ClassName("class", "what to follow")]
+    distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
+    bearing: Annotated[
+        str,
+        EnumArgument(
+            "bearing",
+            ("here", "compass", "course"),
+            "where to stay: as it is, or `angle` from north or course",
+        ),
+    ] = "here"
+    angle_deg: Annotated[
+        float,
+        Number("angle", "deg", -360.0, 360.0, "seen from the object, clockwise; of course, 180 is behind"),
+    ] = 180.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 5.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    occlusion_s: Annotated[
+        float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's expected way this long")
+    ] = 3.0
+    duration_s: Annotated[
+        float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
+    ] = 0.0
+    gimbal: GimbalUse = "leave"
+
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return FollowBehaviour(
+            self.class_name,
+            distance_m=self.distance_m,
+            bearing=self.bearing,
+            angle_rad=math.radians(self.angle_deg),
+            speed_mps=self.speed_mps,
+            confidence=self.confidence,
+            occlusion_s=self.occlusion_s,
+            duration_s=self.duration_s,
+            tracking=GimbalTracking() if self.gimbal == "track" else None,
+        )
+
+
 class FollowBehaviour(Behaviour):
     """Keeps its height, looks at the object and keeps `distance_m` from its nearest surface.
 
-    It begins with the true object of the class before the nose (see `Choice`) and stays with that one.
+    It begins with the true object of the class before the nose (see `EnumArgument`) and stays with that one.
     Unseen, it goes on to where the object is expected to be, for `occlusion_s`; then it ends.
 
     Args:
@@ -83,7 +131,7 @@ class FollowBehaviour(Behaviour):
 
     def _forget(self, now_ns: int, down_m: float) -> None:
         self._track: MovingTrack | None = None
-        self._choice = Choice()
+        self._choice = TargetSelector()
         self._started_ns = self._seen_ns = now_ns
         self._down_m = down_m
         self._doubted = False

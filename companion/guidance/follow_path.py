@@ -3,12 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
-from companion.guidance.behaviour import Situation
+from companion.geometry.points import points_from
+from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points
+from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import home_of, laps_text, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
+from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
+
+
+@behaviour("follow-path", "fly along a row of points, slowing down for corners")
+class FollowPath(Command):
+    points: Annotated[
+        str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
+    ]
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, EnumArgument("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"follow-path: laps must be 0, or 1 or more, got {self.laps:g}")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+    def build(self, context: BuildContext) -> Behaviour:
+        along = self.nose == "along"
+        return FollowPathBehaviour(self.places, self.speed_mps, laps=self.laps, nose_along=along)
 
 
 class FollowPathBehaviour(PathFlight):

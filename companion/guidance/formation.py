@@ -11,13 +11,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
-from companion.geometry.formation import Vector3, slot_motion
+from companion.geometry.formation import SHAPES, Vector3, slot_motion
+from companion.geometry.points import points_from
+from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points, Word
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.formation_group import Agreement, Group
 from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed
 from companion.guidance.neighbours import Neighbour, Neighbourhood
 from companion.guidance.pose import FormationNote, Plan, Structure
+from companion.guidance.registry import behaviour
 from companion.guidance.separation import MARGIN_M, around, pushed_apart
 from companion.guidance.virtual_structure import VirtualStructure
 from companion.vehicle.setpoint import Setpoint
@@ -53,6 +58,63 @@ class _Leader:
     heading_rad: float
     turn_rate_radps: float
     over: bool = False
+
+
+# More vehicles than have been flown, even on paper.
+MOST_SLOTS = 200
+
+
+@behaviour("formation", "hold a slot about a leader: another vehicle, or a virtual one on a path")
+class Formation(Command):
+    shape: Annotated[str, EnumArgument("shape", SHAPES, "of the formation")]
+    leader: Annotated[str, Word("leader", 'vehicle.name of the leader, or "virtual"')]
+    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 6.0
+    slot: Annotated[str, Word("slot", "number of the slot to take, from 1, or auto")] = "auto"
+    points: Annotated[
+        str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long for a leader not heard")
+    ] = 5.0
+
+    @property
+    def endless(self) -> bool:
+        return self.points is None or self.laps == 0.0
+
+    @property
+    def slot_number(self) -> int | None:
+        """None: auto."""
+        return None if self.slot == "auto" else int(self.slot)
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point of the path, metres from home."""
+        return points_from(self.points or "")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
+            raise GrammarError(f"formation: slot must be auto or 1 to {MOST_SLOTS}, got {self.slot!r}")
+        if (self.leader == "virtual") != (self.points is not None):
+            raise GrammarError(
+                "formation: leader=virtual and points=… belong together; one of them is missing"
+            )
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return FormationBehaviour(
+            self.shape,
+            self.leader,
+            self.spacing_m,
+            self.slot_number,
+            points=self.places,
+            speed_mps=self.speed_mps,
+            laps=self.laps,
+            lost_timeout_s=self.lost_timeout_s,
+        )
 
 
 class FormationBehaviour(Behaviour):

@@ -5,10 +5,34 @@ An operator's `gimbal` does not pass here: it changes nothing about what flies (
 
 from __future__ import annotations
 
-from companion.guidance.behaviour import Outcome, Requirement, Situation, Step
+import math
+from typing import Annotated
+
+from companion.guidance.arguments import Number
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal_controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
 from companion.guidance.hold import HoldBehaviour
+from companion.guidance.registry import behaviour
 from companion.vehicle.gimbal import GimbalAim
+
+
+@behaviour("gimbal", "point the gimbal, whatever flies; alone: level and ahead")
+class Gimbal(Command):
+    pitch_deg: Annotated[
+        float, Number("pitch", "deg", -90.0, 90.0, "above the horizon; below is negative")
+    ] = 0.0
+    yaw_deg: Annotated[
+        float, Number("yaw", "deg", -180.0, 180.0, "clockwise from the nose, with which it turns")
+    ] = 0.0
+
+    @property
+    def aim(self) -> GimbalAim:
+        """The same in radians."""
+        return GimbalAim(math.radians(self.pitch_deg), math.radians(self.yaw_deg))
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return PointGimbalBehaviour(self.aim)
 
 
 class PointGimbalBehaviour(HoldBehaviour):

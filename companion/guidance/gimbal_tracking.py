@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+from companion.guidance.arguments import EnumArgument
 from companion.guidance.behaviour import Situation
 from companion.guidance.gimbal_sweep import BEHIND_RAD, PATIENCE_S, gap_text
 from companion.guidance.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
+
+GimbalUse = Annotated[
+    str, EnumArgument("gimbal", ("leave", "track"), "leave it alone, or keep its camera on the object")
+]
 
 # Straight below, an elevation says nothing of a height.
 STEEPEST_RAD = math.radians(89.0)

@@ -3,17 +3,66 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
-from companion.guidance.behaviour import Situation
+from companion.guidance.arguments import GrammarError, Number
+from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.geodesy import north_east
 from companion.guidance.motion import home_of, position_and_yaw
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
+from companion.guidance.registry import behaviour
 from companion.vehicle.state import Vector3
 
 NEAREST_M = 0.05
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.
 GLOBAL_MAX_AGE_S = 0.5
+
+
+@behaviour("goto", "fly straight to a place, given by one pair of its arguments")
+class Goto(Command):
+    north_m: Annotated[float | None, Number("north", "m", -5000.0, 5000.0, "of home, with east")] = None
+    east_m: Annotated[float | None, Number("east", "m", -5000.0, 5000.0, "of home, with north")] = None
+    altitude_m: Annotated[float | None, Number("altitude", "m", 1.0, 500.0, "above home; else as it is")] = (
+        None
+    )
+    forward_m: Annotated[float | None, Number("forward", "m", -5000.0, 5000.0, "of here, with right")] = None
+    right_m: Annotated[float | None, Number("right", "m", -5000.0, 5000.0, "of here, with forward")] = None
+    latitude_deg: Annotated[
+        float | None, Number("latitude", "deg", -90.0, 90.0, "WGS 84, with longitude")
+    ] = None
+    longitude_deg: Annotated[
+        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84, with latitude")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    heading_deg: Annotated[
+        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; else along the way")
+    ] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        pairs = {
+            "north and east": (self.north_m, self.east_m),
+            "forward and right": (self.forward_m, self.right_m),
+            "latitude and longitude": (self.latitude_deg, self.longitude_deg),
+        }
+        begun = [name for name, pair in pairs.items() if pair != (None, None)]
+        if len(begun) != 1:
+            got = " and ".join(begun) if begun else "none of them"
+            raise GrammarError(f"goto: give exactly one pair of {', '.join(pairs)}; got {got}")
+        if None in pairs[begun[0]]:
+            raise GrammarError(f"goto: {begun[0]} belong together; one of them is missing")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return GotoBehaviour(
+            from_home_m=_pair(self.north_m, self.east_m),
+            from_here_m=_pair(self.forward_m, self.right_m),
+            global_deg=_pair(self.latitude_deg, self.longitude_deg),
+            altitude_m=self.altitude_m,
+            speed_mps=self.speed_mps,
+            heading_rad=None if self.heading_deg is None else math.radians(self.heading_deg),
+        )
 
 
 class GotoBehaviour(PathFlight):
@@ -81,3 +130,7 @@ class GotoBehaviour(PathFlight):
 
     def _flown(self) -> str:
         return "there"
+
+
+def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:
+    return None if first is None or second is None else (first, second)

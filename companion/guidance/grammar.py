@@ -15,12 +15,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, dataclass
+from typing import Any
 
 from companion.guidance.arguments import (
     Argument,
-    Choice,
     ClassName,
     ClassNames,
+    EnumArgument,
     FileName,
     GrammarError,
     Number,
@@ -32,7 +33,7 @@ from companion.guidance.arguments import (
     range_of,
 )
 from companion.guidance.command import Command, arguments_of, default_of
-from companion.guidance.commands import COMMANDS
+from companion.guidance.registry import COMMANDS
 
 
 def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
@@ -87,22 +88,84 @@ def describe() -> str:
     """The help text: every command, its arguments, units, ranges and defaults."""
     lines = []
     for kind in COMMANDS.values():
-        lines += [usage(kind), f"    {kind.meaning}"]
+        lines += [usage(kind), f"    {kind.help}"]
         for _, argument in arguments_of(kind):
-            match argument:
-                case Number(key, unit, low, high, meaning):
-                    lines.append(f"    {key}: {meaning} ({low:g} to {high:g}{' ' + unit if unit else ''})")
-                case Choice(key, words, meaning):
-                    lines.append(f"    {key}: {meaning} ({' or '.join(words)})")
-                case (
-                    ClassName(key, meaning)
-                    | ClassNames(key, meaning)
-                    | Points(key, meaning)
-                    | FileName(key, meaning)
-                    | Word(key, meaning)
-                ):
-                    lines.append(f"    {key}: {meaning}")
+            allowed = allowed_values(argument)
+            lines.append(f"    {argument.key}: {argument.meaning}" + (f" ({allowed})" if allowed else ""))
     return "\n".join(lines)
+
+
+def markdown() -> str:
+    """The same as tables for the documentation, one section a command."""
+    lines = []
+    for kind in COMMANDS.values():
+        lines += [
+            "",
+            f"## {kind.word}",
+            "",
+            f"{kind.help[0].upper()}{kind.help[1:]}.",
+            "",
+            f"`{usage(kind)}`",
+        ]
+        if arguments := arguments_of(kind):
+            lines += ["", "| Argument | Meaning | Allowed | Default |", "|---|---|---|---|"]
+        for field, argument in arguments:
+            default = default_of(field)
+            if field.default is MISSING:
+                shown = "required"
+            elif default in (None, ""):
+                shown = "–"
+            else:
+                shown = f"{default:g}" if isinstance(default, float) else str(default)
+            lines.append(f"| `{argument.key}` | {argument.meaning} | {allowed_values(argument)} | {shown} |")
+    return "\n".join(lines).strip() + "\n"
+
+
+def allowed_values(argument: Argument) -> str:
+    """What a value may be, in words; empty where any of its kind is."""
+    match argument:
+        case Number(_, unit, low, high):
+            return f"{low:g} to {high:g}{' ' + unit if unit else ''}"
+        case EnumArgument(_, words):
+            return " or ".join(words)
+    return ""
+
+
+def json_schema(class_names: Sequence[str] | None = None) -> dict[str, Any]:
+    """The table of commands as JSON Schema (draft 2020-12): word → an object of its arguments by their keys.
+
+    Args:
+        class_names: what the detector knows; None: any class name is allowed.
+    """
+    commands: dict[str, Any] = {}
+    for kind in COMMANDS.values():
+        properties: dict[str, Any] = {}
+        for field, argument in arguments_of(kind):
+            properties[argument.key] = schema = _argument_schema(argument, class_names)
+            if (default := default_of(field)) is not None:
+                schema["default"] = default
+        commands[kind.word] = {
+            "type": "object",
+            "description": kind.help,
+            "properties": properties,
+            "required": [a.key for field, a in arguments_of(kind) if field.default is MISSING],
+            "additionalProperties": False,
+        }
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "$defs": commands}
+
+
+def _argument_schema(argument: Argument, class_names: Sequence[str] | None) -> dict[str, Any]:
+    schema: dict[str, Any] = {"type": "string", "description": argument.meaning}
+    match argument:
+        case Number(_, unit, low, high):
+            schema |= {"type": "number", "minimum": low, "maximum": high}
+            if unit:
+                schema["unit"] = unit
+        case EnumArgument(_, words):
+            schema["enum"] = list(words)
+        case ClassName() if class_names is not None:
+            schema["enum"] = list(class_names)
+    return schema
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +231,7 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
                 return float(number)
             except ValueError:
                 raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {text!r}") from None
-        case Choice():
+        case EnumArgument():
             return text.lower()
         case Points() | FileName() | Word():
             return text

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import (
     HOLD_VELOCITY_GAIN,
     PositionController,
@@ -13,6 +16,7 @@ from companion.guidance.motion import (
     speed_of,
     stopping_point,
 )
+from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
@@ -22,6 +26,20 @@ STANDING_MPS = 0.5
 # gust, or the second in which a mode changes, moves a vehicle by less than this. Farther away something else
 # holds it back (a limit, an obstacle, a neighbour), and nobody asked to fly there now.
 GOAL_NEAR_M = 1.0
+
+
+@behaviour("hold", "stay here, under our command")
+class Hold(Command):
+    duration_s: Annotated[
+        float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
+    ] = 0.0
+
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return HoldBehaviour(self.duration_s)
 
 
 class HoldBehaviour(Behaviour):

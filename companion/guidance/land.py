@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 
 # MPC_LAND_SPEED is 0.7 m/s by default; landing detection and PX4's delay to disarm (COM_DISARM_LAND) come on
@@ -14,6 +16,18 @@ GROUND_TIMEOUT_S = 30.0
 # RTL climbs to RTL_RETURN_ALT (30 m) first, then cruises at 5 m/s; both taken generously.
 RETURN_ALTITUDE_M = 60.0
 SLOWEST_RETURN_MPS = 1.5
+
+
+@behaviour("land", "land here and disarm")
+class Land(Command):
+    def build(self, context: BuildContext) -> Behaviour:
+        return LandBehaviour()
+
+
+@behaviour("rtl", "return to home, land and disarm")
+class Rtl(Command):
+    def build(self, context: BuildContext) -> Behaviour:
+        return ReturnBehaviour()
 
 
 class LandBehaviour(Behaviour):

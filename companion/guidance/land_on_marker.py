@@ -10,11 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from enum import StrEnum
+from typing import Annotated
 
+from companion.guidance.arguments import EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.marker_search import MarkerSearch
 from companion.guidance.motion import correction, position_and_yaw, towards
 from companion.guidance.pad_filter import PadFilter
+from companion.guidance.registry import behaviour
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3
@@ -57,6 +61,39 @@ class _Phase(StrEnum):
     FINAL = "landing on"
     CLIMB = "climbing to find again"
     DELEGATED = "the autopilot lands on"
+
+
+@behaviour("land-on-marker", "find a marker below, descend onto it in a narrowing cone, land and disarm")
+class LandOnMarker(Command):
+    identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "of the marker whose pad to land on")]
+    method: Annotated[
+        str,
+        EnumArgument(
+            "method", ("offboard", "autopilot"), "who flies: we, or the autopilot by LANDING_TARGET"
+        ),
+    ] = "offboard"
+    pad: Annotated[str, EnumArgument("pad", ("still", "moving"), "whether the pad may move")] = "still"
+    attempts: Annotated[float, Number("attempts", "", 1.0, 10.0, "descents before giving up")] = 3.0
+    search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "how far around to look for it")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "over ground, at most")] = 1.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key, value in (("id", self.identifier), ("attempts", self.attempts)):
+            if value != int(value):
+                raise GrammarError(f"land-on-marker: {key} must be a whole number, got {value:g}")
+        if self.method == "autopilot" and self.pad == "moving":
+            raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return LandOnMarkerBehaviour(
+            int(self.identifier),
+            by_autopilot=self.method == "autopilot",
+            moving=self.pad == "moving",
+            attempts=int(self.attempts),
+            search_m=self.search_m,
+            speed_mps=self.speed_mps,
+        )
 
 
 class LandOnMarkerBehaviour(Behaviour):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import (
     STOPPING_MPS2,
     correction,
@@ -13,6 +16,7 @@ from companion.guidance.motion import (
     position_and_yaw,
     stopping_speed,
 )
+from companion.guidance.registry import behaviour
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -43,6 +47,40 @@ TURNING_SHARE = 0.5
 # The speed is adapted to that by so many m/s² for each m/s² above or below, at most by so many, filtered.
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
 SLOWEST_MPS = 0.5
+
+
+# What a circle may ask of the vehicle sideways; the envelope's default acceleration.
+MAX_CENTRIPETAL_MPS2 = 2.0
+
+
+@behaviour("orbit", "circle, nose to the centre: the point `radius` ahead, or an object of a class")
+class Orbit(Command):
+    class_name: Annotated[str, ClassName("class", "circle about this object, if given")] = ""
+    radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 10.0, "along the circle")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 100.0, "how many; 0: until another command")] = 0.0
+    direction: Annotated[
+        str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
+    ] = "clockwise"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
+        if self.speed_mps > fastest:
+            raise GrammarError(
+                f"orbit: speed must be at most {math.floor(fastest * 100) / 100:g} m/s on a radius of "
+                f"{self.radius_m:g} m, got {self.speed_mps:g}"
+            )
+
+    def build(self, context: BuildContext) -> Behaviour:
+        clockwise = self.direction == "clockwise"
+        return OrbitBehaviour(
+            self.radius_m, self.speed_mps, self.laps, clockwise=clockwise, class_name=self.class_name
+        )
 
 
 class OrbitBehaviour(Behaviour):

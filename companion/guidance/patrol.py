@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
+from companion.geometry.points import points_from
 from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.arguments import ClassNames, EnumArgument, GrammarError, Number, Points, names_in
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.follow_path import FollowPathBehaviour
 from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
+from companion.guidance.registry import behaviour
 from companion.guidance.sighting import Gaze, Sightings
 from companion.guidance.target import Target
 from companion.vehicle.setpoint import Setpoint
@@ -29,6 +34,58 @@ class _Known:
     track_id: int | None
     place: Vector3 | None
     until_ns: float
+
+
+@behaviour("patrol", "fly a round of points again and again, and stop for what is seen on the way")
+class Patrol(Command):
+    points: Annotated[str, Points("points", "the round: north,east or north,east,height, metres from home")]
+    class_names: Annotated[str, ClassNames("classes", "what to stop for, parted by commas")]
+    do: Annotated[
+        str, EnumArgument("do", ("hold", "approach"), "look at it from the way, or fly up to `distance`")
+    ] = "hold"
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
+    wait_s: Annotated[float, Number("wait", "s", 0.0, 600.0, "how long it stays there")] = 5.0
+    again_s: Annotated[
+        float, Number("again", "s", 0.0, 3600.0, "the same object does not stop it again within this")
+    ] = 120.0
+    apart_m: Annotated[
+        float, Number("apart", "m", 0.5, 100.0, "nearer than this to where an object was is the same one")
+    ] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.places) < 2:
+            raise GrammarError("patrol: a round has at least two points")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The classes, each by itself."""
+        return names_in(self.class_names)
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return PatrolBehaviour(
+            self.places,
+            self.names,
+            speed_mps=self.speed_mps,
+            laps=self.laps,
+            approach_m=self.distance_m if self.do == "approach" else None,
+            wait_s=self.wait_s,
+            again_s=self.again_s,
+            apart_m=self.apart_m,
+            confidence=self.confidence,
+        )
 
 
 class PatrolBehaviour(Behaviour):

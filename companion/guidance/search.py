@@ -2,18 +2,110 @@
 
 from __future__ import annotations
 
-from companion.guidance.behaviour import Outcome, Requirement, Situation, Step
+import math
+from typing import Annotated
+
+from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.gimbal_sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
 from companion.guidance.path import Path
 from companion.guidance.path_flight import PathFlight
-from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
-from companion.guidance.seek import BLIND_TIMEOUT_S, found_text
+from companion.guidance.registry import behaviour
+from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
+from companion.guidance.seek import BLIND_TIMEOUT_S, SeekBehaviour, found_text
 from companion.guidance.sighting import Gaze, Sightings
 from companion.guidance.target import DOUBTED
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
 STANDING_MPS = 0.4
+
+
+@behaviour("seek", "turn, or search an area, until an object of the class is seen; then face it")
+class Seek(Command):
+    class_name: Annotated[str, ClassName("class", "what to look for")]
+    laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
+    rate_radps: Annotated[float, Number("rate", "rad/s", 0.05, 1.0, "how fast to turn")] = 0.5
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+    direction: Annotated[
+        str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
+    ] = "clockwise"
+    pattern: Annotated[
+        str, EnumArgument("pattern", ("turn", "square", "lawnmower"), "on the spot, or over an area about it")
+    ] = "turn"
+    radius_m: Annotated[
+        float | None, Number("radius", "m", 1.0, 500.0, "half a side of the expanding square")
+    ] = None
+    width_m: Annotated[
+        float | None, Number("width", "m", 1.0, 1000.0, "of the lawnmower's area, west to east")
+    ] = None
+    height_m: Annotated[
+        float | None, Number("height", "m", 1.0, 1000.0, "of the lawnmower's area, south to north")
+    ] = None
+    spacing_m: Annotated[
+        float | None, Number("spacing", "m", 1.0, 200.0, "between strips; else what the camera sees")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
+    sweep_deg: Annotated[
+        float | None,
+        Number("sweep", "deg", -90.0, 90.0, "gimbal up and down between level and this; below is negative"),
+    ] = None
+    sweep_rate_dps: Annotated[
+        float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower, the turn is slower too")
+    ] = USUAL_RATE_DPS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sweep_deg is not None and abs(self.sweep_deg) < LEAST_SWEEP_DEG:
+            raise GrammarError(
+                f"seek: sweep must be {LEAST_SWEEP_DEG:g} deg or more from level, got {self.sweep_deg:g}"
+            )
+        if self.sweep_deg is not None and self.pattern != "turn":
+            raise GrammarError(f"seek: pattern={self.pattern} takes no sweep")
+        if self.sweep_deg is None and self.sweep_rate_dps != USUAL_RATE_DPS:
+            raise GrammarError("seek: sweep_rate needs sweep")
+        given = {
+            "radius": self.radius_m,
+            "width": self.width_m,
+            "height": self.height_m,
+            "spacing": self.spacing_m,
+        }
+        needed = {"turn": (), "square": ("radius",), "lawnmower": ("width", "height")}[self.pattern]
+        allowed = (*needed, "spacing") if needed else ()
+        for key, value in given.items():
+            if value is None and key in needed:
+                raise GrammarError(f"seek: pattern={self.pattern} needs {' and '.join(needed)}")
+            if value is not None and key not in allowed:
+                raise GrammarError(f"seek: pattern={self.pattern} takes no {key}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        if self.pattern != "turn":
+            return SearchBehaviour(
+                self.class_name,
+                radius_m=self.radius_m,
+                size_m=None
+                if self.width_m is None or self.height_m is None
+                else (self.width_m, self.height_m),
+                spacing_m=self.spacing_m,
+                footprint=context.footprint,
+                speed_mps=self.speed_mps,
+                confidence=self.confidence,
+            )
+        sweep = None
+        if self.sweep_deg is not None:
+            sweep_rad, rate_radps = math.radians(self.sweep_deg), math.radians(self.sweep_rate_dps)
+            sweep = GimbalSweep(sweep_rad, rate_radps, field_of_view_rad(context.footprint))
+        return SeekBehaviour(
+            self.class_name,
+            laps=self.laps,
+            rate_radps=self.rate_radps,
+            confidence=self.confidence,
+            clockwise=self.direction == "clockwise",
+            whole_turn=True,
+            sweep=sweep,
+        )
 
 
 class SearchBehaviour(PathFlight):

@@ -14,6 +14,8 @@ OVERLAP = 0.2
 # Farther than this a camera that looks to the horizon is not counted on to see an object.
 FARTHEST_M = 25.0
 NARROWEST_M = 1.0
+# What a camera sees across at least, where nobody says what it does.
+NARROW_FIELD_RAD = math.radians(40.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +65,8 @@ def lawnmower(width_m: float, height_m: float, spacing_m: float) -> list[tuple[f
     if height_m >= width_m:
         return points
     return [(beside, along) for along, beside in points]
+
+
+def field_of_view_rad(footprint: Footprint | None) -> float:
+    """What the steering camera sees across, radians; NARROW_FIELD_RAD where that is not known."""
+    return NARROW_FIELD_RAD if footprint is None else footprint.horizontal_fov_rad

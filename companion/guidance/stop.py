@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation, Step
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode
 
 TIMEOUT_S = 5.0
+
+
+@behaviour("stop", "end our command; the autopilot holds its position by itself")
+class Stop(Command):
+    def build(self, context: BuildContext) -> Behaviour:
+        return StopBehaviour()
 
 
 class StopBehaviour(Behaviour):

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from companion.guidance.arguments import Number
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
+from companion.guidance.registry import behaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 
@@ -18,6 +23,14 @@ THERE_S = 0.5
 BASE_TIMEOUT_S = 25.0
 SLOWEST_CLIMB_MPS = 0.5
 CLIMB_MPS = 1.0
+
+
+@behaviour("takeoff", "arm, climb to a height above home and stay there")
+class Takeoff(Command):
+    altitude_m: Annotated[float, Number("altitude", "m", 1.0, 50.0, "height above home")] = 2.5
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return TakeoffBehaviour(self.altitude_m)
 
 
 class TakeoffBehaviour(Behaviour):

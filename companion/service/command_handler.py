@@ -11,15 +11,14 @@ from typing import Any
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Outcome
 from companion.guidance.interface import CommandInput, CommandResult
-from companion.guidance.sequence import SequenceBehaviour
-from companion.missions.mission_file import MissionError
+from companion.guidance.missions.sequence import SequenceBehaviour
 
 
 class CommandHandler:
     """The one place where commands come in.
 
     Args:
-        read: makes a guidance command of an identifier and a text; raises GrammarError or MissionError.
+        read: makes a guidance command of an identifier and a text; raises GrammarError.
         on_command: called when one waits for guidance's next step.
         on_event: called with (level, text) for what a person should know.
     """
@@ -39,7 +38,7 @@ class CommandHandler:
         """Do what a command says; the reply tells how it ended. See `Service.command`."""
         try:
             command = self._read(next(self._identifiers), text)
-        except (GrammarError, MissionError) as error:
+        except GrammarError as error:
             first_line = text.strip().partition("\n")[0]
             return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
         self._on_event("info", f"command: {command.text}")

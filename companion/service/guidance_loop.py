@@ -21,6 +21,11 @@ from companion.vehicle.streamer import Streamer
 
 # Told with the command's own answer.
 _ANSWERED = (EventKind.REFUSED, EventKind.ENDED, EventKind.STARTED)
+# A step that takes longer holds up the setpoints of the 50 Hz stream: processor time, and time that passed
+# (longer, because other programs may have the processor).
+SLOW_STEP_NS, STALLED_STEP_NS = 5_000_000, 50_000_000
+# Of one behaviour it is said so often.
+SLOW_AGAIN_NS = 10_000_000_000
 # The end of the service waits this long for what is held to be given back.
 RELEASE_TIMEOUT_S = 3.0
 
@@ -59,6 +64,7 @@ class GuidanceLoop:
             on_event,
         )
         self._ending = False
+        self._slow: tuple[str, int] = ("", 0)
 
     async def execute(self, text: str) -> dict[str, Any]:
         """Do what a command says; see `Service.command`."""
@@ -97,19 +103,30 @@ class GuidanceLoop:
 
     def _step(self, now_ns: int) -> GuidanceOutput:
         stream = StreamStatus(self._streamer.state, self._streamer.sent_count)
-        output = self.guidance.step(
+        inputs = self._inputs.assemble(
             now_ns,
-            self._inputs.assemble(
-                now_ns,
-                self._driver.state,
-                stream,
-                answers=self._requests.take_answers(),
-                commands=self._commands.take_commands(),
-                ending=self._ending,
-            ),
+            self._driver.state,
+            stream,
+            answers=self._requests.take_answers(),
+            commands=self._commands.take_commands(),
+            ending=self._ending,
         )
+        begun_ns, used_ns = time.monotonic_ns(), time.thread_time_ns()
+        output = self.guidance.step(now_ns, inputs)
+        self._warn_slow(time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
         self._apply(output)
         return output
+
+    def _warn_slow(self, used_ns: int, passed_ns: int, now_ns: int) -> None:
+        """Name a behaviour whose update is slow. If it blocks, its setpoint's deadline ends it."""
+        behaviour = self.guidance.behaviour
+        if behaviour is None or (used_ns < SLOW_STEP_NS and passed_ns < STALLED_STEP_NS):
+            return
+        name, told_ns = self._slow
+        if behaviour.name != name or now_ns - told_ns >= SLOW_AGAIN_NS:
+            self._slow = (behaviour.name, now_ns)
+            text = f"{used_ns / 1e6:.0f} ms of processor time, {passed_ns / 1e6:.0f} ms in all"
+            self._on_event("warning", f"{behaviour.name}: slow update ({text}); at most 5 ms are expected")
 
     def _apply(self, output: GuidanceOutput) -> None:
         if output.setpoint is None:

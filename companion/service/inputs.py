@@ -5,20 +5,20 @@ No asyncio and no clock: the service and a flight in lockstep assemble their inp
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.commands import Command, Gimbal, Mission
+from companion.guidance.command import BuildContext, Command
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, GuidanceInput, StreamStatus
 from companion.guidance.pose_sharing import PoseSharing
-from companion.guidance.registry import behaviour_for
+from companion.guidance.registry import load_plugins
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets import StateHistory
-from companion.missions.mission_file import mission_behaviour
 from companion.perception.views import View
 from companion.perception.views_markers import MarkerWatch
 from companion.settings import Settings
@@ -27,6 +27,8 @@ from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode, VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__name__)
 
 # Of the line of a command; the longest that is of use is a path of hundreds of points.
 LONGEST_LINE = 8000
@@ -41,6 +43,9 @@ class InputAssembler:
         views: the cameras; the one that `guidance.view` names steers.
         on_event: called with (level, text) for what a person should know.
 
+    Raises:
+        PluginError: a module that `plugins.modules` names cannot be loaded.
+
     Attributes:
         steering: the view whose targets behaviours see.
         history: where the vehicle was in the last few seconds.
@@ -50,6 +55,7 @@ class InputAssembler:
     def __init__(
         self, settings: Settings, views: Sequence[View], on_event: Callable[[str, str], None]
     ) -> None:
+        load_plugins(settings.plugins.modules)
         self._settings = settings
         self.steering = next(view for view in views if view.name == settings.guidance.view)
         self.history = StateHistory()
@@ -144,7 +150,7 @@ class InputAssembler:
             check_requirements: guidance's own, asked by a mission at each of its steps.
 
         Raises:
-            GrammarError, MissionError: with what is wrong, a line for each.
+            GrammarError: with what is wrong, a line for each problem.
         """
         text, _, enclosed = text.strip().partition("\n")
         if len(text) > LONGEST_LINE:
@@ -152,22 +158,28 @@ class InputAssembler:
                 f"a command has at most {LONGEST_LINE} characters in its line, got {len(text)}"
             )
         names = self.steering.class_names
-        command: Command = parse(text, names)
-        if isinstance(command, Gimbal):
-            return CommandInput(identifier, str(command), aim=command.aim, mode_changes=self._mode_changes)
-        camera = self.steering.settings.camera
-        footprint = Footprint(camera.field_rad, -self.camera_pitch_rad(state))
-        behaviour: Behaviour
-        if isinstance(command, Mission):
-            behaviour = mission_behaviour(command, enclosed, names, check_requirements, footprint)
-        elif enclosed:
+        command = parse(text, names)
+        if enclosed and not command.takes_attachment:
             raise GrammarError(f"{command}: one command at a time; only a mission may have more lines")
-        else:
-            behaviour = behaviour_for(command, footprint)
+        if (aim := command.aim) is not None:
+            return CommandInput(identifier, str(command), aim=aim, mode_changes=self._mode_changes)
+        footprint = Footprint(self.steering.settings.camera.field_rad, -self.camera_pitch_rad(state))
+        context = BuildContext(footprint, names, enclosed, check_requirements)
         return CommandInput(
             identifier,
             str(command),
-            behaviour,
+            self._built(command, context),
             endless=command.endless,
             mode_changes=self._mode_changes,
         )
+
+    @staticmethod
+    def _built(command: Command, context: BuildContext) -> Behaviour:
+        try:
+            return command.build(context)
+        except GrammarError:
+            raise
+        except Exception as error:
+            # A plug-in must not be able to end the service.
+            logger.exception("%s cannot be built", command.word)
+            raise GrammarError(f"{command.word}: {type(error).__name__}: {error}") from error

@@ -20,3 +20,10 @@ class LogSection(Section):
 
     level: Literal["debug", "info", "warning", "error"] = "info"
     """the least severe lines that are printed"""
+
+
+class PluginsSection(Section):
+    """Programs of others that are loaded into the service. Nothing is loaded that is not named here."""
+
+    modules: tuple[str, ...] = ()
+    """modules on the Python path, or names of installed plug-ins (entry points `companion.plugins`)"""

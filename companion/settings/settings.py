@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from companion.settings.bus import ZenohSection
 from companion.settings.guidance import GuidanceSection
-from companion.settings.operator import LogSection, MetricsSection
+from companion.settings.operator import LogSection, MetricsSection, PluginsSection
 from companion.settings.perception import (
     CameraSection,
     DetectorSection,
@@ -49,6 +49,7 @@ class Settings(Section):
     preview: PreviewSection = PreviewSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
+    plugins: PluginsSection = PluginsSection()
     views: dict[ViewName, ViewSections] = Field(default_factory=dict)
 
     @model_validator(mode="after")

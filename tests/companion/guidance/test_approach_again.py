@@ -4,8 +4,8 @@ from collections.abc import Callable
 import pytest
 
 from companion.guidance.behaviour import Outcome
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.registry import behaviour_for
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
@@ -15,7 +15,7 @@ Each = Callable[[float, Flight], None]
 def flown(
     text: str, car: SeenObject, each: Each, seconds: float = 300.0
 ) -> tuple[Outcome, list[str], Flight]:
-    behaviour = behaviour_for(parse(text))
+    behaviour = parse(text).build(NO_CONTEXT)
     notes: list[str] = []
     vehicle = KinematicVehicle()
     flight = Flight(behaviour, vehicle, [car])

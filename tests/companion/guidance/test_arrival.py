@@ -21,8 +21,8 @@ from companion.guidance.behaviour import Behaviour, Outcome, Situation
 from companion.guidance.figure_eight import FigureEightBehaviour
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.hold import HoldBehaviour
+from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle

@@ -5,9 +5,9 @@ import pytest
 
 from companion.bench.flights import UnknownFlightError, flight_named, flights, summary
 from companion.bench.flights_follow import run
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.follow import FollowBehaviour
 from companion.guidance.grammar import parse
-from companion.guidance.registry import behaviour_for
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
@@ -50,7 +50,9 @@ def test_follow_does_not_take_another_of_the_class_for_its_own() -> None:
 
 
 def test_the_command_makes_the_behaviour() -> None:
-    assert isinstance(behaviour_for(parse("follow car distance=6 bearing=course angle=180")), FollowBehaviour)
+    assert isinstance(
+        parse("follow car distance=6 bearing=course angle=180").build(NO_CONTEXT), FollowBehaviour
+    )
     assert parse("follow car").endless
     assert not parse("follow car duration=10").endless
 

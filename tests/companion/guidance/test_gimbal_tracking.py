@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.command import BuildContext
 from companion.guidance.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.gimbal_sight import GimbalSight
 from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.grammar import parse
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.refusal import refusal
-from companion.guidance.registry import behaviour_for
-from companion.guidance.sequence import SequenceBehaviour
 from companion.guidance.target import Target
-from companion.missions.mission_file import plan_from
 from companion.vehicle.gimbal import GimbalAim, GimbalState
 from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState
@@ -63,7 +63,7 @@ def fly(
 
 
 def command(text: str) -> Behaviour:
-    return behaviour_for(parse(text), FOOTPRINT)
+    return parse(text).build(BuildContext(FOOTPRINT))
 
 
 def reason(log: FlightLog, success: bool) -> str:

@@ -5,12 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.arguments import GrammarError
-from companion.guidance.command import arguments_of
-from companion.guidance.commands import (
-    COMMANDS,
+from companion.guidance import (
     Approach,
-    Command,
     Gimbal,
     Hold,
     Land,
@@ -22,8 +18,10 @@ from companion.guidance.commands import (
     Stop,
     Takeoff,
 )
+from companion.guidance.arguments import GrammarError
+from companion.guidance.command import NO_CONTEXT, Command, arguments_of
 from companion.guidance.grammar import describe, parse
-from companion.guidance.registry import behaviour_for
+from companion.guidance.registry import COMMANDS
 
 NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
 
@@ -191,7 +189,7 @@ def test_what_is_written_is_read_back(command: Command) -> None:
 
 @given(commands)
 def test_every_command_has_a_behaviour_of_its_name(command: Command) -> None:
-    behaviour = behaviour_for(command)
+    behaviour = command.build(NO_CONTEXT)
     assert behaviour.name == command.word
     name = getattr(command, "class_name", "")
     assert behaviour.class_names == ((name,) if name else ())

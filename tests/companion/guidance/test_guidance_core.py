@@ -166,6 +166,39 @@ def test_an_exception_in_a_behaviour_is_logged_ends_it_and_holds(
     assert math.hypot(*harness.vehicle.velocity) < 0.1
 
 
+HOOKS = ("on_activate", "update", "take_notes", "flown", "landing", "gimbal_aim", "landing_target")
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+def test_exception_in_any_hook_ends_it_and_holds(hook: str, caplog: pytest.LogCaptureFixture) -> None:
+    def failing(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    harness = GuidanceHarness(flying())
+    engaged(harness)
+    is_property = isinstance(getattr(Behaviour, hook), property)
+    kind = type("Faulty", (Curious,), {hook: property(failing) if is_property else failing})
+    outcome = harness.outcome(harness.command(kind()), 5.0)
+    assert not outcome.success
+    assert "ZeroDivisionError" in outcome.reason
+    assert "Traceback" in caplog.text
+    harness.run(1.0)
+    assert harness.guidance.phase == "offboard"
+    assert isinstance(harness.guidance.behaviour, HoldBehaviour)
+    assert harness.outputs[-1].setpoint is not None
+
+
+def test_exception_in_the_status_shows_the_name_instead() -> None:
+    class Mute(Curious):
+        @property
+        def status(self) -> str:
+            raise ZeroDivisionError("a bug")
+
+    harness = GuidanceHarness(flying())
+    engaged(harness, Mute())
+    assert harness.guidance.status == "curious"
+
+
 class Curious(Behaviour):
     name = "curious"
     requirements = frozenset()

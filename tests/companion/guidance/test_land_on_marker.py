@@ -7,11 +7,11 @@ import pytest
 from companion.bench.flights_land import land
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Requirement, Situation
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.marker_search import CLIMB_M, MarkerSearch
 from companion.guidance.refusal import refusal
-from companion.guidance.registry import behaviour_for
 from companion.vehicle.state import LandedState, VehicleState
 
 
@@ -47,7 +47,7 @@ def test_a_search_waits_climbs_and_goes_round_until_all_was_looked_at() -> None:
 def test_a_command_becomes_the_behaviour_and_back() -> None:
     command = parse("land-on-marker 7 method=autopilot attempts=2")
     assert str(command) == "land-on-marker 7 method=autopilot attempts=2"
-    assert isinstance(behaviour_for(command), LandOnMarkerBehaviour)
+    assert isinstance(command.build(NO_CONTEXT), LandOnMarkerBehaviour)
     with pytest.raises(GrammarError, match="id must be a whole number, got 7"):
         parse("land-on-marker 7.5")
     with pytest.raises(GrammarError, match="pad that is still"):

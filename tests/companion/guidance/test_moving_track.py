@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.choosing import CHOOSING_S, Choice
+from companion.guidance.choosing import CHOOSING_S, TargetSelector
 from companion.guidance.moving_track import DOUBT_S, MovingTrack
 from companion.guidance.target import RangeSource, Target
 
@@ -157,7 +157,7 @@ def test_what_is_true_now_and_then_is_not_chosen() -> None:
     vehicle = (0.0, 0.0, -4.0)
 
     def chosen(doubts: str) -> Target | None:
-        choice, found = Choice(), None
+        choice, found = TargetSelector(), None
         for frame, doubt in enumerate(doubts):
             target = replace(seen((20.0, 0.0), vehicle, frame * FRAME_S, 3), trusted=doubt != "?")
             found = choice.take([target], 0.0, round(frame * FRAME_S * 1e9))
@@ -171,14 +171,14 @@ def test_what_is_true_now_and_then_is_not_chosen() -> None:
 def test_without_ranges_the_one_nearest_to_the_nose_is_meant() -> None:
     aside = Target("car", 0.9, 1, math.radians(9.5), -0.3, track_id=None)
     ahead = replace(aside, bearing_rad=math.radians(0.2))
-    assert Choice().take([aside, ahead], 0.0, 1) is ahead
+    assert TargetSelector().take([aside, ahead], 0.0, 1) is ahead
 
 
 def test_of_those_before_the_nose_the_nearest_is_meant() -> None:
     vehicle = (0.0, 0.0, -4.0)
 
     def chosen(*places: tuple[float, float]) -> tuple[float, float]:
-        choice = Choice()
+        choice = TargetSelector()
         found = None
         for frame in range(round(CHOOSING_S / FRAME_S) + 2):
             targets = [seen(place, vehicle, frame * FRAME_S, index) for index, place in enumerate(places)]

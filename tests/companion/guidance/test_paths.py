@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
-from companion.guidance.commands_of_flight import FollowPath
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.envelope import Limits
 from companion.guidance.figure_eight import FigureEightBehaviour, lemniscate
-from companion.guidance.follow_path import FollowPathBehaviour
+from companion.guidance.follow_path import FollowPath, FollowPathBehaviour
 from companion.guidance.geodesy import north_east
 from companion.guidance.goto import GotoBehaviour
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
-from companion.guidance.registry import behaviour_for
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import Flight
@@ -168,7 +167,7 @@ def test_a_place_about_home_needs_to_know_home() -> None:
     vehicle = KinematicVehicle()
     state = replace(vehicle.state, home_position_ned_m=None)
     for text in ("goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"):
-        behaviour = behaviour_for(grammar.parse(text))
+        behaviour = grammar.parse(text).build(NO_CONTEXT)
         behaviour.on_activate(Situation(vehicle.now_ns, state))
         step = behaviour.update(0.0, Situation(vehicle.now_ns, state))
         assert isinstance(step, Outcome)
@@ -283,7 +282,7 @@ def test_what_cannot_be_meant_is_one_line(text: str, words: str) -> None:
 def test_commands_are_written_as_they_are_read_and_have_a_behaviour(text: str) -> None:
     command = grammar.parse(text)
     assert grammar.parse(str(command)) == command
-    assert behaviour_for(command).name == command.word
+    assert command.build(NO_CONTEXT).name == command.word
     assert command.endless == ("laps=0" in text)
 
 

@@ -4,10 +4,9 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from companion.guidance.behaviour import Outcome
-from companion.guidance.commands_of_sight import Patrol
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.patrol import PatrolBehaviour
-from companion.guidance.registry import behaviour_for
+from companion.guidance.patrol import Patrol, PatrolBehaviour
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
@@ -160,7 +159,7 @@ def test_the_grammar_of_a_patrol() -> None:
     assert isinstance(command, Patrol)
     assert command.names == ("person", "car")
     assert parse(str(command)) == command
-    assert behaviour_for(command).class_names == ("person", "car")
+    assert command.build(NO_CONTEXT).class_names == ("person", "car")
     assert command.endless
     for text, said in [
         ("patrol 0,0 classes=car", "two points"),

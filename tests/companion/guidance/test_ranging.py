@@ -7,10 +7,10 @@ import math
 import pytest
 
 from companion.guidance.behaviour import Situation
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.refusal import refusal
-from companion.guidance.registry import behaviour_for
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel
 
@@ -21,7 +21,7 @@ OTHERS = ("seek kite", "orbit", 'patrol "0,0 9,9" classes=kite')
 def why(command: str, means: RangeMeans) -> str | None:
     vehicle = KinematicVehicle()
     situation = Situation(vehicle.now_ns, vehicle.state, (), 0.05, True, ranging=means)
-    return refusal(behaviour_for(parse(command)), situation, None)
+    return refusal(parse(command).build(NO_CONTEXT), situation, None)
 
 
 @pytest.mark.parametrize("command", NEEDING)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.registry import behaviour_for
 from companion.guidance.search import SearchBehaviour
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
 from companion.guidance.target import DOUBTED
@@ -73,7 +73,7 @@ def test_a_search_finds_what_is_hidden_from_the_middle_and_ends_facing_it(text: 
         car.visible = math.dist((car.north, car.east), vehicle.position[:2]) < 9.0
 
     vehicle = KinematicVehicle()
-    outcome = Flight(behaviour_for(parse(f"seek car {text}")), vehicle, [car]).run(240.0, each)
+    outcome = Flight(parse(f"seek car {text}").build(NO_CONTEXT), vehicle, [car]).run(240.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     bearing = math.atan2(car.east - vehicle.position[1], car.north - vehicle.position[0])

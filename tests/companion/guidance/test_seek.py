@@ -2,8 +2,8 @@ import math
 
 import pytest
 
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.registry import behaviour_for
 from companion.guidance.seek import SeekBehaviour
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
@@ -104,7 +104,7 @@ def test_the_command_compares_what_a_whole_turn_shows() -> None:
     first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
     surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
     vehicle = KinematicVehicle()
-    outcome = Flight(behaviour_for(parse("seek car")), vehicle, [first, surer]).run(60.0)
+    outcome = Flight(parse("seek car").build(NO_CONTEXT), vehicle, [first, surer]).run(60.0)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert faces(vehicle, surer)

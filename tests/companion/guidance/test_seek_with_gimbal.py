@@ -14,11 +14,11 @@ import pytest
 
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject
+from companion.guidance.command import BuildContext
 from companion.guidance.grammar import parse
-from companion.guidance.registry import behaviour_for
-from companion.guidance.sequence import SequenceBehaviour
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.target import Target
-from companion.missions.mission_file import plan_from
 from tests.companion.guidance.gimbal_flight import (
     CAMERA,
     FOOTPRINT,
@@ -43,7 +43,7 @@ def fly(
         for target in moment.situation.targets:
             seen.setdefault(target.captured_ns, target)
 
-    log = flight.fly(behaviour_for(parse(command), FOOTPRINT), limit_s, each=each)
+    log = flight.fly(parse(command).build(BuildContext(FOOTPRINT)), limit_s, each=each)
     return flight, log, list(seen.values())
 
 

@@ -7,8 +7,8 @@ import pytest
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.sequence import Plan, PlannedStep, SequenceBehaviour
-from companion.missions.mission_file import plan_from
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState

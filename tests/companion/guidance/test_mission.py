@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.sequence import ABORT, END, LAND, RTL
-from companion.missions.mission_file import (
+from companion.guidance.missions.mission_file import (
     MISSIONS_FOLDER,
     MissionError,
     describe,
@@ -18,6 +17,7 @@ from companion.missions.mission_file import (
     plan_from,
     read_mission,
 )
+from companion.guidance.missions.sequence import ABORT, END, LAND, RTL
 from mavlink_sim.testing import running_simulator
 from tests.companion.command_line import companion
 from tests.companion.service_process import running_service

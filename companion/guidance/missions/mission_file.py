@@ -18,20 +18,18 @@ on_success = "continue"          # the next step; after the last one: "end"
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from companion.guidance import grammar
-from companion.guidance.arguments import GrammarError, nearest
+from companion.guidance.arguments import FileName, GrammarError, nearest
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.commands import Command, Mission
-from companion.guidance.registry import behaviour_for
-from companion.guidance.search_pattern import Footprint
-from companion.guidance.sequence import (
+from companion.guidance.command import NO_CONTEXT, BuildContext, Command
+from companion.guidance.grammar import parse
+from companion.guidance.missions.sequence import (
     ABORT,
     CONTINUE,
     END,
@@ -41,6 +39,8 @@ from companion.guidance.sequence import (
     PlannedStep,
     SequenceBehaviour,
 )
+from companion.guidance.registry import behaviour
+from companion.guidance.search_pattern import Footprint
 
 MISSIONS_FOLDER = Path(__file__).parent
 LARGEST_BYTES = 100_000
@@ -51,12 +51,30 @@ _Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
 _Count = Annotated[int, Field(ge=1, le=1000)]
 
 
-class MissionError(ValueError):
+class MissionError(GrammarError):
     """A mission that cannot be flown. `problems` has one line each, with file and step; the text is those."""
 
     def __init__(self, *problems: str) -> None:
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+@behaviour("mission", "fly the steps of a mission file, with their time-outs and branches")
+class Mission(Command):
+    takes_attachment = True
+
+    file: Annotated[
+        str, FileName("file", "a path on the service's computer, or the name of one that came along")
+    ]
+
+    def build(self, context: BuildContext) -> Behaviour:
+        text = context.attachment
+        if len(text.encode()) > LARGEST_BYTES:
+            raise MissionError(f"{self.file}: a mission has at most {LARGEST_BYTES} bytes")
+        if not text.strip():
+            text = read_mission(find_mission(self.file))
+        plan = plan_from(text, self.file, context.class_names, context.footprint)
+        return SequenceBehaviour(plan, context.check_requirements)
 
 
 class StepTable(BaseModel):
@@ -92,27 +110,6 @@ class _Read:
     command: Command
     on_success: int | str
     on_failure: int | str
-
-
-def mission_behaviour(
-    command: Mission,
-    enclosed: str,
-    class_names: Sequence[str] | None,
-    refused: Callable[[Behaviour], str | None],
-    footprint: Footprint | None = None,
-) -> SequenceBehaviour:
-    """What flies a mission: of the text that came with the command, or else of the file it names.
-
-    Args:
-        refused: as `SequenceBehaviour`. footprint: as `behaviour_for`.
-
-    Raises:
-        MissionError: as `find_mission`, `read_mission` and `plan_from`.
-    """
-    if len(enclosed.encode()) > LARGEST_BYTES:
-        raise MissionError(f"{command.file}: a mission has at most {LARGEST_BYTES} bytes")
-    text = enclosed if enclosed.strip() else read_mission(find_mission(command.file))
-    return SequenceBehaviour(plan_from(text, command.file, class_names, footprint), refused)
 
 
 def find_mission(name: str) -> Path:
@@ -159,7 +156,7 @@ def plan_from(
     Args:
         text: of the file. source: its name, for what is said about it.
         class_names: what the detector knows; None: not known, any is taken.
-        footprint: as `behaviour_for`.
+        footprint: of the steering camera; None: not known.
 
     Raises:
         MissionError: with every problem found: no TOML, an unknown key, a step that is no command, an unknown
@@ -182,7 +179,7 @@ def plan_from(
     return Plan(
         name=table.name or Path(source).stem,
         steps=tuple(_planned(step, footprint) for step in read),
-        way_down=lambda word: behaviour_for(grammar.parse(word)),
+        way_down=lambda word: parse(word).build(NO_CONTEXT),
         timeout_s=table.timeout_s,
     )
 
@@ -216,7 +213,7 @@ def _planned(step: _Read, footprint: Footprint | None) -> PlannedStep:
     return PlannedStep(
         title=table.name or str(step.command),
         command=str(step.command),
-        make=lambda: behaviour_for(step.command, footprint),
+        make=lambda: step.command.build(BuildContext(footprint)),
         endless=step.command.endless,
         timeout_s=table.timeout_s,
         repeat=table.repeat,
@@ -280,7 +277,7 @@ def _read_steps(
                 problems.append(f"{where}: {key}: unknown step {word!r}; {nearest(word, known)}")
                 followers.append(ABORT)
         try:
-            command = grammar.parse(step.do, class_names)
+            command = parse(step.do, class_names)
         except GrammarError as error:
             problems.append(f"{where}: {error}")
             continue

@@ -1,0 +1,88 @@
+"""The example plug-in, installed as a package of its own, and flown."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight, plain_settings
+from companion.guidance.registry import COMMANDS
+from mavlink_sim.testing import RunningSimulator
+from tests.companion.service_process import running_service
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    """A folder with the package, as pip installs it."""
+    pytest.importorskip("setuptools")
+    source, target = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    for file in EXAMPLE.iterdir():
+        if file.is_file():
+            (source / file.name).write_bytes(file.read_bytes())
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--no-index", "--target", str(target), str(source)], check=True, timeout=100)
+    return target
+
+
+def test_example_has_at_most_forty_lines() -> None:
+    assert len((EXAMPLE / "companion_circle.py").read_text().splitlines()) <= 40
+
+
+def test_plugin_flies_its_circle(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(installed)
+    before = dict(COMMANDS)
+    try:
+        settings = plain_settings({"plugins.modules": "circle"})
+        flight = LockstepFlight.airborne(seed=3, settings=settings)
+        flight.command("circle radius=6 speed=1.5")
+        flight.run(15.0)
+        places = []
+        for _ in range(25):  # once round: 2 pi 6 m / 1.5 m/s
+            flight.run(1.0)
+            places.append(flight.vehicle.truth.position_ned_m)
+    finally:
+        COMMANDS.clear()
+        COMMANDS.update(before)
+        sys.modules.pop("companion_circle", None)
+    # The circle that fits best: x^2 + y^2 = 2 a x + 2 b y + c (Kasa 1976).
+    points = np.array([place[:2] for place in places])
+    terms = np.column_stack([2 * points, np.ones(len(points))])
+    (north, east, rest), *_ = np.linalg.lstsq(terms, (points**2).sum(axis=1), rcond=None)
+    radius = math.sqrt(rest + north**2 + east**2)
+    assert abs(radius - 6.0) < 1.0
+    assert np.ptp(np.hypot(*(points - (north, east)).T)) < 1.2
+
+
+@pytest.mark.timeout(200)
+def test_service_flies_an_installed_plugin(
+    installed: Path,
+    vehicle: RunningSimulator,
+    filming: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")]))
+    flags = [*filming, "--plugins-modules", "circle"]
+    with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
+        service.take_off(3.0)
+        send = [
+            sys.executable,
+            "-m",
+            "companion.cli",
+            "send",
+            "circle radius=4",
+            "--connect",
+            service.endpoint,
+        ]
+        told = subprocess.run(send, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+        assert told.returncode == 0, told.stderr
+        assert service.command("land")["success"]

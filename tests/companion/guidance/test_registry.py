@@ -1,0 +1,114 @@
+"""Commands register themselves, those of plug-ins too."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from companion.guidance.command import NO_CONTEXT
+from companion.guidance.grammar import describe, json_schema, markdown, parse
+from companion.guidance.registry import COMMANDS, PluginError, load_plugins
+
+PLUGIN = """
+from typing import Annotated
+
+from companion.guidance.arguments import Number
+from companion.guidance.behaviour import Behaviour, Outcome
+from companion.guidance.command import Command
+from companion.guidance.registry import behaviour
+
+
+@behaviour("{word}", "wait for some time")
+class Wait(Command):
+    duration_s: Annotated[float, Number("duration", "s", 0.0, 60.0, "how long")] = 5.0
+
+    def build(self, context):
+        return WaitBehaviour()
+
+
+class WaitBehaviour(Behaviour):
+    name = "{word}"
+
+    def update(self, dt_s, situation):
+        return Outcome(True, "waited")
+"""
+
+
+@pytest.fixture(autouse=True)
+def _table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """The table of commands and the loaded modules as they were."""
+    before, modules = dict(COMMANDS), set(sys.modules)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    COMMANDS.clear()
+    COMMANDS.update(before)
+    for name in set(sys.modules) - modules:
+        del sys.modules[name]
+
+
+def test_module_that_is_named_adds_its_command(tmp_path: Path) -> None:
+    (tmp_path / "plugin_of_a_user.py").write_text(PLUGIN.format(word="wait"))
+    assert "wait" not in COMMANDS
+    load_plugins(["plugin_of_a_user"])
+    command = parse("wait 7s")
+    assert str(command) == "wait duration=7"
+    assert command.build(NO_CONTEXT).name == "wait"
+    assert "wait [duration=5]" in describe()
+    assert json_schema()["$defs"]["wait"]["properties"]["duration"]["unit"] == "s"
+    assert "## wait" in markdown()
+
+
+def test_entry_point_gives_a_module_a_short_name(tmp_path: Path) -> None:
+    (tmp_path / "a_long_module_name.py").write_text(PLUGIN.format(word="wait"))
+    metadata = tmp_path / "waiting-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: waiting\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[companion.plugins]\nwaiting = a_long_module_name\n")
+    load_plugins([])
+    assert "wait" not in COMMANDS
+    load_plugins(["waiting"])
+    assert "wait" in COMMANDS
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("no_such_module", None),
+        ("with_a_bug", "1 / 0"),
+        ("needs_what_is_not_there", "import no_such_library_at_all"),
+        ("takes_a_word_of_ours", PLUGIN.format(word="hold")),
+        ("two_words", PLUGIN.format(word="wait here")),
+        (
+            "no_argument",
+            PLUGIN.format(word="wait").replace('Annotated[float, Number("duration", ', "float #"),
+        ),
+    ],
+)
+def test_plugin_that_cannot_be_loaded_is_named(tmp_path: Path, name: str, source: str | None) -> None:
+    if source is not None:
+        (tmp_path / f"{name}.py").write_text(source)
+    before = dict(COMMANDS)
+    with pytest.raises(PluginError, match=name):
+        load_plugins([name])
+    assert before == COMMANDS
+
+
+def test_schema_holds_every_command_and_its_ranges() -> None:
+    schema = json_schema(["car", "dog"])
+    json.dumps(schema)
+    assert set(schema["$defs"]) == set(COMMANDS)
+    approach = schema["$defs"]["approach"]
+    assert approach["required"] == ["class"]
+    assert approach["properties"]["class"]["enum"] == ["car", "dog"]
+    assert approach["properties"]["distance"] == {
+        "type": "number",
+        "description": "where to stop, to its surface",
+        "minimum": 1.0,
+        "maximum": 100.0,
+        "unit": "m",
+        "default": 5.0,
+    }
