@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import queue
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,9 @@ from companion.bus.session import zenoh_config
 from companion.bus.topics import ROOT, alive_key, command_key
 from companion.settings import ZenohSection
 
-_DISCOVERY_S = 3.0
+_DISCOVERY_S = 2.0
+# After the service has gone an answer of its may still be on its way.
+_LAST_ANSWER_S = 0.3
 
 
 class NoAnswerError(TimeoutError):
@@ -46,7 +49,7 @@ def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> Ze
 
 
 @contextmanager
-def open_client(settings: ZenohSection, *, timeout_s: float = 5.0) -> Iterator[zenoh.Session]:
+def open_client(settings: ZenohSection, *, timeout_s: float = 2.0) -> Iterator[zenoh.Session]:
     """A session connected to somebody.
 
     Raises:
@@ -79,31 +82,58 @@ def send_command(
     """Send one command and wait for its outcome: {"success": bool, "reason": str, ...}.
 
     Raises:
-        NoAnswerError: no service for this vehicle, or it did not end in `timeout_s`.
+        NoAnswerError: no service for this vehicle, it has gone meanwhile, or it did not end in `timeout_s`.
     """
-    _wait_for_service(session, vehicle)
-    # Sent once: a command that was heard and not answered may be flying.
-    for reply in session.get(command_key(vehicle), payload=text, timeout=timeout_s):
-        if reply.ok is not None:
-            answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
-            return answer
-    raise NoAnswerError(
-        f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` tells what it does"
-    )
-
-
-def _wait_for_service(session: zenoh.Session, vehicle: str) -> None:
-    """Until the service's own token is seen: just after connecting it may still be on its way."""
-    deadline = time.monotonic() + _DISCOVERY_S
-    while not any(
-        reply.ok is not None for reply in session.liveliness().get(alive_key(vehicle), timeout=1.0)
-    ):
-        if time.monotonic() > deadline:
+    heard: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
+    # The service's own token tells that it is there (just after connecting it may still be on its way), and
+    # that it has gone: a query to a service that was killed is pending until its time is over.
+    watching = session.liveliness().declare_subscriber(alive_key(vehicle), heard.put, history=True)
+    try:
+        try:
+            while not _is(heard.get(timeout=_DISCOVERY_S), zenoh.SampleKind.PUT):
+                pass
+        except queue.Empty:
             raise NoAnswerError(
                 f"no service for vehicle {vehicle!r} here: is that its vehicle.name? "
                 "`companion echo status` shows who is there"
+            ) from None
+        # Sent once: a command that was heard and not answered may be flying.
+        replies = zenoh.handlers.Callback(heard.put, lambda: heard.put(None))
+        session.get(command_key(vehicle), replies, payload=text, timeout=timeout_s)
+        return _answer(heard, vehicle, text, timeout_s)
+    finally:
+        watching.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _answer(
+    heard: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None], vehicle: str, text: str, timeout_s: float
+) -> dict[str, Any]:
+    """The first answer to a query. None in the queue: no more will come."""
+    over_s, wait_s = time.monotonic() + timeout_s, timeout_s + _LAST_ANSWER_S
+    while True:
+        try:
+            news = heard.get(timeout=wait_s)
+        except queue.Empty:
+            news = None
+        if isinstance(news, zenoh.Reply) and news.ok is not None:
+            answer: dict[str, Any] = json.loads(news.ok.payload.to_string())
+            return answer
+        if _is(news, zenoh.SampleKind.DELETE):
+            wait_s = _LAST_ANSWER_S  # an answer may have left just before
+        elif news is None and time.monotonic() >= over_s:
+            raise NoAnswerError(
+                f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` tells what it does"
             )
-        time.sleep(0.05)
+        elif news is None:
+            raise NoAnswerError(
+                f"{text!r}: the service of vehicle {vehicle!r} has gone before it answered: it was ended or "
+                "killed, or the network to it broke. The vehicle does what its autopilot is set to do; look "
+                "at it, and at the service's log"
+            )
+
+
+def _is(news: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool:
+    return isinstance(news, zenoh.Sample) and news.kind == kind
 
 
 def listen(

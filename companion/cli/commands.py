@@ -76,16 +76,22 @@ def run(settings: Settings) -> None:
     with uncollected():
         from companion.bus.session import BusError
         from companion.guidance.registry import PluginError
+        from companion.operator.line_output import use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.keeper import PerceptionStartError
         from companion.service import Service
         from companion.vehicle.driver import LinkError
 
+    # From here on a reader of standard error that stalls stops nothing; before handlers take the stream.
+    output = use_for_standard_error()
     logging.basicConfig(
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
     with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError):
-        asyncio.run(_run_until_signal(settings, Service))
+        service = Service(
+            settings, console=True, dropped_lines=lambda: 0 if output is None else output.dropped
+        )
+        asyncio.run(_run_until_signal(settings, service))
 
 
 def _keep_what_is_loaded() -> None:
@@ -114,8 +120,7 @@ def _warn_drawn_scenes_only(looked_at: Iterable[tuple[str, str]]) -> None:
         )
 
 
-async def _run_until_signal(settings: Settings, make: type[Service]) -> None:
-    service = make(settings, console=True)
+async def _run_until_signal(settings: Settings, service: Service) -> None:
     loop = asyncio.get_running_loop()
 
     def on_ready() -> None:

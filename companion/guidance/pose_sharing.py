@@ -27,13 +27,14 @@ class PoseSharing:
         vehicle: its name. on_event: called with (level, text) for what a person should know.
 
     Attributes:
+        vehicle: its name. source: of this run of the service, random.
         unread: messages that were no poses.
     """
 
     def __init__(self, vehicle: str, on_event: Callable[[str, str], None]) -> None:
-        self._vehicle, self._on_event = vehicle, on_event
-        self._source = uuid.uuid4().hex[:12]
-        self._neighbours = Neighbours(vehicle, self._source)
+        self.vehicle, self._on_event = vehicle, on_event
+        self.source = uuid.uuid4().hex[:12]
+        self._neighbours = Neighbours(vehicle, self.source)
         self.unread = 0
 
     def hear(self, payload: bytes, receipt_ns: int) -> None:
@@ -54,7 +55,7 @@ class PoseSharing:
         self._neighbours.hear(pose, receipt_ns)
         if len(self._neighbours.namesakes) > namesakes:
             self._on_event(
-                "error", f"another service calls its vehicle {self._vehicle} too: give each its vehicle.name"
+                "error", f"another service calls its vehicle {self.vehicle} too: give each its vehicle.name"
             )
 
     def around(self, state: VehicleState, now_ns: int) -> Neighbourhood:
@@ -68,7 +69,7 @@ class PoseSharing:
         role = "follower" if note is not None else "alone"
         if note is None and self._neighbours.leads():
             role = "leader"
-        return pose_of(state, now_ns, vehicle=self._vehicle, source=self._source, role=role, formation=note)
+        return pose_of(state, now_ns, vehicle=self.vehicle, source=self.source, role=role, formation=note)
 
     def message(self, state: VehicleState, behaviour: Behaviour | None, now_ns: int) -> dict[str, Any] | None:
         """The same as it is published."""

@@ -98,6 +98,16 @@ def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFam
         published.add_metric([topic], float(count))
     yield published
     yield CounterMetricFamily(
+        "companion_log_lines_dropped",
+        "lines of the log that nobody read in time",
+        value=float(status["log"]["dropped_lines"]),
+    )
+    yield GaugeMetricFamily(
+        "companion_other_commanders",
+        "other services seen that command the vehicle",
+        value=float(len(vehicle["other_commanders"])),
+    )
+    yield CounterMetricFamily(
         "companion_messages_unsent", "messages that zenoh did not take", value=float(bus["unsent"])
     )
 

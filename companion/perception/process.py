@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import signal
 import socket
 import sys
+import threading
+import time
 from typing import Self
 
 from companion.perception.messages import (
@@ -23,10 +26,16 @@ from companion.perception.messages import (
 )
 from companion.settings import Settings
 
+logger = logging.getLogger(__name__)
+
 # Results that wait in the kernel are old before they are read: room for about ten, no more.
 _SEND_BUFFER_BYTES = 16384
 # Above this much that the worker has not taken (it is stopped, or busy) no more lines for the video go there.
 _UNREAD_BYTES = 65536
+# What a worker and its libraries print: a traceback goes through, a flood is cut.
+_PRINTED_LINES_PER_S, _PRINTED_LINE_BYTES = 100, 1000
+# At its death the last lines may take so long to be read.
+_LAST_LINES_S = 0.5
 
 
 class PerceptionProcess:
@@ -41,11 +50,16 @@ class PerceptionProcess:
         process: asyncio.subprocess.Process,
         reports: tuple[asyncio.StreamReader, asyncio.StreamWriter],
         orders: tuple[asyncio.StreamReader, asyncio.StreamWriter],
+        printed: int,
     ) -> None:
         self._process = process
         self._reports = reports[0]
         self._orders = orders[1]
         self._ends = (reports[1], orders[1])
+        self._printing = threading.Thread(
+            target=log_printed, args=(printed, process.pid), name="worker's standard error", daemon=True
+        )
+        self._printing.start()
 
     @classmethod
     async def spawn(cls, settings: Settings, standard_input: int, first_track_id: int = 1) -> Self:
@@ -60,7 +74,11 @@ class PerceptionProcess:
         """
         said, saying = socket.socketpair()
         told, telling = socket.socketpair()
-        with saying, told, contextlib.ExitStack() as failing:
+        # Not our own standard error: where nobody reads that, the worker would stop at its next line.
+        printed, printing = os.pipe()
+        with saying, told, contextlib.ExitStack() as always, contextlib.ExitStack() as failing:
+            always.callback(os.close, printing)
+            failing.callback(os.close, printed)
             failing.enter_context(said)
             failing.enter_context(telling)
             saying.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
@@ -78,13 +96,14 @@ class PerceptionProcess:
                 str(os.getpid()),
                 pass_fds=(saying.fileno(), told.fileno()),
                 stdin=standard_input,
-                stdout=2,  # standard output is the service's own
+                stdout=printing,
+                stderr=printing,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
                 # A Ctrl-C in the terminal is for the service, which then asks the worker to end.
                 process_group=0,
             )
             failing.pop_all()
-        worker = cls(process, reports, orders)
+        worker = cls(process, reports, orders, printed)
         worker._put(Begin(settings, first_track_id))
         return worker
 
@@ -136,6 +155,7 @@ class PerceptionProcess:
         """Wait for its death; how it died, in words."""
         code = await self._process.wait()
         self.close()
+        await asyncio.to_thread(self._printing.join, _LAST_LINES_S)
         for end in self._ends:
             with contextlib.suppress(ConnectionError):
                 await end.wait_closed()
@@ -155,3 +175,22 @@ class PerceptionProcess:
         # A write to a worker that is gone is dropped by the transport; its death shows in `read`.
         if not self._orders.is_closing():
             self._orders.write(packed(message))
+
+
+def log_printed(descriptor: int, pid: int) -> None:
+    """Into the log, until its end: what the worker and the libraries in it print."""
+    partial, cut, since_s, lines_left = b"", 0, -1.0, 0
+    with open(descriptor, "rb", buffering=0) as pipe:
+        while data := pipe.read(65536):
+            *lines, partial = (partial + data).split(b"\n")
+            partial = partial[:_PRINTED_LINE_BYTES]
+            if time.monotonic() - since_s >= 1.0:
+                if cut:
+                    logger.warning("process %d printed %d more lines", pid, cut)
+                since_s, lines_left, cut = time.monotonic(), _PRINTED_LINES_PER_S, 0
+            cut += max(len(lines) - lines_left, 0)
+            for line in lines[:lines_left]:
+                logger.warning("%s", line[:_PRINTED_LINE_BYTES].decode(errors="replace").rstrip())
+            lines_left = max(lines_left - len(lines), 0)
+    if partial:
+        logger.warning("%s", partial.decode(errors="replace"))

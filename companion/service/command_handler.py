@@ -21,6 +21,7 @@ class CommandHandler:
         read: makes a guidance command of an identifier and a text; raises GrammarError.
         on_command: called when one waits for guidance's next step.
         on_event: called with (level, text) for what a person should know.
+        refusal: why a command may not go to guidance, or None.
     """
 
     def __init__(
@@ -28,8 +29,11 @@ class CommandHandler:
         read: Callable[[int, str], CommandInput],
         on_command: Callable[[], None],
         on_event: Callable[[str, str], None],
+        *,
+        refusal: Callable[[CommandInput], str | None],
     ) -> None:
         self._read, self._on_command, self._on_event = read, on_command, on_event
+        self._refusal = refusal
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}
@@ -42,6 +46,9 @@ class CommandHandler:
             first_line = text.strip().partition("\n")[0]
             return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
         self._on_event("info", f"command: {command.text}")
+        if (reason := self._refusal(command)) is not None:
+            self._on_event("warning", f"{command.text}: {reason}")
+            return {"command": command.text, "success": False, "reason": reason}
         ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._awaited[command.identifier] = ended
         self._new.append(command)

@@ -15,6 +15,7 @@ from companion.guidance.gimbal_controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceOutput, StreamStatus
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
+from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner
 from companion.vehicle.driver import Driver
 from companion.vehicle.streamer import Streamer
@@ -36,6 +37,7 @@ class GuidanceLoop:
     Args:
         rate_hz: of guidance.
         on_event: called with (level, text). on_step: called after every step with its time.
+        others: who else commands the vehicle.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class GuidanceLoop:
         rate_hz: float,
         on_event: Callable[[str, str], None],
         on_step: Callable[[int], None],
+        others: OtherCommanders,
     ) -> None:
         self.guidance, self._inputs = guidance, inputs
         self._driver, self._streamer = driver, streamer
@@ -62,6 +65,9 @@ class GuidanceLoop:
             ),
             self._wake.set,
             on_event,
+            refusal=lambda command: others.refusal(
+                command, driver.state, in_command=guidance.in_command, now_ns=time.monotonic_ns()
+            ),
         )
         self._ending = False
         self._slow: tuple[str, int] = ("", 0)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from companion.guidance.core import Guidance
 from companion.perception.views import WorkerView
+from companion.service.other_commanders import OtherCommanders
 from companion.service.status import hud_lines
 from companion.service.systemd_notify import SystemdNotifier
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
@@ -19,6 +21,7 @@ class Health:
     """Fed by the loop that steers: what hangs there stops the heartbeat and the watchdog too.
 
     Args:
+        others: who else commands the vehicle; watched from here.
         on_event: called with (level, text) for what a person should know.
     """
 
@@ -27,10 +30,11 @@ class Health:
         driver: Driver,
         views: Sequence[WorkerView],
         notifier: SystemdNotifier,
+        others: OtherCommanders,
         on_event: Callable[[str, str], None],
     ) -> None:
         self._driver, self._views, self._notifier = driver, views, notifier
-        self._on_event = on_event
+        self._others, self._on_event = others, on_event
         self._heartbeat_due_ns = self._hud_due_ns = 0
         self._linked = False
 
@@ -53,8 +57,8 @@ class Health:
                 f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long without us; set it to 1",
             )
 
-    def after_step(self, now_ns: int, status: str) -> None:
-        """Once for every step. `status`: guidance's, in words."""
+    def after_step(self, now_ns: int, guidance: Guidance) -> None:
+        """Once for every step of guidance."""
         linked = self._driver.state.connected(now_ns)
         if linked != self._linked:
             self._linked = linked
@@ -66,10 +70,15 @@ class Health:
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + round(HEARTBEAT_PERIOD_S * 1e9)
             healthy = self.healthy(now_ns)
-            self._driver.send_heartbeat(SystemStatus.ACTIVE if healthy else SystemStatus.CRITICAL)
+            self._driver.send_heartbeat(
+                SystemStatus.ACTIVE if healthy else SystemStatus.CRITICAL,
+                uptime_s=self._others.uptime_s(now_ns),
+                in_command=guidance.in_command,
+            )
+            self._others.watch(self._driver.state, now_ns)
             self._notifier.alive()
         if now_ns >= self._hud_due_ns:
             self._hud_due_ns = now_ns + round(HUD_PERIOD_S * 1e9)
-            lines = hud_lines(self._driver.state, status)
+            lines = hud_lines(self._driver.state, guidance.status)
             for view in self._views:
                 view.keeper.send_hud(lines)

@@ -6,11 +6,8 @@ Everything here runs in one asyncio loop and nothing in it is heavy.
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 from companion.bus import topics
@@ -21,11 +18,12 @@ from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.keeper import PerceptionKeeper
 from companion.perception.views import WorkerView, open_views
-from companion.service.event import Event
+from companion.service.event import Event, EventLog
 from companion.service.factory import driver_of, gimbal_mounting, guidance_options, streamer_of
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
+from companion.service.other_commanders import OtherCommanders
 from companion.service.publisher import Publisher
 from companion.service.status import status_message
 from companion.service.systemd_notify import SystemdNotifier
@@ -35,8 +33,6 @@ from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import StreamState
 from vision.pipeline import PerceptionResult
 
-logger = logging.getLogger(__package__)
-
 
 class Service:
     """One vehicle's companion.
@@ -44,20 +40,27 @@ class Service:
     Attributes:
         ready: everything is up, and commands are taken.
         views: the cameras with their models, the first one first.
+        events: the newest, at most a hundred.
 
     Args:
         settings: all of them.
         on_event: called in the loop with every event, besides the log and the bus.
         console: take commands from the terminal as well.
+        dropped_lines: how many lines of the log were not written, for `status`.
     """
 
     def __init__(
-        self, settings: Settings, *, on_event: Callable[[Event], None] | None = None, console: bool = False
+        self,
+        settings: Settings,
+        *,
+        on_event: Callable[[Event], None] | None = None,
+        console: bool = False,
+        dropped_lines: Callable[[], int] = lambda: 0,
     ) -> None:
         self.settings = settings
-        self._on_event = on_event
-        self._console = console
-        self.events: deque[Event] = deque(maxlen=100)
+        self._console, self._dropped_lines = console, dropped_lines
+        log = EventLog(lambda event: self.bus.publish(topics.EVENTS, event), on_event)
+        self.events, self._event = log.newest, log.add
         self.driver: Driver = driver_of(settings)
         self.streamer = streamer_of(settings, self.driver.send_setpoint)
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
@@ -69,13 +72,19 @@ class Service:
             on_calibration=self._on_calibration,
         )
         self.inputs = InputAssembler(settings, self.views, self._event)
+        self.others = OtherCommanders(
+            settings.vehicle, self.inputs.poses.source, time.monotonic_ns(), self._event
+        )
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
             on_event=self._event,
             on_command=self.command,
             views=tuple(settings.views),
-            listeners=[(topics.POSE, lambda data: self.inputs.poses.hear(data, time.monotonic_ns()))],
+            listeners=[
+                (topics.POSE, lambda data: self.inputs.poses.hear(data, time.monotonic_ns())),
+                (topics.STATUS, lambda data: self.others.on_status(data, time.monotonic_ns())),
+            ],
         )
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs)
         self._loop = GuidanceLoop(
@@ -85,13 +94,13 @@ class Service:
             self.streamer,
             rate_hz=settings.guidance.rate_hz,
             on_event=self._event,
-            on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance.status),
+            on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance),
+            others=self.others,
         )
         self._notifier = SystemdNotifier()
-        self._health = Health(self.driver, self.views, self._notifier, self._event)
+        self._health = Health(self.driver, self.views, self._notifier, self.others, self._event)
         self.ready = False
         self._status: dict[str, Any] | None = None
-        self._started_ns = time.monotonic_ns()
         self._stop = asyncio.Event()
         self._ending = False
 
@@ -156,7 +165,6 @@ class Service:
         now_ns = time.monotonic_ns()
         return status_message(
             now_ns,
-            uptime_s=(now_ns - self._started_ns) / 1e9,
             healthy=self._health.healthy(now_ns),
             driver=self.driver,
             guidance=self.guidance,
@@ -164,6 +172,8 @@ class Service:
             views=self.views,
             inputs=self.inputs,
             bus=self.bus,
+            others=self.others,
+            dropped_lines=self._dropped_lines(),
         )
 
     @property
@@ -241,15 +251,3 @@ class Service:
             # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
             publish = self._publisher.publish_result
             asyncio.get_running_loop().call_soon(publish, view, result, markers)
-
-    def _event(self, level: str, text: str) -> None:
-        event = Event(time.monotonic_ns(), level, text)
-        self.events.append(event)
-        logger.log(getattr(logging, level.upper()), "%s", text)
-        self.bus.publish(topics.EVENTS, asdict(event))
-        if self._on_event is not None:
-            try:
-                self._on_event(event)
-            except Exception:
-                # A listener must not be able to bring the vehicle down.
-                logger.exception("an event listener failed")

@@ -9,6 +9,7 @@ from companion.bus.session import Bus
 from companion.guidance.core import Guidance
 from companion.perception.views import WorkerView
 from companion.service.inputs import InputAssembler
+from companion.service.other_commanders import OtherCommanders
 from companion.vehicle.driver import Driver
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
@@ -17,7 +18,6 @@ from companion.vehicle.streamer import Streamer
 def status_message(
     now_ns: int,
     *,
-    uptime_s: float,
     healthy: bool,
     driver: Driver,
     guidance: Guidance,
@@ -25,18 +25,23 @@ def status_message(
     views: Sequence[WorkerView],
     inputs: InputAssembler,
     bus: Bus,
+    others: OtherCommanders,
+    dropped_lines: int,
 ) -> dict[str, Any]:
     """What is published on `status` (`docs/messages.md`).
 
     Args:
-        now_ns: CLOCK_MONOTONIC. uptime_s: since the service began.
+        now_ns: CLOCK_MONOTONIC.
+        dropped_lines: of the log.
     """
     steering, state = inputs.steering, driver.state
     return {
         "stamp_ns": now_ns,
-        "uptime_s": round(uptime_s, 1),
+        "service": inputs.poses.source,
+        "uptime_s": round(others.uptime_s(now_ns), 1),
         "healthy": healthy,
         "vehicle": {
+            "name": inputs.poses.vehicle,
             "connected": state.connected(now_ns),
             "autopilot": state.autopilot,
             "driver": driver.library,
@@ -45,6 +50,7 @@ def status_message(
             "failsafe": state.failsafe,
             "missing_streams": list(state.missing_streams),
             "said": [one.text for one in state.reports],
+            "other_commanders": others.status(state, now_ns),
         },
         "pilot": {
             "in_command": guidance.in_command,
@@ -67,6 +73,7 @@ def status_message(
             "unsent": bus.unsent,
             "refused_commands": bus.intake.refused,
         },
+        "log": {"dropped_lines": dropped_lines},
     }
 
 

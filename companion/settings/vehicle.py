@@ -23,5 +23,7 @@ class VehicleSection(Section):
     """what the vehicle is called in zenoh's keys: companion/NAME/detections"""
     connect_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     """how long to wait for the autopilot's first heartbeat, seconds"""
+    allow_other_commander: bool = False
+    """fly although another service commands the same vehicle; by default the later one refuses"""
     signing_key_file: str | None = None
     """sign MAVLink with this file's 32 bytes or passphrase, readable by its owner alone; unset: unsigned"""

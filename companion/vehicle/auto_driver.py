@@ -110,9 +110,11 @@ class AutoDriver:
         """See Driver."""
         self._driver.send_landing_target(target)
 
-    def send_heartbeat(self, status: SystemStatus) -> None:
+    def send_heartbeat(
+        self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
+    ) -> None:
         """See Driver."""
-        self._driver.send_heartbeat(status)
+        self._driver.send_heartbeat(status, uptime_s=uptime_s, in_command=in_command)
 
     async def find_gimbal(self) -> bool:
         """See Driver."""

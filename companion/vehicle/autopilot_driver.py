@@ -12,11 +12,13 @@ import logging
 import struct
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
+from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
 from companion.vehicle.connection_advice import why_no_answer, why_no_autopilot, why_not_flown
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
@@ -40,7 +42,6 @@ logger = logging.getLogger(__name__)
 HEARTBEAT_ID = 0
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 _AUTOPILOT_INVALID = 8  # MAV_AUTOPILOT: not an autopilot
-_ONBOARD_CONTROLLER = 18  # MAV_TYPE
 _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
@@ -102,6 +103,7 @@ class AutopilotDriver(ABC):
             lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
         )
         self._sequence = 0
+        self._own_heartbeats: deque[int] = deque(maxlen=8)  # sequence numbers
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
@@ -259,7 +261,7 @@ class AutopilotDriver(ABC):
             self._take_frames(ours)
 
     def _heartbeat_from(self, frame: Frame, source: Source) -> None:
-        custom_mode, _, autopilot, base_mode, system_status, _ = _HEARTBEAT.unpack(
+        custom_mode, mav_type, autopilot, base_mode, system_status, _ = _HEARTBEAT.unpack(
             frame.padded(_HEARTBEAT.size)
         )
         sender = (frame.system_id, frame.component_id)
@@ -267,6 +269,11 @@ class AutopilotDriver(ABC):
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
             self._note_other(sender, "system/component %d/%d is also on this link")
+            # What a network sends back to us is our own, and its number is one that we have given.
+            echo = sender == self.own_address and frame.sequence in self._own_heartbeats
+            commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
+            if commander is not None and frame.system_id == self._own_system_id and not echo:
+                self._heard.take_commander(commander)
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
@@ -360,9 +367,13 @@ class AutopilotDriver(ABC):
             )
         )
 
-    def send_heartbeat(self, status: SystemStatus) -> None:
+    def send_heartbeat(
+        self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
+    ) -> None:
         """See Driver."""
-        payload = _HEARTBEAT.pack(0, _ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
+        mode = commander_mode(uptime_s, in_command)
+        payload = _HEARTBEAT.pack(mode, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
+        self._own_heartbeats.append(self._sequence)
         self._transmit_payload(HEARTBEAT_ID, payload)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:

@@ -88,8 +88,14 @@ class Driver(Protocol):
     def send_landing_target(self, target: LandingTarget) -> None:
         """Put one LANDING_TARGET on the wire, now, in the frame that this autopilot takes."""
 
-    def send_heartbeat(self, status: SystemStatus) -> None:
-        """Put one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER on the wire, now."""
+    def send_heartbeat(
+        self, status: SystemStatus, *, uptime_s: float = 0.0, in_command: bool = False
+    ) -> None:
+        """Put one HEARTBEAT of MAV_TYPE_ONBOARD_CONTROLLER on the wire, now.
+
+        Another service on the same vehicle reads in it for how long this one has run, and whether it is in
+        command (`companion.vehicle.commander`).
+        """
 
     @property
     def own_address(self) -> Address:

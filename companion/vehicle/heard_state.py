@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 
 from companion.vehicle.clock_sync import ClockSync
+from companion.vehicle.commander import Commander
 from companion.vehicle.gimbal_fold import ATTITUDE_STATUS, from_gimbal_device
 from companion.vehicle.manners import Manners, Px4Manners
 from companion.vehicle.report import Report
@@ -110,6 +111,11 @@ class HeardState:
         if report is not None:
             reports = (*self.state.reports, report)[-REPORTS_KEPT:]
             self._show(replace(self.state, reports=reports), "REPORT", {"report": report})
+
+    def take_commander(self, commander: Commander) -> None:
+        """A heartbeat of another service on the same vehicle."""
+        others = (one for one in self.state.other_commanders if one.address != commander.address)
+        self._show(replace(self.state, other_commanders=(*others, commander)), "COMMANDER", {})
 
     def _show(self, state: VehicleState, name: str, fields: Fields) -> None:
         """The state after a message, to whoever waits for it."""

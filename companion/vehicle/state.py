@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.vehicle.clock_sync import ClockOffset
+from companion.vehicle.commander import Commander
 from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.report import WARNING, Report
 
@@ -108,6 +109,7 @@ class VehicleState:
         reports: the newest things it said, the newest last.
         autopilot: "PX4" or "ArduPilot", None until it was heard.
         missing_streams: names of the messages that are needed and come below half of their rate.
+        other_commanders: other services that were seen to command the vehicle, however long ago.
     """
 
     heartbeat_ns: int = 0
@@ -143,6 +145,7 @@ class VehicleState:
     reports: tuple[Report, ...] = ()
     autopilot: str | None = None
     missing_streams: tuple[str, ...] = ()
+    other_commanders: tuple[Commander, ...] = ()
 
     @property
     def yaw_rad(self) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from typing import Any
 
@@ -15,7 +16,10 @@ from companion.guidance.core import Guidance
 from companion.perception.views import View
 from companion.service.factory import driver_of, guidance_options
 from companion.service.guidance_loop import GuidanceLoop
+from companion.service.health import Health
 from companion.service.inputs import InputAssembler
+from companion.service.other_commanders import OtherCommanders
+from companion.service.systemd_notify import SystemdNotifier
 from companion.vehicle.streamer import Streamer
 
 STATION = (245, 190)
@@ -24,11 +28,16 @@ STATION = (245, 190)
 class LiveFlight:
     """The parts that fly, as the service runs them.
 
+    Args:
+        ran_s: for how long it has run already.
+
     Attributes:
         events: (level, text) of everything that guidance told.
     """
 
-    def __init__(self, kind: str, port: int, changes: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, kind: str, port: int, changes: Mapping[str, str] | None = None, *, ran_s: float = 0.0
+    ) -> None:
         link = {"vehicle.driver": kind, "vehicle.url": f"udpin://127.0.0.1:{port}"}
         settings = plain_settings({"detector.enabled": "false", **link, **(changes or {})})
         self.driver = driver_of(settings)
@@ -36,6 +45,9 @@ class LiveFlight:
         self.events: list[tuple[str, str]] = []
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
         self.inputs = InputAssembler(settings, [View(settings.of_view(None))], self._event)
+        started_ns = time.monotonic_ns() - round(ran_s * 1e9)
+        self.others = OtherCommanders(settings.vehicle, "here", started_ns, self._event)
+        self._health = Health(self.driver, (), SystemdNotifier({}), self.others, self._event)
         self.loop = GuidanceLoop(
             self.guidance,
             self.inputs,
@@ -44,10 +56,12 @@ class LiveFlight:
             rate_hz=50.0,
             on_event=self._event,
             on_step=self.on_step,
+            others=self.others,
         )
 
     def on_step(self, now_ns: int) -> None:
         """After every step of guidance."""
+        self._health.after_step(now_ns, self.guidance)
 
     def _event(self, level: str, text: str) -> None:
         self.events.append((level, text))

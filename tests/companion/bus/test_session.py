@@ -9,6 +9,7 @@ import os
 import queue
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -261,3 +262,69 @@ def test_a_client_without_a_service_says_so_in_one_line() -> None:
 def test_every_topic_has_a_key_of_its_own() -> None:
     keys = {topic.key("v") for topic in topics.TOPICS}
     assert len(keys) == len(topics.TOPICS)
+
+
+def _serve(endpoint: str, ready: Connection) -> None:
+    """A service that takes commands and never answers."""
+
+    async def serve() -> None:
+        async def think(_text: str) -> dict[str, Any]:
+            ready.send("asked")
+            await asyncio.Event().wait()
+            return {}
+
+        bus = Bus(ZenohSection(listen=(endpoint,)), "alpha", on_event=Events(), on_command=think)
+        await bus.start()
+        ready.send("up")
+        await asyncio.Event().wait()
+
+    asyncio.run(serve())
+
+
+def test_a_service_that_is_killed_is_gone_for_a_waiting_sender() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    service = context.Process(target=_serve, args=(endpoint, theirs), daemon=True)
+    service.start()
+    killed_s = 0.0
+
+    def kill_when_asked() -> None:
+        nonlocal killed_s
+        assert ours.poll(WAIT_S)
+        assert ours.recv() == "asked"
+        service.kill()
+        killed_s = time.monotonic()
+
+    try:
+        assert ours.poll(WAIT_S)
+        assert ours.recv() == "up"
+        killer = threading.Thread(target=kill_when_asked)
+        with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
+            killer.start()
+            with pytest.raises(NoAnswerError, match="has gone before it answered"):
+                send_command(session, "alpha", "orbit", timeout_s=60.0)
+        assert time.monotonic() - killed_s < 2.0
+        killer.join()
+    finally:
+        service.kill()
+        service.join()
+        ours.close()
+
+
+async def test_another_vehicle_s_name_is_no_service_here() -> None:
+    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
+    bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
+    await bus.start()
+    try:
+
+        def other_side() -> None:
+            with (
+                open_client(client_settings(settings)) as session,
+                pytest.raises(NoAnswerError, match="no service for vehicle 'beta'"),
+            ):
+                send_command(session, "beta", "hold")
+
+        await asyncio.to_thread(other_side)
+    finally:
+        await bus.close()

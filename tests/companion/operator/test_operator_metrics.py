@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import sys
+import threading
 import urllib.request
 from pathlib import Path
 
@@ -69,3 +70,17 @@ def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     with pytest.raises(MetricsError, match=r"pip install 'mavlink-companion\[metrics\]'"):
         MetricsServer("127.0.0.1:0", lambda: None)
+
+
+def test_a_scraper_that_reads_nothing_holds_nobody_up() -> None:
+    server = MetricsServer("127.0.0.1:0", lambda: None)
+    with (
+        socket.create_connection(("127.0.0.1", server.port)),  # asks nothing
+        socket.create_connection(("127.0.0.1", server.port)) as stalled,
+    ):
+        stalled.sendall(b"GET /metrics HTTP/1.1\r\nHost: here\r\n\r\n" * 100)
+        assert fetch(server.port) == {}
+        closing = threading.Thread(target=server.close)
+        closing.start()
+        closing.join(5.0)
+        assert not closing.is_alive()

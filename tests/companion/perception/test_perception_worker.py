@@ -32,7 +32,7 @@ from companion.perception.messages import (
     receive,
 )
 from companion.perception.outbox import Outbox, OutboxHandler
-from companion.perception.process import PerceptionProcess
+from companion.perception.process import PerceptionProcess, log_printed
 from companion.perception.pulse import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Pulse
 from companion.perception.worker import Orders
 from companion.settings.reading import load_settings
@@ -246,6 +246,22 @@ async def test_the_last_words_of_a_worker_are_read_whatever_it_was_told_after_th
         heard.append(message)
     assert heard[-1] == Ended(finished=True, text="end of stream", frames=3)
     assert "exited with code 0" in await process.wait()
+
+
+def test_what_a_worker_prints_is_logged_and_a_flood_is_cut(caplog: pytest.LogCaptureFixture) -> None:
+    reading, writing = os.pipe()
+    logging_it = threading.Thread(target=log_printed, args=(reading, 7))
+    logging_it.start()
+    with open(writing, "wb") as pipe:
+        pipe.writelines(b"%d %s\n" % (number, b"x" * 5000) for number in range(20_000))
+        pipe.write(b"no end")
+    logging_it.join(30.0)
+    assert not logging_it.is_alive()
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines[0].startswith("0 xxx")
+    assert lines[-1] == "no end"
+    assert 100 <= len(lines) < 5000
+    assert max(map(len, lines)) == 1000
 
 
 def test_a_worker_that_may_still_be_loading_is_given_time() -> None:

@@ -7,7 +7,9 @@ from typing import cast
 import pytest
 
 from companion.service.health import Health
+from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
+from companion.settings.vehicle import VehicleSection
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import VehicleState
 
@@ -40,7 +42,8 @@ async def test_a_long_guided_timeout_is_warned_of(
 ) -> None:
     said: list[tuple[str, str]] = []
     driver = cast(Driver, FakeDriver(autopilot, guided_timeout_s))
-    health = Health(driver, (), SystemdNotifier(), lambda level, text: said.append((level, text)))
+    others = OtherCommanders(VehicleSection(), "here", 0, lambda level, text: said.append((level, text)))
+    health = Health(driver, (), SystemdNotifier(), others, lambda level, text: said.append((level, text)))
     await health.check()
     assert [level for level, _ in said] == ["warning"] * len(warned)
     assert all(text.startswith(begin) for (_, text), begin in zip(said, warned, strict=True))

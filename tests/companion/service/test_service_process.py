@@ -6,6 +6,7 @@ import json
 import os
 import queue
 import signal
+import socket
 import subprocess
 import time
 from pathlib import Path
@@ -13,9 +14,11 @@ from typing import Any
 
 import imageio_ffmpeg  # type: ignore[import-untyped]
 import pytest
+import zenoh
 
 from companion.bus.client import listen
-from mavlink_sim.testing import running_simulator
+from companion.bus.topics import command_key
+from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.service_process import ServiceProcess, running_service
 
 # COM_OF_LOSS_T of the built-in vehicle, as PX4's default, and what the promise allows beyond it.
@@ -223,3 +226,43 @@ def test_what_fails_beside_a_service_carries_what_it_said_last(seeing: list[str]
     (note,) = failure.value.__notes__
     assert note.startswith("the service said last:\n")
     assert "ready: commands on" in note
+
+
+def test_two_services_of_one_name_name_each_other_and_one_flies(filming: list[str], tmp_path: Path) -> None:
+    second_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    with (
+        running_simulator() as simulator,
+        running_service(simulator.onboard_port, filming, cwd=tmp_path) as first,
+        running_service(
+            simulator.gcs_port,
+            [*filming, "--zenoh-connect", first.endpoint, "--zenoh-listen", second_endpoint],
+            cwd=tmp_path,
+            endpoint=second_endpoint,
+        ) as second,
+        first.client() as session,
+    ):
+        for service in (first, second):
+            service.wait_for_line("another service commands this vehicle: 1/191 by mavlink")
+            service.wait_for_line("by zenoh, not in command")
+        statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+        seen: dict[str, set[str]] = {}
+        while len(seen) < 2:
+            status = statuses.get(timeout=10)
+            seen[status["service"]] = {one["via"] for one in status["vehicle"]["other_commanders"]}
+        assert list(seen.values()) == [{"mavlink", "zenoh"}] * 2
+        # The name is that of both, so both are asked. The first may still wait for the vehicle's position.
+        while True:
+            asked = session.get(
+                command_key("vehicle1"),
+                payload="takeoff 2.5",
+                timeout=60.0,
+                consolidation=zenoh.ConsolidationMode.NONE,  # or one answer would stand for both
+            )
+            answers = [json.loads(reply.ok.payload.to_string()) for reply in asked if reply.ok]
+            refused = ["allow_other_commander" in answer["reason"] for answer in answers]
+            assert sorted(refused) == [False, True], answers
+            if any(answer["success"] for answer in answers):
+                break
+            time.sleep(0.2)  # twenty commands a second are taken
+        second.wait_for_line("allow_other_commander", 5.0)

@@ -1,0 +1,147 @@
+"""Standard error for a program that must not wait for whoever reads it.
+
+A pipe takes 64 KiB, then a write waits for its reader; a terminal that was stopped with Ctrl-S takes less. So
+lines are queued, and one thread writes them.
+"""
+
+from __future__ import annotations
+
+import atexit
+import io
+import os
+import select
+import sys
+import threading
+import time
+from collections import deque
+
+QUEUED_BYTES = 256 * 1024
+"""Of lines that wait for the reader; what comes after them is dropped, and counted."""
+EXIT_TIMEOUT_S = 1.0
+# One write takes no more, so that a slow reader makes room for new lines early.
+_WRITE_BYTES = 4096
+
+
+class LineOutput(io.TextIOBase):
+    """A text stream that takes every line at once. May be used from any thread.
+
+    Args:
+        descriptor: where the lines go; it stays open.
+        capacity_bytes: of the queue.
+
+    Attributes:
+        dropped: lines that were not written: the queue was full, or the descriptor refused them.
+        queued_bytes: that wait.
+    """
+
+    def __init__(self, descriptor: int, capacity_bytes: int = QUEUED_BYTES) -> None:
+        self.dropped = 0
+        self._descriptor, self._capacity_bytes = descriptor, capacity_bytes
+        self._changed = threading.Condition()
+        self._lines: deque[bytes] = deque()
+        self.queued_bytes = self._unreported = 0
+        self._partial = ""
+        self._writing = self._ended = False
+        self._thread = threading.Thread(target=self._run, name="line output", daemon=True)
+        self._thread.start()
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """As of a terminal; a character that is none is written as its escape."""
+        return "utf-8"
+
+    def writable(self) -> bool:
+        return True
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def write(self, text: str) -> int:
+        """Queue the whole lines in `text`; the rest waits for its end. Never waits, never fails."""
+        with self._changed:
+            *lines, self._partial = (self._partial + text).split("\n")
+            for line in lines:
+                self._put(line)
+            self._changed.notify_all()
+        return len(text)
+
+    def _put(self, line: str) -> None:
+        data = f"{line}\n".encode("utf-8", "backslashreplace")
+        if self._ended or self.queued_bytes + len(data) > self._capacity_bytes:
+            self._drop(1)
+            return
+        self._lines.append(data)
+        self.queued_bytes += len(data)
+
+    def _drop(self, count: int) -> None:
+        self.dropped += count
+        self._unreported += count
+
+    def end(self, timeout_s: float = EXIT_TIMEOUT_S) -> bool:
+        """Write what is queued, as long as the reader takes it within `timeout_s`; whether all was written.
+
+        What is written afterwards is dropped.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        with self._changed:
+            if self._partial:
+                self._put(self._partial)
+                self._partial = ""
+            self._ended = True
+            self._changed.notify_all()
+            while (self._lines or self._writing) and (left_s := deadline_s - time.monotonic()) > 0:
+                self._changed.wait(left_s)
+            return not (self._lines or self._writing)
+
+    def _run(self) -> None:
+        taken = True
+        while (data := self._next(report=taken)) is not None:
+            taken = self._written(data)
+            if not taken:
+                with self._changed:
+                    self._drop(1)
+
+    def _next(self, *, report: bool) -> bytes | None:
+        """Wait for a line; None at the end. `report`: once the queue is empty, say how many are missing."""
+        with self._changed:
+            self._writing = False
+            self._changed.notify_all()
+            while not self._lines:
+                if self._unreported and report:
+                    count, self._unreported = self._unreported, 0
+                    self._writing = True
+                    return f"companion: {count} lines are missing here: nobody read them\n".encode()
+                if self._ended:
+                    return None
+                self._changed.wait()
+            data = self._lines.popleft()
+            self.queued_bytes -= len(data)
+            self._writing = True
+            return data
+
+    def _written(self, data: bytes) -> bool:
+        while data:
+            try:
+                data = data[os.write(self._descriptor, data[:_WRITE_BYTES]) :]
+            except BlockingIOError:  # somebody has made it non-blocking
+                select.select([], [self._descriptor], [])
+            except OSError:  # its reader has gone, or the disk is full: there is nobody to say it to
+                return False
+        return True
+
+
+def use_for_standard_error() -> LineOutput | None:
+    """From now on nothing that this program prints to standard error waits for its reader.
+
+    The end of the program waits for the reader a second at most. None, and nothing changes, where standard
+    error is no descriptor.
+    """
+    try:
+        descriptor = sys.stderr.fileno()
+    except (AttributeError, OSError):  # closed, or a test's buffer
+        return None
+    sys.stderr.flush()
+    output = LineOutput(descriptor)
+    sys.stderr = output
+    atexit.register(output.end)
+    return output

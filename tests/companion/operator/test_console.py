@@ -1,0 +1,78 @@
+"""Commands typed at the service's own terminal: a real terminal, a scripted service."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import pytest
+
+from companion.operator.console import run_console, terminal_is_free
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """The other end of a terminal that is standard input."""
+    other, ours = os.openpty()
+    with open(ours) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        yield other
+    with suppress(OSError):  # the test has closed it
+        os.close(other)
+
+
+class Service:
+    """Answers every command, but "break"."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.said: list[tuple[str, str]] = []
+        self.stopped = False
+
+    async def command(self, text: str) -> dict[str, Any]:
+        self.asked.append(text)
+        if text == "break":
+            raise ZeroDivisionError("no such luck")
+        return {"success": text != "seek dragon", "reason": f"reason {len(self.asked)}"}
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    async def run(self) -> None:
+        async with asyncio.timeout(20.0):
+            await run_console(self.command, self.stop, "HELP", lambda *event: self.said.append(event))
+
+
+async def test_commands_are_answered_until_quit(terminal: int, capsys: pytest.CaptureFixture[str]) -> None:
+    service = Service()
+    assert terminal_is_free("/dev/video0")
+    assert not terminal_is_free("-")
+    os.write(terminal, b"hold\n  seek dragon \n\nbreak\nhelp\n")
+    running = asyncio.create_task(service.run())
+    while len(service.asked) < 3:
+        await asyncio.sleep(0.001)
+    os.write(terminal, b"quit\nland\n")
+    await running
+    assert service.asked == ["hold", "seek dragon", "break"]
+    assert service.stopped
+    lines = capsys.readouterr().err.splitlines()
+    assert "HELP" in lines
+    assert "hold: done: reason 1" in lines
+    assert "seek dragon: no: reason 2" in lines
+    assert "break: no: ZeroDivisionError: no such luck" in lines
+    assert service.said == []
+
+
+async def test_a_terminal_that_closes_ends_the_console_alone(terminal: int) -> None:
+    service = Service()
+    running = asyncio.create_task(service.run())
+    os.write(terminal, b"hold\n")
+    while not service.asked:
+        await asyncio.sleep(0.001)
+    os.close(terminal)
+    await running
+    assert not service.stopped
+    assert service.said == []
