@@ -9,10 +9,11 @@ import sys
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
+
 logger = logging.getLogger(__name__)
 
 _BANNER = "type a command (help, quit): takeoff 5, seek car, approach car distance=5, hold, land, rtl, stop"
-_READ_BYTES = 4096
 
 
 async def run_console(
@@ -48,39 +49,34 @@ async def _read_commands(
         sign = "done" if reply["success"] else "no"
         _print(f"{text}: {sign}: {reply['reason']}")
 
-    typed: asyncio.Queue[str | None] = asyncio.Queue()
-    loop, descriptor = asyncio.get_running_loop(), sys.stdin.fileno()
-    partial = b""
-
-    def on_readable() -> None:
-        nonlocal partial
-        try:
-            data = os.read(descriptor, _READ_BYTES)
-        except OSError:  # the terminal was closed
-            data = b""
-        *lines, partial = (partial + data).split(b"\n")
-        for line in lines:
-            typed.put_nowait(line.decode(errors="replace").strip())
-        if not data:
-            typed.put_nowait(None)
-            loop.remove_reader(descriptor)
-
-    # A terminal is readable when a whole line is there, so this does not wait. To make it non-blocking would
-    # make it so for the shell as well.
-    loop.add_reader(descriptor, on_readable)
+    reader = StandardStreamReader()
+    loop = asyncio.get_running_loop()
+    # The terminal is opened again: the reader makes it non-blocking, which it must not become for standard
+    # error and for the shell.
+    terminal = open(os.ttyname(sys.stdin.fileno()), "rb", buffering=0)  # noqa: ASYNC230, SIM115
+    transport, _ = await loop.connect_read_pipe(lambda: StandardStreamReaderProtocol(reader), terminal)
     try:
-        while (line := await typed.get()) is not None:
-            if line in ("quit", "exit"):
+        while line := (await _line_of(reader)):
+            text = line.decode(errors="replace").strip()
+            if text in ("quit", "exit"):
                 quit_service()
                 return
-            if line == "help":
+            if text == "help":
                 _print(help_text)
-            elif line:
-                task = asyncio.create_task(answer(line))
+            elif text:
+                task = asyncio.create_task(answer(text))
                 running.add(task)
                 task.add_done_callback(running.discard)
     finally:
-        loop.remove_reader(descriptor)
+        transport.close()
+
+
+async def _line_of(reader: asyncio.StreamReader) -> bytes:
+    """The next line; empty at the end of file, or when the terminal was closed (EIO)."""
+    try:
+        return await reader.readline()
+    except OSError:
+        return b""
 
 
 def _print(text: str) -> None:

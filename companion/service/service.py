@@ -72,9 +72,8 @@ class Service:
             on_calibration=self._on_calibration,
         )
         self.inputs = InputAssembler(settings, self.views, self._event)
-        self.others = OtherCommanders(
-            settings.vehicle, self.inputs.poses.source, time.monotonic_ns(), self._event
-        )
+        started_ns = time.monotonic_ns()
+        self.others = OtherCommanders(settings.vehicle, self.inputs.poses.source, started_ns, self._event)
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,

@@ -191,7 +191,12 @@ def test_a_velocity_step_nears_its_goal_slowly_and_stops_so(cockpit: Cockpit, ve
     airframe = cockpit.vehicle.airframe
     ahead = velocity_setpoint(3, 0, 0)
     reached: list[float] = []
-    cockpit.until(lambda: bool(reached.append(airframe.velocity[0])), 6.0, ahead, must=False)
+
+    def reach() -> bool:
+        reached.append(airframe.velocity[0])
+        return False
+
+    cockpit.until(reach, 6.0, ahead, must=False)
     assert max(reached) < 0.95 * 3.0
     assert reached[-1] == pytest.approx(2.65, abs=0.1)
     north = airframe.position[0]
