@@ -98,7 +98,7 @@ def test_a_port_in_use_is_refused(name: str) -> None:
         taken.close()
     assert finished.returncode == 2
     (line,) = finished.stderr.splitlines()
-    assert str(taken.port) in line or "in use" in line
+    assert "in use" in line
 
 
 def test_no_autopilot_is_refused_after_ten_seconds(name: str) -> None:
