@@ -15,6 +15,7 @@ import socket
 import struct
 import threading
 import time
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,10 +33,12 @@ NAMES = {PX4: "PX4", ARDUPILOT: "ArduPilot"}
 PILOT = (245, 190)
 OFFBOARD = {PX4: 6 << 16, ARDUPILOT: 4}
 HOLD = {PX4: 4 << 16 | 3 << 24, ARDUPILOT: 17}  # ArduPilot's BRAKE
+PARKED = {PX4: HOLD[PX4], ARDUPILOT: 0}  # disarmed: PX4 is never ready in LAND, ArduPilot boots in STABILIZE
 LAND = {PX4: 4 << 16 | 6 << 24, ARDUPILOT: 9}
 STANDING_MPS = 0.3
 PREARM_CHECK = dialect.MAV_SYS_STATUS_PREARM_CHECK
 _ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
+_DOWN = (dialect.MAV_LANDED_STATE_ON_GROUND, dialect.MAV_LANDED_STATE_UNDEFINED)
 _ANSWER_S = 3.0
 READY_S, GROUNDED_S = 180.0, 120.0
 # Measured: by autopilot and driver, by what was flown.
@@ -67,7 +70,7 @@ class AutopilotLink:
         autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
-        texts: STATUSTEXT of the autopilot.
+        texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
         home_ned_m: of its newest HOME_POSITION.
         boots: how often its clock has begun again.
     """
@@ -81,6 +84,7 @@ class AutopilotLink:
         self.poses: list[Pose] = []
         self.setpoints_s: list[float] = []
         self.texts: list[str] = []
+        self.results: dict[int, int] = {}
         self.armed = self.ready = False
         self.landed = dialect.MAV_LANDED_STATE_UNDEFINED
         self.boots = 0
@@ -141,8 +145,8 @@ class AutopilotLink:
 
     @property
     def grounded(self) -> bool:
-        """Landed and disarmed."""
-        return not self.armed and self.landed == dialect.MAV_LANDED_STATE_ON_GROUND
+        """Landed, as far as it tells, and disarmed."""
+        return not self.armed and self.landed in _DOWN
 
     @property
     def height_m(self) -> float:
@@ -151,7 +155,8 @@ class AutopilotLink:
 
     def flown(self, since_s: float, until_s: float = math.inf) -> list[Pose]:
         """The poses of that time."""
-        return [pose for pose in self.poses if since_s <= pose.time_s <= until_s]
+        first = bisect_left(self.poses, since_s, key=lambda pose: pose.time_s)
+        return self.poses[first : bisect_right(self.poses, until_s, key=lambda pose: pose.time_s)]
 
     def left_offboard_s(self, since_s: float) -> float | None:
         """How long after a moment another mode was shown."""
@@ -254,6 +259,8 @@ class AutopilotLink:
                 place, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
                 boot_s = message.time_boot_ms / 1e3
                 self.poses.append(Pose(now_s, boot_s, place, velocity, self._yaw_rad))
+            case "COMMAND_ACK":
+                self.results[message.command] = message.result
             case "STATUSTEXT":
                 self.texts.append(message.text.strip())
             case "PARAM_VALUE":
@@ -335,4 +342,4 @@ def bring_down(link: AutopilotLink) -> None:
     if not link.grounded:
         link.set_mode(LAND[link.autopilot or 0])
         link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
-    link.set_mode(HOLD[link.autopilot or 0])
+    link.set_mode(PARKED[link.autopilot or 0])

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.sitl.sitl_harness import ARDUPILOT, HOLD, OFFBOARD, PX4, STANDING_MPS, AutopilotLink, Flight
+from tests.sitl.sitl_harness import ARDUPILOT, HOLD, OFFBOARD, PX4, STANDING_MPS, AutopilotLink, Flight, Pose
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
 # A setpoint that was being sent when the mode changed; and one heartbeat period for a mode to show.
@@ -53,11 +53,15 @@ def orbiting(flight: Flight) -> None:
 
 def standing(link: AutopilotLink, since_s: float) -> tuple[float, float]:
     """Wait until it stands; seconds and metres from a moment on."""
-    link.until(lambda: link.poses[-1].speed_mps < STANDING_MPS, 20.0, "standing")
-    poses = link.flown(since_s)
-    places = [pose.position_ned_m[:2] for pose in poses]
-    flown_m = sum(math.dist(one, other) for one, other in pairwise(places))
-    return poses[-1].time_s - since_s, flown_m
+
+    def stood() -> Pose | None:
+        return next((pose for pose in link.flown(since_s) if pose.speed_mps < STANDING_MPS), None)
+
+    link.until(stood, 20.0, "standing")
+    end = stood()
+    assert end is not None
+    places = [pose.position_ned_m[:2] for pose in link.flown(since_s, end.time_s)]
+    return end.time_s - since_s, sum(math.dist(one, other) for one, other in pairwise(places))
 
 
 def silent(link: AutopilotLink, since_s: float, seconds: float = WATCHED_S) -> int:
@@ -144,9 +148,9 @@ def test_a_lost_link_ends_the_command_and_is_not_resumed(flight: Flight) -> None
     lost, back = flight.said("command lost"), flight.said("autopilot heartbeat received")
     cut_s = time.monotonic()
     link.cut = True
+    reported_s = link.until(lost, 10.0, "reported as lost")
     stands_s, flown_m = standing(link, cut_s)
     left_s = link.left_offboard_s(cut_s)
-    told_s = link.until(lost, 10.0, "reported as lost") + stands_s
     link.after(4.0)
     link.cut = False
     found_s = link.until(back, 10.0, "found again")
@@ -158,7 +162,7 @@ def test_a_lost_link_ends_the_command_and_is_not_resumed(flight: Flight) -> None
         left_offboard_s=left_s,
         stands_s=stands_s,
         flown_m=flown_m,
-        reported_s=told_s,
+        reported_s=reported_s,
         found_after_s=found_s,
     )
 
@@ -179,13 +183,15 @@ def test_refused_arming_has_the_autopilots_own_reason(flight: Flight, parameters
 
 
 def test_points_beyond_the_limits_are_refused(flight: Flight) -> None:
+    link = flight.link
     flight.take_off(4.0)
-    already = len(flight.link.setpoints_s)
-    for text, limit in (("goto 0 0 altitude=90", "50 m"), ("goto 500 0", "200 m")):
+    start = link.poses[-1].position_ned_m
+    for text, limit in (("goto 0 0 altitude=90", "max_altitude_m"), ("goto 500 0", "max_distance_m")):
         reply = flight.command(text)
         assert not reply["success"]
         assert limit in reply["reason"]
-    assert len(flight.link.setpoints_s) == already
+    link.after(2.0)
+    assert math.dist(link.poses[-1].position_ned_m, start) < 1.5
     flight.fly("land")
 
 
@@ -205,4 +211,4 @@ def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, 
     if link.autopilot == PX4:
         assert reply["reason"].startswith("autopilot failsafe: hold mode")
         assert link.modes[-1][1] == HOLD[PX4]  # it holds, and does not return
-    flight.note("geofence of 15 m", at_m=math.hypot(*link.poses[-1].position_ned_m[:2]))
+    flight.note("geofence of 15 m", at_m=math.dist(link.poses[-1].position_ned_m[:2], link.home_ned_m[:2]))
