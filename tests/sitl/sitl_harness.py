@@ -251,8 +251,9 @@ class AutopilotLink:
                 self.landed = message.landed_state
             case "HOME_POSITION":
                 self.home_ned_m = (message.x, message.y, message.z)
-            case "ATTITUDE":
-                self._yaw_rad = message.yaw
+            case "ATTITUDE_QUATERNION":
+                w, x, y, z = message.q1, message.q2, message.q3, message.q4
+                self._yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
             case "LOCAL_POSITION_NED":
                 self.boots += message.time_boot_ms + 1000 < self._boot_ms
                 self._boot_ms = message.time_boot_ms

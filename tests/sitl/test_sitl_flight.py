@@ -120,10 +120,12 @@ def test_a_path_is_followed(flight: Flight) -> None:
     link = flight.link
     flight.take_off(HEIGHT_M)
     flight.fly("goto 0 0")
+    link.after(2.0)
+    home = link.poses[-1].position_ned_m  # ArduPilot's local home is not true in every version
     begun_s = time.monotonic()
     flight.fly("follow-path 0,0 15,0 15,15 0,15")
     took_s = time.monotonic() - begun_s
-    track = np.array([pose.position_ned_m[:2] for pose in link.flown(begun_s)]) - link.home_ned_m[:2]
+    track = np.array([pose.position_ned_m[:2] for pose in link.flown(begun_s)]) - home[:2]
     errors = np.min([distances_m(track, *leg) for leg in pairwise(np.array(CORNERS_M))], axis=0)
     p50, worst = float(np.percentile(errors, 50)), float(errors.max())
     assert p50 < 1.0

@@ -204,11 +204,12 @@ def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, 
         else {"FENCE_TYPE": 2.0, "FENCE_RADIUS": 15.0, "FENCE_ACTION": 4.0, "FENCE_ENABLE": 1.0},
     )
     flight.take_off(5.0)
+    home = link.poses[-1].position_ned_m
     reply = flight.command("goto 40 0")
     assert not reply["success"]
     assert "fence" in reply["reason"].lower()
     link.after(WATCHED_S)
     if link.autopilot == PX4:
         assert reply["reason"].startswith("autopilot failsafe: hold mode")
-        assert link.modes[-1][1] == HOLD[PX4]  # it holds, and does not return
-    flight.note("geofence of 15 m", at_m=math.dist(link.poses[-1].position_ned_m[:2], link.home_ned_m[:2]))
+        assert link.modes[-1][1] == HOLD[PX4], reply  # it holds, and does not return
+    flight.note("geofence of 15 m", at_m=math.dist(link.poses[-1].position_ned_m[:2], home[:2]))
