@@ -79,6 +79,10 @@ class Services:
             flags = ["--source", "frame.ppm", "--source-loop", "true", "--source-rate-hz", "1"]
             flags += ["--detector-enabled", "false", "--driver", driver]
             flags += ["--vehicle-system-id", str(self._link.system_id)]
+            flags += [
+                "--guidance-min-battery-percent",
+                "0",
+            ]  # simulated batteries are not charged between tests
             service = running_service(self._link.service_port, flags, cwd=self._folder)
             running = self._stack.enter_context(service)
             session = self._stack.enter_context(running.client())

@@ -309,7 +309,7 @@ class Flight:
         answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._session.get(
             "companion/vehicle1/command",
-            lambda reply: answers.put(json.loads(reply.ok.payload.to_string())),
+            lambda reply: answers.put(json.loads(reply.ok.payload.to_string()) if reply.ok else {}),
             payload=text,
             timeout=120.0,
         )

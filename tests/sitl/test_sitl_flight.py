@@ -29,7 +29,7 @@ def distances_m(
     """Of each point (n, 2) from the line between two."""
     leg = end - start
     along = np.clip((points - start) @ leg / (leg @ leg), 0.0, 1.0)
-    return np.linalg.norm(points - start - along[:, None] * leg, axis=1)
+    return np.hypot(*(points - start - along[:, None] * leg).T)
 
 
 def test_the_autopilot_is_named_and_all_streams_come(flight: Flight) -> None:
@@ -40,7 +40,6 @@ def test_the_autopilot_is_named_and_all_streams_come(flight: Flight) -> None:
     vehicle = flight.status["vehicle"]
     assert (vehicle["autopilot"], vehicle["driver"]) == (NAMES[link.autopilot or 0], flight.driver)
     assert vehicle["connected"]
-    assert not vehicle["armed"]
     flight.note("all streams", after_s=took_s)
 
 

@@ -201,7 +201,13 @@ def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, 
         link,
         {"GF_MAX_HOR_DIST": 15.0, "GF_ACTION": 2.0}
         if link.autopilot == PX4
-        else {"FENCE_TYPE": 2.0, "FENCE_RADIUS": 15.0, "FENCE_ACTION": 4.0, "FENCE_ENABLE": 1.0},
+        else {
+            "AVOID_ENABLE": 0.0,
+            "FENCE_TYPE": 2.0,
+            "FENCE_RADIUS": 15.0,
+            "FENCE_ACTION": 4.0,
+            "FENCE_ENABLE": 1.0,
+        },
     )
     flight.take_off(5.0)
     home = link.poses[-1].position_ned_m
