@@ -197,18 +197,13 @@ def test_points_beyond_the_limits_are_refused(flight: Flight) -> None:
 
 def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, float]) -> None:
     link = flight.link
-    parameters |= set_for_test(
-        link,
-        {"GF_MAX_HOR_DIST": 15.0, "GF_ACTION": 2.0}
-        if link.autopilot == PX4
-        else {
-            "AVOID_ENABLE": 0.0,
-            "FENCE_TYPE": 2.0,
-            "FENCE_RADIUS": 15.0,
-            "FENCE_ACTION": 4.0,
-            "FENCE_ENABLE": 1.0,
-        },
-    )
+    if link.autopilot == PX4:
+        values = {"GF_MAX_HOR_DIST": 15.0, "GF_ACTION": 2.0}
+    else:
+        values = {"FENCE_TYPE": 2.0, "FENCE_RADIUS": 15.0, "FENCE_ACTION": 4.0, "FENCE_ENABLE": 1.0}
+        if link.parameter("AVOID_ENABLE") is not None:
+            values |= {"AVOID_ENABLE": 0.0}  # else it stops inside the fence, and no mode changes
+    parameters |= set_for_test(link, values)
     flight.take_off(5.0)
     home = link.poses[-1].position_ned_m
     reply = flight.command("goto 40 0")
