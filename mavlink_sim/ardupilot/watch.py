@@ -12,7 +12,7 @@ from mavlink_sim.wire.announcements import CRITICAL, Text
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.autopilot import CopterAutopilot
 
-WARNING = 4  # MAV_SEVERITY_WARNING
+WARNING, NOTICE = 4, 5  # MAV_SEVERITY_WARNING, MAV_SEVERITY_NOTICE
 POSITION_LOST_S = 1.0
 FENCE_ALTITUDE, FENCE_CIRCLE = 1, 2  # bits of FENCE_TYPE
 # FS_GCS_ENABLE: 1 RTL, 2 AUTO or RTL, 3 and 4 SMART_RTL, 5 LAND, 7 BRAKE or LAND. There is no SMART_RTL here.
@@ -113,7 +113,7 @@ class FailsafeWatch:
         was_breached, self.is_breached = self.is_breached, breach is not None
         if breach is None or was_breached or not autopilot.armed or autopilot.landed:
             return
-        autopilot.texts.append(Text(CRITICAL, f"{breach} fence breached"))
+        autopilot.texts.append(Text(NOTICE, f"{breach} fence breached"))
         autopilot.announce(f"{breach} fence breached")
         mode = _FENCE_MODES.get(int(value("FENCE_ACTION")))
         if mode is not None and autopilot.mode not in _GOING_DOWN:

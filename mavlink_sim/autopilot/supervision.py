@@ -10,7 +10,7 @@ import math
 import struct
 from typing import TYPE_CHECKING
 
-from mavlink_sim.autopilot.arming_checks import GEOFENCE, failing_checks
+from mavlink_sim.autopilot.arming_checks import GEOFENCE_CHECKS, failing_checks
 from mavlink_sim.autopilot.failsafe_actions import Action
 from mavlink_sim.autopilot.failsafe_announcements import INFO_LEVELS
 from mavlink_sim.autopilot.failsafe_conditions import Conditions
@@ -214,7 +214,9 @@ class Supervision:
         self._watch_position()
         breached = autopilot.navigator.is_breached
         if breached and not self.conditions.geofence_breached:
-            autopilot.texts.extend(failing_checks(autopilot, GEOFENCE))  # PX4 tells a check when it changes
+            autopilot.texts.extend(
+                failing_checks(autopilot, GEOFENCE_CHECKS)
+            )  # PX4 tells a check when it changes
         self.conditions.geofence_breached = breached
         sticks_request = self._watch_sticks()
         autopilot.follow_failsafes(self.run_failsafes(dt_s, sticks_request))

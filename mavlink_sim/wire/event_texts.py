@@ -83,6 +83,8 @@ _ARMING_CHECKS: dict[str, tuple[str, Arguments]] = {
     "check_estimator_heading_not_stable": ("Heading estimate not stable", _CHECK),
     "check_modes_local_pos": ("Navigation error: No valid position estimate", _CHECK),
     "check_gf_violation_max_hor_dist": ("Geofence violation: exceeding maximum distance to Home", _CHECK),
+    "check_gf_violation_max_alt": ("Geofence violation: exceeding maximum altitude above Home", _CHECK),
+    "check_gf_violation_custom_gf": ("Geofence violation: approaching or outside geofence", _CHECK),
     "check_rc_dl_no_dllink": ("No connection to the ground control station", _CHECK),
     "check_modes_mission": ("No valid mission available", _CHECK),
     "check_modes_offboard_signal": ("No offboard signal", _CHECK),
