@@ -40,5 +40,5 @@ class StatusTexts:
 def _text_report(severity: int, text: bytes, now_ns: int) -> Report | None:
     words = text.split(b"\0")[0].decode("utf-8", "replace").strip()
     if words.endswith("fence breached"):
-        severity = min(severity, WARNING)  # a NOTICE of ArduPilot 4.7, and the reason of its next change of mode
+        severity = min(severity, WARNING)  # ArduPilot 4.7's NOTICE is the reason of its next change of mode
     return Report(now_ns, severity, words) if words else None
