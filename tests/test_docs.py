@@ -20,7 +20,7 @@ from mavlink_sim.datasets.cli import app as dataset_app
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [
     ROOT / "README.md",
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").glob("**/*.md")),
     ROOT / "systemd" / "companion.service",
 ]
 APPS = {"companion": companion_app, "mavlink-sim": simulator_app}

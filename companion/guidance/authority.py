@@ -22,6 +22,7 @@ SHOW_DELAY_S = 2.0
 TAKEOFF_SHORT_M = 1.3
 # What the autopilot says of a failsafe comes so shortly before or after its change of mode.
 SAID_S = 1.0
+_FAILSAFES = "commander_failsafe_enter"
 _LASTING_FAILSAFES = ("commander_failsafe_enter", "commander_failsafe_enter_generic")
 GOING_DOWN = (FlightMode.LAND, FlightMode.RETURN, FlightMode.PRECISION_LAND)
 
@@ -134,6 +135,9 @@ class Authority:
         if state.mode is self._mode:
             return True  # not for a mode
         silent = not state.reports or bool(self.said_of_it(state, now_ns))
+        if state.reports and self._holds_by_itself(state):
+            # What is wrong is said first; whether the hold is to last, only in the event of the failsafe.
+            silent = any(one.name.startswith(_FAILSAFES) for one in _warnings(state, now_ns))
         whose = state.intended_beside in (FlightMode.UNKNOWN, state.mode) or state.failsafe
         return whose and (silent or state.intended_mode is state.mode)
 
@@ -147,11 +151,15 @@ class Authority:
 
         Not one that waits for COM_FAIL_ACT_T before what PX4 does in earnest: its events have other names.
         """
+        return self._holds_by_itself(state) and any(
+            one.name in _LASTING_FAILSAFES for one in _warnings(state, now_ns)
+        )
+
+    def _holds_by_itself(self, state: VehicleState) -> bool:
         return (
             self._mode is FlightMode.OFFBOARD
             and state.mode is state.intended_beside is FlightMode.HOLD
             and state.intended_mode is FlightMode.OFFBOARD
-            and any(one.name in _LASTING_FAILSAFES for one in _warnings(state, now_ns))
         )
 
     def _explained(self, state: VehicleState, now_ns: int) -> bool:

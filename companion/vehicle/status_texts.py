@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from companion.vehicle.framing import Frame
-from companion.vehicle.report import Report
+from companion.vehicle.report import WARNING, Report
 
 STATUSTEXT_ID = 253
 _STATUSTEXT = struct.Struct("<B50sHB")  # severity, text, id, chunk_seq
@@ -39,4 +39,6 @@ class StatusTexts:
 
 def _text_report(severity: int, text: bytes, now_ns: int) -> Report | None:
     words = text.split(b"\0")[0].decode("utf-8", "replace").strip()
+    if words.endswith("fence breached"):
+        severity = min(severity, WARNING)  # ArduPilot 4.7's NOTICE is the reason of its next change of mode
     return Report(now_ns, severity, words) if words else None

@@ -13,7 +13,7 @@ from mavlink_sim.wire.announcements import CRITICAL, Text
 if TYPE_CHECKING:
     from mavlink_sim.ardupilot.autopilot import CopterAutopilot
 
-WARNING = 4  # MAV_SEVERITY_WARNING
+WARNING, NOTICE = 4, 5  # MAV_SEVERITY_WARNING, MAV_SEVERITY_NOTICE
 POSITION_LOST_S = 1.0
 FENCE_ALTITUDE, FENCE_CIRCLE = 1, 2  # bits of FENCE_TYPE
 STOP_AT_FENCE = 1  # a bit of AVOID_ENABLE
@@ -133,7 +133,7 @@ class FailsafeWatch:
         was_breached, self.is_breached = self.is_breached, breach is not None
         if breach is None or was_breached or not autopilot.armed or autopilot.landed:
             return
-        autopilot.texts.append(Text(CRITICAL, f"{breach} fence breached"))
+        autopilot.texts.append(Text(NOTICE, f"{breach} fence breached"))
         autopilot.announce(f"{breach} fence breached")
         mode = _FENCE_MODES.get(int(value("FENCE_ACTION")))
         if mode is not None and autopilot.mode not in _GOING_DOWN:

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from mavlink_sim.autopilot import position_failsafe
+from mavlink_sim.missions import geofence
 from mavlink_sim.px4.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, Mode
 from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
 
@@ -35,18 +36,26 @@ _NAVIGATION_STATES = {
     Mode.PRECLAND: 20,
     Mode.ORBIT: 21,
 }
+GEOFENCE_CHECKS = {
+    "check_gf_violation_max_hor_dist": geofence.TOO_FAR,
+    "check_gf_violation_max_alt": geofence.TOO_HIGH,
+    "check_gf_violation_custom_gf": geofence.OUTSIDE,
+}
 _ALTITUDE_CRUISE = 1 << 8  # of the manual modes; this vehicle does not have it
 
 
-def failing_checks(autopilot: Autopilot) -> list[Text]:
-    """An event for each check that fails, whatever the mode; without a text of its own."""
+def failing_checks(autopilot: Autopilot, only: Collection[str] | None = None) -> list[Text]:
+    """An event for each check that fails, whatever the mode; without a text of its own. `only`: of these."""
     with_position = [mode for mode in Mode if position_failsafe.needs_position(mode)]
     in_wrong_mode = autopilot.mode in MODES_PREVENTING_ARMING
     mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks
+    breaches = autopilot.navigator.breaches
+    unlinked = autopilot.supervision.lacks_ground_station
     checks = (
         ("check_estimator_heading_not_stable", not autopilot.sensors_ready, _ERROR, None, _NO_COMPONENT),
         ("check_modes_local_pos", not autopilot.position_valid, _ERROR, with_position, _NO_COMPONENT),
-        ("check_gf_violation_max_hor_dist", autopilot.navigator.is_breached, _ERROR, None, _NO_COMPONENT),
+        *((name, words in breaches, _ERROR, None, _SYSTEM) for name, words in GEOFENCE_CHECKS.items()),
+        ("check_rc_dl_no_dllink", unlinked, _ERROR, None, _NO_COMPONENT),
         ("check_modes_mission", not mission.valid, _INFO, [Mode.MISSION], _SYSTEM),
         ("check_modes_offboard_signal", not autopilot.has_setpoints, _ERROR, [Mode.OFFBOARD], _SYSTEM),
         ("check_modes_manual_control", not sticks, _ERROR, MANUAL_MODES, _MANUAL_CONTROL),
@@ -55,7 +64,7 @@ def failing_checks(autopilot: Autopilot) -> list[Text]:
     return [
         Text(CRITICAL, "", (event_identifier(name), levels, struct.pack("<IB", _bits(modes), component)))
         for name, fails, levels, modes, component in checks
-        if fails
+        if fails and (only is None or name in only)
     ]
 
 

@@ -10,6 +10,7 @@ import math
 import struct
 from typing import TYPE_CHECKING
 
+from mavlink_sim.autopilot.arming_checks import GEOFENCE_CHECKS, failing_checks
 from mavlink_sim.autopilot.failsafe_actions import Action
 from mavlink_sim.autopilot.failsafe_announcements import INFO_LEVELS
 from mavlink_sim.autopilot.failsafe_conditions import Conditions
@@ -112,6 +113,11 @@ class Supervision:
         return self.killed or self.terminated
 
     @property
+    def lacks_ground_station(self) -> bool:
+        """NAV_DLL_ACT wants a ground station, and none is there."""
+        return self._parameters.number("NAV_DLL_ACT") > 0 and self.conditions.ground_station_lost
+
+    @property
     def allows_arming(self) -> bool:
         return self._arming_problem() is None
 
@@ -130,7 +136,7 @@ class Supervision:
                     return _BATTERY_TEXTS[max(warning, BatteryWarning.LOW)]
             elif warning >= BatteryWarning.CRITICAL:
                 return _BATTERY_TEXTS[warning]
-        if self._parameters.number("NAV_DLL_ACT") > 0 and self.conditions.ground_station_lost:
+        if self.lacks_ground_station:
             return WARNING, "Preflight Fail: No connection to the GCS"
         return None
 
@@ -206,7 +212,12 @@ class Supervision:
         self._watch_ground_station()
         self._watch_battery()
         self._watch_position()
-        self.conditions.geofence_breached = autopilot.navigator.is_breached
+        breached = autopilot.navigator.is_breached
+        if breached and not self.conditions.geofence_breached:
+            autopilot.texts.extend(
+                failing_checks(autopilot, GEOFENCE_CHECKS)
+            )  # PX4 tells a check when it changes
+        self.conditions.geofence_breached = breached
         sticks_request = self._watch_sticks()
         autopilot.follow_failsafes(self.run_failsafes(dt_s, sticks_request))
         killed_s = now_s - self._killed_since_s

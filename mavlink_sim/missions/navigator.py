@@ -123,6 +123,11 @@ class Navigator:
         return bool(self._breaches)
 
     @property
+    def breaches(self) -> list[str]:
+        """PX4's words for each way in which it is."""
+        return self._breaches
+
+    @property
     def in_progress(self) -> bool:
         """A mission is being flown; it is not disarmed by itself then."""
         return self._autopilot.mode is Mode.MISSION and not self.mission.finished

@@ -326,7 +326,7 @@ def test_the_fence_is_watched(flying: LockstepVehicle) -> None:
     guided(flying, POSITION, 40.0, 0.0, -6.0)
     flying.run_until(lambda truth: truth.mode == "RTL", 20.0)
     assert flying.truth.position_ned_m[0] == pytest.approx(12.0, abs=0.5)
-    assert (2, "Circle fence breached") in texts(flying)
+    assert (5, "Circle fence breached") in texts(flying)
 
 
 def test_velocity_targets_stop_before_the_fence(flying: LockstepVehicle) -> None:

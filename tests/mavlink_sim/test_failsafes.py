@@ -322,6 +322,10 @@ def test_losing_the_ground_station_returns_after_the_hold(make_cockpit: type[Coc
     cockpit.until(lambda: cockpit.vehicle.autopilot.sensors_ready, 5.0)
     cockpit.fly(0.2)
     assert not cockpit.vehicle.autopilot.can_arm
+    cockpit.vehicle.autopilot.arm()
+    cockpit.fly(0.2)
+    events = [event.id for event in cockpit.received("EVENT")]
+    assert event_identifier("check_rc_dl_no_dllink") in events
     cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
     cockpit.take_off(12.0)
     cockpit.heartbeats.clear()

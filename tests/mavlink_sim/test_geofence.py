@@ -146,8 +146,9 @@ def test_a_breach_does_what_gf_action_says(
     assert cockpit.mode == mode
     assert "Geofence: approaching or outside geofence" in cockpit.texts()
     assert ("Failsafe activated\t" in cockpit.texts()) is (action != 1)
-    warning = event_identifier("commander_failsafe_enter_generic_warn")
-    assert (warning in [event.id for event in cockpit.received("EVENT")]) is (action == 1)
+    events = [event.id for event in cockpit.received("EVENT")]
+    assert (event_identifier("commander_failsafe_enter_generic_warn") in events) is (action == 1)
+    assert event_identifier("check_gf_violation_custom_gf") in events
     assert cockpit.heartbeat().system_status == (4 if action == 1 else 5)
     assert any("geofence breached" in event for event in cockpit.events)
 

@@ -133,3 +133,29 @@ def test_a_hold_that_px4_means_to_keep_is_confirmed_and_one_before_a_return_is_n
     harness.run(3.0)
     assert harness.autopilot.requests == asks
     assert not harness.guidance.in_command
+
+
+@pytest.mark.parametrize("late_s", [0.1, 0.25])
+def test_a_hold_is_confirmed_when_its_event_comes_after_its_cause(late_s: float) -> None:
+    """PX4 names what is wrong before it says what it does about it; the latter may come later."""
+    changed_ns: list[int] = []
+
+    def tell(inputs: GuidanceInput) -> GuidanceInput:
+        state = inputs.state
+        reports: tuple[Report, ...] = (Report(state.heartbeat_ns, 4, "Geofence violation", "arming_check"),)
+        if changed_ns and harness.vehicle.now_ns - changed_ns[0] >= late_s * 1e9:
+            name = "commander_failsafe_enter_generic"
+            reports += (Report(changed_ns[0], 2, "Failsafe activated: switching to Hold", "default", name),)
+        told = replace(state, intended_mode=FlightMode.OFFBOARD, intended_beside=state.mode, reports=reports)
+        return replace(inputs, state=told)
+
+    harness = GuidanceHarness(flying(), inputs=tell)
+    harness.command(OrbitBehaviour(radius_m=5.0))
+    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
+    harness.run(0.2)
+    harness.autopilot.requests.clear()
+    changed_ns.append(harness.vehicle.now_ns)
+    harness.autopilot.change_mode(FlightMode.HOLD)
+    harness.run(1.0)
+    assert harness.autopilot.requests == ["hold"]
+    assert not harness.guidance.in_command

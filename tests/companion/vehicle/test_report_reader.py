@@ -44,6 +44,11 @@ def test_a_short_text_is_told_at_once_without_its_tab() -> None:
     assert StatusTexts().take(text(b"\t"), 7) is None
 
 
+def test_a_fence_breach_that_is_only_a_notice_is_a_warning() -> None:
+    report = StatusTexts().take(text(b"Circle fence breached", severity=5), 7)
+    assert report == Report(7, 4, "Circle fence breached")
+
+
 def test_a_long_text_is_put_together() -> None:
     texts, words = StatusTexts(), b"x" * 50 + b"y" * 50 + b"z"
     assert texts.take(text(words[:50], 4, 0), 1) is None

@@ -1,0 +1,115 @@
+"""Fixtures for tests against a real or simulated autopilot (`docs/how-to/sitl.md`)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.vehicle.link_url import parse_link_url
+from tests.companion.service_process import running_service
+from tests.sitl.sitl_harness import FIGURES, NAMES, PX4, READY_S, AutopilotLink, Flight, bring_down
+
+URL = "COMPANION_SITL_URL"
+REPORT = "COMPANION_SITL_REPORT"
+HEARTBEAT_S = 60.0
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip without an autopilot; one driver after the other, and last what may not come back."""
+    ours = [item for item in items if item.get_closest_marker("sitl")]
+    if URL not in os.environ:
+        for item in ours:
+            item.add_marker(pytest.mark.skip(reason=f"{URL} names no autopilot"))
+    ours.sort(key=lambda item: ("reboot" in item.name, "mavsdk" in item.name))
+    items[:] = [item for item in items if item not in set(ours)] + ours
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print what was measured, and write it to the file that COMPANION_SITL_REPORT names."""
+    if not FIGURES:
+        return
+    terminalreporter.section("measured")
+    for driver, names in FIGURES.items():
+        for name, values in names.items():
+            terminalreporter.write_line(f"{driver}: {name}: {json.dumps(values)}")
+    if path := os.environ.get(REPORT):
+        Path(path).write_text(json.dumps(FIGURES, indent=1) + "\n")
+
+
+@pytest.fixture(scope="session")
+def link() -> Iterator[AutopilotLink]:
+    """The autopilot, heard."""
+    opened = AutopilotLink(parse_link_url(os.environ[URL]))
+    try:
+        opened.until(lambda: opened.autopilot in NAMES, HEARTBEAT_S, f"heard at {os.environ[URL]}")
+        yield opened
+    finally:
+        opened.close()
+
+
+@pytest.fixture(params=["pymavlink", "mavsdk"])
+def driver(request: pytest.FixtureRequest, link: AutopilotLink) -> str:
+    """Which library flies it."""
+    if request.param == "mavsdk" and link.autopilot != PX4:
+        pytest.skip("the mavsdk driver flies PX4 alone; this is ArduPilot")
+    return str(request.param)
+
+
+class Services:
+    """One service at a time, kept from test to test as long as it runs and has the driver that is wanted."""
+
+    def __init__(self, link: AutopilotLink, folder: Path) -> None:
+        self._link, self._folder = link, folder
+        self._stack = contextlib.ExitStack()
+        self._flight: Flight | None = None
+
+    def flight(self, driver: str) -> Flight:
+        """With this driver."""
+        flight = self._flight
+        if flight is None or flight.driver != driver or flight.service.process.poll() is not None:
+            self.close()
+            (self._folder / "frame.ppm").write_bytes(b"P6 4 4 255\n" + bytes(48))
+            flags = ["--source", "frame.ppm", "--source-loop", "true", "--source-rate-hz", "1"]
+            flags += ["--detector-enabled", "false", "--driver", driver]
+            flags += ["--vehicle-system-id", str(self._link.system_id)]
+            flags += [
+                "--guidance-min-battery-percent",
+                "0",
+            ]  # simulated batteries are not charged between tests
+            service = running_service(self._link.service_port, flags, cwd=self._folder)
+            running = self._stack.enter_context(service)
+            session = self._stack.enter_context(running.client())
+            self._flight = flight = Flight(self._link, running, session, driver)
+        return flight
+
+    def close(self) -> None:
+        """End what runs."""
+        self._flight = None
+        self._stack.close()
+
+
+@pytest.fixture(scope="session")
+def services(link: AutopilotLink, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Services]:
+    """The running service."""
+    opened = Services(link, tmp_path_factory.mktemp("sitl"))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def flight(link: AutopilotLink, driver: str, services: Services) -> Iterator[Flight]:
+    """A service that is ready, before a vehicle that is on the ground and ready to be armed."""
+    if not link.connected:
+        pytest.skip("the autopilot is gone")
+    bring_down(link)
+    ready = services.flight(driver)
+    link.until(lambda: link.ready, READY_S, "ready to be armed")
+    yield ready
+    bring_down(link)

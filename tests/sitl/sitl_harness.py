@@ -1,0 +1,346 @@
+"""A service as a process of its own before a real or simulated autopilot, and what both of them send.
+
+`AutopilotLink` listens where the service would, passes on every byte, records both sides on one clock, cuts
+the link, and sends what a pilot at a ground station sends.
+World frame: the autopilot's local NED.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import queue
+import select
+import socket
+import struct
+import threading
+import time
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from companion.bus.client import listen, send_command
+from companion.vehicle.link_url import LinkScheme, LinkUrl
+from mavlink_sim.testing import free_port
+from mavlink_sim.wire.messages import dialect
+from tests.companion.service_process import ServiceProcess
+
+PX4, ARDUPILOT = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+NAMES = {PX4: "PX4", ARDUPILOT: "ArduPilot"}
+PILOT = (245, 190)
+OFFBOARD = {PX4: 6 << 16, ARDUPILOT: 4}
+HOLD = {PX4: 4 << 16 | 3 << 24, ARDUPILOT: 17}  # ArduPilot's BRAKE
+PARKED = {PX4: HOLD[PX4], ARDUPILOT: 0}  # disarmed: PX4 is never ready in LAND, ArduPilot boots in STABILIZE
+LAND = {PX4: 4 << 16 | 6 << 24, ARDUPILOT: 9}
+STANDING_MPS = 0.3
+PREARM_CHECK = dialect.MAV_SYS_STATUS_PREARM_CHECK
+_ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
+_DOWN = (dialect.MAV_LANDED_STATE_ON_GROUND, dialect.MAV_LANDED_STATE_UNDEFINED)
+_ANSWER_S = 3.0
+READY_S, GROUNDED_S = 180.0, 120.0
+# Measured: by autopilot and driver, by what was flown.
+FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """One LOCAL_POSITION_NED. `time_s`: CLOCK_MONOTONIC of its arrival; `boot_s`: the autopilot's own."""
+
+    time_s: float
+    boot_s: float
+    position_ned_m: tuple[float, float, float]
+    velocity_ned_mps: tuple[float, float, float]
+    yaw_rad: float
+
+    @property
+    def speed_mps(self) -> float:
+        """Over ground."""
+        return math.hypot(*self.velocity_ned_mps[:2])
+
+
+class AutopilotLink:
+    """One autopilot, and the port at which the service finds it.
+
+    Attributes:
+        service_port: the service listens there.
+        cut: nothing is passed on while it is true; what the autopilot sends is still recorded.
+        autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
+        modes: (time_s, custom_mode) of every change.
+        poses, setpoints_s: everything since the start; when each setpoint of the service came.
+        texts: STATUSTEXT of the autopilot. results: the newest MAV_RESULT of each command, whoever gave it.
+        home_ned_m: of its newest HOME_POSITION.
+        boots: how often its clock has begun again.
+    """
+
+    def __init__(self, url: LinkUrl) -> None:
+        self.service_port = free_port()
+        self.cut = False
+        self.autopilot: int | None = None
+        self.system_id = 0
+        self.modes: list[tuple[float, int]] = []
+        self.poses: list[Pose] = []
+        self.setpoints_s: list[float] = []
+        self.texts: list[str] = []
+        self.results: dict[int, int] = {}
+        self.armed = self.ready = False
+        self.landed = dialect.MAV_LANDED_STATE_UNDEFINED
+        self.boots = 0
+        self.home_ned_m = (0.0, 0.0, 0.0)
+        self._heartbeat_s = -math.inf
+        self._boot_ms = 0
+        self._yaw_rad = math.nan
+        self._parameters: dict[str, tuple[float, int]] = {}
+        self._changed = threading.Condition()
+        self._peer: tuple[str, int] | None = None
+        if url.scheme is LinkScheme.UDP_IN:
+            self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._far.bind(url.address)
+        elif url.scheme is LinkScheme.TCP:
+            self._far = socket.create_connection(url.address, 10.0)
+        else:
+            raise ValueError(f"COMPANION_SITL_URL={url}: expected udpin://HOST:PORT or tcp://HOST:PORT")
+        self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._near.bind(("127.0.0.1", 0))
+        self._pilot = dialect.MAVLink(None, *PILOT)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="autopilot-link", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, then the sockets."""
+        self._closing.set()
+        self._thread.join(5.0)
+        self._far.close()
+        self._near.close()
+
+    # --- what is waited for ------------------------------------------------------------------------------
+
+    def until(self, condition: Callable[[], object], timeout_s: float, what: str) -> float:
+        """Wait; returns how many seconds it took. Raises TimeoutError with `what` and the newest words."""
+        since_s = time.monotonic()
+        with self._changed:
+            if not self._changed.wait_for(condition, timeout_s):
+                raise TimeoutError(f"not {what} within {timeout_s:g} s; the autopilot said {self.texts[-5:]}")
+        return time.monotonic() - since_s
+
+    def after(self, seconds: float) -> None:
+        """Record for so long."""
+        with self._changed:
+            self._changed.wait_for(lambda: False, seconds)
+
+    @property
+    def connected(self) -> bool:
+        """A heartbeat of the autopilot is no older than 3 s."""
+        return time.monotonic() - self._heartbeat_s <= 3.0
+
+    @property
+    def offboard(self) -> bool:
+        """It shows OFFBOARD (GUIDED)."""
+        return (
+            bool(self.modes) and self.autopilot is not None and self.modes[-1][1] == OFFBOARD[self.autopilot]
+        )
+
+    @property
+    def grounded(self) -> bool:
+        """Landed, as far as it tells, and disarmed."""
+        return not self.armed and self.landed in _DOWN
+
+    @property
+    def height_m(self) -> float:
+        """Above home."""
+        return self.home_ned_m[2] - self.poses[-1].position_ned_m[2]
+
+    def flown(self, since_s: float, until_s: float = math.inf) -> list[Pose]:
+        """The poses of that time."""
+        first = bisect_left(self.poses, since_s, key=lambda pose: pose.time_s)
+        return self.poses[first : bisect_right(self.poses, until_s, key=lambda pose: pose.time_s)]
+
+    def left_offboard_s(self, since_s: float) -> float | None:
+        """How long after a moment another mode was shown."""
+        left = [
+            at - since_s for at, mode in self.modes if at >= since_s and mode != OFFBOARD[self.autopilot or 0]
+        ]
+        return left[0] if left else None
+
+    # --- a pilot at a ground station ----------------------------------------------------------------------
+
+    def send(self, message: Any) -> None:
+        """Put one message on the autopilot's link, from 245/190."""
+        self._to_autopilot(message.pack(self._pilot))
+        self._pilot.seq = (self._pilot.seq + 1) % 256
+
+    def command(self, number: int, *parameters: float) -> None:
+        """One COMMAND_LONG; what it does is seen, not what it answers."""
+        seven = (*parameters, *[0.0] * (7 - len(parameters)))
+        self.send(dialect.MAVLink_command_long_message(self.system_id, 1, number, 0, *seven))
+
+    def set_mode(self, custom_mode: int) -> None:
+        """By DO_SET_MODE, as a ground station does."""
+        if self.autopilot == PX4:
+            self.command(176, 1, (custom_mode >> 16) & 0xFF, custom_mode >> 24)
+        else:
+            self.command(176, 1, custom_mode)
+
+    def parameter(self, name: str) -> float | None:
+        """Its value; None: there is none of that name."""
+        self._parameters.pop(name, None)
+        self.send(dialect.MAVLink_param_request_read_message(self.system_id, 1, name.encode(), -1))
+        try:
+            self.until(lambda: name in self._parameters, _ANSWER_S, f"answered for {name}")
+        except TimeoutError:
+            return None
+        return self._parameters[name][0]
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set one that `parameter` has read, and wait for its echo."""
+        kind = self._parameters[name][1]
+        wire = value
+        if self.autopilot == PX4 and kind != dialect.MAV_PARAM_TYPE_REAL32:
+            (wire,) = struct.unpack("<f", struct.pack("<i", round(value)))
+        self.send(dialect.MAVLink_param_set_message(self.system_id, 1, name.encode(), wire, kind))
+        self.until(
+            lambda: math.isclose(self._parameters[name][0], value, rel_tol=1e-6), _ANSWER_S, f"{name} set"
+        )
+
+    # --- the thread ---------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        hears, overhears = dialect.MAVLink(None), dialect.MAVLink(None)
+        hears.robust_parsing = overhears.robust_parsing = True
+        while not self._closing.is_set():
+            for ready in select.select([self._far, self._near], [], [], 0.2)[0]:
+                data, sender = ready.recvfrom(65536)
+                if ready is self._near:
+                    sent = overhears.parse_buffer(data) or []
+                    now_s = time.monotonic()
+                    self.setpoints_s += [now_s for message in sent if message.get_msgId() == 84]
+                    if not self.cut:
+                        self._to_autopilot(data)
+                    continue
+                self._peer = sender or self._peer
+                if not self.cut:
+                    self._near.sendto(data, ("127.0.0.1", self.service_port))
+                messages = hears.parse_buffer(data) or []
+                with self._changed:
+                    for message in messages:
+                        if message.get_srcComponent() == 1 and self.system_id in (0, message.get_srcSystem()):
+                            self._note(message, time.monotonic())
+                    self._changed.notify_all()
+
+    def _to_autopilot(self, data: bytes) -> None:
+        if self._far.type is socket.SOCK_STREAM:
+            self._far.sendall(data)
+        elif self._peer is not None:
+            self._far.sendto(data, self._peer)
+
+    def _note(self, message: Any, now_s: float) -> None:
+        match message.get_type():
+            case "HEARTBEAT":
+                self._heartbeat_s = now_s
+                self.autopilot, self.system_id = message.autopilot, message.get_srcSystem()
+                self.armed = bool(message.base_mode & _ARMED)
+                self._note_mode(message.custom_mode, now_s)
+            case "CURRENT_MODE":
+                self._note_mode(message.custom_mode, now_s)
+            case "SYS_STATUS":
+                self.ready = bool(message.onboard_control_sensors_health & PREARM_CHECK)
+            case "EXTENDED_SYS_STATE":
+                self.landed = message.landed_state
+            case "HOME_POSITION":
+                self.home_ned_m = (message.x, message.y, message.z)
+            case "ATTITUDE_QUATERNION":
+                w, x, y, z = message.q1, message.q2, message.q3, message.q4
+                self._yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            case "LOCAL_POSITION_NED":
+                self.boots += message.time_boot_ms + 1000 < self._boot_ms
+                self._boot_ms = message.time_boot_ms
+                place, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
+                boot_s = message.time_boot_ms / 1e3
+                self.poses.append(Pose(now_s, boot_s, place, velocity, self._yaw_rad))
+            case "COMMAND_ACK":
+                self.results[message.command] = message.result
+            case "STATUSTEXT":
+                self.texts.append(message.text.strip())
+            case "PARAM_VALUE":
+                value = message.param_value
+                if self.autopilot == PX4 and message.param_type != dialect.MAV_PARAM_TYPE_REAL32:
+                    (value,) = struct.unpack("<i", struct.pack("<f", value))
+                self._parameters[message.param_id] = (float(value), message.param_type)
+
+    def _note_mode(self, custom_mode: int, now_s: float) -> None:
+        if not self.modes or self.modes[-1][1] != custom_mode:
+            self.modes.append((now_s, custom_mode))
+
+
+class Flight:
+    """A service of its own process, the autopilot that it flies, and what both say.
+
+    Attributes:
+        events: texts of the topic `events`. status: the newest of the topic `status`.
+    """
+
+    def __init__(
+        self, link: AutopilotLink, service: ServiceProcess, session: zenoh.Session, driver: str
+    ) -> None:
+        self.link, self.service, self.driver = link, service, driver
+        self._session = session
+        self.events: list[str] = []
+        self.status: dict[str, Any] = {}
+        self._subscribers = [
+            listen(session, "events", lambda _, text: self.events.append(json.loads(text)["text"])),
+            listen(session, "status", lambda _, text: self.status.update(json.loads(text))),
+        ]
+
+    def command(self, text: str, timeout_s: float = 120.0) -> dict[str, Any]:
+        """What `companion send` does."""
+        return send_command(self._session, "vehicle1", text, timeout_s=timeout_s)
+
+    def fly(self, text: str, timeout_s: float = 120.0) -> dict[str, Any]:
+        """A command that has to succeed."""
+        reply = self.command(text, timeout_s)
+        assert reply["success"], reply
+        return reply
+
+    def begin(self, text: str) -> queue.SimpleQueue[dict[str, Any]]:
+        """Send a command and go on; its answer comes in the queue."""
+        answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._session.get(
+            "companion/vehicle1/command",
+            lambda reply: answers.put(json.loads(reply.ok.payload.to_string()) if reply.ok else {}),
+            payload=text,
+            timeout=120.0,
+        )
+        return answers
+
+    def take_off(self, height_m: float) -> None:
+        """Again while it is refused: estimators of real autopilots are ready when they are."""
+        until_s = time.monotonic() + READY_S
+        while not (reply := self.command(f"takeoff {height_m:g}"))["success"]:
+            refused = " needs " in reply["reason"] or "refused" in reply["reason"]
+            assert refused, reply
+            assert time.monotonic() < until_s, reply
+            self.link.after(1.0)
+        self.link.until(lambda: self.link.height_m > height_m - 1.0, 5.0, "at its height")
+
+    def said(self, text: str) -> Callable[[], bool]:
+        """Whether an event with these words came from now on."""
+        already = len(self.events)
+        return lambda: any(text in event for event in self.events[already:])
+
+    def note(self, name: str, **figures: float | None) -> None:
+        """Keep measured figures for the report."""
+        title = f"{NAMES[self.link.autopilot or 0]}, {self.driver}"
+        rounded = {key: None if value is None else round(value, 2) for key, value in figures.items()}
+        FIGURES.setdefault(title, {})[name] = rounded
+
+
+def bring_down(link: AutopilotLink) -> None:
+    """Land it as a pilot would, whatever the service does; then a mode that it can be armed in."""
+    link.cut = False
+    if not link.grounded:
+        link.set_mode(LAND[link.autopilot or 0])
+        link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
+    link.set_mode(PARKED[link.autopilot or 0])

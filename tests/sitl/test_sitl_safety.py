@@ -1,0 +1,216 @@
+"""The dead-man, the pilot and the limits, on the autopilot at COMPANION_SITL_URL."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+
+import pytest
+
+from tests.sitl.sitl_harness import ARDUPILOT, HOLD, OFFBOARD, PX4, STANDING_MPS, AutopilotLink, Flight, Pose
+
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400)]
+# A setpoint that was being sent when the mode changed; and one heartbeat period for a mode to show.
+IN_TRANSIT_S, WATCHED_S = 0.3, 3.0
+ORBIT_MPS = 2.8
+ORBIT = f"orbit radius=10 speed={ORBIT_MPS:g}"
+
+
+def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, float]:
+    """Set parameters; what they were. Skips where the autopilot has no such parameter."""
+    before = {}
+    for name in values:
+        value = link.parameter(name)
+        if value is None:
+            pytest.skip(f"this autopilot has no parameter {name}")
+        before[name] = value
+    for name, value in values.items():
+        link.set_parameter(name, value)
+    return before
+
+
+@pytest.fixture
+def parameters(flight: Flight) -> Iterator[dict[str, float]]:
+    """What a test sets is written here, and taken back."""
+    before: dict[str, float] = {}
+    yield before
+    flight.link.cut = False
+    for name, value in before.items():
+        flight.link.set_parameter(name, value)
+
+
+def orbiting(flight: Flight) -> None:
+    """In the air, steadily at speed."""
+    flight.take_off(5.0)
+    flight.fly(ORBIT)
+    link = flight.link
+    link.until(lambda: link.poses[-1].speed_mps > 0.9 * ORBIT_MPS, 20.0, "at speed")
+    link.after(1.0)
+
+
+def standing(link: AutopilotLink, since_s: float) -> tuple[float, float]:
+    """Wait until it stands; seconds and metres from a moment on."""
+
+    def stood() -> Pose | None:
+        return next((pose for pose in link.flown(since_s) if pose.speed_mps < STANDING_MPS), None)
+
+    link.until(stood, 20.0, "standing")
+    end = stood()
+    assert end is not None
+    places = [pose.position_ned_m[:2] for pose in link.flown(since_s, end.time_s)]
+    return end.time_s - since_s, sum(math.dist(one, other) for one, other in pairwise(places))
+
+
+def silent(link: AutopilotLink, since_s: float, seconds: float = WATCHED_S) -> int:
+    """How many setpoints came from a moment on until so many seconds from now."""
+    link.after(seconds)
+    return sum(at > since_s for at in link.setpoints_s)
+
+
+def test_a_pilots_change_of_mode_ends_the_command(flight: Flight) -> None:
+    link = flight.link
+    orbiting(flight)
+    lost = flight.said("the pilot took over: hold mode")
+    asked_s = time.monotonic()
+    link.set_mode(HOLD[link.autopilot or 0])
+    shown_s = link.until(lambda: not link.offboard, 3.0, "in the pilot's mode")
+    link.until(lost, 3.0, "reported as the pilot's")
+    assert silent(link, asked_s + shown_s + IN_TRANSIT_S) == 0
+    last_s = link.setpoints_s[-1] - asked_s - shown_s
+    flight.note("pilot's change of mode", shown_after_s=shown_s, last_setpoint_after_s=last_s)
+    # OFFBOARD again, and not by us: nothing is sent. (PX4 refuses it without a stream.)
+    again_s = time.monotonic()
+    link.set_mode(OFFBOARD[link.autopilot or 0])
+    assert silent(link, again_s) == 0
+    flight.fly("land")
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL], ids=lambda number: number.name)
+def test_a_service_that_hangs_or_dies_ends_the_flight(flight: Flight, number: signal.Signals) -> None:
+    link = flight.link
+    orbiting(flight)
+    speed_mps = link.poses[-1].speed_mps
+    fault_s = time.monotonic()
+    flight.service.signal(number)
+    try:
+        stands_s, flown_m = standing(link, fault_s)
+        link.after(0.5)
+        left_s = link.left_offboard_s(fault_s)
+    finally:
+        if number is signal.SIGSTOP:
+            resumed_s = time.monotonic()
+            flight.service.signal(signal.SIGCONT)
+    guided_s = link.parameter("GUID_TIMEOUT") if link.autopilot == ARDUPILOT else None
+    flight.note(
+        f"kill -{'STOP' if number is signal.SIGSTOP else '9'} at speed",
+        speed_mps=speed_mps,
+        left_offboard_s=left_s,
+        stands_s=stands_s,
+        flown_m=flown_m,
+        GUID_TIMEOUT=guided_s,
+    )
+    if link.autopilot == PX4:
+        loss_s = link.parameter("COM_OF_LOSS_T")
+        assert loss_s is not None
+        assert left_s is not None
+        assert left_s < loss_s + 0.5
+    else:
+        assert guided_s is not None
+        assert left_s is None
+        assert stands_s < guided_s + 3.0
+    if number is signal.SIGKILL:
+        flight.service.process.wait(10)
+    else:
+        # It goes on where it was: what was about to be sent has expired, and nothing follows.
+        assert silent(link, resumed_s) == 0
+        flight.fly("land")
+
+
+def test_a_service_that_is_ended_lets_the_autopilot_hold(flight: Flight) -> None:
+    link = flight.link
+    orbiting(flight)
+    speed_mps = link.poses[-1].speed_mps
+    asked_s = time.monotonic()
+    flight.service.signal(signal.SIGTERM)
+    link.until(lambda: link.modes[-1][1] == HOLD[link.autopilot or 0], 3.0, "in hold")
+    stands_s, flown_m = standing(link, asked_s)
+    assert flight.service.process.wait(20) == 0
+    flight.note("SIGTERM at speed", speed_mps=speed_mps, stands_s=stands_s, flown_m=flown_m)
+
+
+def test_a_lost_link_ends_the_command_and_is_not_resumed(flight: Flight) -> None:
+    link = flight.link
+    orbiting(flight)
+    speed_mps = link.poses[-1].speed_mps
+    lost, back = flight.said("command lost"), flight.said("autopilot heartbeat received")
+    cut_s = time.monotonic()
+    link.cut = True
+    reported_s = link.until(lost, 10.0, "reported as lost")
+    stands_s, flown_m = standing(link, cut_s)
+    left_s = link.left_offboard_s(cut_s)
+    link.after(4.0)
+    link.cut = False
+    found_s = link.until(back, 10.0, "found again")
+    assert silent(link, time.monotonic()) == 0
+    flight.fly("land")
+    flight.note(
+        "link loss at speed",
+        speed_mps=speed_mps,
+        left_offboard_s=left_s,
+        stands_s=stands_s,
+        flown_m=flown_m,
+        reported_s=reported_s,
+        found_after_s=found_s,
+    )
+
+
+def test_refused_arming_has_the_autopilots_own_reason(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    values, reason = (
+        ({"NAV_DLL_ACT": 2.0}, "No connection to the G")  # "GCS" or "ground control station"
+        if link.autopilot == PX4
+        else ({"BATT_ARM_VOLT": 90.0}, "below minimum arming voltage")
+    )
+    parameters |= set_for_test(link, values)
+    link.until(lambda: not link.ready, 10.0, "not ready to be armed")
+    reply = flight.command("takeoff 3")
+    assert not reply["success"]
+    assert reason.lower() in reply["reason"].lower()
+    assert not link.armed
+
+
+def test_points_beyond_the_limits_are_refused(flight: Flight) -> None:
+    link = flight.link
+    flight.take_off(4.0)
+    start = link.poses[-1].position_ned_m
+    for text, limit in (("goto 0 0 altitude=90", "max_altitude_m"), ("goto 500 0", "max_distance_m")):
+        reply = flight.command(text)
+        assert not reply["success"]
+        assert limit in reply["reason"]
+    link.after(2.0)
+    assert math.dist(link.poses[-1].position_ned_m, start) < 1.5
+    flight.fly("land")
+
+
+def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, float]) -> None:
+    link = flight.link
+    if link.autopilot == PX4:
+        values = {"GF_MAX_HOR_DIST": 15.0, "GF_ACTION": 2.0}
+    else:
+        values = {"FENCE_TYPE": 2.0, "FENCE_RADIUS": 15.0, "FENCE_ACTION": 4.0, "FENCE_ENABLE": 1.0}
+        if link.parameter("AVOID_ENABLE") is not None:
+            values |= {"AVOID_ENABLE": 0.0}  # else it stops inside the fence, and no mode changes
+    parameters |= set_for_test(link, values)
+    flight.take_off(5.0)
+    home = link.poses[-1].position_ned_m
+    reply = flight.command("goto 40 0")
+    assert not reply["success"]
+    assert "fence" in reply["reason"].lower()
+    link.after(WATCHED_S)
+    if link.autopilot == PX4:
+        assert reply["reason"].startswith("autopilot failsafe: hold mode")
+        assert link.modes[-1][1] == HOLD[PX4], reply  # it holds, and does not return
+    flight.note("geofence of 15 m", at_m=math.dist(link.poses[-1].position_ned_m[:2], home[:2]))
