@@ -289,7 +289,7 @@ class CopterAutopilot(Autopilot):
         frame, ground = self._airframe, self.ground
         if ground.landed:
             if self.home.position[2] - frame.position[2] > TAKEOFF_DETECTION_HEIGHT_M and not frame.on_ground:
-                ground.leave()
+                ground.leave(self.now_s)
                 self._on_event("takeoff")
         elif ground.presses(self.now_s, wanted_down_mps):
             self._has_landed()

@@ -45,7 +45,7 @@ def request_read(vehicle: CopterVehicle, link: Link, message: Any) -> None:
 
 
 def set_parameter(vehicle: CopterVehicle, link: Link, message: Any) -> None:
-    """PARAM_SET: rounded and cut to what the type holds, then told on every link."""
+    """PARAM_SET: truncated and cut to what the type holds, then told on every link."""
     name = _text_of(message.param_id)
     if name not in vehicle.parameters:
         return

@@ -186,13 +186,13 @@ class CopterParameters(Parameters):
         return changed
 
     def _set_own(self, name: str, value: float) -> Parameter:
-        """ArduPilot rounds what is for an integer and cuts it to its range."""
+        """ArduPilot truncates what is for an integer and cuts it to its range."""
         parameter = self[name]
         if not math.isfinite(value):
             raise ValueError(f"parameter {name} needs a finite number, got {value}")
         if parameter.kind in _RANGES:
             low, high = _RANGES[parameter.kind]
-            number: int | float = min(max(round(value), low), high)
+            number: int | float = min(max(int(value), low), high)
         else:
             number = _single(value)
         changed = replace(parameter, value=number)

@@ -50,7 +50,7 @@ def _sys_status(vehicle: CopterVehicle) -> Any:
 
 
 def _home_position(vehicle: CopterVehicle) -> Any:
-    """The local position in it is always zero with ArduPilot, wherever home is."""
+    """Its local position counts from the EKF's origin; its attitude is not known."""
     if not vehicle.copter.sensors_ready:
         return None
     latitude, longitude, altitude = geographic(vehicle.copter.home.position)
@@ -58,8 +58,8 @@ def _home_position(vehicle: CopterVehicle) -> Any:
         round(latitude * 1e7),
         round(longitude * 1e7),
         round(altitude * 1000),
-        *NOTHING,
-        [1.0, 0.0, 0.0, 0.0],
+        *vehicle.copter.home.position,
+        [math.nan] * 4,
         *NOTHING,
         vehicle.boot_us,
     )

@@ -448,7 +448,7 @@ class Autopilot:
         airframe = self._airframe
         if self.ground.landed:
             if airframe.floor_down_m - airframe.position[2] > TAKEOFF_DETECTION_HEIGHT_M:
-                self.ground.leave()
+                self.ground.leave(self.now_s)
                 self._say(INFO, "Takeoff detected\t", TAKEOFF_EVENT)
                 self._on_event("takeoff")
         elif self.ground.presses(self.now_s, self.controller.velocity[2]):

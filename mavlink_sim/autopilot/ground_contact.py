@@ -26,7 +26,7 @@ class GroundContact:
 
     Attributes:
         landed: it stands, as far as it can tell: from `touch_down` to `leave`.
-        has_flown: it has been in the air since it was armed.
+        has_flown: it has been in the air since it was armed. left_s: when it left the ground last.
     """
 
     def __init__(self, airframe: Multirotor, parameters: Parameters, detection_s: float) -> None:
@@ -35,6 +35,7 @@ class GroundContact:
         self._detection_s = detection_s
         self.landed = airframe.on_ground  # it may boot while it falls
         self.has_flown = False
+        self.left_s: float | None = None
         self._armed_since_s = self._landed_since_s = 0.0
         self._touching_since_s: float | None = None
         self._lifting_since_s: float | None = None
@@ -81,9 +82,10 @@ class GroundContact:
         rise = (progress - RAMP_THRUST_SHARE) / (1.0 - RAMP_THRUST_SHARE)
         return min(max(speed * rise, RAMP_CREEP_MPS), speed)
 
-    def leave(self) -> None:
+    def leave(self, now_s: float) -> None:
         """It is in the air."""
         self.landed = False
+        self.left_s = now_s
         self.has_flown = True
 
     def presses(self, now_s: float, wanted_down_mps: float) -> bool:

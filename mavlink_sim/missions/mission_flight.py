@@ -199,7 +199,7 @@ class MissionFlight(flight.Task):
             # reached as it begins (since PX4 v1.17): in a moment another mode flies the vehicle
             self._navigator.reached(self._mission.current)
             if self._mission.current + 1 == len(self._mission.items):
-                self._finish()
+                self._end()
 
     def _replay_speed(self) -> None:
         """A mission that is resumed has the speed of the last change before its current item."""

@@ -96,6 +96,24 @@ _STANDARD_MODES = {
     Mode.TAKEOFF: 8,
 }
 
+# AVAILABLE_MODES lists them in the order of PX4's navigation states.
+LISTED_MODES = (
+    Mode.MANUAL,
+    Mode.ALTCTL,
+    Mode.POSCTL,
+    Mode.MISSION,
+    Mode.HOLD,
+    Mode.RTL,
+    Mode.POSITION_SLOW,
+    Mode.ACRO,
+    Mode.OFFBOARD,
+    Mode.STABILIZED,
+    Mode.TAKEOFF,
+    Mode.LAND,
+    Mode.FOLLOW,
+    Mode.PRECLAND,
+    Mode.ORBIT,
+)
 MANUAL_MODES = frozenset(
     {Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.POSITION_SLOW, Mode.ACRO, Mode.STABILIZED}
 )

@@ -14,6 +14,7 @@ from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.mission_start import mission_start
 from mavlink_sim.services.telemetry import MESSAGE_IDS
+from mavlink_sim.services.telemetry_of_system import available_modes
 from mavlink_sim.wire.announcements import CRITICAL, Text
 from mavlink_sim.wire.messages import dialect, protocol_version
 
@@ -46,7 +47,11 @@ ARM_DISARM = 400
 GET_MESSAGE_INTERVAL = 510
 SET_MESSAGE_INTERVAL = 511
 REQUEST_MESSAGE = 512
+GET_HOME_POSITION = 410
 MESSAGE_INTERVAL = 244  # a message, which REQUEST_MESSAGE asks for with another's number
+AVAILABLE_MODES = 435  # the same with the index of a mode, 0 for all
+# ACTUATOR_OUTPUT_FUNCTION: motors 1-12, servos 1-8, and from 1000 on PX4's own numbers
+_TESTED_FUNCTIONS = (range(1, 13), range(33, 41), range(1000, 2**31))
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,10 +218,42 @@ def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
 def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
     if _identifier(command.parameters[0]) == MESSAGE_INTERVAL:
         return _tell_interval(vehicle, link, command.parameters[1])
+    if _identifier(command.parameters[0]) == AVAILABLE_MODES:
+        modes = available_modes(_identifier(command.parameters[1]))
+        for message in modes:
+            link.send(message)
+        return ACCEPTED if modes else DENIED
     name = MESSAGE_IDS.get(_identifier(command.parameters[0]))
     if name is None or not vehicle.send_built(link, name):
         return DENIED
     return ACCEPTED
+
+
+def _get_home_position(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return ACCEPTED if vehicle.send_built(link, "HOME_POSITION") else DENIED
+
+
+def _actuator_test(vehicle: Vehicle, link: Link, command: Command) -> int | None:
+    """No actuator moves. A function that PX4 does not have is not answered."""
+    if vehicle.autopilot.armed or vehicle.parameters.number("COM_MOT_TEST_EN") != 1:
+        return DENIED
+    function = _identifier(command.parameters[4])
+    return ACCEPTED if any(function in known for known in _TESTED_FUNCTIONS) else None
+
+
+def _calibrate(vehicle: Vehicle, link: Link, command: Command) -> int:
+    """All zero asks for nothing, and ends a calibration; there is none here."""
+    if vehicle.autopilot.armed:
+        return TEMPORARILY_REJECTED
+    return UNSUPPORTED if any(command.parameters) else ACCEPTED
+
+
+def _reboot(vehicle: Vehicle, link: Link, command: Command) -> int:
+    return UNSUPPORTED if any(command.parameters) else ACCEPTED
+
+
+def _silence(vehicle: Vehicle, link: Link, command: Command) -> None:
+    """Commander leaves it to a part of PX4 that is not there."""
 
 
 def _request_capabilities(vehicle: Vehicle, link: Link, command: Command) -> int:
@@ -273,19 +310,27 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
     179: _set_home,  # DO_SET_HOME
     185: _flight_termination,  # DO_FLIGHTTERMINATION
     DO_CHANGE_ALTITUDE: _change_altitude,
+    187: _accept,  # DO_SET_ACTUATOR
     DO_REPOSITION: _reposition,
     gimbal_protocol.DO_SET_ROI_LOCATION: gimbal_protocol.set_roi_location,
     gimbal_protocol.DO_SET_ROI_NONE: gimbal_protocol.set_roi_none,
     gimbal_protocol.DO_SET_ROI: gimbal_protocol.set_roi,
+    205: _silence,  # DO_MOUNT_CONTROL
+    241: _calibrate,  # PREFLIGHT_CALIBRATION
     245: _preflight_storage,  # PREFLIGHT_STORAGE
+    246: _reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
     300: _mission_start,
+    310: _actuator_test,  # ACTUATOR_TEST
     ARM_DISARM: _arm,
     401: _run_prearm_checks,
+    GET_HOME_POSITION: _get_home_position,
     GET_MESSAGE_INTERVAL: _get_message_interval,
     SET_MESSAGE_INTERVAL: _set_message_interval,
     REQUEST_MESSAGE: _request_message,
     519: _request_protocol_version,  # REQUEST_PROTOCOL_VERSION
     520: _request_capabilities,  # REQUEST_AUTOPILOT_CAPABILITIES
+    531: _silence,  # SET_CAMERA_ZOOM
+    2510: _silence,  # LOGGING_START
     gimbal_protocol.PITCHYAW: gimbal_protocol.pitchyaw,
     gimbal_protocol.CONFIGURE: gimbal_protocol.configure,
 }
@@ -293,4 +338,6 @@ _HANDLERS: dict[int, Callable[[Vehicle, Link, Command], int | None]] = {
 # PX4's MAVLink receiver accepts these at once, whatever Commander answers a moment later (since v1.16).
 ANSWERED_TWICE = frozenset({DO_SET_MODE})
 # These never get to Commander's queue.
-ANSWERED_BY_RECEIVER = frozenset({GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, 519, 520})
+ANSWERED_BY_RECEIVER = frozenset(
+    {GET_HOME_POSITION, GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, 519, 520}
+)

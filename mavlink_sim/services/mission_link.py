@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.flight.precision_landing import LandingTarget
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 CAMERA_COMPONENT = 100  # MAV_COMP_ID_CAMERA
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
+HOLD_BEFORE_RETURN_S = 0.05
 MAX_PLACE_M = 1e6
 # a single shot goes to PX4's camera trigger as DO_DIGICAM_CONTROL, "shoot"
 _SHOOT = (0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
@@ -37,7 +39,12 @@ def update(vehicle: Vehicle) -> None:
             elif navigator.mission.items:
                 link.send(mission_current(vehicle))
     while navigator.commands:
-        _carry_out(vehicle, navigator.commands.popleft())
+        item = navigator.commands.popleft()
+        if item.command == mission_items.RETURN_TO_LAUNCH and navigator.mission.finished:
+            # measured: with its last item the mission is over, and HOLD is flown before the return
+            vehicle.after(HOLD_BEFORE_RETURN_S, partial(_carry_out, vehicle, item))
+        else:
+            _carry_out(vehicle, item)
     for session in navigator.sessions.values():
         session.update()
 

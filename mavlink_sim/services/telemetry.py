@@ -61,6 +61,7 @@ BUILDERS: dict[str, Builder] = {
 REQUESTED: dict[str, Builder] = {
     "AUTOPILOT_VERSION": telemetry_of_system.autopilot_version,
     "COMPONENT_METADATA": metadata_message,
+    "FLIGHT_INFORMATION": telemetry_of_system.flight_information,
     "GIMBAL_MANAGER_INFORMATION": gimbal_protocol.manager_information,
     "GIMBAL_DEVICE_INFORMATION": gimbal_protocol.device_information,
 }

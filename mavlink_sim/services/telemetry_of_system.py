@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from mavlink_sim.physics.geography import geographic
+from mavlink_sim.px4.modes import LISTED_MODES, Mode
 from mavlink_sim.services import pilot_link
 from mavlink_sim.wire.messages import current_event_sequence as event_sequence_message
 from mavlink_sim.wire.messages import dialect, time_estimate_to_target
@@ -137,6 +138,38 @@ def home_position(vehicle: Vehicle) -> Any:
         0.0,
         vehicle.boot_us,
     )
+
+
+def flight_information(vehicle: Vehicle) -> Any:
+    """FLIGHT_INFORMATION; its times are since boot, as PX4's are, and 0 where there is none."""
+    autopilot = vehicle.autopilot
+    armed_s = vehicle.now_s - autopilot.ground.armed_for_s(vehicle.now_s) if autopilot.armed else 0.0
+    return dialect.MAVLink_flight_information_message(
+        vehicle.boot_ms,
+        round(armed_s * 1e6),
+        round((autopilot.ground.left_s or 0.0) * 1e6),
+        int(vehicle.parameters.number("COM_FLIGHT_UUID")),
+    )
+
+
+def available_modes(index: int) -> list[Any]:
+    """AVAILABLE_MODES of one mode by its index from 1, of all with index 0; none: there is no such mode."""
+    chosen = (
+        enumerate(LISTED_MODES, 1)
+        if index == 0
+        else [(index, mode) for mode in LISTED_MODES[index - 1 : index]]
+    )
+    return [
+        dialect.MAVLink_available_modes_message(
+            len(LISTED_MODES),
+            number,
+            mode.standard_mode,
+            mode.custom_mode,
+            0 if mode in (Mode.ALTCTL, Mode.POSCTL) else dialect.MAV_MODE_PROPERTY_ADVANCED,
+            b"" if mode.standard_mode else mode.title.encode(),
+        )
+        for number, mode in chosen
+    ]
 
 
 def vibration(vehicle: Vehicle) -> Any:

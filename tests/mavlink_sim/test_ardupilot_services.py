@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -123,10 +124,10 @@ def test_parameters_travel_as_numbers_in_the_order_of_the_list_without_a_hash(
     assert "MPC_XY_CRUISE" not in values
 
 
-def test_a_set_is_rounded_cut_and_told_and_what_is_unknown_is_met_with_silence(
+def test_a_set_is_truncated_cut_and_told_and_the_unknown_is_silence(
     copter: LockstepVehicle,
 ) -> None:
-    for value, kept in ((42.4, 42.0), (1000.0, 127.0)):
+    for value, kept in ((1.6, 1.0), (-1.6, -1.0), (1000.0, 127.0)):
         copter.send(dialect.MAVLink_param_set_message(1, 1, b"DISARM_DELAY", value, 9))
         copter.step(0.02)
         (echo,) = [m for m in copter.receive() if m.get_type() == "PARAM_VALUE"]
@@ -148,14 +149,15 @@ def test_a_message_asked_for_follows_its_acknowledgement(copter: LockstepVehicle
     assert copter.command(2000) == "UNSUPPORTED"
 
 
-def test_home_is_where_it_was_armed_and_its_local_position_is_always_zero(copter: LockstepVehicle) -> None:
+def test_home_is_where_it_was_armed_and_its_local_place_is_true(copter: LockstepVehicle) -> None:
     copter.vehicle.airframe.position = (4.0, 0.0, 0.0)
     copter.step(0.1)
     copter.command(400, 1)
     copter.step(0.02)
     home = copter.newest["onboard"]["HOME_POSITION"]
     assert home.latitude - 473977432 == pytest.approx(360, abs=40)
-    assert (home.x, home.y, home.z) == (0.0, 0.0, 0.0)
+    assert (home.x, home.y, home.z) == pytest.approx((4.0, 0.0, 0.0), abs=0.5)
+    assert all(map(math.isnan, home.q))
 
 
 @pytest.mark.parametrize("place", [(1.0,), (0.0, 0.0, 0.0, 0.0, 47.3977432, 8.545594, 488.0)])

@@ -123,6 +123,6 @@ async def test_what_the_vehicle_refuses_is_an_error_of_its_own() -> None:
         with pytest.raises(ActionError, match="COMMAND_DENIED"):
             await action.arm()  # not ready
         with pytest.raises(ActionError, match="UNSUPPORTED"):
-            await action.set_actuator(1, 0.5)
+            await action.reboot()
         with pytest.raises(ActionError, match="VTOL"):
             await action.transition_to_fixedwing()

@@ -55,7 +55,7 @@ def test_the_ramp_creeps_then_climbs_and_begins_anew_with_each_take_off() -> Non
     assert ramp[0] == ramp[15] == RAMP_CREEP_MPS
     assert all(before <= after for before, after in itertools.pairwise(ramp))
     assert ground.climb_limit_mps(4.5) == Parameters().number("MPC_TKO_SPEED")  # not off the ground yet
-    ground.leave()
+    ground.leave(1.0)
     assert ground.climb_limit_mps(4.6) == math.inf
     ground.touch_down(9.0)
     assert ground.rests(9.1, rises=False)
@@ -66,7 +66,7 @@ def test_the_ramp_creeps_then_climbs_and_begins_anew_with_each_take_off() -> Non
 @pytest.mark.parametrize("detection_s", [1.0, 1.5])
 def test_it_has_landed_when_it_pressed_on_the_ground_for_so_long_without_a_break(detection_s: float) -> None:
     airframe, ground = contact(detection_s)
-    ground.leave()
+    ground.leave(1.0)
     assert not ground.presses(0.0, 1.0)
     assert not ground.presses(detection_s - 0.1, 1.0)
     assert not ground.presses(detection_s, math.nan)  # nothing is wanted, and the rotors carry it
@@ -80,7 +80,7 @@ def test_it_has_landed_when_it_pressed_on_the_ground_for_so_long_without_a_break
 def test_what_it_has_done_counts_from_arming() -> None:
     _, ground = contact()
     ground.arm(1.0)
-    ground.leave()
+    ground.leave(1.0)
     assert (ground.landed, ground.has_flown) == (False, True)
     ground.touch_down(8.0)
     assert (ground.landed, ground.has_flown) == (True, True)

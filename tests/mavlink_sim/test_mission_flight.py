@@ -137,6 +137,17 @@ def test_delay_and_speed_and_jump_items_do_what_they_say(cockpit: Cockpit) -> No
     assert status(cockpit)[2:] == (5, 2)  # complete, though the vehicle is still on its way
 
 
+def test_a_mission_that_ends_in_a_return_holds_for_a_moment(cockpit: Cockpit) -> None:
+    upload(cockpit, [takeoff(3.0), waypoint(4, 0, 3), RETURN])
+    cockpit.command(300)
+    cockpit.until(lambda: cockpit.mode == "HOLD", 30.0)
+    assert 0.03 <= cockpit.until(lambda: cockpit.mode == "RTL", 1.0) <= 0.07
+    cockpit.until(lambda: not cockpit.armed, 60.0)
+    assert cockpit.mode == "HOLD"
+    changes = [line for line in cockpit.events if line.startswith("mode ")]
+    assert changes == ["mode MISSION", "mode HOLD", "mode RTL", "mode HOLD"]
+
+
 def test_a_pause_keeps_the_place_in_the_mission(cockpit: Cockpit) -> None:
     upload(cockpit, [takeoff(4.0), waypoint(12, 0, 4), waypoint(12, 8, 4)])
     cockpit.command(300)

@@ -27,6 +27,11 @@ pytestmark = pytest.mark.hears("everything")
         (31010, (), 3),
         (43000, (), 3),
         (60000, (), 3),
+        (187, (0.5,), 0),
+        (241, (), 0),
+        (246, (), 0),
+        (310, (0.1, 0.5, 0, 0, 33), 0),
+        (410, (), 0),
     ],
 )
 def test_the_result_of_a_command_is_as_measured(
@@ -52,9 +57,57 @@ def test_home_is_not_set_while_its_parameter_forbids_it(make_cockpit: type[Cockp
     assert cockpit.command(179, 1) == [2]
 
 
-def test_command_zero_is_not_answered(cockpit: Cockpit) -> None:
+@pytest.mark.parametrize("command", [0, 205, 310, 531, 2510])
+def test_what_px4_leaves_to_others_is_not_answered(cockpit: Cockpit, command: int) -> None:
     cockpit.fly(0.1)
-    assert cockpit.command(0) == []
+    assert cockpit.command(command) == []
+
+
+@pytest.mark.parametrize(("command", "result"), [(241, 1), (310, 2)])
+def test_an_armed_vehicle_is_not_calibrated_and_no_actuator_tested(
+    cockpit: Cockpit, command: int, result: int
+) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(400, 1) == [0]
+    assert cockpit.command(command, 0, 0, 0, 0, 1) == [result]
+
+
+def test_get_home_position_sends_it_before_the_acknowledgement(cockpit: Cockpit) -> None:
+    cockpit.wait_ready()
+    cockpit.forget()
+    assert cockpit.command(410) == [0]
+    kinds = [item.message.get_type() for _, item in cockpit.inbox["onboard"]]
+    assert kinds.index("HOME_POSITION") < kinds.index("COMMAND_ACK")
+
+
+def test_available_modes_lists_one_or_all(cockpit: Cockpit) -> None:
+    cockpit.fly(0.1)
+    assert cockpit.command(512, 435, 0) == [0]
+    listed = cockpit.received("AVAILABLE_MODES")
+    assert [told.mode_index for told in listed] == list(range(1, listed[0].number_modes + 1))
+    assert {told.custom_mode for told in listed} >= {0x00010000, 0x03040000, 0x04040000, 0x00060000}
+    cockpit.forget()
+    assert cockpit.command(512, 435, 1) == [0]
+    (manual,) = cockpit.received("AVAILABLE_MODES")
+    assert (manual.custom_mode, manual.standard_mode, manual.properties) == (0x00010000, 0, 1)
+    assert manual.mode_name.rstrip("\0") == "Manual"
+    assert cockpit.command(512, 435, 200) == [2]
+
+
+def test_flight_information_tells_when_it_armed_and_took_off(cockpit: Cockpit) -> None:
+    cockpit.wait_ready()
+    assert cockpit.command(512, 264) == [0]
+    before = cockpit.received("FLIGHT_INFORMATION")[-1]
+    assert (before.arming_time_utc, before.takeoff_time_utc, before.flight_uuid) == (0, 0, 0)
+    armed_us = cockpit.now_s * 1e6
+    cockpit.command(400, 1)
+    cockpit.command(22, *[float("nan")] * 7)
+    cockpit.until(lambda: not cockpit.vehicle.autopilot.landed, 5.0)
+    left_us = cockpit.now_s * 1e6
+    assert cockpit.command(512, 264) == [0]
+    flying = cockpit.received("FLIGHT_INFORMATION")[-1]
+    assert flying.arming_time_utc == pytest.approx(armed_us, abs=20_000)
+    assert flying.takeoff_time_utc == pytest.approx(left_us, abs=20_000)
 
 
 def test_the_protocol_version_is_sent_on_request(cockpit: Cockpit) -> None:
