@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import queue
 import select
 import socket
 import struct
@@ -47,10 +46,9 @@ FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """One LOCAL_POSITION_NED. `time_s`: CLOCK_MONOTONIC of its arrival; `boot_s`: the autopilot's own."""
+    """One LOCAL_POSITION_NED. `time_s`: CLOCK_MONOTONIC of its arrival."""
 
     time_s: float
-    boot_s: float
     position_ned_m: tuple[float, float, float]
     velocity_ned_mps: tuple[float, float, float]
     yaw_rad: float
@@ -258,8 +256,7 @@ class AutopilotLink:
                 self.boots += message.time_boot_ms + 1000 < self._boot_ms
                 self._boot_ms = message.time_boot_ms
                 place, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-                boot_s = message.time_boot_ms / 1e3
-                self.poses.append(Pose(now_s, boot_s, place, velocity, self._yaw_rad))
+                self.poses.append(Pose(now_s, place, velocity, self._yaw_rad))
             case "COMMAND_ACK":
                 self.results[message.command] = message.result
             case "STATUSTEXT":
@@ -303,17 +300,6 @@ class Flight:
         reply = self.command(text, timeout_s)
         assert reply["success"], reply
         return reply
-
-    def begin(self, text: str) -> queue.SimpleQueue[dict[str, Any]]:
-        """Send a command and go on; its answer comes in the queue."""
-        answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self._session.get(
-            "companion/vehicle1/command",
-            lambda reply: answers.put(json.loads(reply.ok.payload.to_string()) if reply.ok else {}),
-            payload=text,
-            timeout=120.0,
-        )
-        return answers
 
     def take_off(self, height_m: float) -> None:
         """Again while it is refused: estimators of real autopilots are ready when they are."""
