@@ -221,3 +221,15 @@ def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path
     assert {"stamp_ns", "position_ned_m", "velocity_ned_mps", "yaw_rad", "armed", "objects"} == set(
         json.loads(flown.read_text().splitlines()[0])
     )
+
+
+def test_help_names_the_further_commands(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["mavlink-sim", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for command in ("mavlink-sim camera", "mavlink-sim dataset", "mavlink-sim bench"):
+        assert command in said
