@@ -203,8 +203,8 @@ def test_the_autopilots_geofence_is_named(flight: Flight, parameters: dict[str, 
         values = {"FENCE_TYPE": 2.0, "FENCE_RADIUS": 15.0, "FENCE_ACTION": 4.0, "FENCE_ENABLE": 1.0}
         if link.parameter("AVOID_ENABLE") is not None:
             values |= {"AVOID_ENABLE": 0.0}  # else it stops inside the fence, and no mode changes
+    flight.take_off(5.0)  # home is here now, wherever the flight before ended
     parameters |= set_for_test(link, values)
-    flight.take_off(5.0)
     home = link.poses[-1].position_ned_m
     reply = flight.command("goto 40 0")
     assert not reply["success"]
