@@ -60,7 +60,7 @@ class SourceSection(Section):
 
 
 class CameraSection(Section):
-    """The lens, and how the camera is mounted. Body frame: forward, right, down."""
+    """Lens and mount; a key not set is the camera's own where it brings one. Body: forward, right, down."""
 
     horizontal_fov_deg: Annotated[float, Field(gt=1, lt=179)] = 80.0
     """field of view from the left edge to the right, degrees; unused when fx_px is set"""

@@ -211,7 +211,9 @@ class _Run:
         history, system_id = self._history, self._link.system_id
 
         def known() -> bool:
-            return history.span_ns is not None and self._process.ready
+            if (span := history.span_ns) is not None and self._origin is None:
+                self._place_origin(history.at(span[1]).position)
+            return span is not None and self._process.ready
 
         if not self._until(known, 2 * OTHERS_S):
             if history.missing:
@@ -239,11 +241,10 @@ class _Run:
                     self._show(self._next_ns + round(due * period_ns))
                     self._next_ns += round((due + 1) * period_ns)
             elif time.monotonic() - advanced_s > POSE_LOST_S:
-                raise CameraError(
-                    f"the pose of system {self._link.system_id} stopped {POSE_LOST_S:g} s ago; "
-                    "no more frames are written",
-                    1,
-                )
+                self._receive()  # what came while this process did not run counts
+                if history.span_ns == span:
+                    text = f"the pose of system {self._link.system_id} stopped {POSE_LOST_S:g} s ago"
+                    raise CameraError(f"{text}; no more frames are written", 1)
             if not announced and self._process.written:
                 announced = True
                 self._announce()
@@ -254,15 +255,18 @@ class _Run:
 
     def _begin(self, boot_ns: int) -> None:
         self._start_ns = self._next_ns = self._next_truth_ns = boot_ns
-        if self._origin is None:
-            self._origin = self._history.at(boot_ns).position
-            if self._link.systems.get(self._link.system_id or 0):
-                print(
-                    "the vehicle is armed: the ground is drawn at its present height; "
-                    "if it is in the air, give --origin N,E,D",
-                    file=sys.stderr,
-                    flush=True,
-                )
+
+    def _place_origin(self, position: Vector) -> None:
+        """Put the world's origin below the vehicle, as soon as that is known: it may take off while the
+        camera's process still paints."""
+        self._origin = position
+        if self._link.systems.get(self._link.system_id or 0):
+            print(
+                "the vehicle is armed: the ground is drawn at its present height; "
+                "if it is in the air, give --origin N,E,D",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def _show(self, boot_ns: int) -> None:
         assert self._origin is not None

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.frame import Frame
 from vision.shared_frame import (
     SHARED_MEMORY_DIRECTORY,
@@ -305,3 +306,55 @@ def test_a_name_that_is_no_file_name_is_refused(bad: str) -> None:
 def test_the_segment_is_for_its_owner_only(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, False):
         assert Path(segment_path(name)).stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.12, 0.03, 0.0005, -0.0003), (-0.12, 0.03, 5e-4, -3e-4, 0.01)])
+@pytest.mark.parametrize(
+    "mount",
+    [
+        None,
+        CameraMount(0.12, -0.3, 0.05, 0.1, -0.35, 1.2),
+        CameraMount(pitch_rad=-0.4, levelled=True),
+        CameraMount(forward_m=0.2, on_gimbal=True),
+    ],
+    ids=["none", "fixed", "stabilized", "gimbal"],
+)
+def test_calibration_comes_out_as_it_went_in(
+    name: str, distortion: tuple[float, ...], mount: CameraMount | None
+) -> None:
+    calibration = CameraCalibration(CameraModel(16, 12, 11.5, 11.25, 7.25, 5.75, distortion), mount)
+    with (
+        SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration),
+        SharedFrameReader(name) as reader,
+    ):
+        assert reader.calibration == calibration
+
+
+def test_a_writer_without_calibration_brings_none(name: str) -> None:
+    with SharedFrameWriter(name, 16, 12, depth=False), SharedFrameReader(name) as reader:
+        assert reader.calibration is None
+
+
+def test_calibration_of_another_size_is_refused(name: str) -> None:
+    calibration = CameraCalibration(CameraModel.from_horizontal_fov(640, 480, 1.2))
+    with pytest.raises(ValueError, match="640x480"):
+        SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration)
+
+
+def test_a_segment_of_version_one_is_refused(name: str) -> None:
+    with SharedFrameWriter(name, 16, 12, depth=False):
+        with segment_path(name).open("r+b") as file:
+            file.seek(8)
+            file.write((1).to_bytes(8, sys.byteorder))
+        with pytest.raises(ValueError, match=f"version 1, expected 2.*{os.getpid()}.*restart"):
+            SharedFrameReader(name)
+
+
+def test_a_damaged_calibration_is_refused(name: str) -> None:
+    calibration = CameraCalibration(CameraModel.from_horizontal_fov(16, 12, 1.2))
+    with SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration):
+        with segment_path(name).open("r+b") as file:
+            file.seek(13 * 8)
+            file.write(np.array([np.nan]).tobytes())
+        with pytest.raises(ValueError, match="damaged"):
+            SharedFrameReader(name)

@@ -8,9 +8,11 @@ import time
 import numpy as np
 import pytest
 
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameWriter
 from vision.sources import SourceError, SourceSettings, open_source
+from vision.sources.source import CameraChangedError
 
 QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.3, retry_min_s=0.02, retry_max_s=0.05)
 
@@ -76,3 +78,30 @@ def test_nobody_writing_is_one_clear_line() -> None:
         SourceError, match=r"no frames in the shared memory 'test-none'.*is its writer running"
     ):
         open_source("shm://test-none", SourceSettings(open_timeout_s=0.3, retry_min_s=0.1))
+
+
+def test_a_source_brings_its_camera_and_ends_when_it_changes() -> None:
+    name = f"test-{secrets.token_hex(6)}"
+    lens = CameraCalibration(CameraModel.from_horizontal_fov(6, 4, 1.2), CameraMount(pitch_rad=-0.35))
+    other = CameraCalibration(CameraModel.from_horizontal_fov(6, 4, 1.4), CameraMount(pitch_rad=-0.35))
+    first = SharedFrameWriter(name, 6, 4, depth=True, calibration=lens)
+    first.write(frame(0, 10))
+    with open_source(f"shm://{name}", QUICK) as source:
+        assert source.calibration == lens
+        assert source.read(20.0) is not None
+        first.close()
+        with SharedFrameWriter(name, 6, 4, depth=True, calibration=other) as second:
+            deadline_s = time.monotonic() + 20
+            ended: SourceError | None = None
+            sequence = 0
+            while ended is None:
+                assert time.monotonic() < deadline_s
+                second.write(frame(sequence, 20))
+                sequence += 1
+                try:
+                    got = source.read(0.05)
+                    assert got is None or int(got.image[0, 0, 0]) == 10
+                except SourceError as error:
+                    ended = error
+            assert isinstance(ended, CameraChangedError)
+        assert source.calibration == lens

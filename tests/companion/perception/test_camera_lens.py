@@ -1,0 +1,87 @@
+"""`mavlink-sim --camera front` and a view of `shm://front`, with nothing said about the lens."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import secrets
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from companion.perception.views import WorkerView
+from companion.settings.reading import load_settings
+from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
+from mavlink_sim.testing import running_simulator
+from vision.camera_model import CameraModel
+from vision.geolocation import Sightlines
+from vision.shared_frame import segment_path
+
+HEIGHT_M = 3.0
+
+
+@pytest.fixture(scope="module")
+def front() -> Iterator[str]:
+    name = f"test-lens-{os.getpid()}-{secrets.token_hex(4)}"
+    with running_simulator(camera=name):
+        yield name
+    segment_path(name).unlink(missing_ok=True)
+
+
+def started_view(front: str, **camera: str) -> tuple[WorkerView, list[tuple[str, str]], int]:
+    """A view after its start, what it said, and how often its camera changed."""
+    events: list[tuple[str, str]] = []
+    changes = 0
+
+    def changed() -> None:
+        nonlocal changes
+        changes += 1
+
+    overrides = {"source.uri": f"shm://{front}", "source.open_timeout_s": "90", "detector.enabled": "false"}
+    overrides |= {f"camera.{key}": value for key, value in camera.items()}
+    view = WorkerView(
+        load_settings(os.devnull, overrides, environment={}),
+        None,
+        on_result=lambda *_: None,
+        on_preview=lambda *_: None,
+        on_event=lambda level, text: events.append((level, text)),
+        on_calibration=changed,
+    )
+
+    async def start() -> None:
+        await view.start()
+        await view.keeper.stop()
+
+    asyncio.run(start())
+    return view, events, changes
+
+
+def ground_range_m(view: WorkerView, true_m: float) -> float:
+    """What the view makes of a ground point so far ahead of a level vehicle; NaN above the horizon."""
+    eye = DEFAULT_MOUNT.position_frd_m
+    offset = np.array([[true_m, 0.0, HEIGHT_M]]) - eye
+    pixels = DEFAULT_CAMERA.project(offset @ DEFAULT_MOUNT.ned_from_optical(np.eye(3)))
+    camera = view.settings.camera
+    model = camera.model(DEFAULT_CAMERA.width, DEFAULT_CAMERA.height)
+    return float(Sightlines.of(model, camera.mount(), np.eye(3), pixels).on_ground(HEIGHT_M)[0, 0])
+
+
+def test_a_ground_point_has_its_true_range_without_settings(front: str) -> None:
+    view, events, changes = started_view(front)
+    assert changes == 1
+    assert [level for level, _ in events if level != "info"] == []
+    for true_m in (5.0, 10.0, 20.0):
+        assert ground_range_m(view, true_m) == pytest.approx(true_m, abs=0.01)
+
+
+def test_a_setting_that_says_otherwise_is_one_warning(front: str) -> None:
+    view, events, _ = started_view(front, horizontal_fov_deg="80", mount_pitch_deg="0")
+    ((level, text),) = [event for event in events if event[0] != "info"]
+    assert level == "warning"
+    for value in ("80.0°", "70.0°", "mount_pitch_deg 0 (camera: -20)"):
+        assert value in text
+    own = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+    assert view.settings.camera.model(640, 480) == own
+    assert view.settings.camera.mount().pitch_rad == 0.0
