@@ -36,6 +36,7 @@ from companion.sim_session import (
     until_ready_to_arm,
     with_service,
 )
+from companion.vehicle.state import LandedState
 from mavlink_sim.world.mesh import surface_range_to
 from mavlink_sim.world.world import demo_world
 from vision.video_encoders import has_pyav
@@ -86,7 +87,7 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say, vehicle_url: 
     flight = asyncio.run(_fly(output, truth_path, vehicle_url, seed=seed, limit_s=limit_s, say=say))
     final_range_m = _range_at(truth_path, flight.reached_ns, seed) if flight.reached_ns else None
     reached = final_range_m is not None and abs(final_range_m - STOP_DISTANCE_M) <= RANGE_TOLERANCE_M
-    landed = flight.ended and _landed(truth_path)
+    landed = flight.ended and _landed(truth_path, flight.on_ground)
     failure = flight.failure
     if failure is None and not reached:
         stood = "nowhere" if final_range_m is None else f"{final_range_m:.2f} m from the {TARGET_CLASS}"
@@ -121,6 +122,7 @@ class _Flight:
     found: bool = False
     reached_ns: int | None = None
     ended: bool = False
+    on_ground: bool = False
     frames: int = 0
     published: int = 0
     received: int = 0
@@ -223,6 +225,7 @@ async def _mission(service: Service, flight: _Flight) -> None:
             flight.reached_ns = step["ended_ns"]
     state = service.driver.state
     flight.ended = not state.armed
+    flight.on_ground = state.landed is LandedState.ON_GROUND
     if flight.failure is not None and state.armed:
         flight.failure += f"; the vehicle is left armed, in {state.mode.value} mode"
 
@@ -237,9 +240,10 @@ def _range_at(truth_path: Path, stamp_ns: int, seed: int) -> float | None:
     return min(surface_range_to(car, place) for car in cars)
 
 
-def _landed(truth_path: Path) -> bool:
+def _landed(truth_path: Path, on_ground: bool) -> bool:
+    """Disarmed on the ground. `on_ground`: what the autopilot says, where the file does not have it."""
     rows = _rows(truth_path)
-    return bool(rows) and not rows[-1]["armed"] and bool(rows[-1]["landed"])
+    return bool(rows) and not rows[-1]["armed"] and bool(rows[-1].get("landed", on_ground))
 
 
 def _rows(truth_path: Path) -> list[dict[str, Any]]:
