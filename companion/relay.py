@@ -130,7 +130,7 @@ class Relay:
         known = source == self._source and self._checked
         heartbeat = None if known else _heartbeat_in(data)
         if heartbeat is not None and source != self._source:
-            self._on_new_sender(source)
+            self._on_new_sender(source, heartbeat)
         if source != self._source:
             return
         if heartbeat is not None:
@@ -140,10 +140,17 @@ class Relay:
         for program in self._programs:
             program.send(data)
 
-    def _on_new_sender(self, source: Source) -> None:
-        """Answer an autopilot that is the first, or the only one that still sends (it has restarted)."""
+    def _on_new_sender(self, source: Source, heartbeat: AutopilotHeartbeat) -> None:
+        """Answer the first autopilot, or the same one when it has restarted and sends from another port.
+
+        Another autopilot never takes its place: it was not checked, and setpoints are not meant for it.
+        """
         silent_s = time.monotonic() - self._received_s
-        if self._source is None or silent_s > HEARTBEAT_MAX_AGE_S:
+        same = self.heartbeat is None or heartbeat.system_id == self.heartbeat.system_id
+        restarted = same and source not in self.others and silent_s > HEARTBEAT_MAX_AGE_S
+        if self._source is None or restarted:
+            if self._source is not None:
+                logger.warning("%s: the autopilot sends from %s:%s now", self.url, *source[:2])
             self._source = source
             assert self._vehicle is not None
             self._vehicle.answer_to(source)

@@ -98,18 +98,23 @@ def send_command(
                 "`companion echo status` shows who is there"
             ) from None
         # Sent once: a command that was heard and not answered may be flying.
+        over_s = time.monotonic() + timeout_s
         replies = zenoh.handlers.Callback(heard.put, lambda: heard.put(None))
         session.get(command_key(vehicle), replies, payload=text, timeout=timeout_s)
-        return _answer(heard, vehicle, text, timeout_s)
+        return _answer(heard, vehicle, text, timeout_s, over_s)
     finally:
         watching.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _answer(
-    heard: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None], vehicle: str, text: str, timeout_s: float
+    heard: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None],
+    vehicle: str,
+    text: str,
+    timeout_s: float,
+    over_s: float,
 ) -> dict[str, Any]:
-    """The first answer to a query. None in the queue: no more will come."""
-    over_s, wait_s = time.monotonic() + timeout_s, timeout_s + _LAST_ANSWER_S
+    """The first answer to a query. None in the queue: no more will come. `over_s`: when the query ends."""
+    wait_s = timeout_s + _LAST_ANSWER_S
     while True:
         try:
             news = heard.get(timeout=wait_s)
@@ -120,6 +125,8 @@ def _answer(
             return answer
         if _is(news, zenoh.SampleKind.DELETE):
             wait_s = _LAST_ANSWER_S  # an answer may have left just before
+        elif _is(news, zenoh.SampleKind.PUT):
+            wait_s = timeout_s + _LAST_ANSWER_S  # the network was gone for a moment
         elif news is None and time.monotonic() >= over_s:
             raise NoAnswerError(
                 f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` tells what it does"

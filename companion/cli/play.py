@@ -52,6 +52,8 @@ def play(
     started_s = time.monotonic()
     with uncollected():
         from companion.bus.session import BusError
+        from companion.guidance.registry import PluginError
+        from companion.operator.line_output import LineOutput, use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.keeper import PerceptionStartError
         from companion.play import PlayOptions, SimulationLostError
@@ -59,6 +61,7 @@ def play(
         from companion.sim_session import SimSessionError
         from companion.vehicle.driver import LinkError
 
+    use_for_standard_error()
     level = settings.log.level.upper() if "log.level" in given else "WARNING"
     logging.basicConfig(level=level, format="companion: %(message)s", stream=sys.stderr)
     # What the service logs is printed here with its time: once is enough.
@@ -66,12 +69,15 @@ def play(
     service.propagate = False
     service.addHandler(logging.NullHandler())
     options = PlayOptions(scene, seed, vehicles, url, autopilot)
-    errors = (SimSessionError, LinkError, PerceptionStartError, BusError, MetricsError)
+    errors = (SimSessionError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
+    output = LineOutput(sys.stdout.fileno())
     with plain_errors(*errors):
         try:
             start(
-                settings, options, lambda text: typer.echo(f"{time.monotonic() - started_s:6.1f} s  {text}")
+                settings, options, lambda text: output.print(f"{time.monotonic() - started_s:6.1f} s  {text}")
             )
         except SimulationLostError as error:
             typer.echo(f"companion: {error}", err=True)
             raise typer.Exit(EXIT_FAILED) from error
+        finally:
+            output.end()

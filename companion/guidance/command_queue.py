@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement
+from companion.guidance.behaviour import Outcome, Requirement
 from companion.guidance.gimbal_controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
 from companion.vehicle.state import VehicleState
@@ -38,16 +38,16 @@ class CommandQueue:
         command: CommandInput,
         now_ns: int,
         state: VehicleState,
-        active: Behaviour | None,
+        gimbal_user: str,
         out: OutputCollector,
     ) -> None:
-        """A new command. `active`: the behaviour that is flown now."""
+        """A new command. `gimbal_user`: name of the behaviour that moves the gimbal now; empty: none does."""
         self.supersede(command.text, out)
         if command.mode_changes not in (None, self._mode_changes):
             out.result(command.identifier, Outcome(False, f"superseded by {_change(state)}"))
             return
-        if command.aim is not None and active is not None and active.flown.gimbal_aim is not None:
-            reason = f"gimbal: {active.flown.name} moves it; end that first"
+        if command.aim is not None and gimbal_user:
+            reason = f"gimbal: {gimbal_user} moves it; end that first"
             out.result(command.identifier, Outcome(False, reason))
             return
         behaviour = command.behaviour

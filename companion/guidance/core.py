@@ -127,6 +127,15 @@ class Guidance:
         self._goal_ned_m: Vector3 | None = None
         self._mode_changes = 0
         self._landing_target_ns = 0
+        # Read once in each step, where an exception is handled.
+        self._flown: Behaviour | None = None
+        self._landing = False
+        self._gimbal_user = ""
+
+    @property
+    def flown(self) -> Behaviour | None:
+        """The behaviour whose turn it is, of several in turn; None: none has been updated yet."""
+        return self._flown
 
     @property
     def behaviour(self) -> Behaviour | None:
@@ -187,7 +196,7 @@ class Guidance:
             return self._output(None, released=self.gimbal.released)
         self._queue.watch(inputs.mode_changes, inputs.state, out)
         for command in inputs.commands:
-            self._queue.add(command, now_ns, inputs.state, self._behaviour, out)
+            self._queue.add(command, now_ns, inputs.state, self._gimbal_user, out)
         for command in self._queue.take_due(now_ns, inputs.state, out):
             self._begin_command(command, situation)
         landing_target = None
@@ -197,7 +206,7 @@ class Guidance:
                 self._tell_reset(self._behaviour, before, situation)
                 self._update(situation, inputs, paused_s)
             landing_target = self._new_landing_target()
-            self.gimbal.update(now_ns, inputs.state, self._behaviour, out)
+            self.gimbal.update(now_ns, inputs.state, self._flown, out)
         except Exception as error:
             self._behaviour_failed(error, situation, inputs.stream.sent_count)
         self._answer_endless(inputs)
@@ -305,15 +314,17 @@ class Guidance:
             situation.now_ns,
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
             sent=self.sent if fresh and self.phase is Phase.OFFBOARD else None,
-            landing=self._behaviour.flown.landing,
+            landing=self._landing,
         )
         if why is not None or self._yielded is not None:
             self._yield(why, situation)
             return
-        self._watch_battery(self._behaviour, situation)
+        # Before any hook of the behaviour: what the autopilot has answered must not be lost by its exception.
         for answer in inputs.answers:
             if answer.identifier == self._request:
                 self._take_answer(answer, situation)
+        if self._behaviour is not None:
+            self._watch_battery(self._behaviour, situation)
         self._ask_next(situation)
         if self.phase is Phase.ENGAGING and self._activated:
             self._engage(situation, inputs.stream.sent_count)
@@ -325,6 +336,7 @@ class Guidance:
     def _begin(self, behaviour: Behaviour, command: CommandInput | None, *, busy: bool = True) -> None:
         self._behaviour, self._command, self._busy = behaviour, command, busy
         self._activated, self._position_lost_ns, self._blind = False, None, False
+        self._flown, self._landing, self._gimbal_user = None, False, ""
 
     def _run(self, behaviour: Behaviour, situation: Situation, sent_count: int) -> None:
         """One update of the behaviour, and what follows from it."""
@@ -340,6 +352,9 @@ class Guidance:
         for note in behaviour.take_notes():
             self._out.event(EventKind.NOTED, behaviour.name, note)
         self._stepped_ns = situation.now_ns
+        self._flown = flown = behaviour.flown
+        self._landing = flown.landing
+        self._gimbal_user = flown.name if flown.gimbal_aim is not None else ""
         match step:
             case Outcome():
                 self._conclude(step, situation, sent_count)
@@ -348,16 +363,26 @@ class Guidance:
                     self._start_request(step, situation)
             case Setpoint() if self.phase is Phase.OFFBOARD:
                 self._limit(behaviour, step, situation, dt_s)
-            case Setpoint() if self.phase is not Phase.ENGAGING:
-                self._start_engaging(situation, sent_count)
+            case Setpoint():
+                if self.phase is not Phase.ENGAGING:
+                    self._start_engaging(situation, sent_count)
+            case _:
+                got = type(step).__name__
+                raise TypeError(f"update returned {got}, expected Setpoint, ModeRequest or Outcome")
 
     def _behaviour_failed(self, error: Exception, situation: Situation, sent_count: int) -> None:
         """A hook of the behaviour raised: the vehicle is held. To be called where an exception is handled."""
         name = "guidance" if self._behaviour is None else self._behaviour.name
         logger.exception("%s failed", name)
         why = f"{name} failed: {type(error).__name__}: {error}"
-        if self.busy:
-            self._conclude(Outcome(False, why), situation, sent_count)
+        if self._yielded is not None:
+            self._lose(self._yielded[1])
+        elif self.busy:
+            try:
+                self._conclude(Outcome(False, why), situation, sent_count)
+            except Exception:
+                logger.exception("the hold after %s failed", name)
+                self._lose(why)
         else:
             self._lose(why)
 
@@ -380,7 +405,7 @@ class Guidance:
             situation.now_ns,
             dt_s,
             situation.neighbours,
-            landing=behaviour.flown.landing,
+            landing=self._landing,
         )
 
     def _tell_blindness(self, behaviour: Behaviour, blind: str | None) -> None:
@@ -559,8 +584,8 @@ class Guidance:
         """Take the active behaviour off, and answer the command that asked for it."""
         behaviour, command, busy = self._behaviour, self._command, self._busy
         after_battery, self._after_battery = self._after_battery, False
-        self._behaviour = self._command = None
-        self._busy = False
+        self._behaviour = self._command = self._flown = None
+        self._busy, self._landing, self._gimbal_user = False, False, ""
         if behaviour is None:
             return
         if self._activated:

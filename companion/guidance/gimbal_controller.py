@@ -155,11 +155,8 @@ class GimbalController:
                     out.event(EventKind.GIMBAL, "", text, warning=True)
                 self._release_failed = answer.refused is not None
 
-    def update(
-        self, now_ns: int, state: VehicleState, behaviour: Behaviour | None, out: OutputCollector
-    ) -> None:
-        """One step, after the behaviour's."""
-        flown = None if behaviour is None else behaviour.flown
+    def update(self, now_ns: int, state: VehicleState, flown: Behaviour | None, out: OutputCollector) -> None:
+        """One step, after that of the behaviour that is flown."""
         aim = None if flown is None else flown.gimbal_aim
         owner: object | None = flown
         if self._point is not None and aim is not None and flown is not None:

@@ -44,12 +44,12 @@ class PluginError(RuntimeError):
 
 
 @dataclass_transform(frozen_default=True)
-def behaviour(word: str, help: str) -> Callable[[type[_Kind]], type[_Kind]]:
+def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]:
     """Make a frozen dataclass of a command and add it to the table.
 
     Args:
         word: how it is called: lower-case letters, digits and hyphens.
-        help: what it does, one line without a full stop.
+        help_text: what it does, one line without a full stop.
 
     Raises:
         TypeError: a field has no argument (`Annotated[float, Number(...)]`) beside its type.
@@ -69,7 +69,7 @@ def behaviour(word: str, help: str) -> Callable[[type[_Kind]], type[_Kind]]:
         for field in fields(made):
             if not any(isinstance(part, Argument) for part in get_args(hints[field.name])[1:2]):
                 raise TypeError(f"{kind.__qualname__}.{field.name}: expected Annotated[type, argument]")
-        made.word, made.help = word, help
+        made.word, made.help = word, help_text
         COMMANDS[word] = made
         return made
 

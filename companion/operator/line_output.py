@@ -18,7 +18,9 @@ from collections import deque
 QUEUED_BYTES = 256 * 1024
 """Of lines that wait for the reader; what comes after them is dropped, and counted."""
 EXIT_TIMEOUT_S = 1.0
-# One write takes no more, so that a slow reader makes room for new lines early.
+LONGEST_LINE = 16 * 1024
+"""Characters; what has no end by then is written as a line."""
+# Of one write: with a slow reader, room in the queue comes back in small steps.
 _WRITE_BYTES = 4096
 
 
@@ -59,11 +61,18 @@ class LineOutput(io.TextIOBase):
     def write(self, text: str) -> int:
         """Queue the whole lines in `text`; the rest waits for its end. Never waits, never fails."""
         with self._changed:
-            *lines, self._partial = (self._partial + text).split("\n")
+            *lines, partial = (self._partial + text).split("\n")
+            if len(partial) > LONGEST_LINE:
+                lines, partial = [*lines, partial], ""
+            self._partial = partial
             for line in lines:
                 self._put(line)
             self._changed.notify_all()
         return len(text)
+
+    def print(self, line: str) -> None:
+        """Queue one line."""
+        self.write(f"{line}\n")
 
     def _put(self, line: str) -> None:
         data = f"{line}\n".encode("utf-8", "backslashreplace")

@@ -117,22 +117,25 @@ class GuidanceLoop:
             commands=self._commands.take_commands(),
             ending=self._ending,
         )
+        name = "" if self.guidance.behaviour is None else self.guidance.behaviour.name
         begun_ns, used_ns = time.monotonic_ns(), time.thread_time_ns()
         output = self.guidance.step(now_ns, inputs)
-        self._warn_slow(time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
+        self._warn_slow(name, time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
         self._apply(output)
         return output
 
-    def _warn_slow(self, used_ns: int, passed_ns: int, now_ns: int) -> None:
-        """Name a behaviour whose update is slow. If it blocks, its setpoint's deadline ends it."""
-        behaviour = self.guidance.behaviour
-        if behaviour is None or (used_ns < SLOW_STEP_NS and passed_ns < STALLED_STEP_NS):
+    def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:
+        """Name a behaviour whose update is slow (`before`: the one of before the step, if there was one).
+
+        While an update blocks nothing is sent, and the autopilot's failsafe acts."""
+        name = before or ("" if self.guidance.behaviour is None else self.guidance.behaviour.name)
+        if not name or (used_ns < SLOW_STEP_NS and passed_ns < STALLED_STEP_NS):
             return
-        name, told_ns = self._slow
-        if behaviour.name != name or now_ns - told_ns >= SLOW_AGAIN_NS:
-            self._slow = (behaviour.name, now_ns)
+        last, told_ns = self._slow
+        if name != last or now_ns - told_ns >= SLOW_AGAIN_NS:
+            self._slow = (name, now_ns)
             text = f"{used_ns / 1e6:.0f} ms of processor time, {passed_ns / 1e6:.0f} ms in all"
-            self._on_event("warning", f"{behaviour.name}: slow update ({text}); at most 5 ms are expected")
+            self._on_event("warning", f"{name}: slow update ({text}); at most 5 ms are expected")
 
     def _apply(self, output: GuidanceOutput) -> None:
         if output.setpoint is None:

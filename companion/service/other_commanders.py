@@ -21,6 +21,8 @@ from companion.vehicle.state import VehicleState
 GONE_AFTER_S = 3.5
 # Both are told in whole seconds and arrive late: started so near to each other, neither counts as the first.
 SAME_START_S = 2.0
+# Of a `status` that is read, and of services by their status: more are no service of ours.
+LARGEST_STATUS_BYTES, MOST_SERVICES = 64 * 1024, 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +70,17 @@ class OtherCommanders:
 
     def on_status(self, payload: bytes, now_ns: int) -> None:
         """Anybody's `status`, our own too."""
+        if len(payload) > LARGEST_STATUS_BYTES:
+            return
         try:
             message = json.loads(payload)
             name, service = message["vehicle"]["name"], str(message["service"])
             started_ns = now_ns - round(float(message["uptime_s"]) * 1e9)
             in_command = bool(message["pilot"]["in_command"])
-        except (ValueError, TypeError, KeyError, OverflowError):
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
             return  # not of a service like ours
-        if name == self._vehicle and service != self._service:
+        known = service in self._by_status or len(self._by_status) < MOST_SERVICES
+        if name == self._vehicle and service != self._service and known and len(service) <= 64:
             self._by_status[service] = _Other("zenoh", service, now_ns, started_ns, in_command)
 
     def present(self, state: VehicleState, now_ns: int) -> list[_Other]:

@@ -74,7 +74,7 @@ class Publisher:
         while True:
             now_ns, state = time.monotonic_ns(), self._driver.state
             self._bus.publish(topics.VEHICLE, vehicle_message(state, now_ns))
-            pose = self._inputs.poses.message(state, guidance.behaviour, now_ns)
+            pose = self._inputs.poses.message(state, guidance.flown, now_ns)
             if pose is not None:
                 self._bus.publish(topics.POSE, pose)
             for view in views:

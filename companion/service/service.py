@@ -248,5 +248,4 @@ class Service:
                 self._loop.on_seen()
         finally:
             # The guidance loop wakes before it: a subscriber can wait for a millisecond, a setpoint not.
-            publish = self._publisher.publish_result
-            asyncio.get_running_loop().call_soon(publish, view, result, markers)
+            asyncio.get_running_loop().call_soon(self._publisher.publish_result, view, result, markers)

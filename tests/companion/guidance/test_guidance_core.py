@@ -188,6 +188,62 @@ def test_exception_in_any_hook_ends_it_and_holds(hook: str, caplog: pytest.LogCa
     assert harness.outputs[-1].setpoint is not None
 
 
+@pytest.mark.parametrize("idle", [True, False])
+def test_update_that_returns_nothing_ends_it(idle: bool) -> None:
+    harness = GuidanceHarness(flying())
+    if not idle:
+        engaged(harness)
+    kind = type("Forgetful", (Curious,), {"update": lambda *_: None})
+    outcome = harness.outcome(harness.command(kind()), 5.0)
+    assert not outcome.success
+    assert "TypeError" in outcome.reason
+    harness.run(1.0)
+    assert harness.guidance.phase == ("idle" if idle else "offboard")
+
+
+def test_pilot_wins_while_a_hook_raises() -> None:
+    harness = GuidanceHarness(flying())
+
+    class Faulty(Curious):
+        broken = False
+
+        @property
+        def flown(self) -> Behaviour:
+            if self.broken:
+                raise ZeroDivisionError("a bug")
+            return self
+
+    behaviour = Faulty()
+    pending = engaged(harness, behaviour)
+    behaviour.broken = True
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    outcome = harness.outcome(pending, 2.0)
+    sent = len(harness.autopilot.setpoints)
+    assert not outcome.success
+    harness.run(1.0)
+    assert harness.guidance.phase == "idle"
+    assert len(harness.autopilot.setpoints) == sent
+
+
+def test_exception_with_the_answer_does_not_lose_it() -> None:
+    """OFFBOARD is answered in the very step in which a hook raises: the hold that follows is flown."""
+    harness = GuidanceHarness(flying())
+    harness.run(0.1)
+
+    class Faulty(Curious):
+        @property
+        def flown(self) -> Behaviour:
+            if harness.guidance.phase == "offboard":
+                raise ZeroDivisionError("a bug")
+            return self
+
+    outcome = harness.outcome(harness.command(Faulty()), 5.0)
+    assert not outcome.success
+    harness.run(1.0)
+    assert harness.guidance.phase == "offboard"
+    assert harness.outcome(harness.command(HoldBehaviour(duration_s=0.5)), 5.0).success
+
+
 def test_exception_in_the_status_shows_the_name_instead() -> None:
     class Mute(Curious):
         @property
