@@ -128,9 +128,14 @@ def test_half_the_speed_in_the_right_direction_is_followed() -> None:
 
 def test_a_vehicle_that_swings_about_the_setpoint_is_followed() -> None:
     """A badly tuned hold: 1.6 m/s to and fro, against setpoints that are a quarter of a period late."""
-    turn = lambda seconds: 1.9 * seconds  # noqa: E731
-    flown = lambda seconds: (1.6 * math.cos(turn(seconds)), 1.6 * math.sin(turn(seconds)), 0.0)  # noqa: E731
-    sent = lambda seconds: (-math.sin(turn(seconds)), math.cos(turn(seconds)), 0.0)  # noqa: E731
+    rate_radps = 1.9
+
+    def flown(seconds: float) -> Vector3:
+        return (1.6 * math.cos(rate_radps * seconds), 1.6 * math.sin(rate_radps * seconds), 0.0)
+
+    def sent(seconds: float) -> Vector3:
+        return (-math.sin(rate_radps * seconds), math.cos(rate_radps * seconds), 0.0)
+
     sequence = Sequence()
     assert sequence.fly(sent, flown, 20.0) is None
     assert sequence.largest_mps > 0.8
@@ -167,7 +172,7 @@ def test_nothing_is_compared_by_an_invalid_estimate() -> None:
 
 def test_standing_on_the_ground_at_a_landing_is_allowed() -> None:
     """The autopilot takes seconds to tell that it has landed."""
-    down = lambda seconds: (0.2, 0.1, 0.7)  # noqa: E731
+    down: Velocity = lambda seconds: (0.2, 0.1, 0.7)  # noqa: E731
     sequence = Sequence()
     assert sequence.fly(down, lambda seconds: (0.1, 0.1, 0.7), 3.0, landing=True) is None
     assert sequence.fly(down, still, 10.0, landing=True) is None
