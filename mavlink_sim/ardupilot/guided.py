@@ -18,16 +18,15 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_TH
 from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import Quaternion, quaternion_from_euler
 
-# A place that moves by a velocity waits for the vehicle (ArduPilot's leash): a little while it moves, so that
-# the vehicle does not race after it; where it stands it is a place to keep. What is planned lags the target,
-# as the vehicle does while it leans. Both are tuned: a real Copter's step to 3 m/s peaks at 3.05 m/s, and
-# its circle of 5 m at 3 m/s is at worst 0.44 m off.
-LEASH_M, MOVING_LEASH_M = 2.0, 0.1
-TILT_LAG_S = 0.1
+# A target that runs ahead of the vehicle waits for it (ArduPilot's leash).
+LEASH_M = 2.0
+# What is planned of a velocity lags its target, as the vehicle does while it leans: tuned to a real Copter,
+# whose step to 3 m/s passes 1.8 m/s after 1 s, peaks at 3.03 to 3.05 m/s, and stops within 3.2 m.
+VELOCITY_LAG_S = 0.4
 # A take-off asks for what the vehicle gains in this time; it gains at least the least.
-CLIMB_LEAD_S = 0.25
+CLIMB_LEAD_S = 0.35
 LEAST_GAIN_MPS2 = 0.1
-TAKEOFF_DONE_M = 0.3  # so near to the height a take-off counts as complete
+TAKEOFF_DONE_M = 0.06  # so near to the height a take-off counts as complete
 CLIMB_GAIN_PER_S = 4.0
 FACING_SPEED_MPS = 1.0  # above it "the direction of flight" is known
 THRUST_AS_THRUST = 8  # GUID_OPTIONS: SET_ATTITUDE_TARGET's thrust is no climb rate
@@ -236,12 +235,11 @@ class Guided(flight.Task):
             self._parameters.positive("MPC_ACC_HOR") * dt_s,
             self._parameters.positive("MPC_ACC_DOWN_MAX") * dt_s,
         )
-        share = min(dt_s / TILT_LAG_S, 1.0)
+        share = min(dt_s / VELOCITY_LAG_S, 1.0)
         vx, vy, vz = (now + (then - now) * share for now, then in zip(self._followed, velocity, strict=True))
         self._followed = (vx, vy, vz)
-        leash = MOVING_LEASH_M if any(velocity) else LEASH_M
         x, y, z = (
-            min(max(place + speed * dt_s, here - leash), here + leash)
+            min(max(place + speed * dt_s, here - LEASH_M), here + LEASH_M)
             for place, speed, here in zip(
                 trajectory.position, self._followed, self._airframe.position, strict=True
             )
