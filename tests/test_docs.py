@@ -14,6 +14,7 @@ from companion.cli import app as companion_app
 from companion.guidance import grammar
 from companion.guidance.registry import COMMANDS
 from mavlink_sim.bench import app as bench_app
+from mavlink_sim.camera.cli import app as camera_app
 from mavlink_sim.cli import app as simulator_app
 from mavlink_sim.datasets.cli import app as dataset_app
 
@@ -24,7 +25,7 @@ DOCUMENTS = [
     ROOT / "systemd" / "companion.service",
 ]
 APPS = {"companion": companion_app, "mavlink-sim": simulator_app}
-SIMULATOR_SUBCOMMANDS = {"dataset": dataset_app, "bench": bench_app}
+SIMULATOR_SUBCOMMANDS = {"dataset": dataset_app, "bench": bench_app, "camera": camera_app}
 
 
 def shell_lines(document: Path) -> Iterator[str]:

@@ -26,9 +26,9 @@ from companion.vehicle.state import LandedState, Vector3, VehicleState
 SLOWEST_S = 2.0
 # Telemetry, transport, the autopilot's shaping of a setpoint and its tilt: with 0.2 s of additional delay.
 DELAY_S = 0.5
-# (residual m/s, lasting s). The second one is for slow setpoints. Set by flights in lockstep, in wind up to
-# 3 m/s with gusts of 0.6 m/s (docs/safety.md has their margin).
-RULES = ((0.8, 1.0), (0.4, 4.0))
+# (residual m/s, lasting s). The later ones are for slow setpoints. Set by flights in lockstep, in wind up to
+# 3 m/s with gusts of 0.6 m/s; formations of five are the hardest: with 0.8 m/s for 1 s five of seven ended.
+RULES = ((1.5, 1.0), (1.0, 2.5), (0.5, 6.0))
 # The residual is at least this part of the commanded speed: a vehicle that flies the right way, slower than
 # it should (wind, a speed limit of the autopilot's), follows.
 RELATIVE = 0.7

@@ -318,7 +318,7 @@ def test_all_are_seen_at_one_simulated_time(tmp_path: Path) -> None:
             simulation.vehicle.step(0.5)
             simulation.vehicle.autopilot.arm()
             simulation.vehicle.autopilot.takeoff(20.0)
-            simulation.vehicle.step(4.0)
+            simulation.vehicle.step(6.0)
             for link in simulation.vehicle.links:
                 simulation.vehicle.outgoing(link)
         watched = fleet.simulations[0].vehicle

@@ -119,6 +119,7 @@ def test_a_vehicle_ahead_is_in_the_ring_and_one_that_is_higher_is_not() -> None:
     _, one, other = pair()
     for vehicle in (one, other):
         vehicle.take_off(3.0)
+        vehicle.step(3.0)  # level again, where the take-off ended
     beside(one, other)
     one.step(0.2)
     found = around(one)

@@ -65,21 +65,21 @@ def rising(speed_mps: float, within_s: float, delay_s: float = 0.0) -> Velocity:
     return lambda seconds: (speed_mps * (1 - math.exp(-max(0.0, seconds - delay_s) / within_s)), 0.0, 0.0)
 
 
-@pytest.mark.parametrize("speed_mps", [1.0, 2.0, 5.0])
-def test_a_vehicle_that_is_stopped_in_flight_does_not_follow(speed_mps: float) -> None:
+@pytest.mark.parametrize(("speed_mps", "lasting_s"), [(1.0, 2.5), (2.0, 1.0), (5.0, 1.0)])
+def test_a_vehicle_that_is_stopped_in_flight_does_not_follow(speed_mps: float, lasting_s: float) -> None:
     sequence = Sequence()
     assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
     braking = lambda seconds: (max(0.0, speed_mps - 3.0 * seconds), 0.0, 0.0)  # noqa: E731
     seen_s = sequence.fly(north(speed_mps), braking, 5.0)
     assert seen_s is not None
-    assert 1.0 <= seen_s <= 1.0 + speed_mps / 3.0 + 0.2
+    assert lasting_s <= seen_s <= lasting_s + speed_mps / 3.0 + 0.2
 
 
-@pytest.mark.parametrize("speed_mps", [1.0, 3.0])
-def test_a_vehicle_that_never_starts_does_not_follow(speed_mps: float) -> None:
+@pytest.mark.parametrize(("speed_mps", "at_most_s"), [(1.0, 9.0), (3.0, 4.5)])
+def test_a_vehicle_that_never_starts_does_not_follow(speed_mps: float, at_most_s: float) -> None:
     seen_s = Sequence().fly(north(speed_mps), still, 10.0)
     assert seen_s is not None
-    assert seen_s < 4.5
+    assert seen_s < at_most_s
 
 
 def test_a_vehicle_that_flies_off_a_hold_does_not_follow() -> None:
@@ -102,7 +102,7 @@ def test_a_vehicle_that_flies_elsewhere_does_not_follow() -> None:
 def test_a_slow_setpoint_takes_the_long_rule(speed_mps: float, noticed: bool) -> None:
     sequence = Sequence()
     assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
-    assert (sequence.fly(north(speed_mps), still, 6.0) is not None) is noticed
+    assert (sequence.fly(north(speed_mps), still, 8.0) is not None) is noticed
 
 
 @pytest.mark.parametrize("within_s", [0.3, 1.0, 1.7])
