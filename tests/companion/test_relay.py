@@ -129,7 +129,7 @@ async def test_messages_of_a_second_autopilot_are_dropped() -> None:
         ends.send(heartbeat(armed=True), number=1)
         ends.send(b"last")
         program = ends.programs[0]
-        got = []
+        got: list[bytes] = []
         while got[-1:] != [b"last"]:
             await until(received(program))
             got.append(program.recv(2048))
