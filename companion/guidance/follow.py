@@ -82,7 +82,7 @@ class Follow(Command):
 class FollowBehaviour(Behaviour):
     """Keeps its height, looks at the object and keeps `distance_m` from its nearest surface.
 
-    It begins with the true object of the class before the nose (see `TargetSelector`) and stays with that one.
+    It begins with the true object of the class before the nose (see `TargetSelector`) and stays with it.
     Unseen, it goes on to where the object is expected to be, for `occlusion_s`; then it ends.
 
     Args:

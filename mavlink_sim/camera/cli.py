@@ -29,7 +29,7 @@ OTHERS_S = 1.5
 """After the first heartbeat: one a second comes from each autopilot on the link."""
 POSE_TIMEOUT_S = 60.0
 """An autopilot that has just started has no position before its estimator has converged."""
-POSE_LOST_S = 1.0
+POSE_LOST_S = 3.0
 TRUTH_RATE_HZ = 20.0
 POLL_S = 0.05
 

@@ -204,7 +204,9 @@ def place(north: float, east: float, down: float) -> Any:
 
 def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
     pair = [
-        LockstepVehicle({"onboard": {}}, system_id=number, seed=number, gusts_mps=0.0, start_ned_m=(start, 0.0))
+        LockstepVehicle(
+            {"onboard": {}}, system_id=number, seed=number, gusts_mps=0.0, start_ned_m=(start, 0.0)
+        )
         for number, start in ((1, 0.0), (2, 6.0))
     ]
     flock = Flock(2)

@@ -25,7 +25,7 @@ def blocks(language: str) -> list[str]:
 
 
 COMMANDS = [line for block in blocks("sh") for line in block.splitlines()]
-# `mavlink-sim camera` starts no vehicle: it needs one (test_camera_of_vehicle.py), and test_docs.py reads its options.
+# `mavlink-sim camera` starts no vehicle; test_docs.py reads its options, test_camera_of_vehicle.py runs it.
 OF_CAMERAS = [line for line in COMMANDS if line.startswith("mavlink-sim camera")]
 OF_THE_VEHICLE = [line for line in COMMANDS if line.startswith("mavlink-sim") and line not in OF_CAMERAS]
 
