@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from mavlink_sim.camera.cli import POSE_LOST_S
 from mavlink_sim.camera.vehicle_link import AutopilotLink, LinkError
 from mavlink_sim.cli import main
 from mavlink_sim.testing import free_port, running_simulator
@@ -207,7 +208,7 @@ def test_frames_are_drawn_from_another_autopilots_pose(name: str, tmp_path: Path
         finally:
             process.kill()
     assert process.returncode == 1
-    assert "stopped 1 s ago" in said.splitlines()[-1]
+    assert f"stopped {POSE_LOST_S:g} s ago" in said.splitlines()[-1]
     assert not segment_path(name).exists()
     true = [json.loads(line) for line in (tmp_path / "truth.jsonl").read_text().splitlines()]
     for line in seen.read_text().splitlines():

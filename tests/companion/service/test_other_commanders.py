@@ -134,7 +134,9 @@ async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: st
         async with first.running(), second.running():
             await first.until(lambda: first.driver.state.other_commanders)
             await second.until(lambda: second.driver.state.other_commanders)
-            await first.until(lambda: first.driver.state.ready_to_arm and first.driver.state.position_ned_m)
+            await first.until(
+                lambda: first.driver.state.ready_to_arm and first.driver.state.position_ned_m, 60.0
+            )
             refused = await second.fly("takeoff 3")
             assert not refused.success
             assert "allow_other_commander" in refused.reason

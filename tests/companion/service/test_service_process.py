@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -230,26 +231,27 @@ def test_what_fails_beside_a_service_carries_what_it_said_last(seeing: list[str]
 
 def test_two_services_of_one_name_name_each_other_and_one_flies(filming: list[str], tmp_path: Path) -> None:
     second_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    with (
-        running_simulator() as simulator,
-        running_service(simulator.onboard_port, filming, cwd=tmp_path) as first,
-        running_service(
-            simulator.gcs_port,
-            [*filming, "--zenoh-connect", first.endpoint, "--zenoh-listen", second_endpoint],
-            cwd=tmp_path,
-            endpoint=second_endpoint,
-        ) as second,
-        first.client() as session,
-    ):
+    statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    with contextlib.ExitStack() as running:
+        simulator = running.enter_context(running_simulator())
+        first = running.enter_context(running_service(simulator.onboard_port, filming, cwd=tmp_path))
+        session = running.enter_context(first.client())
+        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+        # Started within 2 s of each other, neither would be the first.
+        while statuses.get(timeout=20)["uptime_s"] < 3.0:
+            pass
+        flags = [*filming, "--zenoh-connect", first.endpoint, "--zenoh-listen", second_endpoint]
+        second = running.enter_context(
+            running_service(simulator.gcs_port, flags, cwd=tmp_path, endpoint=second_endpoint)
+        )
         for service in (first, second):
             service.wait_for_line("another service commands this vehicle: 1/191 by mavlink")
             service.wait_for_line("by zenoh, not in command")
-        statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
         seen: dict[str, set[str]] = {}
         while len(seen) < 2:
             status = statuses.get(timeout=10)
-            seen[status["service"]] = {one["via"] for one in status["vehicle"]["other_commanders"]}
+            if status["vehicle"]["other_commanders"]:
+                seen[status["service"]] = {one["via"] for one in status["vehicle"]["other_commanders"]}
         assert list(seen.values()) == [{"mavlink", "zenoh"}] * 2
         # The name is that of both, so both are asked. The first may still wait for the vehicle's position.
         while True:
