@@ -103,7 +103,7 @@ class AutopilotDriver(ABC):
             lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
         )
         self._sequence = 0
-        self._own_heartbeats: deque[int] = deque(maxlen=8)  # sequence numbers
+        self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=8)  # (sequence number, custom_mode)
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding: what a driver adds -------------------------------------------------------------
@@ -269,8 +269,9 @@ class AutopilotDriver(ABC):
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
             self._note_other(sender, "system/component %d/%d is also on this link")
-            # What a network sends back to us is our own, and its number is one that we have given.
-            echo = sender == self.own_address and frame.sequence in self._own_heartbeats
+            # What a network sends back to us is our own: the same number and content as one that we sent.
+            sent = (frame.sequence, custom_mode) in self._own_heartbeats
+            echo = sender == self.own_address and sent
             commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
             if commander is not None and frame.system_id == self._own_system_id and not echo:
                 self._heard.take_commander(commander)
@@ -373,7 +374,7 @@ class AutopilotDriver(ABC):
         """See Driver."""
         mode = commander_mode(uptime_s, in_command)
         payload = _HEARTBEAT.pack(mode, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
-        self._own_heartbeats.append(self._sequence)
+        self._own_heartbeats.append((self._sequence, mode))
         self._transmit_payload(HEARTBEAT_ID, payload)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
