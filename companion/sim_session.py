@@ -232,7 +232,7 @@ async def _spawn(arguments: Sequence[str], options: SimOptions) -> asyncio.subpr
 
 
 def _end_with_us() -> None:
-    """Run in the new process: however we end, the simulator is told to end too (prctl(2))."""
+    """Run in the new process: however we end, the simulator receives SIGTERM (prctl(2))."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 

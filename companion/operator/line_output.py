@@ -20,7 +20,7 @@ QUEUED_BYTES = 256 * 1024
 EXIT_TIMEOUT_S = 1.0
 LONGEST_LINE = 16 * 1024
 """Characters; what has no end by then is written as a line."""
-# Of one write: with a slow reader, room in the queue comes back in small steps.
+# Of one write: with a slow reader, the queue empties in small steps.
 _WRITE_BYTES = 4096
 
 
