@@ -76,7 +76,7 @@ class Formation(Command):
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
     lost_timeout_s: Annotated[
-        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long when the pose of the leader is missing")
+        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long without the leader's pose")
     ] = 5.0
 
     @property

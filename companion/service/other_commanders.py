@@ -19,7 +19,7 @@ from companion.vehicle.state import VehicleState
 
 # Heartbeats and `status` come once a second.
 GONE_AFTER_S = 3.5
-# Uptimes come in whole seconds, and late: of services started so close together neither is the first.
+# Uptimes come in whole seconds, and late: of two started so close together neither is the first.
 SAME_START_S = 2.0
 # Of a `status` that is read, and of services by their status: more are no service of ours.
 LARGEST_STATUS_BYTES, MOST_SERVICES = 64 * 1024, 16
