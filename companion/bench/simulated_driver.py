@@ -256,7 +256,7 @@ def setpoint_message(setpoint: Setpoint, system_id: int = 1) -> Any:
         setpoint.type_mask,
         *(setpoint.position_ned_m or zero),
         *(setpoint.velocity_ned_mps or zero),
-        *zero,
+        *(setpoint.acceleration_ned_mps2 or zero),
         setpoint.yaw_rad or 0.0,
         setpoint.yaw_rate_radps or 0.0,
     )

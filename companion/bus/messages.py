@@ -132,6 +132,7 @@ def setpoint_message(setpoint: Setpoint | None) -> dict[str, Any] | None:
     return {
         "position_ned_m": _rounded(setpoint.position_ned_m),
         "velocity_ned_mps": _rounded(setpoint.velocity_ned_mps),
+        "acceleration_ned_mps2": _rounded(setpoint.acceleration_ned_mps2),
         "yaw_rad": _finite(setpoint.yaw_rad),
         "yaw_rate_radps": _finite(setpoint.yaw_rate_radps),
         "deadline_ns": setpoint.deadline_ns,

@@ -66,7 +66,7 @@ class Situation:
     min_separation_m: float = 3.0
     gimbal: GimbalSight = NO_GIMBAL
     ranging: RangeMeans = ALL_MEANS
-    max_acceleration_mps2: float = 2.0
+    max_acceleration_mps2: float = 3.0
     goal_ned_m: Vector3 | None = None
 
     def why_blind(self, usually: str) -> str:

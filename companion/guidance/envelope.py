@@ -2,6 +2,9 @@
 
 The envelope only ever takes away. A velocity that leaves it is never faster than the one that came, neither
 over ground nor upwards or downwards; braking is never delayed. A setpoint inside every limit passes as it is.
+
+A velocity's feed-forward acceleration carries a vehicle away from that velocity, so it passes only while what
+it makes of the velocity the vehicle has would pass too.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ from vision.attitude import wrap_angle
 POSITION_GAIN_PER_S = 1.0
 # A loop that stood still must not earn itself a jump.
 LONGEST_STEP_S = 0.2
+# So long a feed-forward acceleration acts before what it did is seen.
+FEED_FORWARD_S = 0.3
 # Heights that differ by less are the same one.
 SAME_HEIGHT_M = 0.05
 # Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
@@ -56,7 +61,7 @@ class Limits:
     max_climb_mps: float = 2.0
     max_descend_mps: float = 1.0
     max_yaw_rate_radps: float = 1.0
-    max_acceleration_mps2: float = 2.0
+    max_acceleration_mps2: float = 3.0
     min_altitude_m: float = 1.0
     max_altitude_m: float = 50.0
     max_distance_m: float = 200.0
@@ -166,6 +171,9 @@ class Envelope:
             self._velocity = velocity
             if velocity != setpoint.velocity_ned_mps:
                 sent = replace(sent, velocity_ned_mps=velocity)
+            if setpoint.acceleration_ned_mps2 is not None:
+                forward = self._limit_feed_forward(setpoint.acceleration_ned_mps2, state, reasons)
+                sent = replace(sent, acceleration_ned_mps2=forward)
         elif setpoint.position_ned_m is not None and state.position_ned_m is not None:
             place = self._limit_position(setpoint.position_ned_m, state.position_ned_m, state, reasons)
             self._velocity = None
@@ -192,6 +200,22 @@ class Envelope:
         velocity = self._slew((north, east, down), state, dt_s, reasons)
         # Last, so that no slew delays what a fence takes away.
         return self._slow_at_fences(velocity, state, reasons)
+
+    def _limit_feed_forward(self, asked: Vector3, state: VehicleState, reasons: list[str]) -> Vector3 | None:
+        """As much of it as the limits of acceleration and speed allow; none where it leads over a fence."""
+        limits, velocity = self.limits, state.velocity_ned_mps
+        if velocity is None:
+            reasons.append("velocity unknown: no acceleration ahead")
+            return None
+        scale = min(1.0, limits.max_acceleration_mps2 / max(math.hypot(*asked), 1e-9))
+        added = (asked[0] * FEED_FORWARD_S, asked[1] * FEED_FORWARD_S, asked[2] * FEED_FORWARD_S)
+        scale = min(scale, _until_length(velocity, added, limits.max_horizontal_speed_mps))
+        north, east, down = (v + scale * a for v, a in zip(velocity, added, strict=True))
+        slowed = self._slow_at_fences((north, east, down), state, []) != (north, east, down)
+        if slowed or not -limits.max_climb_mps <= down <= limits.max_descend_mps:
+            reasons.append("no acceleration ahead of a limit")
+            return None
+        return (asked[0] * scale, asked[1] * scale, asked[2] * scale)
 
     def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
         """Take away what would carry the vehicle over a fence: no more speed than the way left stops."""
@@ -336,6 +360,16 @@ class Envelope:
         self._yaw_rad = wrap_angle(previous + math.copysign(limit * dt_s, turn))
         reasons.append(f"yaw rate limited to {limit:g} rad/s")
         return replace(setpoint, yaw_rad=self._yaw_rad)
+
+
+def _until_length(vector: Vector3, added: Vector3, longest: float) -> float:
+    """The part 0..1 of `added` that makes `vector` `longest` over ground, or all of it."""
+    square = added[0] ** 2 + added[1] ** 2
+    if square < 1e-12:
+        return 1.0
+    product = vector[0] * added[0] + vector[1] * added[1]
+    left = max(0.0, longest**2 - vector[0] ** 2 - vector[1] ** 2)
+    return max(0.0, min(1.0, (math.sqrt(product**2 + left * square) - product) / square))
 
 
 def _shorten(vector: Vector3, longest: float) -> Vector3:

@@ -17,11 +17,11 @@ STOPPING_DELAY_S = 0.5
 # Under the envelope's acceleration, so that a vehicle that answers late still stops in time.
 STOPPING_MPS2 = 0.7
 # `PositionController`: gains of position (1/s), of velocity (as VELOCITY_GAIN), of the integral (1/s²), and
-# the integral's limit. Tuned in lockstep in gusts of 0.6 m/s with MPC_XY_VEL_P_ACC 1.4 to 5 and up to 0.2 s
-# of additional delay: 0.22 m horizontally (p95), where PX4's own position hold has 0.66 m. Higher gains
-# oscillate at the envelope's acceleration limit.
-HOLD_GAIN = 1.6
-HOLD_VELOCITY_GAIN = 1.0
+# the integral's limit. Tuned in lockstep in gusts of 0.6 m/s with MPC_XY_VEL_P_ACC 1.2 to 3: 0.17 m
+# horizontally (p95), where PX4's own position hold has 0.66 m. Higher gains oscillate at the envelope's
+# acceleration limit, and these do at 2 m/s².
+HOLD_GAIN = 1.8
+HOLD_VELOCITY_GAIN = 1.5
 HOLD_DOWN_GAIN = 1.3
 HOLD_INTEGRAL_GAIN = 0.4
 HOLD_INTEGRAL_MPS = 0.5

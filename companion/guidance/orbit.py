@@ -24,32 +24,35 @@ from vision.attitude import wrap_angle
 
 # Nearer to the centre than this there is no direction outwards.
 MIN_RADIUS_M = 0.2
-# How late velocity and heading of a multirotor follow: a first guess, the integrals below find the rest.
-# The heading's is about 1 / MC_YAW_P; 0.34 s measured in lockstep.
-VELOCITY_DELAY_S = 0.4
+# How late velocity, acceleration and heading of a multirotor follow: a first guess, the integrals below find
+# the rest. The heading's is about 1 / MC_YAW_P; 0.34 s measured in lockstep.
+VELOCITY_DELAY_S = 0.1
+ACCELERATION_DELAY_S = 0.2
 YAW_DELAY_S = 0.34
-# What may be asked for beyond the wanted speed so that drag does not make it less.
+# What may be asked for beyond the wanted speed to come back onto the circle.
 SPEED_MARGIN = 1.25
 # Gains of the error of radius (1/s; its integral 1/s²) and of velocity outwards, as in
-# `motion.PositionController`; of the velocity along the circle; of the integrals of speed and heading (1/s).
+# `motion.PositionController`; of the velocity along the circle; of the integrals of speed (1/s²) and
+# heading (1/s).
 RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.3, 0.4
-VELOCITY_GAIN = 1.0
-ALONG_GAIN = 0.3
+VELOCITY_GAIN = 1.5
+ALONG_GAIN = 0.6
 SPEED_INTEGRAL_GAIN = 0.3
 HEADING_INTEGRAL_GAIN = 0.5
+# What drag may be found to take along the circle.
+MAX_DRAG_MPS2 = 3.0
 MAX_LEAD_RAD = 0.6
 # Farther than this from the circle it is only flown to.
 ON_CIRCLE_M = 1.5
 # On the circle the velocity that is asked for turns all the time. What that takes of the envelope's
-# acceleration is kept to this share of it, by flying slower: the rest is for corrections. At 0.6 the radius
-# of an orbit of 8 m at 4 m/s is off by 0.29 m (p95) in gusts of 0.6 m/s, at 0.75 by 0.5 m.
-TURNING_SHARE = 0.5
+# acceleration is kept to this share of it, by flying slower: the rest is for corrections. With 3 m/s² an orbit
+# of 8 m at 4 m/s is not slowed; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
+TURNING_SHARE = 0.8
 # The speed is adapted to that by so many m/s² for each m/s² above or below, at most by so many, filtered.
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
 SLOWEST_MPS = 0.5
 
-
-# What a circle may ask of the vehicle sideways; the envelope's default acceleration.
+# What a circle may ask of the vehicle sideways.
 MAX_CENTRIPETAL_MPS2 = 2.0
 
 
@@ -117,7 +120,7 @@ class OrbitBehaviour(Behaviour):
         self._down_m = 0.0
         self._angle_rad: float | None = None
         self._flown_rad = 0.0
-        self._out_mps = self._along_mps = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
+        self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
         self._until_ns: float = 0
 
@@ -125,7 +128,7 @@ class OrbitBehaviour(Behaviour):
         position, yaw_rad = position_and_yaw(situation.state)
         self._down_m = position[2]
         self._angle_rad, self._flown_rad = None, 0.0
-        self._out_mps = self._along_mps = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
+        self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
         self._centre = None
         if not self._class_name:
@@ -178,12 +181,21 @@ class OrbitBehaviour(Behaviour):
         )
         bearing = math.atan2(-east, -north)
         turn_radps = self._turn * along_mps / distance
-        if abs(distance - self._radius_m) < ON_CIRCLE_M:
+        on_circle = abs(distance - self._radius_m) < ON_CIRCLE_M
+        if on_circle:
             behind = wrap_angle(bearing - yaw_rad)
             lead = self._lead_rad + HEADING_INTEGRAL_GAIN * behind * dt_s
             self._lead_rad = max(-MAX_LEAD_RAD, min(MAX_LEAD_RAD, lead))
         heading = wrap_angle(bearing + turn_radps * YAW_DELAY_S + self._lead_rad)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=heading)
+        ahead = angle + turn_radps * ACCELERATION_DELAY_S
+        turning = self._acceleration(ahead, turn_radps * self._turn * along_mps if on_circle else 0.0)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=heading, acceleration_ned_mps2=turning)
+
+    def _acceleration(self, angle_rad: float, inward_mps2: float) -> Vector3:
+        """What the vehicle needs at this angle of the circle: to turn, and against drag."""
+        north, east = math.cos(angle_rad), math.sin(angle_rad)
+        around_mps2 = self._turn * self._drag_mps2
+        return (-inward_mps2 * north - around_mps2 * east, -inward_mps2 * east + around_mps2 * north, 0.0)
 
     def _adapt_pace(self, along_mps: float, distance_m: float, limit_mps2: float, dt_s: float) -> None:
         """Slower where the turning of what is asked for takes too much of the envelope's acceleration."""
@@ -201,14 +213,14 @@ class OrbitBehaviour(Behaviour):
         wanted_along = math.sqrt(max(0.0, pace**2 - wanted_out**2))
         if abs(missing_m) < ON_CIRCLE_M:
             self._out_mps += RADIUS_INTEGRAL_GAIN * missing_m * dt_s
-            self._along_mps += SPEED_INTEGRAL_GAIN * (wanted_along - along_mps) * dt_s
+            self._drag_mps2 += SPEED_INTEGRAL_GAIN * (wanted_along - along_mps) * dt_s
             self._out_mps = max(-self._speed_mps, min(self._speed_mps, self._out_mps))
-            self._along_mps = max(0.0, min(fastest - self._speed_mps, self._along_mps))
+            self._drag_mps2 = max(0.0, min(MAX_DRAG_MPS2, self._drag_mps2))
         # The vehicle flies what was asked a moment ago; that lacks the centripetal acceleration since then.
         late = VELOCITY_DELAY_S * wanted_along**2 / max(self._radius_m, self._radius_m - missing_m)
         asked_out = wanted_out + VELOCITY_GAIN * (wanted_out - out_mps) + self._out_mps - late
         asked_out = max(-fastest, min(fastest, asked_out))
-        asked_along = wanted_along + ALONG_GAIN * (wanted_along - along_mps) + self._along_mps
+        asked_along = wanted_along + ALONG_GAIN * (wanted_along - along_mps)
         return asked_out, min(asked_along, math.sqrt(fastest**2 - asked_out**2))
 
     @property

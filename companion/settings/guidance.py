@@ -25,7 +25,7 @@ class GuidanceSection(Section):
     """largest descent rate asked for, metres a second"""
     max_yaw_rate_radps: Annotated[float, Field(gt=0, le=6)] = 1.0
     """largest turn rate asked for, radians a second"""
-    max_acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 2.0
+    max_acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 3.0
     """largest change of the velocity asked for, metres a second squared"""
     min_altitude_m: Annotated[float, Field(gt=0, le=1000)] = 1.0
     """never asks to fly lower than this above home, unless to land (on a marker, too), metres"""

@@ -388,7 +388,11 @@ class AutopilotDriver(ABC):
             return
         setpoint = setpoint.moved(self._heard.state.reset_offset_ned_m)
         zero = (0.0, 0.0, 0.0)  # the type mask says what counts
-        kinematics = (*(setpoint.position_ned_m or zero), *(setpoint.velocity_ned_mps or zero), *zero)
+        kinematics = (
+            *(setpoint.position_ned_m or zero),
+            *(setpoint.velocity_ned_mps or zero),
+            *(setpoint.acceleration_ned_mps2 or zero),
+        )
         self._send_message(
             "SET_POSITION_TARGET_LOCAL_NED",
             self._heard.manners.setpoint_fields(

@@ -1,7 +1,8 @@
 """A setpoint: where to be or how to move, in local NED, and until when that is meant.
 
 The two shapes that leave this house are the ones PX4 takes in frame MAV_FRAME_LOCAL_NED of
-SET_POSITION_TARGET_LOCAL_NED (MAVLink common, 84): a position or a velocity, each with a yaw or a yaw rate.
+SET_POSITION_TARGET_LOCAL_NED (MAVLink common, 84): a position or a velocity, each with a yaw or a yaw rate. A
+velocity may come with the acceleration it is about to need (feed-forward).
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class Setpoint:
         deadline_ns: CLOCK_MONOTONIC nanoseconds after which this must not be sent any more.
         position_ned_m: metres, local NED.
         velocity_ned_mps: metres a second, local NED.
+        acceleration_ned_mps2: feed-forward of a velocity setpoint, m/s², local NED: PX4 and ArduPilot add it
+            to what their velocity controllers ask for. None: none.
         yaw_rad: heading, clockwise from north.
         yaw_rate_radps: clockwise seen from above.
 
@@ -44,13 +47,19 @@ class Setpoint:
     velocity_ned_mps: Vector3 | None = None
     yaw_rad: float | None = None
     yaw_rate_radps: float | None = None
+    acceleration_ned_mps2: Vector3 | None = None
 
     def __post_init__(self) -> None:
         if (self.position_ned_m is None) == (self.velocity_ned_mps is None):
             raise ValueError("a setpoint is a position or a velocity: give exactly one of them")
         if self.yaw_rad is not None and self.yaw_rate_radps is not None:
             raise ValueError("a setpoint has a yaw or a yaw rate, not both")
+        if self.acceleration_ned_mps2 is not None and self.velocity_ned_mps is None:
+            raise ValueError(
+                "acceleration_ned_mps2 is the feed-forward of a velocity: give a velocity with it"
+            )
         values = [*(self.position_ned_m or ()), *(self.velocity_ned_mps or ())]
+        values += self.acceleration_ned_mps2 or ()
         values += [value for value in (self.yaw_rad, self.yaw_rate_radps) if value is not None]
         if not all(math.isfinite(value) for value in values):
             raise ValueError(f"every value of a setpoint must be finite, got {values}")
@@ -63,6 +72,7 @@ class Setpoint:
         *,
         yaw_rad: float | None = None,
         yaw_rate_radps: float | None = None,
+        acceleration_ned_mps2: Vector3 | None = None,
         lifetime_s: float = DEFAULT_LIFETIME_S,
     ) -> Setpoint:
         """Move with this velocity, for `lifetime_s` from now."""
@@ -71,6 +81,7 @@ class Setpoint:
             velocity_ned_mps=velocity_ned_mps,
             yaw_rad=yaw_rad,
             yaw_rate_radps=yaw_rate_radps,
+            acceleration_ned_mps2=acceleration_ned_mps2,
         )
 
     @classmethod
@@ -93,7 +104,7 @@ class Setpoint:
     @property
     def type_mask(self) -> int:
         """POSITION_TARGET_TYPEMASK: the bits of what is to be ignored."""
-        mask = IGNORE_ACCELERATION
+        mask = IGNORE_ACCELERATION if self.acceleration_ned_mps2 is None else 0
         mask |= IGNORE_POSITION if self.position_ned_m is None else 0
         mask |= IGNORE_VELOCITY if self.velocity_ned_mps is None else 0
         mask |= IGNORE_YAW if self.yaw_rad is None else 0
@@ -115,7 +126,3 @@ class Setpoint:
             return self
         north, east, down = (p + d for p, d in zip(self.position_ned_m, by_ned_m, strict=True))
         return replace(self, position_ned_m=(north, east, down))
-
-    def with_velocity(self, velocity_ned_mps: Vector3) -> Setpoint:
-        """The same with another velocity (of a velocity setpoint)."""
-        return replace(self, velocity_ned_mps=velocity_ned_mps)

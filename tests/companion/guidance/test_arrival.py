@@ -34,7 +34,7 @@ VEHICLES: dict[str, dict[str, float]] = {
     "slow": {"MPC_XY_VEL_P_ACC": 1.4, "MC_YAW_P": 1.4},
     "loose": {"MPC_XY_VEL_P_ACC": 1.2, "MPC_XY_VEL_I_ACC": 0.6, "MPC_XY_P": 0.8, "MC_YAW_P": 2.0},
 }
-CASES = [("px4", seed) for seed in (1, 2, 3)] + [("slow", 4), ("loose", 6)]
+CASES = [("px4", seed) for seed in (1, 2, 3)] + [("slow", 4), ("loose", 5), ("loose", 6)]
 GUSTS_MPS = 0.6
 HOLD_S = 10.0
 
@@ -78,16 +78,17 @@ def then_hold(
     return outcomes[0], [moment for moment in log.moments if moment.situation.now_ns >= ended_ns]
 
 
-def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3) -> None:
-    """There within 0.3 m and slower than 0.3 m/s, and kept."""
+def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3, name: str) -> None:
+    """There within 0.3 m and slower than 0.3 m/s, and kept: as near by what answers as PX4 does."""
     assert outcome.goal_ned_m == pytest.approx(goal, abs=1e-3)
     first = hold[0].situation.state
     assert first.velocity_ned_mps is not None
     off_m = [math.dist(moment.situation.state.position_ned_m or (), goal) for moment in hold]
     assert off_m[0] <= 0.3
     assert math.hypot(*first.velocity_ned_mps) <= 0.3
-    assert sorted(off_m)[round(0.9 * len(off_m))] <= 0.35
-    assert max(off_m) <= 0.6
+    usually_m, at_most_m = (0.5, 0.7) if name == "loose" else (0.3, 0.5)
+    assert sorted(off_m)[round(0.9 * len(off_m))] <= usually_m
+    assert max(off_m) <= at_most_m
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
@@ -101,7 +102,7 @@ def test_goto_arrives_and_the_hold_keeps_its_goal(name: str, seed: int) -> None:
     home = flight.state.home_position_ned_m
     assert home is not None
     outcome, hold = then_hold(flight, goto)
-    assert_arrived(outcome, hold, (home[0] + goal[0], home[1] + goal[1], home[2] - height_m))
+    assert_arrived(outcome, hold, (home[0] + goal[0], home[1] + goal[1], home[2] - height_m), name)
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
@@ -115,7 +116,7 @@ def test_figure_eight_ends_standing_where_it_began(name: str, seed: int) -> None
             super().on_activate(situation)
 
     outcome, hold = then_hold(flight, Watched(8.0, 2.5, 1.0))
-    assert_arrived(outcome, hold, begin[0])
+    assert_arrived(outcome, hold, begin[0], name)
 
 
 @pytest.mark.parametrize(("name", "seed"), CASES)
@@ -129,7 +130,7 @@ def test_approach_fixes_its_goal_on_arrival(name: str, seed: int) -> None:
     flight.turn_to(math.atan2(3.0, 15.0))
     outcome, hold = then_hold(flight, ApproachBehaviour("car", distance_m=5.0))
     assert outcome.goal_ned_m is not None
-    assert_arrived(outcome, hold, outcome.goal_ned_m)
+    assert_arrived(outcome, hold, outcome.goal_ned_m, name)
     assert car.range_m(outcome.goal_ned_m, 0.0) == pytest.approx(5.0, abs=0.5)
 
 
@@ -159,7 +160,7 @@ def on_circle(radius_m: float, speed_mps: float, name: str, seed: int) -> tuple[
 def test_orbit_keeps_radius_and_nose(radius_m: float, speed_mps: float, name: str, seed: int) -> None:
     wide, nose = on_circle(radius_m, speed_mps, name, seed)
     share = round(0.9 * len(wide))
-    assert wide[share] <= (0.3 if name == "px4" else 0.45)
+    assert wide[share] <= (0.25 if name == "px4" else 0.35)
     assert nose[share] <= 3.0
 
 

@@ -142,7 +142,7 @@ def test_a_velocity_grows_with_no_more_than_the_greatest_acceleration() -> None:
         sent, _ = envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05)
         assert sent.velocity_ned_mps is not None
         speed = sent.velocity_ned_mps[0]
-        assert speed - previous <= 2.0 * 0.05 + 1e-9
+        assert speed - previous <= LIMITS.max_acceleration_mps2 * 0.05 + 1e-9
         previous = speed
     assert previous == pytest.approx(4.0)
     assert envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05).reasons == ()
@@ -161,7 +161,7 @@ def test_after_a_reset_the_first_velocity_starts_from_how_the_vehicle_moves() ->
         Setpoint.velocity((4.0, 0.0, 0.0), NOW), vehicle(velocity=(3.0, 0.0, 0.0)), NOW, 0.1
     )
     assert sent.velocity_ned_mps is not None
-    assert sent.velocity_ned_mps[0] == pytest.approx(3.2)
+    assert sent.velocity_ned_mps[0] == pytest.approx(3.0 + LIMITS.max_acceleration_mps2 * 0.1)
 
 
 @pytest.mark.parametrize(
@@ -334,3 +334,48 @@ def test_strong_braking_does_not_shoot_over_the_fence(acceleration_mps2: float, 
         sent, _ = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
         vehicle.fly(sent, 0.02)
         assert vehicle.position[0] < 50.0
+
+
+def feed_forward(
+    acceleration: Vector3, velocity: Vector3 = (0.0, 0.0, 0.0), position: Vector3 = (0.0, 0.0, -5.0)
+) -> tuple[Vector3 | None, tuple[str, ...]]:
+    """What is left of it for a vehicle with this velocity, which is asked to keep it."""
+    vehicle = KinematicVehicle(position=list(position), velocity=list(velocity))
+    limits = Limits(fence=Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))))
+    setpoint = Setpoint.velocity(velocity, 1, acceleration_ned_mps2=acceleration)
+    sent, why = Envelope(limits).apply(setpoint, vehicle.state, 1, 0.02)
+    return sent.acceleration_ned_mps2, why
+
+
+def test_feed_forward_inside_the_limits_passes_as_it_is() -> None:
+    assert feed_forward((0.0, 2.0, 0.0), (4.0, 0.0, 0.0)) == ((0.0, 2.0, 0.0), ())
+
+
+def test_feed_forward_is_no_more_than_the_greatest_acceleration() -> None:
+    left, _ = feed_forward((0.0, 30.0, 0.0))
+    assert left == pytest.approx((0.0, 3.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "velocity", "position"),
+    [
+        pytest.param((3.0, 0.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, -5.0), id="over the greatest speed"),
+        pytest.param((3.0, 0.0, 0.0), (0.0, 0.0, 0.0), (19.9, 0.0, -5.0), id="over the fence"),
+        pytest.param((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -49.9), id="above the greatest altitude"),
+        pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -1.1), id="below the lowest altitude"),
+        pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.9), (0.0, 0.0, -20.0), id="faster down than allowed"),
+    ],
+)
+def test_feed_forward_does_not_lead_over_a_limit(
+    acceleration: Vector3, velocity: Vector3, position: Vector3
+) -> None:
+    left, _ = feed_forward(acceleration, velocity, position)
+    assert math.hypot(*(left or (0.0,))) < 1e-6
+
+
+def test_feed_forward_of_a_vehicle_of_unknown_velocity_is_left_out() -> None:
+    state = replace(KinematicVehicle(position=[0.0, 0.0, -5.0]).state, velocity_ned_mps=None)
+    setpoint = Setpoint.velocity((1.0, 0.0, 0.0), 1, acceleration_ned_mps2=(1.0, 0.0, 0.0))
+    sent, why = Envelope().apply(setpoint, state, 1, 0.2)
+    assert sent.acceleration_ned_mps2 is None
+    assert any("velocity" in reason for reason in why)

@@ -41,6 +41,19 @@ async def test_a_velocity_setpoint_is_one_message_with_px4s_type_mask(
     assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
 
 
+async def test_a_velocity_takes_its_feed_forward_acceleration_along(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
+    now_ns = time.monotonic_ns()
+    driver.send_setpoint(
+        Setpoint.velocity((1.5, -2.0, 0.25), now_ns, yaw_rad=0.5, acceleration_ned_mps2=(0.5, -0.25, 0.0))
+    )
+    (message,) = await autopilot.hears(SETPOINT)
+    assert (message.vx, message.vy, message.vz, message.yaw) == (1.5, -2.0, 0.25, 0.5)
+    assert (message.afx, message.afy, message.afz) == (0.5, -0.25, 0.0)
+    assert message.type_mask == 0b1000_0000_0111
+
+
 async def test_a_position_setpoint_keeps_its_yaw_and_ignores_velocity(
     driver: Driver, autopilot: FakeAutopilot
 ) -> None:

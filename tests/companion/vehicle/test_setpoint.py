@@ -25,6 +25,16 @@ vectors = st.tuples(finite, finite, finite)
             "not both",
             id="yaw and its rate",
         ),
+        pytest.param(
+            {"position_ned_m": POSITION, "acceleration_ned_mps2": POSITION},
+            "give a velocity",
+            id="feed-forward of a position",
+        ),
+        pytest.param(
+            {"velocity_ned_mps": POSITION, "acceleration_ned_mps2": (0.0, math.nan, 0.0)},
+            "finite",
+            id="acceleration is not a number",
+        ),
         pytest.param({"velocity_ned_mps": (math.nan, 0.0, 0.0)}, "finite", id="not a number"),
         pytest.param({"position_ned_m": (0.0, math.inf, 0.0)}, "finite", id="infinite"),
         pytest.param({"velocity_ned_mps": POSITION, "yaw_rad": math.nan}, "finite", id="yaw is not a number"),
@@ -54,21 +64,33 @@ _IGNORE = {
 }
 
 
-@given(vector=vectors, is_position=st.booleans(), turn=st.sampled_from([None, "yaw", "rate"]), angle=finite)
+@given(
+    vector=vectors,
+    is_position=st.booleans(),
+    turn=st.sampled_from([None, "yaw", "rate"]),
+    angle=finite,
+    forward=st.none() | vectors,
+)
 def test_the_type_mask_ignores_exactly_what_is_not_given(
-    vector: tuple[float, float, float], is_position: bool, turn: str | None, angle: float
+    vector: tuple[float, float, float],
+    is_position: bool,
+    turn: str | None,
+    angle: float,
+    forward: tuple[float, float, float] | None,
 ) -> None:
+    forward = None if is_position else forward
     setpoint = Setpoint(
         0,
         position_ned_m=vector if is_position else None,
         velocity_ned_mps=None if is_position else vector,
         yaw_rad=angle if turn == "yaw" else None,
         yaw_rate_radps=angle if turn == "rate" else None,
+        acceleration_ned_mps2=forward,
     )
     mask = setpoint.type_mask
     assert bool(mask & _IGNORE["position"]) is not is_position
     assert bool(mask & _IGNORE["velocity"]) is is_position
-    assert mask & _IGNORE["acceleration"] == _IGNORE["acceleration"]
+    assert mask & _IGNORE["acceleration"] == (_IGNORE["acceleration"] if forward is None else 0)
     assert bool(mask & _IGNORE["yaw"]) is (turn != "yaw")
     assert bool(mask & _IGNORE["yaw rate"]) is (turn != "rate")
     assert not mask & mavlink.POSITION_TARGET_TYPEMASK_FORCE_SET
@@ -92,10 +114,3 @@ def test_a_brake_stands_still_and_does_not_turn() -> None:
     assert brake.velocity_ned_mps == (0.0, 0.0, 0.0)
     assert brake.yaw_rate_radps == 0.0
     assert brake.deadline_ns == 1000 + round(DEFAULT_LIFETIME_S * 1e9)
-
-
-def test_with_velocity_keeps_the_deadline_and_the_turn() -> None:
-    setpoint = Setpoint.velocity((1.0, 0.0, 0.0), 5, yaw_rad=1.0)
-    slower = setpoint.with_velocity((0.5, 0.0, 0.0))
-    assert (slower.deadline_ns, slower.yaw_rad) == (setpoint.deadline_ns, 1.0)
-    assert slower.velocity_ned_mps == (0.5, 0.0, 0.0)
