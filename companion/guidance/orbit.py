@@ -45,8 +45,8 @@ MAX_LEAD_RAD = 0.6
 # Farther than this from the circle it is only flown to.
 ON_CIRCLE_M = 1.5
 # On the circle the velocity that is asked for turns all the time. What that takes of the envelope's
-# acceleration is kept to this share of it, by flying slower: the rest is for corrections. With 3 m/s² an orbit
-# of 8 m at 4 m/s is not slowed; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
+# acceleration is kept to this share of it, by flying slower: the rest is for corrections. An orbit of 8 m at
+# 4 m/s is not slowed at 3 m/s²; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
 TURNING_SHARE = 0.8
 # The speed is adapted to that by so many m/s² for each m/s² above or below, at most by so many, filtered.
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
