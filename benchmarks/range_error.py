@@ -25,8 +25,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.target import Target
-from companion.guidance.targets import StateHistory, targets_from_detections
+from companion.guidance.targets.from_detections import StateHistory, targets_from_detections
+from companion.guidance.targets.target import Target
 from companion.settings.perception import DetectorSection
 from companion.vehicle.state import VehicleState
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth

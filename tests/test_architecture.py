@@ -31,6 +31,31 @@ FLOORS = {
     "bench": 7,
     "cli": 8,
 }
+# The same inside `companion.guidance`: its folders, and its own files.
+GUIDANCE_FLOORS = {
+    "arguments": 0,
+    "gimbal_sight": 0,
+    "motion": 0,
+    "search_pattern": 0,
+    "targets": 0,
+    "path": 1,
+    "formation": 2,
+    "behaviour": 3,
+    "command": 4,
+    "interface": 4,
+    "gimbal": 5,
+    "registry": 5,
+    "behaviours": 6,
+    "grammar": 6,
+    "limits": 7,
+    "missions": 7,
+    "pose_sharing": 7,
+    "authority": 8,
+    "command_queue": 8,
+    "mode_sequence": 8,
+    "refusal": 8,
+    "core": 9,
+}
 # The same for `mavlink_sim`; its modules at the top, and the ArduPilot made of them, stand above every room.
 SIMULATOR_FLOORS = {
     "px4": 0,
@@ -125,6 +150,18 @@ def test_rooms_of_the_companion_import_downwards_only() -> None:
             if not other.startswith("companion.") or room(other) == here:
                 continue
             assert FLOORS[room(other)] < FLOORS[here], f"{name} imports upwards: {other}"
+
+
+def test_parts_of_guidance_import_downwards_only() -> None:
+    for name, path in modules().items():
+        if not name.startswith("companion.guidance."):
+            continue
+        here = name.split(".")[2]
+        assert here in GUIDANCE_FLOORS, f"{name}: a new part of guidance; give it a floor here"
+        for other in imports_of(name, path):
+            there = other.removeprefix("companion.guidance").split(".")[1:2]
+            if other.startswith("companion.guidance.") and there != [here]:
+                assert GUIDANCE_FLOORS[there[0]] < GUIDANCE_FLOORS[here], f"{name} imports upwards: {other}"
 
 
 def test_guidance_has_no_clock_and_no_input_or_output() -> None:

@@ -16,7 +16,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, camera_setti
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import ApproachBehaviour
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 

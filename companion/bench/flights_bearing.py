@@ -20,8 +20,8 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment, came
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.targets import StateHistory
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.targets.from_detections import StateHistory
 from companion.vehicle.state import VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount

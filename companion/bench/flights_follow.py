@@ -25,7 +25,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment, came
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.follow import FollowBehaviour
+from companion.guidance.behaviours.follow import FollowBehaviour
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion

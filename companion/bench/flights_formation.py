@@ -15,9 +15,9 @@ import numpy as np
 from companion.bench.flights import FlightResult
 from companion.bench.formation import Fleet, LockstepAirframe
 from companion.geometry.formation import SHAPES
-from companion.guidance.envelope import Limits
-from companion.guidance.follow_path import FollowPathBehaviour
-from companion.guidance.formation import FormationBehaviour
+from companion.guidance.behaviours.follow_path import FollowPathBehaviour
+from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.limits.envelope import Limits
 
 VEHICLES = 5
 SPACING_M = 6.0

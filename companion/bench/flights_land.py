@@ -23,8 +23,8 @@ from companion.bench.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.guidance.behaviour import Outcome
-from companion.guidance.envelope import Limits
-from companion.guidance.land_on_marker import LandOnMarkerBehaviour
+from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
+from companion.guidance.limits.envelope import Limits
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.lockstep import Truth
 from mavlink_sim.world.plates import Print

@@ -15,7 +15,7 @@ import numpy as np
 from companion.bench.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera
-from companion.guidance.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import GotoBehaviour
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.world import World, WorldObject, range_to

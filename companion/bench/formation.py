@@ -17,12 +17,12 @@ from typing import Any, Protocol
 from companion.bench.lockstep_flight import TICK_S, LockstepFlight, plain_settings
 from companion.bench.simulated_driver import LockstepDriver, SimulatedDriver
 from companion.guidance.behaviour import Behaviour, Outcome
-from companion.guidance.envelope import Limits
-from companion.guidance.formation import FormationBehaviour
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.formation.neighbours import Anchor
+from companion.guidance.formation.pose import pose_from_message, pose_message
 from companion.guidance.interface import Answer, EventKind, Request, SetMode
-from companion.guidance.neighbours import Anchor
-from companion.guidance.pose import pose_from_message, pose_message
+from companion.guidance.limits.envelope import Limits
 from companion.service.factory import guidance_options
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint

@@ -19,11 +19,11 @@ from typing import Any, Protocol
 from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, LockstepDriver, SimulatedDriver
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
-from companion.guidance.envelope import Limits
 from companion.guidance.interface import CommandInput, GuidanceEvent, StreamStatus
+from companion.guidance.limits.envelope import Limits
+from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.motion import position_and_yaw
-from companion.guidance.obstacles import ObstacleRules
-from companion.guidance.targets import StateHistory
+from companion.guidance.targets.from_detections import StateHistory
 from companion.perception.views import View
 from companion.service.factory import guidance_options, streamer_of
 from companion.service.inputs import InputAssembler

@@ -12,7 +12,7 @@ import numpy as np
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_perception import RenderedPerception
 from companion.bench.synthetic_detector import SceneObject
-from companion.guidance.targets import HistoryError, StateHistory
+from companion.guidance.targets.from_detections import HistoryError, StateHistory
 from companion.perception.views import View
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.targets import HistoryError, StateHistory, mount_at
+from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
 from companion.perception.views import View
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState

@@ -5,22 +5,22 @@ them in this order.
 """
 
 # isort: off
-from companion.guidance.takeoff import Takeoff
-from companion.guidance.land import Land, Rtl
-from companion.guidance.stop import Stop
-from companion.guidance.hold import Hold
-from companion.guidance.goto import Goto
-from companion.guidance.follow_path import FollowPath
-from companion.guidance.figure_eight import FigureEight
-from companion.guidance.orbit import Orbit
-from companion.guidance.search import Seek
-from companion.guidance.approach_again import Approach
-from companion.guidance.follow import Follow
-from companion.guidance.patrol import Patrol
+from companion.guidance.behaviours.takeoff import Takeoff
+from companion.guidance.behaviours.land import Land, Rtl
+from companion.guidance.behaviours.stop import Stop
+from companion.guidance.behaviours.hold import Hold
+from companion.guidance.behaviours.goto import Goto
+from companion.guidance.behaviours.follow_path import FollowPath
+from companion.guidance.behaviours.figure_eight import FigureEight
+from companion.guidance.behaviours.orbit import Orbit
+from companion.guidance.behaviours.search import Seek
+from companion.guidance.behaviours.approach_again import Approach
+from companion.guidance.behaviours.follow import Follow
+from companion.guidance.behaviours.patrol import Patrol
 from companion.guidance.missions.mission_file import Mission
-from companion.guidance.formation import Formation
-from companion.guidance.land_on_marker import LandOnMarker
-from companion.guidance.gimbal_pointing import Gimbal
+from companion.guidance.behaviours.formation import Formation
+from companion.guidance.behaviours.land_on_marker import LandOnMarker
+from companion.guidance.behaviours.gimbal_pointing import Gimbal
 
 __all__ = [
     "Approach",

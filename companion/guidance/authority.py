@@ -8,7 +8,7 @@ without a change of mode (`setpoint_monitor`).
 
 from __future__ import annotations
 
-from companion.guidance.setpoint_monitor import SetpointMonitor
+from companion.guidance.limits.setpoint_monitor import SetpointMonitor
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report, words_of
 from companion.vehicle.setpoint import Setpoint

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.gimbal_sight import NO_GIMBAL, GimbalSight
-from companion.guidance.marker_target import NO_MARKERS, MarkerSight
-from companion.guidance.neighbours import Neighbour, Neighbourhood
-from companion.guidance.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.target import Target
+from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
+from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint

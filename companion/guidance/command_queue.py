@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from companion.guidance.behaviour import Outcome, Requirement
-from companion.guidance.gimbal_controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
+from companion.guidance.gimbal.controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
 from companion.vehicle.state import VehicleState
 

@@ -16,12 +16,10 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from companion.guidance.authority import Authority, silence
-from companion.guidance.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryWatch
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command_queue import CommandQueue
-from companion.guidance.envelope import Envelope, Limits
-from companion.guidance.gimbal_controller import ENDING, GimbalController, GimbalMounting
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.gimbal.controller import ENDING, GimbalController, GimbalMounting
 from companion.guidance.interface import (
     Answer,
     CommandInput,
@@ -31,8 +29,10 @@ from companion.guidance.interface import (
     OutputCollector,
     SetMode,
 )
+from companion.guidance.limits.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryWatch
+from companion.guidance.limits.envelope import Envelope, Limits
+from companion.guidance.limits.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.mode_sequence import ModeSequence
-from companion.guidance.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.refusal import refusal
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget

@@ -7,10 +7,10 @@ from enum import StrEnum
 from typing import Literal
 
 from companion.guidance.behaviour import Behaviour, Outcome
-from companion.guidance.marker_target import NO_MARKERS, MarkerSight
-from companion.guidance.neighbours import Neighbourhood
-from companion.guidance.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.target import Target
+from companion.guidance.formation.neighbours import Neighbourhood
+from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
+from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint

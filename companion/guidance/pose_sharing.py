@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.formation import FormationBehaviour
-from companion.guidance.neighbours import Neighbourhood, Neighbours
-from companion.guidance.pose import Pose, PoseError, pose_from_message, pose_message, pose_of
+from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
+from companion.guidance.formation.pose import Pose, PoseError, pose_from_message, pose_message, pose_of
 from companion.vehicle.state import VehicleState
 
 logger = logging.getLogger(__name__)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from companion.guidance.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.formation.neighbours import missing_neighbours
 from companion.guidance.gimbal_sight import missing_gimbal
-from companion.guidance.neighbours import missing_neighbours
-from companion.guidance.obstacles import NO_RULES, ObstacleRules
+from companion.guidance.limits.battery import NO_MINIMUM, BatteryMinimum
+from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.vehicle.state import LandedState
 
 PERCEPTION_GAP_S = 1.5

@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
-from companion.guidance.target import Target
-from companion.guidance.targets import HistoryError, StateHistory, targets_from_detections
+from companion.guidance.targets.from_detections import HistoryError, StateHistory, targets_from_detections
+from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
+from companion.guidance.targets.target import Target
 from companion.perception.keeper import PerceptionKeeper, PerceptionStartError, PerceptionState
 from companion.perception.messages import Preview
 from companion.perception.pulse import START_S

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from companion.guidance.marker_target import MarkerSight, MarkerTarget, looks_down, marker_targets
-from companion.guidance.targets import HistoryError, StateHistory, mount_at
+from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
+from companion.guidance.targets.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
 from companion.perception.views import View
 from vision.markers import Marker
 from vision.pipeline import PerceptionResult

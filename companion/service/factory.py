@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from companion.guidance.battery import BatteryMinimum
 from companion.guidance.core import GuidanceOptions
-from companion.guidance.envelope import Limits
-from companion.guidance.gimbal_controller import GimbalMounting
-from companion.guidance.obstacles import ObstacleRules
+from companion.guidance.gimbal.controller import GimbalMounting
+from companion.guidance.limits.battery import BatteryMinimum
+from companion.guidance.limits.envelope import Limits
+from companion.guidance.limits.obstacles import ObstacleRules
 from companion.settings import CameraSection, Settings
 from companion.vehicle.driver import Driver
 from companion.vehicle.drivers import open_driver

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.guidance.core import Guidance
-from companion.guidance.gimbal_controller import ENDING
+from companion.guidance.gimbal.controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceOutput, StreamStatus
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler

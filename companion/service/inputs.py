@@ -18,7 +18,7 @@ from companion.guidance.interface import Answer, CommandInput, GuidanceInput, St
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.registry import load_plugins
 from companion.guidance.search_pattern import Footprint
-from companion.guidance.targets import StateHistory
+from companion.guidance.targets.from_detections import StateHistory
 from companion.perception.views import View
 from companion.perception.views_markers import MarkerWatch
 from companion.settings import Settings

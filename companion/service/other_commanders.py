@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from companion.guidance.battery import needs_charge
 from companion.guidance.interface import CommandInput
+from companion.guidance.limits.battery import needs_charge
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.state import VehicleState
 

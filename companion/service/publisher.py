@@ -18,7 +18,7 @@ from companion.bus.messages import (
 )
 from companion.bus.session import Bus
 from companion.guidance.core import Guidance
-from companion.guidance.obstacles import obstacles_message
+from companion.guidance.limits.obstacles import obstacles_message
 from companion.perception.messages import Preview
 from companion.perception.views import WorkerView
 from companion.service.inputs import InputAssembler

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
-from companion.guidance.envelope import Limits
-from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import (
     Answer,
     Arm,
@@ -23,7 +22,8 @@ from companion.guidance.interface import (
     StreamStatus,
     TakeOff,
 )
-from companion.guidance.target import Target
+from companion.guidance.limits.envelope import Limits
+from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState

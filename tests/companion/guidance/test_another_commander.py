@@ -9,7 +9,7 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.core import Phase
 from companion.guidance.interface import EventKind
-from companion.guidance.setpoint_monitor import REASON
+from companion.guidance.limits.setpoint_monitor import REASON
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import StreamState

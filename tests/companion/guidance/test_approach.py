@@ -3,8 +3,8 @@ import random
 
 import pytest
 
-from companion.guidance.approach import ApproachBehaviour
-from companion.guidance.target import RangeSource
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.targets.target import RangeSource
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 

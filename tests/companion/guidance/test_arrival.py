@@ -16,14 +16,14 @@ from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_setti
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
-from companion.guidance.figure_eight import FigureEightBehaviour
-from companion.guidance.goto import GotoBehaviour
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
+from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
-from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.attitude import wrap_angle

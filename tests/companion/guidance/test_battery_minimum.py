@@ -2,15 +2,15 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.guidance.battery import BATTERY_MAX_AGE_S, BatteryAction, BatteryMinimum
 from companion.guidance.behaviour import Behaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.core import GuidanceOptions
-from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.stop import StopBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
+from companion.guidance.limits.battery import BATTERY_MAX_AGE_S, BatteryAction, BatteryMinimum
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry_fold import fold
 from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import Behaviour, Requirement, Situation
-from companion.guidance.gimbal_controller import FIND_TIMEOUT_S
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.gimbal.controller import FIND_TIMEOUT_S
 from companion.guidance.interface import EventKind, FindGimbal, GuidanceInput, Request
-from companion.guidance.orbit import OrbitBehaviour
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.geometry.fence import Fence
-from companion.guidance.envelope import Envelope, Limits
+from companion.guidance.limits.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle

@@ -5,8 +5,8 @@ import pytest
 
 from companion.bench.flights import UnknownFlightError, flight_named, flights, summary
 from companion.bench.flights_follow import run
+from companion.guidance.behaviours.follow import FollowBehaviour
 from companion.guidance.command import NO_CONTEXT
-from companion.guidance.follow import FollowBehaviour
 from companion.guidance.grammar import parse
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject

@@ -10,12 +10,12 @@ import pytest
 
 from companion.bench.formation import Fleet, PointAirframe
 from companion.guidance.behaviour import Outcome
-from companion.guidance.envelope import Limits
-from companion.guidance.figure_eight import FigureEightBehaviour
-from companion.guidance.follow_path import FollowPathBehaviour
-from companion.guidance.formation import FormationBehaviour
-from companion.guidance.goto import GotoBehaviour
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
+from companion.guidance.behaviours.follow_path import FollowPathBehaviour
+from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.limits.envelope import Limits
 
 GRID = [(0.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 6.0), (-12.0, 0.0), (-12.0, -6.0), (-12.0, 6.0)]
 

@@ -14,8 +14,8 @@ from typing import Any
 
 from companion.bus import topics
 from companion.bus.session import Bus
-from companion.guidance.formation import FormationBehaviour
-from companion.guidance.neighbours import Neighbourhood
+from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.formation.neighbours import Neighbourhood
 from companion.settings import ZenohSection
 from mavlink_sim.testing import FleetMember, RunningSimulator, free_port, running_simulator
 from tests.companion.live_flight import LiveFlight

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.gimbal_controller import (
+from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.gimbal.controller import (
     FIND_TIMEOUT_S,
     RELEASE_TIMEOUT_S,
     GimbalController,
     GimbalMounting,
     direction_text,
 )
-from companion.guidance.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.interface import (
     Answer,
     FindGimbal,

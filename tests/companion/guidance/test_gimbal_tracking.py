@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.command import BuildContext
-from companion.guidance.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.gimbal.tracking import GimbalTracking
 from companion.guidance.gimbal_sight import GimbalSight
-from companion.guidance.gimbal_tracking import GimbalTracking
 from companion.guidance.grammar import parse
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.refusal import refusal
-from companion.guidance.target import Target
+from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim, GimbalState
 from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState

@@ -6,12 +6,12 @@ from collections.abc import Callable
 import pytest
 
 from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.stop import StopBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked

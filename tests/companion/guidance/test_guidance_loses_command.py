@@ -3,11 +3,11 @@
 import pytest
 
 from companion.guidance.behaviour import Outcome
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.land import LandBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.land import LandBehaviour
-from companion.guidance.orbit import OrbitBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 

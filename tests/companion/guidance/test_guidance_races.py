@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.follow_path import FollowPathBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.core import Phase
-from companion.guidance.follow_path import FollowPathBehaviour
-from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import Answer, CommandInput, EventKind, FindGimbal, GuidanceInput, Request
-from companion.guidance.takeoff import TakeoffBehaviour
 from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
 from companion.vehicle.state import FlightMode, LandedState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked

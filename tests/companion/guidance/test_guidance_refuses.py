@@ -6,17 +6,17 @@ import pytest
 
 from companion.geometry.fence import Fence
 from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation
+from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
+from companion.guidance.behaviours.follow_path import FollowPathBehaviour
+from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.land import LandBehaviour
+from companion.guidance.behaviours.patrol import PatrolBehaviour
+from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.core import GuidanceOptions
-from companion.guidance.envelope import Limits
-from companion.guidance.figure_eight import FigureEightBehaviour
-from companion.guidance.follow_path import FollowPathBehaviour
-from companion.guidance.goto import GotoBehaviour
-from companion.guidance.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.land import LandBehaviour
-from companion.guidance.patrol import PatrolBehaviour
-from companion.guidance.seek import SeekBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
+from companion.guidance.limits.envelope import Limits
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import Behaviour, Situation, Step
-from companion.guidance.hold import HoldBehaviour
-from companion.guidance.orbit import OrbitBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import Flight

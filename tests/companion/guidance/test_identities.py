@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.approach import ApproachBehaviour
-from companion.guidance.seek import SeekBehaviour
-from companion.guidance.target import DOUBTED, RangeSource, Target
-from companion.guidance.track import ObjectTrack
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.targets.target import DOUBTED, RangeSource, Target
+from companion.guidance.targets.track import ObjectTrack
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 

@@ -7,10 +7,10 @@ import pytest
 from companion.bench.flights_land import land
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Requirement, Situation
+from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
+from companion.guidance.behaviours.marker_search import CLIMB_M, MarkerSearch
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.land_on_marker import LandOnMarkerBehaviour
-from companion.guidance.marker_search import CLIMB_M, MarkerSearch
 from companion.guidance.refusal import refusal
 from companion.vehicle.state import LandedState, VehicleState
 

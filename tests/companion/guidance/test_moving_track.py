@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.choosing import CHOOSING_S, TargetSelector
-from companion.guidance.moving_track import DOUBT_S, MovingTrack
-from companion.guidance.target import RangeSource, Target
+from companion.guidance.targets.choosing import CHOOSING_S, TargetSelector
+from companion.guidance.targets.moving_track import DOUBT_S, MovingTrack
+from companion.guidance.targets.target import RangeSource, Target
 
 SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.guidance.behaviour import Behaviour, Requirement, Situation, Step
-from companion.guidance.neighbours import Anchor, Neighbour, Neighbours, missing_neighbours
-from companion.guidance.pose import Pose
+from companion.guidance.formation.neighbours import Anchor, Neighbour, Neighbours, missing_neighbours
+from companion.guidance.formation.pose import Pose
 from companion.guidance.refusal import refusal
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.test_pose import NOW_NS, STATE

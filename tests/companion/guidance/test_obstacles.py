@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 
 from companion.bench.flights_obstacles import ALLOWED_M, MARGIN_M, run
 from companion.guidance.behaviour import Situation
+from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.core import GuidanceOptions
-from companion.guidance.envelope import Envelope
-from companion.guidance.goto import GotoBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.land import LandBehaviour
-from companion.guidance.obstacles import (
+from companion.guidance.limits.envelope import Envelope
+from companion.guidance.limits.obstacles import (
     MAX_AGE_S,
     ObstacleMemory,
     ObstacleRules,

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.geometry.geodesy import north_east
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.behaviours.figure_eight import FigureEightBehaviour, lemniscate
+from companion.guidance.behaviours.follow_path import FollowPath, FollowPathBehaviour
+from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.command import NO_CONTEXT
-from companion.guidance.envelope import Limits
-from companion.guidance.figure_eight import FigureEightBehaviour, lemniscate
-from companion.guidance.follow_path import FollowPath, FollowPathBehaviour
-from companion.guidance.geodesy import north_east
-from companion.guidance.goto import GotoBehaviour
+from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3

@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from companion.guidance.behaviour import Outcome
+from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.patrol import Patrol, PatrolBehaviour
 from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject

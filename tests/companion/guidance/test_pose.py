@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.pose import (
+from companion.guidance.formation.pose import (
     FormationNote,
     Plan,
     Pose,

@@ -9,8 +9,8 @@ import pytest
 from companion.guidance.behaviour import Situation
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.refusal import refusal
+from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel
 

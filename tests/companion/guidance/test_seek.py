@@ -2,9 +2,9 @@ import math
 
 import pytest
 
+from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.seek import SeekBehaviour
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from vision.attitude import wrap_angle

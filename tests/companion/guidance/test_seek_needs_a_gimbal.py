@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from companion.guidance.approach import ApproachBehaviour
 from companion.guidance.behaviour import Behaviour, Outcome, Situation
-from companion.guidance.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
+from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.gimbal.sweep import GimbalSweep
 from companion.guidance.gimbal_sight import GimbalSight
-from companion.guidance.gimbal_sweep import GimbalSweep
 from companion.guidance.refusal import refusal
-from companion.guidance.seek import SeekBehaviour
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from companion.vehicle.setpoint import Setpoint
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle

@@ -10,9 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guidance.envelope import Envelope, Limits
-from companion.guidance.neighbours import Neighbour
-from companion.guidance.separation import Row, allowed_speed, apart, around, level_rows, pushed_apart, rows_at
+from companion.guidance.formation.neighbours import Neighbour
+from companion.guidance.formation.separation import (
+    Row,
+    allowed_speed,
+    apart,
+    around,
+    level_rows,
+    pushed_apart,
+    rows_at,
+)
+from companion.guidance.limits.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle

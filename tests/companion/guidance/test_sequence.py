@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour

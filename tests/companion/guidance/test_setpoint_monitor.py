@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from companion.guidance.setpoint_monitor import REASON, SetpointMonitor
+from companion.guidance.limits.setpoint_monitor import REASON, SetpointMonitor
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import LandedState, Vector3, VehicleState
 

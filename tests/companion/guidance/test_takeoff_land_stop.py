@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from companion.guidance.behaviour import ModeRequest, Outcome, Situation
-from companion.guidance.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.stop import StopBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
+from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from tests.companion.guidance.kinematic_vehicle import START_NS, KinematicVehicle

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.target import RangeSource, Target
-from companion.guidance.track import ObjectTrack
+from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.state import Vector3
 
 T0 = 10**12

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.hold import HoldBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import CommandInput
-from companion.guidance.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.stop import StopBehaviour
-from companion.guidance.takeoff import TakeoffBehaviour
 from companion.service.other_commanders import OtherCommanders
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.commander import Commander

@@ -1,0 +1,74 @@
+"""A figure of eight, level, about the place where it begins."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from companion.guidance.arguments import EnumArgument, Number
+from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviours.path_flight import PathFlight
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.motion import laps_text, position_and_yaw
+from companion.guidance.path import Path
+from companion.guidance.registry import behaviour
+from companion.vehicle.state import Vector3
+
+_POINTS = 96
+
+
+@behaviour("figure-eight", "fly a level eight about this place, first towards the nose")
+class FigureEight(Command):
+    radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its middle to either end")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most; bends are slower")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, EnumArgument("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def build(self, context: BuildContext) -> Behaviour:
+        along = self.nose == "along"
+        return FigureEightBehaviour(self.radius_m, self.speed_mps, self.laps, nose_along=along)
+
+
+class FigureEightBehaviour(PathFlight):
+    """Bernoulli's lemniscate, crossed in the middle towards the nose; each loop reaches `radius_m` out."""
+
+    name = "figure-eight"
+
+    def __init__(self, radius_m: float, speed_mps: float, laps: float, *, nose_along: bool = True) -> None:
+        super().__init__(speed_mps, laps=laps, nose_along=nose_along)
+        self._radius_m = radius_m
+
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        centre, yaw_rad = position_and_yaw(situation.state)
+        return tuple(lemniscate(centre, yaw_rad, self._radius_m))
+
+    def _path(self, situation: Situation) -> Path:
+        centre, yaw_rad = position_and_yaw(situation.state)
+        return Path(lemniscate(centre, yaw_rad, self._radius_m), self._speed_mps, closed=True)
+
+    def _flown(self) -> str:
+        return f"{laps_text(self._laps)} of the eight flown"
+
+
+def lemniscate(centre: Vector3, bearing_rad: float, radius_m: float) -> list[Vector3]:
+    """One round of Bernoulli's lemniscate from its middle.
+
+    Args:
+        centre: local NED metres. bearing_rad: of the long axis. radius_m: from the middle to either end.
+    """
+    points = []
+    for step in range(_POINTS):
+        angle = math.tau * step / _POINTS + math.pi / 2
+        scale = radius_m / (1.0 + math.sin(angle) ** 2)
+        along, across = -scale * math.cos(angle), -scale * math.cos(angle) * math.sin(angle)
+        north = along * math.cos(bearing_rad) - across * math.sin(bearing_rad)
+        east = along * math.sin(bearing_rad) + across * math.cos(bearing_rad)
+        points.append((centre[0] + north, centre[1] + east, centre[2]))
+    return points

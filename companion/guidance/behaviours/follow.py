@@ -1,0 +1,269 @@
+"""Keep a distance and a bearing to a moving object of a class."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from companion.guidance.arguments import ClassName, EnumArgument, Number
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.gimbal.tracking import GimbalTracking, GimbalUse
+from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
+from companion.guidance.registry import behaviour
+from companion.guidance.targets.choosing import TargetSelector
+from companion.guidance.targets.moving_track import MovingTrack
+from companion.guidance.targets.target import DOUBTED
+from companion.vehicle.gimbal import GimbalAim
+from companion.vehicle.setpoint import Setpoint
+from vision.attitude import wrap_angle
+
+# Answer to what is missing in distance and along the circle, 1/s, and the fastest that is made good: on top
+# of the object's own velocity.
+GAIN_PER_S = 1.2
+# More of a velocity is asked for where the vehicle does not follow it, see `motion.pressed`.
+PRESS = 1.0
+MOST_CLOSING_MPS = 2.5
+MOST_CIRCLING_MPS = 2.0
+# An object slower than this has no course: the last one is kept.
+COURSE_MPS = 0.7
+# A course swings with the noise of a velocity; the place to be, 8 m away, must not: its fastest turn, rad/s.
+COURSE_RATE_RADPS = 0.35
+# What is known of the object's velocity counts fully below this uncertainty, and less above.
+SURE_OF_SPEED_MPS = 1.0
+# Detectors miss single frames; unseen for longer, the speed towards a guess is held back.
+UNSEEN_S = 0.6
+
+
+@behaviour("follow", "keep a distance and a bearing to a moving object of the class")
+class Follow(Command):
+    class_name: Annotated[str, ClassName("class", "what to follow")]
+    distance_m: Annotated[float, Number("distance", "m", 1.5, 100.0, "to keep, to its surface")] = 8.0
+    bearing: Annotated[
+        str,
+        EnumArgument(
+            "bearing",
+            ("here", "compass", "course"),
+            "where to stay: as it is, or `angle` from north or course",
+        ),
+    ] = "here"
+    angle_deg: Annotated[
+        float,
+        Number("angle", "deg", -360.0, 360.0, "seen from the object, clockwise; of course, 180 is behind"),
+    ] = 180.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 5.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.3
+    occlusion_s: Annotated[
+        float, Number("occlusion", "s", 0.5, 60.0, "follow a hidden object's expected way this long")
+    ] = 3.0
+    duration_s: Annotated[
+        float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
+    ] = 0.0
+    gimbal: GimbalUse = "leave"
+
+    @property
+    def endless(self) -> bool:
+        return self.duration_s == 0.0
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return FollowBehaviour(
+            self.class_name,
+            distance_m=self.distance_m,
+            bearing=self.bearing,
+            angle_rad=math.radians(self.angle_deg),
+            speed_mps=self.speed_mps,
+            confidence=self.confidence,
+            occlusion_s=self.occlusion_s,
+            duration_s=self.duration_s,
+            tracking=GimbalTracking() if self.gimbal == "track" else None,
+        )
+
+
+class FollowBehaviour(Behaviour):
+    """Keeps its height, looks at the object and keeps `distance_m` from its nearest surface.
+
+    It begins with the true object of the class before the nose (see `TargetSelector`) and stays with it.
+    Unseen, it goes on to where the object is expected to be, for `occlusion_s`; then it ends.
+
+    Args:
+        bearing: where the vehicle stays, seen from the object: "here", in the direction in which it is;
+            "compass", `angle_rad` clockwise from north; "course", that far clockwise from the object's
+            direction of motion (π is behind it).
+        speed_mps: at most, the object's own speed included.
+        duration_s: ends after this, successfully; 0: until another command.
+        tracking: keeps the camera's gimbal on the object; None: it is left alone.
+    """
+
+    name = "follow"
+    requirements = frozenset(
+        {
+            Requirement.POSITION,
+            Requirement.IN_AIR,
+            Requirement.PERCEPTION,
+            Requirement.DEPTH_OR_SIZE,
+            Requirement.BATTERY,
+        }
+    )
+
+    def __init__(
+        self,
+        class_name: str,
+        *,
+        distance_m: float = 8.0,
+        bearing: str = "here",
+        angle_rad: float = math.pi,
+        speed_mps: float = 5.0,
+        confidence: float = 0.3,
+        occlusion_s: float = 3.0,
+        duration_s: float = 0.0,
+        tracking: GimbalTracking | None = None,
+    ) -> None:
+        self._tracking = tracking
+        if tracking is not None:
+            self.requirements = FollowBehaviour.requirements | {Requirement.GIMBAL}
+        self.class_names = (class_name,)
+        self._class_name = class_name
+        self._distance_m, self._speed_mps = distance_m, speed_mps
+        self._bearing, self._angle_rad = bearing, angle_rad
+        self._confidence, self._occlusion_s = confidence, occlusion_s
+        self._duration_s = duration_s
+        self._forget(0, 0.0)
+
+    def _forget(self, now_ns: int, down_m: float) -> None:
+        self._track: MovingTrack | None = None
+        self._choice = TargetSelector()
+        self._started_ns = self._seen_ns = now_ns
+        self._down_m = down_m
+        self._doubted = False
+        self._yaw_rad: float | None = None
+        self._course_rad: float | None = None
+        self._range_m = math.nan
+        self._unseen_s = 0.0
+
+    def on_activate(self, situation: Situation) -> None:
+        position, _ = position_and_yaw(situation.state)
+        self._forget(situation.now_ns, position[2])
+        if self._tracking is not None:
+            self._tracking.begin(situation)
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        now_ns, state = situation.now_ns, situation.state
+        position, yaw_rad = position_and_yaw(state)
+        self._observe(situation, yaw_rad)
+        track = self._track
+        self._unseen_s = (now_ns - self._seen_ns) / 1e9
+        if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
+            if track is None:
+                return Outcome(False, f"saw no {self._class_name} to follow in {self._duration_s:g} s")
+            return Outcome(True, f"followed the {self._class_name} for {self._duration_s:g} s")
+        if self._unseen_s > self._occlusion_s:
+            return Outcome(False, self._lost(situation))
+        if track is not None:
+            place = track.place(now_ns)
+            north, east = place[0] - position[0], place[1] - position[1]
+            self._range_m = math.hypot(north, east)
+        if self._tracking is not None:
+            newest = None if track is None else track.newest
+            why = self._tracking.keep_on(newest, self._range_m, position, situation)
+            if why is not None:
+                return Outcome(False, f"follow lost the gimbal: {why}")
+        height_mps = correction(self._down_m - position[2])
+        if track is None:
+            if self._yaw_rad is None:
+                return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rate_radps=0.0)
+            return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rad=self._yaw_rad)
+
+        self._yaw_rad = towards_rad = math.atan2(east, north)
+        wanted = self._wanted(track, towards_rad, dt_s)
+        north_mps, east_mps = pressed(wanted, state, self._speed_mps, PRESS)
+        return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)
+
+    def _wanted(self, track: MovingTrack, towards_rad: float, dt_s: float) -> tuple[float, float]:
+        """Velocity over ground: the object's own, and what is missing along the line to it and across.
+
+        In polar form about the object, so that the way to another side of it leads around it.
+        """
+        trust = min(1.0, SURE_OF_SPEED_MPS / max(track.speed_sigma_mps, 1e-6))
+        if self._unseen_s > UNSEEN_S:
+            # The farther the guess, the less is flown towards it.
+            trust *= max(0.0, 1.0 - (self._unseen_s - UNSEEN_S) / max(self._occlusion_s, UNSEEN_S)) ** 0.5
+        north, east = (trust * speed for speed in track.velocity)
+        closing = GAIN_PER_S * (self._range_m - self._distance_m)
+        closing = max(-MOST_CLOSING_MPS, min(MOST_CLOSING_MPS, closing))
+        circling = 0.0
+        goal_rad = self._goal_rad(track, towards_rad, dt_s)
+        if goal_rad is not None:
+            from_object_rad = wrap_angle(towards_rad + math.pi)
+            missing_m = wrap_angle(goal_rad - from_object_rad) * max(self._range_m, 1.0)
+            circling = max(-MOST_CIRCLING_MPS, min(MOST_CIRCLING_MPS, GAIN_PER_S * missing_m))
+        # Growing bearings about the object run along (sin, -cos) of the direction to it.
+        c, s = math.cos(towards_rad), math.sin(towards_rad)
+        return (north + closing * c + circling * s, east + closing * s - circling * c)
+
+    def _goal_rad(self, track: MovingTrack, towards_rad: float, dt_s: float) -> float | None:
+        """Where to be, seen from the object; None: anywhere on the circle."""
+        if self._bearing == "here":
+            return None
+        if self._bearing == "compass":
+            return wrap_angle(self._angle_rad)
+        north, east = track.velocity
+        if math.hypot(north, east) > COURSE_MPS:
+            course = math.atan2(east, north)
+            if self._course_rad is None:
+                self._course_rad = course
+            most = COURSE_RATE_RADPS * dt_s
+            turn = wrap_angle(course - self._course_rad)
+            self._course_rad = wrap_angle(self._course_rad + max(-most, min(most, turn)))
+        return None if self._course_rad is None else wrap_angle(self._course_rad + self._angle_rad)
+
+    def _observe(self, situation: Situation, yaw_rad: float) -> None:
+        if not situation.perception_fresh:
+            return
+        position, _ = position_and_yaw(situation.state)
+        fitting = [
+            target
+            for target in situation.targets
+            if target.class_name == self._class_name and target.score >= self._confidence
+        ]
+        if self._track is not None:
+            if self._track.update(fitting, position):
+                self._seen_ns = self._track.captured_ns
+            return
+        if fitting:
+            self._doubted = not any(target.trusted for target in fitting)
+        chosen = self._choice.take(fitting, yaw_rad, situation.now_ns)
+        if chosen is None:
+            return
+        if chosen.position_ned_m is None:
+            # Turned to, it may come fully into the picture, and its range with it.
+            self._yaw_rad = chosen.bearing_rad
+            if self._tracking is not None:
+                self._tracking.turn_to(chosen, situation)
+            return
+        self._track, self._seen_ns = MovingTrack(chosen, position), chosen.captured_ns
+
+    def _lost(self, situation: Situation) -> str:
+        if not situation.perception_fresh:
+            why = situation.why_blind("nothing comes from the detector")
+        elif self._track is not None:
+            north, east = self._track.velocity
+            moving = (
+                f", moving at {math.hypot(north, east):.1f} m/s to {in_degrees(math.atan2(east, north))}°"
+            )
+            why = f"last expected {self._range_m:.1f} m away{moving}"
+        elif self._doubted:
+            why = DOUBTED
+        else:
+            why = "it was never seen with a known range"
+        return f"lost the {self._class_name} for {self._unseen_s:.1f} s: {why}"
+
+    @property
+    def gimbal_aim(self) -> GimbalAim | None:
+        return None if self._tracking is None else self._tracking.aim
+
+    @property
+    def status(self) -> str:
+        if self._track is None:
+            return f"looking for the {self._class_name}"
+        hidden = f", unseen for {self._unseen_s:.1f} s" if self._unseen_s > UNSEEN_S else ""
+        return f"following the {self._class_name}, {self._range_m:.1f} m away{hidden}"

@@ -1,0 +1,96 @@
+"""Fly along a row of points, once or round and round, slowing down for the corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from companion.geometry.points import points_from
+from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points
+from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviours.path_flight import PathFlight
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.motion import home_of, laps_text, position_and_yaw
+from companion.guidance.path import Path
+from companion.guidance.registry import behaviour
+from companion.vehicle.state import Vector3
+
+
+@behaviour("follow-path", "fly along a row of points, slowing down for corners")
+class FollowPath(Command):
+    points: Annotated[
+        str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
+    ]
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
+    nose: Annotated[
+        str, EnumArgument("nose", ("along", "still"), "where it points: along the way, or as it is")
+    ] = "along"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"follow-path: laps must be 0, or 1 or more, got {self.laps:g}")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+    def build(self, context: BuildContext) -> Behaviour:
+        along = self.nose == "along"
+        return FollowPathBehaviour(self.places, self.speed_mps, laps=self.laps, nose_along=along)
+
+
+class FollowPathBehaviour(PathFlight):
+    """From where the vehicle is to the first point, and on along the others.
+
+    Args:
+        points: (north, east) or (north, east, height) metres from home; without a height, the one before's.
+        laps: 0: until another command; any but 1: from the last point on to the first again.
+        round_trip: that also for a single lap.
+    """
+
+    name = "follow-path"
+
+    def __init__(
+        self,
+        points: Sequence[tuple[float, ...]],
+        speed_mps: float,
+        *,
+        laps: float = 1.0,
+        nose_along: bool = True,
+        round_trip: bool = False,
+    ) -> None:
+        super().__init__(speed_mps, laps=laps, nose_along=nose_along)
+        self._points = tuple(points)
+        self._round_trip = round_trip or laps != 1.0
+
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        return tuple(self._places(situation))
+
+    def _places(self, situation: Situation) -> list[Vector3]:
+        position, _ = position_and_yaw(situation.state)
+        home = home_of(situation.state)
+        down, places = position[2], list[Vector3]()
+        for north, east, *height in self._points:
+            down = home[2] - height[0] if height else down
+            places.append((home[0] + north, home[1] + east, down))
+        return places
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        places = self._places(situation)
+        if self._round_trip:
+            return Path(places, self._speed_mps, closed=True)
+        return Path([position, *places], self._speed_mps)
+
+    def _flown(self) -> str:
+        if not self._round_trip:
+            return f"all {len(self._points)} points flown"
+        return f"{laps_text(self._laps)} of {len(self._points)} points flown"

@@ -1,0 +1,433 @@
+"""Fly in formation: hold a slot about a leader, a vehicle or a place that moves, and let it move on with it.
+
+The slot is where the shape says, in the leader's heading frame; its velocity (the leader's, and what the turn
+adds) is flown by as it is, and what is missing to the slot by a proportional law, the same for every vehicle:
+so vehicles that change slots do not cross (`companion.geometry.formation.assign`). A leader that is not heard
+any more is not guessed at: its followers brake, hold, and after a while end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+from companion.geometry.formation import SHAPES, Vector3, slot_motion
+from companion.geometry.points import points_from
+from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points, Word
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.formation.group import Agreement, Group
+from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.formation.pose import FormationNote, Plan, Structure
+from companion.guidance.formation.separation import MARGIN_M, around, pushed_apart
+from companion.guidance.formation.virtual_structure import VirtualStructure
+from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed
+from companion.guidance.registry import behaviour
+from companion.vehicle.setpoint import Setpoint
+from vision.attitude import wrap_angle
+
+VIRTUAL = "virtual"
+LOST_TIMEOUT_S = 5.0
+# Answer to an error of place, 1/s, and the speed over ground and up or down it may ask for.
+SLOT_GAIN_PER_S = 0.8
+CATCH_UP_MPS = 1.8
+CLIMB_MPS = 1.0
+# The outermost slot is swung round no faster than this, and set into that motion at this.
+SWING_MPS = 1.5
+SWING_MPS2 = 0.7
+# Above this a vehicle brakes first: held at once, it would fly back to where it was told.
+STANDING_MPS = 0.5
+# A neighbour slower than this beside the formation stands in the way and is flown around.
+IN_THE_WAY_MPS = 0.6
+# Ways past others are flown so far outside of the least distance.
+CLEARANCE_M = 1.2
+# Nearer than this to its slot a vehicle flies straight there.
+FAR_M = 3.0
+# Of a virtual structure: all are there, so near and for so long; then the others are told so for a while.
+THERE_M, THERE_S, TELL_S = 1.2, 1.0, 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class _Leader:
+    """What is followed now: local NED, and a heading that may jump."""
+
+    position: Vector3
+    velocity: Vector3
+    heading_rad: float
+    turn_rate_radps: float
+    over: bool = False
+
+
+# More vehicles than have been flown, even on paper.
+MOST_SLOTS = 200
+
+
+@behaviour("formation", "hold a slot about a leader: another vehicle, or a virtual one on a path")
+class Formation(Command):
+    shape: Annotated[str, EnumArgument("shape", SHAPES, "of the formation")]
+    leader: Annotated[str, Word("leader", 'vehicle.name of the leader, or "virtual"')]
+    spacing_m: Annotated[float, Number("spacing", "m", 1.0, 100.0, "of neighbouring slots")] = 6.0
+    slot: Annotated[str, Word("slot", "number of the slot to take, from 1, or auto")] = "auto"
+    points: Annotated[
+        str | None, Points("points", 'path of a virtual leader, from home: "0,0 20,0 20,20,8"')
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "of a virtual leader, at most")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "of its path; 0: until another command")] = 1.0
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 600.0, "hold this long without the leader's pose")
+    ] = 5.0
+
+    @property
+    def endless(self) -> bool:
+        return self.points is None or self.laps == 0.0
+
+    @property
+    def slot_number(self) -> int | None:
+        """None: auto."""
+        return None if self.slot == "auto" else int(self.slot)
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point of the path, metres from home."""
+        return points_from(self.points or "")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
+            raise GrammarError(f"formation: slot must be auto or 1 to {MOST_SLOTS}, got {self.slot!r}")
+        if (self.leader == "virtual") != (self.points is not None):
+            raise GrammarError(
+                "formation: leader=virtual and points=… belong together; one of them is missing"
+            )
+        if 0.0 < self.laps < 1.0:
+            raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return FormationBehaviour(
+            self.shape,
+            self.leader,
+            self.spacing_m,
+            self.slot_number,
+            points=self.places,
+            speed_mps=self.speed_mps,
+            laps=self.laps,
+            lost_timeout_s=self.lost_timeout_s,
+        )
+
+
+class FormationBehaviour(Behaviour):
+    """Holds a slot until another command comes, or a virtual structure has flown its path.
+
+    Args:
+        shape: line, column, wedge or circle. leader: a vehicle's name, or "virtual" with points.
+        slot: the one to take, from 1; None: the one that suits all best.
+        points, speed_mps, laps: the path of a virtual structure, as `follow-path` has it.
+        lost_timeout_s: so long is waited for a leader that is not heard.
+
+    Attributes:
+        note: what the others are told; None while nothing is flown.
+        slot_offset_ned_m: from the leader to the slot, as it was last flown.
+    """
+
+    name = "formation"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.NEIGHBOURS})
+
+    def __init__(
+        self,
+        shape: str,
+        leader: str,
+        spacing_m: float = 6.0,
+        slot: int | None = None,
+        *,
+        points: Sequence[tuple[float, ...]] = (),
+        speed_mps: float = 2.0,
+        laps: float = 1.0,
+        lost_timeout_s: float = LOST_TIMEOUT_S,
+    ) -> None:
+        self._shape, self.leader_name, self._spacing_m, self._slot = shape, leader, spacing_m, slot
+        self._structure = VirtualStructure(points, speed_mps, laps) if leader == VIRTUAL else None
+        self._lost_timeout_s = lost_timeout_s
+        self.neighbour_names = () if leader == VIRTUAL else (leader,)
+        self._reset()
+
+    def _reset(self) -> None:
+        self._group: Group | None = None
+        self._agreement: Agreement | None = None
+        self._heading_rad: float | None = None
+        self._turn_rate_radps = 0.0
+        self._error_m = 0.0
+        self._lost_since_ns: int | None = None
+        self._place: Vector3 | None = None
+        self._there_since_ns: int | None = None
+        self._over_since_ns: int | None = None
+        self._words = "waiting for the others"
+        self._side = 1.0
+        self.note: FormationNote | None = None
+        self.slot_offset_ned_m: Vector3 | None = None
+
+    def on_activate(self, situation: Situation) -> None:
+        self._reset()
+
+    def on_deactivate(self) -> None:
+        self.note = None
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        hood = situation.neighbourhood
+        if hood is None or hood.problem is not None or hood.anchor is None:
+            return self._without_leader(
+                situation, "the others are not heard" if hood is None else hood.problem
+            )
+        leader = self._leader(dt_s, situation, hood)
+        if isinstance(leader, Outcome):
+            return leader
+        if isinstance(leader, str):
+            self._tell_waiting(hood)
+            return self._without_leader(situation, leader)
+        self._lost_since_ns = None
+        position, _ = position_and_yaw(situation.state)
+        if self._heading_rad is None:
+            self._heading_rad = leader.heading_rad
+        agreement = self._agree(hood, leader, position)
+        if ended := self._ended(situation, agreement, leader):
+            return ended
+        self._turn(dt_s, hood, leader, agreement)
+        offset = agreement.offset(hood.own, centre_taken=self._centre_taken(hood))
+        self._tell(hood, agreement)
+        if offset is None:
+            self._words = f"waiting for a slot from {agreement.by}"
+            return self._stand(situation)
+        self._place = None
+        return self._fly(situation, hood, leader, agreement, offset, position)
+
+    # ---- the leader -------------------------------------------------------------------------------------
+
+    def _leader(self, dt_s: float, situation: Situation, hood: Neighbourhood) -> _Leader | Outcome | str:
+        """What is followed; or why it cannot be now; or why it cannot be at all."""
+        if self._structure is not None:
+            return self._virtual_leader(dt_s, situation, hood, self._structure)
+        if self.leader_name == hood.own:
+            return Outcome(False, f"{hood.own} cannot follow itself: name another leader")
+        leader = hood.named(self.leader_name)
+        if leader is None or leader.silent:
+            return f"{self.leader_name}, the leader, is not heard"
+        if leader.formation is not None and leader.formation.leader == hood.own:
+            return Outcome(False, f"{leader.name} follows {hood.own}: two cannot follow each other")
+        if not (leader.airborne or leader.virtual):
+            return Outcome(False, f"{leader.name}, the leader, is on the ground")
+        return _Leader(
+            leader.position_ned_m, leader.velocity_ned_mps, leader.heading_rad, leader.turn_rate_radps
+        )
+
+    def _virtual_leader(
+        self, dt_s: float, situation: Situation, hood: Neighbourhood, structure: VirtualStructure
+    ) -> _Leader | Outcome | str:
+        assert hood.anchor is not None
+        told = self._told_structures(hood)
+        mover = min((other.name for other in self._companions(hood) if not other.silent), default=hood.own)
+        if mover < hood.own:
+            if mover not in told:
+                return f"{mover} has not told yet where the structure is"
+            structure.leave()
+            other, where = told[mover]
+            place = hood.anchor.local(*where.place)
+            north, east, down = (
+                p + v * other.age_s for p, v in zip(place, where.velocity_ned_mps, strict=True)
+            )
+            return _Leader((north, east, down), where.velocity_ned_mps, where.heading_rad, 0.0, where.over)
+        try:
+            if not structure.begun:
+                known = max((where for _, where in told.values()), key=lambda w: w.along_m, default=None)
+                if known is not None:
+                    structure.take_over(hood.anchor, known)
+                else:
+                    home = home_of(situation.state)
+                    structure.begin(hood.anchor, home, situation.state.altitude_m or 0.0)
+        except ValueError as error:
+            return Outcome(False, f"{self.name}: {error}")
+        position, velocity, heading = structure.motion()
+        if heading is None:
+            heading = self._heading_rad if self._heading_rad is not None else 0.0
+        if self._agreement is not None and self._agreement.by == hood.own:
+            off_rad = 0.0 if self._heading_rad is None else heading - self._heading_rad
+            structure.move(dt_s, self._agreement.worst_error_m, off_rad)
+        return _Leader(position, velocity, heading, 0.0, self._over_since_ns is not None)
+
+    def _companions(self, hood: Neighbourhood) -> list[Neighbour]:
+        """Those who fly in this formation, as far as they are known."""
+        return [
+            other
+            for other in hood.vehicles
+            if other.formation is not None and other.formation.leader == self.leader_name
+        ]
+
+    def _told_structures(self, hood: Neighbourhood) -> dict[str, tuple[Neighbour, Structure]]:
+        return {
+            other.name: (other, other.formation.structure)
+            for other in self._companions(hood)
+            if other.formation is not None and other.formation.structure is not None
+        }
+
+    def _centre_taken(self, hood: Neighbourhood) -> bool:
+        leader = hood.named(self.leader_name)
+        return self._structure is None and not (leader is not None and leader.virtual)
+
+    # ---- the others -------------------------------------------------------------------------------------
+
+    def _agree(self, hood: Neighbourhood, leader: _Leader, position: Vector3) -> Agreement:
+        if self._group is None:
+            self._group = Group(hood.own, self.leader_name, self._shape, self._spacing_m, self._slot)
+        self._group.centre_taken = self._centre_taken(hood)
+        heading = self._heading_rad or 0.0
+        places = {other.name: _in_frame(other.position_ned_m, leader, heading) for other in hood.vehicles}
+        places[hood.own] = _in_frame(position, leader, heading)
+        self._agreement = self._group.agree(hood.vehicles, places, self._error_m)
+        return self._agreement
+
+    def _ended(self, situation: Situation, agreement: Agreement, leader: _Leader) -> Outcome | None:
+        own = situation.neighbourhood.own if situation.neighbourhood is not None else ""
+        given = agreement.slots.get(own)
+        if self._slot is not None and agreement.slots and given != self._slot:
+            holder = next((name for name, number in agreement.slots.items() if number == self._slot), None)
+            if holder is not None:
+                return Outcome(False, f"slot {self._slot} is {holder}'s: choose another, or slot=auto")
+        if agreement.plan.spacing_m < situation.min_separation_m + MARGIN_M:
+            least_m = situation.min_separation_m + MARGIN_M
+            return Outcome(
+                False,
+                f"spacing must be {least_m:g} m at least with guidance.min_separation_m at "
+                f"{situation.min_separation_m:g} m, got {agreement.plan.spacing_m:g} m",
+            )
+        if self._structure is None:
+            return None
+        now_ns = situation.now_ns
+        if agreement.by != own:
+            return Outcome(True, "the structure has flown its path") if leader.over else None
+        if not (self._structure.arrived and agreement.worst_error_m < THERE_M):
+            self._there_since_ns = None
+        elif self._there_since_ns is None:
+            self._there_since_ns = now_ns
+        elif self._over_since_ns is None and now_ns - self._there_since_ns > THERE_S * 1e9:
+            self._over_since_ns = now_ns
+        if self._over_since_ns is not None and now_ns - self._over_since_ns > TELL_S * 1e9:
+            return Outcome(True, "the structure has flown its path")
+        return None
+
+    def _turn(self, dt_s: float, hood: Neighbourhood, leader: _Leader, agreement: Agreement) -> None:
+        """The formation's heading: after the leader's, as fast as its outermost slot can be swung round."""
+        assert self._heading_rad is not None
+        by = hood.named(agreement.by)
+        if agreement.by != hood.own and by is not None and by.formation is not None and by.formation.count:
+            note = by.formation
+            self._turn_rate_radps = note.turn_rate_radps
+            self._heading_rad = wrap_angle(note.heading_rad + note.turn_rate_radps * by.age_s)
+            return
+        reach_m = max(1.0, agreement.reach_m(centre_taken=self._centre_taken(hood)))
+        fastest, growth = SWING_MPS / reach_m, SWING_MPS2 / reach_m
+        behind = wrap_angle(leader.heading_rad - self._heading_rad)
+        wanted = leader.turn_rate_radps + stopping_speed(behind, fastest, growth)
+        wanted = max(-fastest, min(fastest, wanted))
+        change = max(-growth * dt_s, min(growth * dt_s, wanted - self._turn_rate_radps))
+        self._turn_rate_radps += change
+        self._heading_rad = wrap_angle(self._heading_rad + self._turn_rate_radps * dt_s)
+
+    def _tell(self, hood: Neighbourhood, agreement: Agreement) -> None:
+        assigning = agreement.by == hood.own
+        note = FormationNote(
+            self.leader_name,
+            agreement.plan,
+            self._slot,
+            self._error_m,
+            tuple(sorted(agreement.slots.items())) if assigning else (),
+            agreement.count if assigning else 0,
+            self._heading_rad or 0.0,
+            self._turn_rate_radps,
+        )
+        if assigning and self._structure is not None and self._structure.begun and hood.anchor is not None:
+            _, _, heading = self._structure.motion()
+            over = self._over_since_ns is not None
+            told = self._structure.told(hood.anchor, note.heading_rad if heading is None else heading, over)
+            note = replace(note, structure=told)
+        self.note = note
+
+    def _tell_waiting(self, hood: Neighbourhood) -> None:
+        """Until the leader is heard nothing is assigned, but the others know who waits."""
+        plan = Plan(0, hood.own, self._shape, self._spacing_m)
+        held = self.note
+        self.note = FormationNote(self.leader_name, plan if held is None else held.plan, self._slot)
+
+    # ---- flying -----------------------------------------------------------------------------------------
+
+    def _fly(
+        self,
+        situation: Situation,
+        hood: Neighbourhood,
+        leader: _Leader,
+        agreement: Agreement,
+        offset: Vector3,
+        position: Vector3,
+    ) -> Setpoint:
+        assert self._heading_rad is not None
+        slot, moving = slot_motion(
+            leader.position, leader.velocity, self._heading_rad, self._turn_rate_radps, offset
+        )
+        north, east, down = (s - p for s, p in zip(slot, leader.position, strict=True))
+        self.slot_offset_ned_m = (north, east, down)
+        missing = (slot[0] - position[0], slot[1] - position[1], slot[2] - position[2])
+        self._error_m = math.hypot(*missing)
+        way_m = math.hypot(missing[0], missing[1])
+        gain = min(SLOT_GAIN_PER_S, CATCH_UP_MPS / way_m) if way_m > 1e-6 else 0.0
+        nearest_m = situation.min_separation_m
+        closing = (missing[0] * gain, missing[1] * gain)
+        if way_m > FAR_M:
+            standing = [other for other in hood.vehicles if _stands(other, moving)]
+            closing, self._side = around(
+                closing, way_m, position, standing, nearest_m + CLEARANCE_M, self._side
+            )
+        # Neighbours in their slots do not push each other.
+        soft_m = min(nearest_m + CLEARANCE_M, max(nearest_m + MARGIN_M, 0.9 * agreement.plan.spacing_m))
+        push = pushed_apart(position, hood.vehicles, soft_m)
+        down = max(-CLIMB_MPS, min(CLIMB_MPS, SLOT_GAIN_PER_S * missing[2]))
+        wanted = (moving[0] + closing[0] + push[0], moving[1] + closing[1] + push[1])
+        north, east = pressed(wanted, situation.state, math.hypot(*wanted) + 1.0)
+        self._words = (
+            f"slot {agreement.slots[hood.own]} of {agreement.plan.shape}, {self._error_m:.1f} m from it"
+        )
+        return Setpoint.velocity((north, east, moving[2] + down), situation.now_ns, yaw_rad=self._heading_rad)
+
+    def _without_leader(self, situation: Situation, why: str | None) -> Step:
+        """Brake and hold; not for ever."""
+        now_ns = situation.now_ns
+        if self._lost_since_ns is None:
+            self._lost_since_ns = now_ns
+        lost_s = (now_ns - self._lost_since_ns) / 1e9
+        if lost_s > self._lost_timeout_s:
+            return Outcome(False, f"{why or 'the leader is lost'}; waited for {self._lost_timeout_s:g} s")
+        self._words = f"holding: {why}"
+        return self._stand(situation)
+
+    def _stand(self, situation: Situation) -> Setpoint:
+        state, now_ns = situation.state, situation.now_ns
+        yaw_rad = self._heading_rad if self._heading_rad is not None else state.yaw_rad
+        if self._place is None and math.hypot(*(state.velocity_ned_mps or (0.0, 0.0, 0.0))) < STANDING_MPS:
+            self._place = state.position_ned_m
+        if self._place is None:
+            return Setpoint.velocity((0.0, 0.0, 0.0), now_ns, yaw_rad=yaw_rad)
+        return Setpoint.position(self._place, now_ns, yaw_rad=yaw_rad)
+
+    @property
+    def status(self) -> str:
+        return f"formation, {self._words}"
+
+
+def _in_frame(place: Vector3, leader: _Leader, heading_rad: float) -> Vector3:
+    """A place as (forward, right, down) of the leader."""
+    north, east = place[0] - leader.position[0], place[1] - leader.position[1]
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    return (north * cosine + east * sine, east * cosine - north * sine, place[2] - leader.position[2])
+
+
+def _stands(other: Neighbour, moving: Vector3) -> bool:
+    """It keeps its place in the formation, or stands where the formation does."""
+    return not other.virtual and math.dist(other.velocity_ned_mps[:2], moving[:2]) < IN_THE_WAY_MPS

@@ -1,0 +1,136 @@
+"""Fly straight to a place: metres from home, metres from here by the nose, or latitude and longitude."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from companion.geometry.geodesy import north_east
+from companion.guidance.arguments import GrammarError, Number
+from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviours.path_flight import PathFlight
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.motion import home_of, position_and_yaw
+from companion.guidance.path import Path
+from companion.guidance.registry import behaviour
+from companion.vehicle.state import Vector3
+
+NEAREST_M = 0.05
+# GLOBAL_POSITION_INT comes 5 to 50 times a second.
+GLOBAL_MAX_AGE_S = 0.5
+
+
+@behaviour("goto", "fly straight to a place, given by one pair of its arguments")
+class Goto(Command):
+    north_m: Annotated[float | None, Number("north", "m", -5000.0, 5000.0, "of home, with east")] = None
+    east_m: Annotated[float | None, Number("east", "m", -5000.0, 5000.0, "of home, with north")] = None
+    altitude_m: Annotated[float | None, Number("altitude", "m", 1.0, 500.0, "above home; else as it is")] = (
+        None
+    )
+    forward_m: Annotated[float | None, Number("forward", "m", -5000.0, 5000.0, "of here, with right")] = None
+    right_m: Annotated[float | None, Number("right", "m", -5000.0, 5000.0, "of here, with forward")] = None
+    latitude_deg: Annotated[
+        float | None, Number("latitude", "deg", -90.0, 90.0, "WGS 84, with longitude")
+    ] = None
+    longitude_deg: Annotated[
+        float | None, Number("longitude", "deg", -180.0, 180.0, "WGS 84, with latitude")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    heading_deg: Annotated[
+        float | None, Number("heading", "deg", -360.0, 360.0, "of the nose; else along the way")
+    ] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        pairs = {
+            "north and east": (self.north_m, self.east_m),
+            "forward and right": (self.forward_m, self.right_m),
+            "latitude and longitude": (self.latitude_deg, self.longitude_deg),
+        }
+        begun = [name for name, pair in pairs.items() if pair != (None, None)]
+        if len(begun) != 1:
+            got = " and ".join(begun) if begun else "none of them"
+            raise GrammarError(f"goto: give exactly one pair of {', '.join(pairs)}; got {got}")
+        if None in pairs[begun[0]]:
+            raise GrammarError(f"goto: {begun[0]} belong together; one of them is missing")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return GotoBehaviour(
+            from_home_m=_pair(self.north_m, self.east_m),
+            from_here_m=_pair(self.forward_m, self.right_m),
+            global_deg=_pair(self.latitude_deg, self.longitude_deg),
+            altitude_m=self.altitude_m,
+            speed_mps=self.speed_mps,
+            heading_rad=None if self.heading_deg is None else math.radians(self.heading_deg),
+        )
+
+
+class GotoBehaviour(PathFlight):
+    """Exactly one pair says where; what is not said about the height stays as it is.
+
+    Args:
+        from_home_m: (north, east) of home. from_here_m: (forward, right) of where it begins.
+        global_deg: (latitude, longitude), WGS 84. altitude_m: above home; None: as it is.
+    """
+
+    name = "goto"
+
+    def __init__(
+        self,
+        *,
+        from_home_m: tuple[float, float] | None = None,
+        from_here_m: tuple[float, float] | None = None,
+        global_deg: tuple[float, float] | None = None,
+        altitude_m: float | None = None,
+        speed_mps: float = 3.0,
+        heading_rad: float | None = None,
+    ) -> None:
+        super().__init__(speed_mps, heading_rad=heading_rad)
+        given = [place for place in (from_home_m, from_here_m, global_deg) if place is not None]
+        if len(given) != 1:
+            raise ValueError("goto needs exactly one of from_home_m, from_here_m and global_deg")
+        self._from_home_m, self._from_here_m, self._global_deg = from_home_m, from_here_m, global_deg
+        self._altitude_m = altitude_m
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        goal = self._goal(situation)
+        if math.dist(goal, position) < NEAREST_M:
+            # A path has a length: who is there already arrives from a hand's breadth above.
+            position = (goal[0], goal[1], goal[2] - NEAREST_M)
+        return Path([position, goal], self._speed_mps)
+
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        try:
+            return (self._goal(situation),)
+        except ValueError:
+            return ()  # it says so when it begins
+
+    def _goal(self, situation: Situation) -> Vector3:
+        state = situation.state
+        position, yaw_rad = position_and_yaw(state)
+        down = position[2] if self._altitude_m is None else home_of(state)[2] - self._altitude_m
+        if self._from_home_m is not None:
+            home = home_of(state)
+            return (home[0] + self._from_home_m[0], home[1] + self._from_home_m[1], down)
+        if self._from_here_m is not None:
+            forward, right = self._from_here_m
+            north = forward * math.cos(yaw_rad) - right * math.sin(yaw_rad)
+            east = forward * math.sin(yaw_rad) + right * math.cos(yaw_rad)
+            return (position[0] + north, position[1] + east, down)
+        assert self._global_deg is not None
+        if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
+            raise ValueError("the vehicle does not know its latitude and longitude")
+        age_s = (situation.now_ns - state.global_ns) / 1e9
+        if age_s > GLOBAL_MAX_AGE_S:
+            raise ValueError(f"the vehicle's latitude and longitude are {age_s:.1f} s old")
+        north, east = north_east((state.latitude_deg, state.longitude_deg), self._global_deg)
+        return (position[0] + north, position[1] + east, down)
+
+    def _flown(self) -> str:
+        return "there"
+
+
+def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:
+    return None if first is None or second is None else (first, second)

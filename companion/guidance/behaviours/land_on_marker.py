@@ -1,0 +1,377 @@
+"""Land on a marker: find it, stay above it, come down in a cone that narrows, and touch down on its pad.
+
+Down to the final height it is flown by sight, by us. The last of the way is blind: the marker has left the
+picture, and the autopilot's own landing goes down where it is. Lost or missed before that, the vehicle climbs
+and tries again, a few times. Or the autopilot flies all of it, told by LANDING_TARGET where the pad is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Annotated
+
+from companion.guidance.arguments import EnumArgument, GrammarError, Number
+from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviours.marker_search import MarkerSearch
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.motion import correction, position_and_yaw, towards
+from companion.guidance.registry import behaviour
+from companion.guidance.targets.pad_filter import PadFilter
+from companion.vehicle.landing_target import LandingTarget
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import FlightMode, LandedState, Vector3
+
+# A sighting is a rumour: so many, the newest no older than this, make a pad.
+SIGHTINGS_NEEDED, SIGHT_FRESH_S = 3, 0.6
+# Unseen for so long, the descent waits; for so long, it is given up.
+WAIT_AFTER_S, LOST_AFTER_S = 0.4, 2.2
+# From higher up than this there is time: the place is remembered, and flown to, for longer.
+LOW_M, LOST_HIGH_AFTER_S = 3.5, 5.0
+# The cone: allowed distance beside the pad's centre, metres, at the ground and for each metre of height.
+CONE_M, CONE_PER_M = 0.10, 0.20
+# The answer to a distance beside the pad, 1/s, and how much more of a velocity is asked for where the vehicle
+# does not follow: like an MPC_XY_VEL_P_ACC of 5, the most PX4 allows. Measured in lockstep in gusts, with an
+# acceleration limit of 5 m/s².
+GAIN_PER_S, PRESS = 1.6, 1.75
+DESCENT_MPS, SLOWEST_DESCENT_MPS, DESCENT_PER_M = 0.8, 0.2, 0.3
+# Unseen, it rises a little: from higher up more is in the picture. So slowly, m/s.
+RISE_MPS = 0.3
+# Gusts move it up and down too: the wanted height is held by so much for each metre, 1/s, but no further off.
+HEIGHT_GAIN_PER_S, HEIGHT_LEASH_M = 1.2, 0.5
+# Blind from here on: a marker of a pad's size no longer fits into the picture.
+FINAL_M = 0.45
+# What may be off when the blind part begins: the distance, and what the speed will make of it.
+FINAL_ERROR_M, FINAL_LOOKAHEAD_S = 0.12, 0.35
+# In gusts it never stands that still: after so long of waiting, what is allowed has grown by as much again.
+PATIENCE_S = 6.0
+# Seen so far off during the blind part, and still so high, it is not landed.
+MISSED_M, MISSED_HEIGHT_M = 0.3, 0.45
+CLIMB_MPS, CLIMB_M = 1.0, 2.5
+TOUCHDOWN_MPS = 0.7
+BASE_TIMEOUT_S, BLIND_TIMEOUT_S, LANDING_TIMEOUT_S, DELEGATED_TIMEOUT_S = 60.0, 5.0, 30.0, 150.0
+# An autopilot that fell back to landing where it was did not land on the marker.
+ON_PAD_M = 1.0
+
+
+class _Phase(StrEnum):
+    SEARCH = "looking for"
+    DESCEND = "descending to"
+    FINAL = "landing on"
+    CLIMB = "climbing to find again"
+    DELEGATED = "the autopilot lands on"
+
+
+@behaviour("land-on-marker", "find a marker below, descend onto it in a narrowing cone, land and disarm")
+class LandOnMarker(Command):
+    identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "of the marker whose pad to land on")]
+    method: Annotated[
+        str,
+        EnumArgument(
+            "method", ("offboard", "autopilot"), "who flies: we, or the autopilot by LANDING_TARGET"
+        ),
+    ] = "offboard"
+    pad: Annotated[str, EnumArgument("pad", ("still", "moving"), "whether the pad may move")] = "still"
+    attempts: Annotated[float, Number("attempts", "", 1.0, 10.0, "descents before giving up")] = 3.0
+    search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "how far around to look for it")] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "over ground, at most")] = 1.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key, value in (("id", self.identifier), ("attempts", self.attempts)):
+            if value != int(value):
+                raise GrammarError(f"land-on-marker: {key} must be a whole number, got {value:g}")
+        if self.method == "autopilot" and self.pad == "moving":
+            raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return LandOnMarkerBehaviour(
+            int(self.identifier),
+            by_autopilot=self.method == "autopilot",
+            moving=self.pad == "moving",
+            attempts=int(self.attempts),
+            search_m=self.search_m,
+            speed_mps=self.speed_mps,
+        )
+
+
+class LandOnMarkerBehaviour(Behaviour):
+    """Lands on the pad of one marker, and ends when the autopilot has disarmed.
+
+    Args:
+        identifier: of the marker; others that lie on its pad count too.
+        by_autopilot: it flies its precision landing; we only tell it where the pad is.
+        moving: the pad may move, in a line and slowly; the blind part is flown with its velocity.
+        attempts: descents before giving up.
+        search_m: how far around to look for it.
+        speed_mps: over ground, at most.
+    """
+
+    name = "land-on-marker"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.MARKER})
+
+    def __init__(
+        self,
+        identifier: int,
+        *,
+        by_autopilot: bool = False,
+        moving: bool = False,
+        attempts: int = 3,
+        search_m: float = 5.0,
+        speed_mps: float = 1.5,
+    ) -> None:
+        self._identifier = identifier
+        self._by_autopilot, self._moving = by_autopilot, moving
+        self._attempts, self._search_m, self._speed_mps = attempts, search_m, speed_mps
+        self._pad: PadFilter | None = None
+        self._target: LandingTarget | None = None
+        self._phase = _Phase.SEARCH
+        self._phase_ns = 0
+        self._search: MarkerSearch | None = None
+        self._started_down_m = self._goal_down_m = 0.0
+        self._failures: list[str] = []
+        self._newest_ns = 0
+        self._blind_since_ns: int | None = None
+        self._waiting_s = self._blocked_s = 0.0
+        self._wanted_down_m = 0.0
+        self._until_ns: float = math.inf
+        self._touching = False
+        self._height_m = math.nan
+
+    def on_activate(self, situation: Situation) -> None:
+        position, _ = position_and_yaw(situation.state)
+        self._started_down_m = position[2]
+        self._pad = self._target = self._blind_since_ns = None
+        self._failures = []
+        # Frames captured before the command do not count: they may be of another place.
+        self._newest_ns = situation.now_ns
+        self._begin_search(situation, position)
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        position, _ = position_and_yaw(situation.state)
+        self._observe(situation)
+        if self._pad is not None:
+            self._height_m = self._pad.at(situation.now_ns)[2] - position[2]
+        state = situation.state
+        if self._phase in (_Phase.FINAL, _Phase.DELEGATED):
+            if not state.armed and state.landed is LandedState.ON_GROUND:
+                return self._landed(situation, position)
+        elif not state.armed:
+            return Outcome(False, f"disarmed while {self.status}")
+        if situation.now_ns > self._until_ns:
+            return Outcome(False, f"timed out while {self.status}{self._so_far()}")
+        return _STEPS[self._phase](self, dt_s, situation, position)
+
+    @property
+    def landing_target(self) -> LandingTarget | None:
+        return self._target if self._by_autopilot else None
+
+    @property
+    def landing(self) -> bool:
+        return self._phase in (_Phase.DESCEND, _Phase.FINAL)
+
+    @property
+    def status(self) -> str:
+        words = f"{self._phase.value} marker {self._identifier}"
+        if self._phase is _Phase.SEARCH and self._search is not None:
+            return f"{words}, {self._search.status}"
+        return words if math.isnan(self._height_m) else f"{words}, {self._height_m:.1f} m above it"
+
+    # --- what is seen
+
+    def _observe(self, situation: Situation) -> None:
+        sight = situation.markers
+        self._blind_since_ns = (
+            None if sight.fresh else self._blind_since_ns or max(situation.now_ns, self._newest_ns)
+        )
+        sightings = [
+            target
+            for target in sight.targets
+            if target.pad == self._identifier and target.captured_ns > self._newest_ns
+        ]
+        if not sightings:
+            return
+        self._newest_ns = max(target.captured_ns for target in sightings)
+        for target in sightings:
+            if self._pad is None:
+                self._pad = PadFilter(target, moving=self._moving)
+            elif not self._pad.add(target):
+                continue
+            self._target = LandingTarget(
+                target.captured_ns,
+                self._identifier,
+                self._pad.at(target.captured_ns),
+                target.pad_offset_frd_m,
+                target.size_m,
+            )
+
+    def _unseen_s(self, now_ns: int) -> float:
+        return math.inf if self._pad is None else self._pad.unseen_s(now_ns)
+
+    def _found(self, now_ns: int) -> PadFilter | None:
+        """The pad, when it is seen now and for sure."""
+        pad = self._pad
+        return (
+            pad if pad is not None and pad.count >= SIGHTINGS_NEEDED and pad.unseen_s(now_ns) < SIGHT_FRESH_S
+            else None
+        )  # fmt: skip
+
+    # --- the phases
+
+    def _enter(self, phase: _Phase, now_ns: int, timeout_s: float) -> None:
+        self._phase, self._phase_ns = phase, now_ns
+        self._until_ns = now_ns + timeout_s * 1e9
+        self._waiting_s = self._blocked_s = 0.0
+        self._touching = False
+
+    def _begin_search(self, situation: Situation, position: Vector3) -> None:
+        height_m = max(situation.state.altitude_m or 0.0, 1.0)
+        self._search = MarkerSearch(position, self._search_m, height_m)
+        turns = self._search_m / height_m + 1.0
+        self._enter(_Phase.SEARCH, situation.now_ns, BASE_TIMEOUT_S + 12.0 * turns * self._search_m)
+
+    def _searching(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
+        now_ns = situation.now_ns
+        if self._found(now_ns) is not None:
+            if self._by_autopilot:
+                self._enter(_Phase.DELEGATED, now_ns, DELEGATED_TIMEOUT_S)
+                return ModeRequest(FlightMode.PRECISION_LAND)
+            height_m = max(self._height_m, 0.0)
+            self._enter(_Phase.DESCEND, now_ns, BASE_TIMEOUT_S + 6.0 * height_m)
+            self._wanted_down_m = position[2]
+            return self._descending(dt_s, situation, position)
+        if self._blind_since_ns is not None:
+            if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
+                return Outcome(False, f"nothing came from the camera for {BLIND_TIMEOUT_S:g} s")
+            return Setpoint.brake(now_ns)
+        search = self._search
+        assert search is not None
+        place = search.update(dt_s, position)
+        if search.ended:
+            what = f"looked {self._search_m:g} m around"
+            return Outcome(False, f"marker {self._identifier} was not seen, {what}{self._so_far()}")
+        return self._to(place, situation, position, (0.0, 0.0), correction(place[2] - position[2], CLIMB_MPS))
+
+    def _descending(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
+        now_ns, pad = situation.now_ns, self._pad
+        assert pad is not None
+        unseen_s = pad.unseen_s(now_ns)
+        if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
+            return self._climb(f"lost {self._height_m:.1f} m above it", situation, position)
+        place, drift = pad.at(now_ns), pad.velocity_mps
+        error_m = math.dist(place[:2], position[:2])
+        if self._height_m <= FINAL_M:
+            self._waiting_s += dt_s
+            if unseen_s < LOST_AFTER_S and self._well_above(error_m, situation, drift):
+                self._enter(_Phase.FINAL, now_ns, LANDING_TIMEOUT_S)
+                return self._finishing(dt_s, situation, position)
+        allowed_m = CONE_M + CONE_PER_M * max(self._height_m, 0.0)
+        inside = max(0.0, min(1.0, 2.0 * (allowed_m - error_m) / allowed_m))
+        rate = min(DESCENT_MPS, SLOWEST_DESCENT_MPS + DESCENT_PER_M * max(self._height_m, 0.0)) * inside
+        if unseen_s > WAIT_AFTER_S:
+            rate = -RISE_MPS if self._height_m < LOW_M else 0.0
+        elif self._height_m <= FINAL_M:
+            rate = 0.0
+        return self._to(place, situation, position, drift, self._held(rate, dt_s, position))
+
+    def _held(self, rate_mps: float, dt_s: float, position: Vector3) -> float:
+        """The velocity down that keeps to a height which changes at a rate."""
+        wanted_m = self._wanted_down_m + rate_mps * dt_s
+        wanted_m = max(position[2] - HEIGHT_LEASH_M, min(position[2] + HEIGHT_LEASH_M, wanted_m))
+        self._wanted_down_m = wanted_m
+        return max(-CLIMB_MPS, min(DESCENT_MPS, rate_mps + HEIGHT_GAIN_PER_S * (wanted_m - position[2])))
+
+    def _well_above(self, error_m: float, situation: Situation, drift: tuple[float, float]) -> bool:
+        north, east, _ = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        speed = math.hypot(north - drift[0], east - drift[1])
+        allowed_m = FINAL_ERROR_M * (1.0 + min(1.0, self._waiting_s / PATIENCE_S))
+        return error_m + FINAL_LOOKAHEAD_S * speed < allowed_m
+
+    def _finishing(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
+        now_ns, pad = situation.now_ns, self._pad
+        assert pad is not None
+        place, drift = pad.at(now_ns), pad.velocity_mps
+        error_m = math.dist(place[:2], position[:2])
+        seen = pad.unseen_s(now_ns) < WAIT_AFTER_S
+        if seen and error_m > MISSED_M and self._height_m > MISSED_HEIGHT_M and not self._touching:
+            return self._climb(f"{error_m:.1f} m beside it before touching down", situation, position)
+        on_ground = situation.state.landed is LandedState.ON_GROUND
+        if self._touching or on_ground:
+            self._touching |= on_ground
+            return ModeRequest(FlightMode.LAND)
+        return self._to(place, situation, position, drift, TOUCHDOWN_MPS)
+
+    def _climb(self, why: str, situation: Situation, position: Vector3) -> Step:
+        self._failures.append(why)
+        # Higher than where it began, the marker may be too small to be seen.
+        self._goal_down_m = min(position[2], max(self._started_down_m, position[2] - 2 * CLIMB_M))
+        self._enter(_Phase.CLIMB, situation.now_ns, BASE_TIMEOUT_S)
+        return self._climbing(0.0, situation, position)
+
+    def _climbing(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
+        now_ns, pad = situation.now_ns, self._pad
+        left_m = position[2] - self._goal_down_m
+        held = situation.sent is not None and (situation.sent.velocity_ned_mps or (0, 0, 0))[2] > -0.05
+        # An envelope's ceiling ends a climb as well as its goal does.
+        self._blocked_s = self._blocked_s + dt_s if held else 0.0
+        if left_m < 0.3 or self._blocked_s > 3.0:
+            if len(self._failures) >= self._attempts:
+                return Outcome(False, f"gave up{self._so_far()}")
+            if pad is not None and pad.unseen_s(now_ns) > LOST_AFTER_S:
+                # Where it is now is to be seen anew; what is remembered may have been the mistake.
+                self._pad = self._target = None
+            self._begin_search(situation, position)
+            return self._searching(dt_s, situation, position)
+        place = position if pad is None else pad.at(now_ns)
+        drift = (0.0, 0.0) if pad is None else pad.velocity_mps
+        if self._unseen_s(now_ns) > 2 * LOST_AFTER_S:
+            place, drift = position, (0.0, 0.0)
+        return self._to(place, situation, position, drift, -CLIMB_MPS)
+
+    def _delegated(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
+        return ModeRequest(FlightMode.PRECISION_LAND)
+
+    # --- ends and ways
+
+    def _landed(self, situation: Situation, position: Vector3) -> Outcome:
+        assert self._pad is not None
+        beside_m = math.dist(self._pad.at(situation.now_ns)[:2], position[:2])
+        where = f"{beside_m:.2f} m beside where marker {self._identifier} was last seen"
+        if self._by_autopilot and beside_m > ON_PAD_M:
+            return Outcome(False, f"the autopilot landed elsewhere: {where}")
+        return Outcome(True, f"landed and disarmed, {where}")
+
+    def _so_far(self) -> str:
+        if not self._failures:
+            return ""
+        times = "once" if len(self._failures) == 1 else f"{len(self._failures)} times"
+        return f"; came down {times} without landing: {', then '.join(self._failures)}"
+
+    def _to(
+        self,
+        place: Vector3,
+        situation: Situation,
+        position: Vector3,
+        drift: tuple[float, float],
+        down_mps: float,
+    ) -> Setpoint:
+        """Towards a place over ground that moves with `drift`, and down (negative: up) at a rate."""
+        north, east = towards(place, position, GAIN_PER_S, self._speed_mps)
+        wanted = (north + drift[0], east + drift[1])
+        now_north, now_east, _ = situation.state.velocity_ned_mps or (*wanted, 0.0)
+        north = wanted[0] + PRESS * (wanted[0] - now_north)
+        east = wanted[1] + PRESS * (wanted[1] - now_east)
+        top_mps = self._speed_mps + math.hypot(*drift)
+        scale = min(1.0, top_mps / max(math.hypot(north, east), 1e-6))
+        velocity = (north * scale, east * scale, down_mps)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rate_radps=0.0)
+
+
+_STEPS: dict[_Phase, Callable[[LandOnMarkerBehaviour, float, Situation, Vector3], Step]] = {
+    _Phase.SEARCH: LandOnMarkerBehaviour._searching,
+    _Phase.DESCEND: LandOnMarkerBehaviour._descending,
+    _Phase.FINAL: LandOnMarkerBehaviour._finishing,
+    _Phase.CLIMB: LandOnMarkerBehaviour._climbing,
+    _Phase.DELEGATED: LandOnMarkerBehaviour._delegated,
+}

@@ -1,0 +1,233 @@
+"""Circle about a point, nose to the centre, height kept."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.motion import (
+    STOPPING_MPS2,
+    correction,
+    in_degrees,
+    laps_text,
+    position_and_yaw,
+    stopping_speed,
+)
+from companion.guidance.registry import behaviour
+from companion.guidance.targets.target import Target
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+from vision.attitude import wrap_angle
+
+# Nearer to the centre than this there is no direction outwards.
+MIN_RADIUS_M = 0.2
+# How late velocity, acceleration and heading of a multirotor follow: a first guess, the integrals below find
+# the rest. The heading's is about 1 / MC_YAW_P; 0.34 s measured in lockstep.
+VELOCITY_DELAY_S = 0.1
+ACCELERATION_DELAY_S = 0.2
+YAW_DELAY_S = 0.34
+# What may be asked for beyond the wanted speed to come back onto the circle.
+SPEED_MARGIN = 1.25
+# Gains of the error of radius (1/s; its integral 1/s²) and of velocity outwards, as in
+# `motion.PositionController`; of the velocity along the circle; of the integrals of speed (1/s²) and
+# heading (1/s).
+RADIUS_GAIN, RADIUS_INTEGRAL_GAIN = 1.3, 0.4
+VELOCITY_GAIN = 1.5
+ALONG_GAIN = 0.6
+SPEED_INTEGRAL_GAIN = 0.3
+HEADING_INTEGRAL_GAIN = 0.5
+# What drag may be found to take along the circle.
+MAX_DRAG_MPS2 = 3.0
+MAX_LEAD_RAD = 0.6
+# Farther than this from the circle it is only flown to.
+ON_CIRCLE_M = 1.5
+# On the circle the velocity that is asked for turns all the time. What that takes of the envelope's
+# acceleration is kept to this share of it, by flying slower: the rest is for corrections. An orbit of 8 m at
+# 4 m/s is not slowed at 3 m/s²; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
+TURNING_SHARE = 0.8
+# The speed is adapted to that by so many m/s² for each m/s² above or below, at most by so many, filtered.
+PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
+SLOWEST_MPS = 0.5
+
+# What a circle may ask of the vehicle sideways.
+MAX_CENTRIPETAL_MPS2 = 2.0
+
+
+@behaviour("orbit", "circle, nose to the centre: the point `radius` ahead, or an object of a class")
+class Orbit(Command):
+    class_name: Annotated[str, ClassName("class", "circle about this object, if given")] = ""
+    radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 10.0, "along the circle")] = 2.0
+    laps: Annotated[float, Number("laps", "", 0.0, 100.0, "how many; 0: until another command")] = 0.0
+    direction: Annotated[
+        str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
+    ] = "clockwise"
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
+        if self.speed_mps > fastest:
+            raise GrammarError(
+                f"orbit: speed must be at most {math.floor(fastest * 100) / 100:g} m/s on a radius of "
+                f"{self.radius_m:g} m, got {self.speed_mps:g}"
+            )
+
+    def build(self, context: BuildContext) -> Behaviour:
+        clockwise = self.direction == "clockwise"
+        return OrbitBehaviour(
+            self.radius_m, self.speed_mps, self.laps, clockwise=clockwise, class_name=self.class_name
+        )
+
+
+class OrbitBehaviour(Behaviour):
+    """Flies at `speed_mps` along the circle; what is needed to come back onto the circle is taken from it.
+
+    On the circle everything is constant as seen from the centre, so integrals of the errors of radius, speed
+    and heading find what to ask for, whatever the vehicle's delays are. It is slower than asked where the
+    envelope does not let it keep the radius.
+
+    The centre is the point `radius_m` ahead of the vehicle when it begins or, with a class name, the place of
+    the object of that class nearest to the nose, taken once.
+    """
+
+    name = "orbit"
+
+    def __init__(
+        self,
+        radius_m: float = 10.0,
+        speed_mps: float = 2.0,
+        laps: float = 0.0,
+        *,
+        clockwise: bool = True,
+        class_name: str = "",
+    ) -> None:
+        needs = {Requirement.POSITION, Requirement.IN_AIR}
+        if class_name:
+            needs |= {Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
+        self.requirements = frozenset(needs)
+        self.class_names = (class_name,) if class_name else ()
+        self._class_name = class_name
+        self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps
+        self._turn = 1.0 if clockwise else -1.0
+        self._centre: Vector3 | None = None
+        self._down_m = 0.0
+        self._angle_rad: float | None = None
+        self._flown_rad = 0.0
+        self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
+        self._asked_mps = (0.0, 0.0)
+        self._until_ns: float = 0
+
+    def on_activate(self, situation: Situation) -> None:
+        position, yaw_rad = position_and_yaw(situation.state)
+        self._down_m = position[2]
+        self._angle_rad, self._flown_rad = None, 0.0
+        self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
+        self._asked_mps = (0.0, 0.0)
+        self._centre = None
+        if not self._class_name:
+            self._centre = (
+                position[0] + self._radius_m * math.cos(yaw_rad),
+                position[1] + self._radius_m * math.sin(yaw_rad),
+                position[2],
+            )
+        elif (target := self._nearest_to_nose(situation.targets, yaw_rad)) is not None:
+            self._centre = target.position_ned_m
+        away_m = 0.0 if self._centre is None else math.dist(position[:2], self._centre[:2])
+        path_m = self._laps * math.tau * self._radius_m + abs(away_m - self._radius_m)
+        turning_mps2 = TURNING_SHARE * situation.max_acceleration_mps2
+        slow_mps = min(self._speed_mps, math.sqrt(turning_mps2 * self._radius_m))
+        self._until_ns = situation.now_ns + (2.0 * path_m / slow_mps + 30.0) * 1e9
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        if self._centre is None:
+            return Outcome(False, f"no {self._class_name} with a known place in sight to orbit")
+        position, yaw_rad = position_and_yaw(situation.state)
+        north, east = position[0] - self._centre[0], position[1] - self._centre[1]
+        distance = math.hypot(north, east)
+        angle = math.atan2(east, north)
+        if self._angle_rad is not None:
+            self._flown_rad += self._turn * wrap_angle(angle - self._angle_rad)
+        self._angle_rad = angle
+        if self._laps and self._flown_rad >= self._laps * math.tau:
+            return Outcome(True, f"{laps_text(self._laps)} flown at {distance:.1f} m")
+        if self._laps and situation.now_ns > self._until_ns:
+            return Outcome(
+                False, f"orbit timed out after {self._flown_rad / math.tau:.1f} of {self._laps:g} laps"
+            )
+
+        if distance < MIN_RADIUS_M:
+            return Setpoint.velocity(
+                (self._speed_mps, 0.0, correction(self._down_m - position[2])), situation.now_ns
+            )
+        outward = (north / distance, east / distance)
+        velocity = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        out_mps = outward[0] * velocity[0] + outward[1] * velocity[1]
+        along_mps = self._turn * (outward[0] * velocity[1] - outward[1] * velocity[0])
+        self._adapt_pace(along_mps, distance, situation.max_acceleration_mps2, dt_s)
+        asked_out_mps, asked_along_mps = self._asked(self._radius_m - distance, out_mps, along_mps, dt_s)
+        self._asked_mps = (asked_out_mps, asked_along_mps)
+        around_mps = self._turn * asked_along_mps
+        velocity = (
+            outward[0] * asked_out_mps - outward[1] * around_mps,
+            outward[1] * asked_out_mps + outward[0] * around_mps,
+            correction(self._down_m - position[2]),
+        )
+        bearing = math.atan2(-east, -north)
+        turn_radps = self._turn * along_mps / distance
+        on_circle = abs(distance - self._radius_m) < ON_CIRCLE_M
+        if on_circle:
+            behind = wrap_angle(bearing - yaw_rad)
+            lead = self._lead_rad + HEADING_INTEGRAL_GAIN * behind * dt_s
+            self._lead_rad = max(-MAX_LEAD_RAD, min(MAX_LEAD_RAD, lead))
+        heading = wrap_angle(bearing + turn_radps * YAW_DELAY_S + self._lead_rad)
+        ahead = angle + turn_radps * ACCELERATION_DELAY_S
+        turning = self._acceleration(ahead, turn_radps * self._turn * along_mps if on_circle else 0.0)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=heading, acceleration_ned_mps2=turning)
+
+    def _acceleration(self, angle_rad: float, inward_mps2: float) -> Vector3:
+        """What the vehicle needs at this angle of the circle: to turn, and against drag."""
+        north, east = math.cos(angle_rad), math.sin(angle_rad)
+        around_mps2 = self._turn * self._drag_mps2
+        return (-inward_mps2 * north - around_mps2 * east, -inward_mps2 * east + around_mps2 * north, 0.0)
+
+    def _adapt_pace(self, along_mps: float, distance_m: float, limit_mps2: float, dt_s: float) -> None:
+        """Slower where the turning of what is asked for takes too much of the envelope's acceleration."""
+        turning_mps2 = math.hypot(*self._asked_mps) * along_mps / distance_m
+        self._turning_mps2 += min(1.0, dt_s / PACE_FILTER_S) * (turning_mps2 - self._turning_mps2)
+        change = PACE_GAIN * (TURNING_SHARE * limit_mps2 - self._turning_mps2)
+        pace = self._pace_mps + max(-MAX_PACE_MPS2, min(MAX_PACE_MPS2, change)) * dt_s
+        self._pace_mps = max(min(pace, self._speed_mps), min(SLOWEST_MPS, self._speed_mps))
+
+    def _asked(self, missing_m: float, out_mps: float, along_mps: float, dt_s: float) -> tuple[float, float]:
+        """Velocity to ask for, outwards and along the circle, from what the vehicle has of both."""
+        pace = self._pace_mps
+        fastest = SPEED_MARGIN * self._speed_mps
+        wanted_out = stopping_speed(missing_m, pace, STOPPING_MPS2, RADIUS_GAIN)
+        wanted_along = math.sqrt(max(0.0, pace**2 - wanted_out**2))
+        if abs(missing_m) < ON_CIRCLE_M:
+            self._out_mps += RADIUS_INTEGRAL_GAIN * missing_m * dt_s
+            self._drag_mps2 += SPEED_INTEGRAL_GAIN * (wanted_along - along_mps) * dt_s
+            self._out_mps = max(-self._speed_mps, min(self._speed_mps, self._out_mps))
+            self._drag_mps2 = max(0.0, min(MAX_DRAG_MPS2, self._drag_mps2))
+        # The vehicle flies what was asked a moment ago; that lacks the centripetal acceleration since then.
+        late = VELOCITY_DELAY_S * wanted_along**2 / max(self._radius_m, self._radius_m - missing_m)
+        asked_out = wanted_out + VELOCITY_GAIN * (wanted_out - out_mps) + self._out_mps - late
+        asked_out = max(-fastest, min(fastest, asked_out))
+        asked_along = wanted_along + ALONG_GAIN * (wanted_along - along_mps)
+        return asked_out, min(asked_along, math.sqrt(fastest**2 - asked_out**2))
+
+    @property
+    def status(self) -> str:
+        angle = 0.0 if self._angle_rad is None else self._angle_rad
+        return f"orbiting, {self._flown_rad / math.tau:.1f} laps, {in_degrees(angle)}° of the centre"
+
+    def _nearest_to_nose(self, targets: tuple[Target, ...], yaw_rad: float) -> Target | None:
+        fitting = [t for t in targets if t.class_name == self._class_name and t.position_ned_m is not None]
+        return min(fitting, key=lambda t: abs(wrap_angle(t.bearing_rad - yaw_rad)), default=None)

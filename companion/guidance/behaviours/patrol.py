@@ -1,0 +1,299 @@
+"""Round and round along waypoints, stopping for what is seen on the way, and on from where it was left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from companion.geometry.points import points_from
+from companion.guidance.arguments import ClassNames, EnumArgument, GrammarError, Number, Points, names_in
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.follow_path import FollowPathBehaviour
+from companion.guidance.behaviours.sighting import Gaze, Sightings
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
+from companion.guidance.registry import behaviour
+from companion.guidance.targets.target import Target
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+
+# Slower than this the vehicle has stopped, and stays there.
+STANDING_MPS = 0.4
+# Without a single frame for so long a patrol is blind.
+BLIND_TIMEOUT_S = 10.0
+
+
+@dataclass(slots=True)
+class _Known:
+    """An object that the patrol has stopped for."""
+
+    class_name: str
+    track_id: int | None
+    place: Vector3 | None
+    until_ns: float
+
+
+@behaviour("patrol", "fly a round of points again and again, and stop for what is seen on the way")
+class Patrol(Command):
+    points: Annotated[str, Points("points", "the round: north,east or north,east,height, metres from home")]
+    class_names: Annotated[str, ClassNames("classes", "what to stop for, parted by commas")]
+    do: Annotated[
+        str, EnumArgument("do", ("hold", "approach"), "look at it from the way, or fly up to `distance`")
+    ] = "hold"
+    distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
+    wait_s: Annotated[float, Number("wait", "s", 0.0, 600.0, "how long it stays there")] = 5.0
+    again_s: Annotated[
+        float, Number("again", "s", 0.0, 3600.0, "the same object does not stop it again within this")
+    ] = 120.0
+    apart_m: Annotated[
+        float, Number("apart", "m", 0.5, 100.0, "nearer than this to where an object was is the same one")
+    ] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
+    laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+
+    @property
+    def endless(self) -> bool:
+        return self.laps == 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.places) < 2:
+            raise GrammarError("patrol: a round has at least two points")
+
+    @property
+    def places(self) -> tuple[tuple[float, ...], ...]:
+        """(north, east) or (north, east, height) of each point, metres from home."""
+        return points_from(self.points)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The classes, each by itself."""
+        return names_in(self.class_names)
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return PatrolBehaviour(
+            self.places,
+            self.names,
+            speed_mps=self.speed_mps,
+            laps=self.laps,
+            approach_m=self.distance_m if self.do == "approach" else None,
+            wait_s=self.wait_s,
+            again_s=self.again_s,
+            apart_m=self.apart_m,
+            confidence=self.confidence,
+        )
+
+
+class PatrolBehaviour(Behaviour):
+    """Flies the round; stops for an object that counts as true, turns to it and says where it is.
+
+    Args:
+        points: (north, east) or (north, east, height) metres from home; from the last on to the first.
+        speed_mps: along the way. laps: 0: until another command.
+        approach_m: fly to within so much of what was found; None: look at it from the way.
+        wait_s: how long it stays there.
+        again_s: an object that was stopped for does not stop the patrol again within this time.
+        apart_m: what is nearer than this to where an object was is the same one.
+    """
+
+    name = "patrol"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+
+    def __init__(
+        self,
+        points: Sequence[tuple[float, ...]],
+        class_names: Collection[str],
+        *,
+        speed_mps: float = 3.0,
+        laps: float = 0.0,
+        approach_m: float | None = None,
+        wait_s: float = 5.0,
+        again_s: float = 120.0,
+        apart_m: float = 5.0,
+        confidence: float = 0.4,
+    ) -> None:
+        self.class_names = tuple(class_names)
+        if approach_m is not None:
+            self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
+        self._way = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
+        self._sightings = Sightings(class_names, confidence)
+        self._speed_mps, self._confidence = speed_mps, confidence
+        self._approach_m, self._wait_s = approach_m, wait_s
+        self._again_s, self._apart_m = again_s, apart_m
+        self._known: list[_Known] = []
+        self._notes: list[str] = []
+        self._gaze: Gaze | None = None
+        self._reported = False
+        self._approach: ApproachBehaviour | None = None
+        self._wait_until_ns: float | None = None
+        self._stop: Vector3 | None = None
+        self._down_m = 0.0
+        self._blind_since_ns: int | None = None
+        self._found = 0
+
+    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        return self._way.goals(situation)
+
+    def on_activate(self, situation: Situation) -> None:
+        self._way.on_activate(situation)
+        self._sightings.reset(situation.now_ns)
+        self._known.clear()
+        self._gaze = self._approach = self._stop = self._blind_since_ns = self._wait_until_ns = None
+        self._found = 0
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        position, yaw_rad = position_and_yaw(situation.state)
+        if self._approach is not None:
+            return self._fly_there(self._approach, dt_s, situation, position)
+        if not situation.perception_fresh:
+            return self._wait_blind(situation, position)
+        self._blind_since_ns = None
+        if self._gaze is not None:
+            return self._look_at(self._gaze, situation, position, yaw_rad)
+        found = self._sightings.look(situation, lambda target: not self._known_already(target, situation))
+        if found is not None:
+            self._gaze, self._reported, self._stop = Gaze(found, situation.now_ns), False, None
+            self._down_m = position[2]
+            return self._stand(situation, position, found.bearing_rad)
+        if self._stop is not None:
+            # Blind for a moment, it stood there.
+            self._resume(situation)
+        step = self._way.update(dt_s, situation)
+        if isinstance(step, Outcome) and step.success:
+            stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
+            return Outcome(True, f"{step.reason}, {stops}")
+        return step
+
+    def take_notes(self) -> Sequence[str]:
+        notes, self._notes = self._notes, []
+        return notes
+
+    @property
+    def status(self) -> str:
+        if self._approach is not None:
+            return f"patrol, to what was found: {self._approach.status}"
+        if self._gaze is not None:
+            return f"patrol, looking at a {self._gaze.target.class_name}"
+        return self._way.status.replace(self._way.name, "patrol", 1)
+
+    def _look_at(self, gaze: Gaze, situation: Situation, position: Vector3, yaw_rad: float) -> Step:
+        """Stand, turn to it, tell of it; then go there, or stay for a while."""
+        now_ns = situation.now_ns
+        gaze.follow(self._sightings.fresh(situation))
+        if self._wait_until_ns is not None:
+            self._remember(gaze.target, now_ns)
+            if now_ns >= self._wait_until_ns:
+                return self._go_on(situation, position)
+        elif gaze.lost(now_ns):
+            self._note(f"lost sight of a {_named(gaze.target)} before it was faced")
+            self._remember(gaze.target, now_ns)
+            return self._go_on(situation, position)
+        elif gaze.faced(yaw_rad, now_ns):
+            self._found += 1
+            self._remember(gaze.target, now_ns)
+            self._note(f"found a {_named(gaze.target)}, {self._place_text(gaze.target, situation)}")
+            if self._approach_m is not None:
+                self._approach = ApproachBehaviour(
+                    gaze.target.class_name,
+                    distance_m=self._approach_m,
+                    speed_mps=min(self._speed_mps, 3.0),
+                    confidence=min(0.3, self._confidence),
+                )
+                self._approach.on_activate(situation)
+                return self._fly_there(self._approach, 0.0, situation, position)
+            self._wait_until_ns = now_ns + self._wait_s * 1e9
+        return self._stand(situation, position, gaze.target.bearing_rad)
+
+    def _fly_there(
+        self, approach: ApproachBehaviour, dt_s: float, situation: Situation, position: Vector3
+    ) -> Step:
+        step = approach.update(dt_s, situation)
+        if not isinstance(step, Outcome):
+            return step
+        approach.on_deactivate()
+        self._approach = None
+        self._note(step.reason)
+        # What is seen from here is what was flown to: it is still looked at while waiting.
+        self._stop, self._wait_until_ns = None, situation.now_ns + self._wait_s * 1e9
+        _, yaw_rad = position_and_yaw(situation.state)
+        return self._stand(situation, position, yaw_rad)
+
+    def _stand(self, situation: Situation, position: Vector3, bearing_rad: float) -> Setpoint:
+        """Brake, stay where the vehicle comes to rest, nose to a direction."""
+        if self._stop is None and ground_speed(situation.state) < STANDING_MPS:
+            self._stop = (position[0], position[1], self._down_m)
+        velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=bearing_rad)
+
+    def _go_on(self, situation: Situation, position: Vector3) -> Step:
+        self._gaze = self._wait_until_ns = None
+        self._sightings.forget()
+        self._resume(situation)
+        return self._way.update(0.0, situation)
+
+    def _resume(self, situation: Situation) -> None:
+        self._stop = None
+        self._way.resume(situation)
+
+    def _wait_blind(self, situation: Situation, position: Vector3) -> Step:
+        """Nothing is seen at all: flying on would leave a part of the way unseen."""
+        now_ns = situation.now_ns
+        if self._blind_since_ns is None:
+            self._blind_since_ns, self._down_m, self._stop = now_ns, position[2], None
+        if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
+            why = situation.why_blind("nothing came from the detector")
+            return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
+        _, yaw_rad = position_and_yaw(situation.state)
+        return self._stand(situation, position, yaw_rad)
+
+    def _known_already(self, target: Target, situation: Situation) -> bool:
+        """Whether the patrol stopped for it lately. One that moves is followed in memory."""
+        self._known = [known for known in self._known if known.until_ns > situation.now_ns]
+        for known in self._known:
+            if self._same(known, target):
+                _update(known, target)
+                return True
+        return False
+
+    def _remember(self, target: Target, now_ns: int) -> None:
+        until_ns = now_ns + self._again_s * 1e9
+        for known in self._known:
+            if self._same(known, target):
+                _update(known, target)
+                known.until_ns = until_ns
+                return
+        self._known.append(_Known(target.class_name, target.track_id, target.position_ned_m, until_ns))
+
+    def _same(self, known: _Known, target: Target) -> bool:
+        if known.class_name != target.class_name:
+            return False
+        if known.track_id is not None and known.track_id == target.track_id:
+            return True
+        if known.place is None or target.position_ned_m is None:
+            return False
+        return math.dist(known.place[:2], target.position_ned_m[:2]) <= self._apart_m
+
+    def _place_text(self, target: Target, situation: Situation) -> str:
+        place = target.position_ned_m
+        if place is None:
+            return f"bearing {math.degrees(target.bearing_rad) % 360:.0f}°, range unknown"
+        home = home_of(situation.state)
+        north, east = place[0] - home[0], place[1] - home[1]
+        return f"{target.ground_range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
+
+    def _note(self, text: str) -> None:
+        self._notes.append(f"patrol: {text}")
+
+
+def _named(target: Target) -> str:
+    return target.class_name + ("" if target.track_id is None else f" (track {target.track_id})")
+
+
+def _update(known: _Known, target: Target) -> None:
+    known.place = target.position_ned_m or known.place
+    known.track_id = target.track_id if target.track_id is not None else known.track_id

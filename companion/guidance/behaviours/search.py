@@ -1,0 +1,211 @@
+"""Search an area along a pattern until an object of a class is found, then stop and face it."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
+from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviours.path_flight import PathFlight
+from companion.guidance.behaviours.seek import BLIND_TIMEOUT_S, SeekBehaviour, found_text
+from companion.guidance.behaviours.sighting import Gaze, Sightings
+from companion.guidance.command import BuildContext, Command
+from companion.guidance.gimbal.sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
+from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
+from companion.guidance.path import Path
+from companion.guidance.registry import behaviour
+from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
+from companion.guidance.targets.target import DOUBTED
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
+
+STANDING_MPS = 0.4
+
+
+@behaviour("seek", "turn, or search an area, until an object of the class is seen; then face it")
+class Seek(Command):
+    class_name: Annotated[str, ClassName("class", "what to look for")]
+    laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
+    rate_radps: Annotated[float, Number("rate", "rad/s", 0.05, 1.0, "how fast to turn")] = 0.5
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "least confidence that counts")] = 0.4
+    direction: Annotated[
+        str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
+    ] = "clockwise"
+    pattern: Annotated[
+        str, EnumArgument("pattern", ("turn", "square", "lawnmower"), "on the spot, or over an area about it")
+    ] = "turn"
+    radius_m: Annotated[
+        float | None, Number("radius", "m", 1.0, 500.0, "half a side of the expanding square")
+    ] = None
+    width_m: Annotated[
+        float | None, Number("width", "m", 1.0, 1000.0, "of the lawnmower's area, west to east")
+    ] = None
+    height_m: Annotated[
+        float | None, Number("height", "m", 1.0, 1000.0, "of the lawnmower's area, south to north")
+    ] = None
+    spacing_m: Annotated[
+        float | None, Number("spacing", "m", 1.0, 200.0, "between strips; else what the camera sees")
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
+    sweep_deg: Annotated[
+        float | None,
+        Number("sweep", "deg", -90.0, 90.0, "gimbal up and down between level and this; below is negative"),
+    ] = None
+    sweep_rate_dps: Annotated[
+        float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower, the turn is slower too")
+    ] = USUAL_RATE_DPS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sweep_deg is not None and abs(self.sweep_deg) < LEAST_SWEEP_DEG:
+            raise GrammarError(
+                f"seek: sweep must be {LEAST_SWEEP_DEG:g} deg or more from level, got {self.sweep_deg:g}"
+            )
+        if self.sweep_deg is not None and self.pattern != "turn":
+            raise GrammarError(f"seek: pattern={self.pattern} takes no sweep")
+        if self.sweep_deg is None and self.sweep_rate_dps != USUAL_RATE_DPS:
+            raise GrammarError("seek: sweep_rate needs sweep")
+        given = {
+            "radius": self.radius_m,
+            "width": self.width_m,
+            "height": self.height_m,
+            "spacing": self.spacing_m,
+        }
+        needed = {"turn": (), "square": ("radius",), "lawnmower": ("width", "height")}[self.pattern]
+        allowed = (*needed, "spacing") if needed else ()
+        for key, value in given.items():
+            if value is None and key in needed:
+                raise GrammarError(f"seek: pattern={self.pattern} needs {' and '.join(needed)}")
+            if value is not None and key not in allowed:
+                raise GrammarError(f"seek: pattern={self.pattern} takes no {key}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        if self.pattern != "turn":
+            return SearchBehaviour(
+                self.class_name,
+                radius_m=self.radius_m,
+                size_m=None
+                if self.width_m is None or self.height_m is None
+                else (self.width_m, self.height_m),
+                spacing_m=self.spacing_m,
+                footprint=context.footprint,
+                speed_mps=self.speed_mps,
+                confidence=self.confidence,
+            )
+        sweep = None
+        if self.sweep_deg is not None:
+            sweep_rad, rate_radps = math.radians(self.sweep_deg), math.radians(self.sweep_rate_dps)
+            sweep = GimbalSweep(sweep_rad, rate_radps, field_of_view_rad(context.footprint))
+        return SeekBehaviour(
+            self.class_name,
+            laps=self.laps,
+            rate_radps=self.rate_radps,
+            confidence=self.confidence,
+            clockwise=self.direction == "clockwise",
+            whole_turn=True,
+            sweep=sweep,
+        )
+
+
+class SearchBehaviour(PathFlight):
+    """Flies an expanding square or a lawnmower's way about where it begins, nose along the way.
+
+    Args:
+        radius_m: half a side of the expanding square. size_m: (west to east, south to north) of the
+            lawnmower's area. Exactly one of them.
+        spacing_m: of neighbouring strips; None: as `footprint` allows at the height flown.
+    """
+
+    name = "seek"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
+
+    def __init__(
+        self,
+        class_name: str,
+        *,
+        radius_m: float | None = None,
+        size_m: tuple[float, float] | None = None,
+        spacing_m: float | None = None,
+        footprint: Footprint | None = None,
+        speed_mps: float = 2.0,
+        confidence: float = 0.4,
+    ) -> None:
+        super().__init__(speed_mps)
+        if (radius_m is None) == (size_m is None):
+            raise ValueError("a search needs exactly one of radius_m and size_m")
+        self.class_names = (class_name,)
+        self._class_name = class_name
+        self._radius_m, self._size_m = radius_m, size_m
+        self._spacing_m, self._footprint = spacing_m, footprint
+        self._sightings = Sightings((class_name,), confidence)
+        self._gaze: Gaze | None = None
+        self._stop: Vector3 | None = None
+        self._blind_since_ns: int | None = None
+
+    def on_activate(self, situation: Situation) -> None:
+        super().on_activate(situation)
+        self._sightings.reset(situation.now_ns)
+        self._gaze = self._stop = self._blind_since_ns = None
+
+    def update(self, dt_s: float, situation: Situation) -> Step:
+        now_ns = situation.now_ns
+        position, yaw_rad = position_and_yaw(situation.state)
+        if not situation.perception_fresh:
+            self._blind_since_ns = now_ns if self._blind_since_ns is None else self._blind_since_ns
+            if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
+                why = situation.why_blind("nothing came from the detector")
+                return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
+            return self._stand(situation, position, yaw_rad)
+        self._blind_since_ns = None
+        if self._gaze is not None:
+            self._gaze.follow(self._sightings.fresh(situation))
+            if self._gaze.faced(yaw_rad, now_ns):
+                return Outcome(True, found_text(self._gaze.target))
+            if not self._gaze.lost(now_ns):
+                return self._stand(situation, position, self._gaze.target.bearing_rad)
+            self._gaze = None
+            self._sightings.forget()
+        elif (found := self._sightings.look(situation)) is not None:
+            self._gaze, self._stop = Gaze(found, now_ns), None
+            return self._stand(situation, position, found.bearing_rad)
+        if self._stop is not None:
+            self._stop = None
+            self.resume(situation)
+        step = super().update(dt_s, situation)
+        if isinstance(step, Outcome) and step.success:
+            why = f": {DOUBTED}" if self._sightings.doubted else ""
+            return Outcome(False, f"no {self._class_name} seen in the whole area{why}")
+        return step
+
+    @property
+    def status(self) -> str:
+        if self._gaze is not None:
+            return f"facing the {self._class_name}"
+        return f"looking for a {self._class_name} over an area{super().status.removeprefix(self.name)}"
+
+    def _stand(self, situation: Situation, position: Vector3, bearing_rad: float) -> Setpoint:
+        if self._stop is None and ground_speed(situation.state) < STANDING_MPS:
+            self._stop = position
+        velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
+        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=bearing_rad)
+
+    def _path(self, situation: Situation) -> Path:
+        position, _ = position_and_yaw(situation.state)
+        spacing_m = self._spacing_m
+        if spacing_m is None:
+            if self._footprint is None:
+                raise ValueError("the camera's footprint is not known: give spacing")
+            spacing_m = self._footprint.spacing_m(situation.state.altitude_m or 0.0)
+        if self._radius_m is not None:
+            points = expanding_square(self._radius_m, spacing_m)
+        else:
+            assert self._size_m is not None
+            points = lawnmower(*self._size_m, spacing_m)
+        places = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
+        if self._radius_m is not None and len(points) == 1:
+            raise ValueError(f"from here strips {spacing_m:.0f} m apart show it all: use pattern=turn")
+        return Path([position, *places], self._speed_mps)
+
+    def _flown(self) -> str:
+        return "the whole area flown"

@@ -1,0 +1,1 @@
+"""The camera's gimbal: whose it is, where it is to look."""

@@ -1,0 +1,1 @@
+"""What no behaviour can leave or ignore: envelope, obstacles, battery, setpoint monitor."""

@@ -1,0 +1,381 @@
+"""The limits that no behaviour can leave: the last thing a setpoint passes before it is sent.
+
+The envelope only ever takes away. A velocity that leaves it is never faster than the one that came, neither
+over ground nor upwards or downwards; braking is never delayed. A setpoint inside every limit passes as it is.
+
+A velocity's feed-forward acceleration carries a vehicle away from that velocity, so it passes only while what
+it makes of the velocity the vehicle has would pass too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+from companion.geometry.fence import Fence
+from companion.guidance.formation.neighbours import Neighbour
+from companion.guidance.formation.separation import BRAKING, Row, apart, level_rows, rows_at
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3, VehicleState
+from vision.attitude import wrap_angle
+
+# PX4 flies towards a position with about this much speed for each metre that is missing (MPC_XY_P 0.95,
+# MPC_Z_P 1.0), so a position limit/gain ahead is flown to with no more than the limit.
+POSITION_GAIN_PER_S = 1.0
+# A loop that stood still must not earn itself a jump.
+LONGEST_STEP_S = 0.2
+# So long a feed-forward acceleration acts before what it did is seen.
+FEED_FORWARD_S = 0.3
+# Heights that differ by less are the same one.
+SAME_HEIGHT_M = 0.05
+# Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
+FENCE_BRAKING = 0.5
+# How late a multirotor's velocity follows.
+FENCE_DELAY_S = 0.4
+# Speed for each metre left, at most: a velocity that follows by 0.3 s is then critically damped.
+FENCE_GAIN_PER_S = 0.8
+NO_FENCE = Fence()
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the vehicle may be asked for.
+
+    Attributes:
+        max_horizontal_speed_mps: over ground.
+        max_climb_mps, max_descend_mps: upwards, downwards.
+        max_yaw_rate_radps: either way.
+        max_acceleration_mps2: at which a commanded velocity may grow or turn.
+        min_altitude_m, max_altitude_m: band above home.
+        max_distance_m: horizontally from home.
+        fence: polygons about home to stay inside and out of.
+        min_separation_m: to every other vehicle that tells where it is.
+
+    Raises:
+        ValueError: a limit is not finite and positive, or the band of altitudes is empty.
+    """
+
+    max_horizontal_speed_mps: float = 5.0
+    max_climb_mps: float = 2.0
+    max_descend_mps: float = 1.0
+    max_yaw_rate_radps: float = 1.0
+    max_acceleration_mps2: float = 3.0
+    min_altitude_m: float = 1.0
+    max_altitude_m: float = 50.0
+    max_distance_m: float = 200.0
+    fence: Fence = NO_FENCE
+    min_separation_m: float = 3.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name != "fence" and not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{field.name} must be a finite number above 0, got {value}")
+        if self.min_altitude_m >= self.max_altitude_m:
+            raise ValueError(
+                f"min_altitude_m must be below max_altitude_m, got {self.min_altitude_m} "
+                f"and {self.max_altitude_m}"
+            )
+
+
+class Limited(NamedTuple):
+    """What the envelope let through, and a few words for every limit that acted."""
+
+    sent: Setpoint
+    reasons: tuple[str, ...]
+
+
+class Envelope:
+    """Applies `limits` to a stream of setpoints. It remembers the last one, for acceleration and yaw rate.
+
+    Attributes:
+        near: what obstacles allow: (north, east) unit direction, and the speed in it.
+    """
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self.limits = limits or Limits()
+        self._velocity: Vector3 | None = None
+        self._home: Vector3 | None = None
+        self._yaw_rad: float | None = None
+        self._neighbours: Sequence[Neighbour] = ()
+        self._landing = False
+        self.near: tuple[tuple[float, float, float], ...] = ()
+
+    def reset(self) -> None:
+        """Forget the last setpoint: the next one starts from how the vehicle really moves."""
+        self._velocity = self._yaw_rad = None
+
+    def why_not_there(self, goal: Vector3, state: VehicleState) -> str | None:
+        """Why a goal (local NED metres) is nowhere to fly to; None: it is allowed.
+
+        The height the vehicle has is always allowed: a way along it asks for no other.
+        """
+        home = state.home_position_ned_m or self._home or (0.0, 0.0, 0.0)
+        away = (goal[0] - home[0], goal[1] - home[1])
+        where = f"{away[0]:.1f} m north and {away[1]:.1f} m east of home"
+        if math.hypot(*away) > self.limits.max_distance_m:
+            return f"{where} is farther than guidance.max_distance_m = {self.limits.max_distance_m:g}"
+        if not self.limits.fence.holds(away):
+            return f"{where} is not inside the fence (guidance.fence_include, fence_exclude)"
+        here = state.position_ned_m
+        if here is not None and abs(goal[2] - here[2]) <= SAME_HEIGHT_M:
+            return None
+        height_m, low_m, high_m = home[2] - goal[2], self.limits.min_altitude_m, self.limits.max_altitude_m
+        if height_m > high_m + SAME_HEIGHT_M:
+            return f"{height_m:.1f} m above home is higher than guidance.max_altitude_m = {high_m:g}"
+        if height_m < low_m - SAME_HEIGHT_M:
+            return f"{height_m:.1f} m above home is lower than guidance.min_altitude_m = {low_m:g}"
+        return None
+
+    def apply(
+        self,
+        setpoint: Setpoint,
+        state: VehicleState,
+        now_ns: int,
+        dt_s: float,
+        neighbours: Sequence[Neighbour] = (),
+        *,
+        landing: bool = False,
+    ) -> Limited:
+        """What may be sent of a setpoint.
+
+        Args:
+            setpoint: as the behaviour asked for it.
+            state: for where the vehicle is, how it moves, and where home is.
+            now_ns: CLOCK_MONOTONIC nanoseconds.
+            dt_s: since the last call; more than 0.2 s counts as that.
+            neighbours: other vehicles, to keep apart from.
+            landing: the lowest altitude does not hold: the way leads to the ground.
+
+        Without a known position a position setpoint cannot be judged: a brake takes its place.
+        """
+        dt_s = max(0.0, min(dt_s, LONGEST_STEP_S))
+        self._neighbours, self._landing = neighbours, landing
+        reasons: list[str] = []
+        if state.home_position_ned_m is not None:
+            self._home = state.home_position_ned_m
+        elif self._home is not None:
+            # An autopilot may take a moment to tell it again; where it was is the best guess meanwhile.
+            state = replace(state, home_position_ned_m=self._home)
+        elif self.limits.fence != NO_FENCE:
+            self.reset()
+            return Limited(Setpoint.brake(now_ns), ("home unknown, and there is a fence about it",))
+        if setpoint.position_ned_m is not None and state.position_ned_m is None:
+            self.reset()
+            return Limited(Setpoint.brake(now_ns), ("position unknown",))
+        sent = setpoint
+        if setpoint.velocity_ned_mps is not None:
+            velocity = self._limit_velocity(setpoint.velocity_ned_mps, state, dt_s, reasons)
+            self._velocity = velocity
+            if velocity != setpoint.velocity_ned_mps:
+                sent = replace(sent, velocity_ned_mps=velocity)
+            if setpoint.acceleration_ned_mps2 is not None:
+                forward = self._limit_feed_forward(setpoint.acceleration_ned_mps2, state, reasons)
+                sent = replace(sent, acceleration_ned_mps2=forward)
+        elif setpoint.position_ned_m is not None and state.position_ned_m is not None:
+            place = self._limit_position(setpoint.position_ned_m, state.position_ned_m, state, reasons)
+            self._velocity = None
+            if place != setpoint.position_ned_m:
+                sent = replace(sent, position_ned_m=place)
+        return Limited(self._limit_yaw(sent, state, dt_s, reasons), tuple(reasons))
+
+    def _limit_velocity(
+        self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]
+    ) -> Vector3:
+        limits = self.limits
+        parts = (
+            (limits.max_horizontal_speed_mps, math.hypot(asked[0], asked[1]), "horizontal speed"),
+            (limits.max_climb_mps, -asked[2], "climb"),
+            (limits.max_descend_mps, asked[2], "descent"),
+        )
+        scale = 1.0
+        for limit, value, what in parts:
+            if value > limit * (1.0 + 1e-12):
+                # All of it alike, so that a steep way is flown slower and not another way.
+                scale = min(scale, limit / value)
+                reasons.append(f"{what} limited to {limit:g} m/s")
+        north, east, down = (value * scale for value in asked) if scale < 1.0 else asked
+        velocity = self._slew((north, east, down), state, dt_s, reasons)
+        # Last, so that no slew delays what a fence takes away.
+        return self._slow_at_fences(velocity, state, reasons)
+
+    def _limit_feed_forward(self, asked: Vector3, state: VehicleState, reasons: list[str]) -> Vector3 | None:
+        """As much of it as the limits of acceleration and speed allow; none where it leads over a fence."""
+        limits, velocity = self.limits, state.velocity_ned_mps
+        if velocity is None:
+            reasons.append("velocity unknown: no acceleration ahead")
+            return None
+        scale = min(1.0, limits.max_acceleration_mps2 / max(math.hypot(*asked), 1e-9))
+        added = (asked[0] * FEED_FORWARD_S, asked[1] * FEED_FORWARD_S, asked[2] * FEED_FORWARD_S)
+        scale = min(scale, _until_length(velocity, added, limits.max_horizontal_speed_mps))
+        north, east, down = (v + scale * a for v, a in zip(velocity, added, strict=True))
+        slowed = self._slow_at_fences((north, east, down), state, []) != (north, east, down)
+        if slowed or not -limits.max_climb_mps <= down <= limits.max_descend_mps:
+            reasons.append("no acceleration ahead of a limit")
+            return None
+        return (asked[0] * scale, asked[1] * scale, asked[2] * scale)
+
+    def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
+        """Take away what would carry the vehicle over a fence: no more speed than the way left stops."""
+        limits, altitude_m = self.limits, state.altitude_m
+        if state.position_ned_m is None or altitude_m is None:
+            return velocity
+        rows = self._rows(state.position_ned_m)
+        velocity = self._keep_apart(velocity, rows, reasons)
+        north, east, down = velocity
+        if down < -self._towards_fence(limits.max_altitude_m - altitude_m):
+            down = -self._towards_fence(limits.max_altitude_m - altitude_m)
+            reasons.append(f"altitude limited to {limits.max_altitude_m:g} m")
+        elif not self._landing and down > self._towards_fence(altitude_m - limits.min_altitude_m):
+            down = self._towards_fence(altitude_m - limits.min_altitude_m)
+            reasons.append(f"altitude kept above {limits.min_altitude_m:g} m")
+        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
+        distance_m = math.hypot(*away)
+        # The circle is one more edge, so that what one takes away another cannot give back.
+        circle: list[tuple[float, float, float]] = list(self.near)
+        if distance_m > 0.0:
+            allowed_mps = self._towards_fence(limits.max_distance_m - distance_m)
+            circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
+            if north * circle[-1][0] + east * circle[-1][1] > allowed_mps + 1e-9:
+                reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
+        circle += level_rows(rows, down)
+        over_ground = limits.fence.slowed((north, east), away, self._towards_fence, also=circle)
+        if math.dist(over_ground, (north, east)) > 1e-9:
+            if not reasons or not reasons[-1].startswith("distance from home"):
+                reasons.append(self._what_slows((north, east)))
+            north, east = over_ground
+        return (north, east, down)
+
+    def _rows(self, place: Vector3) -> list[Row]:
+        limits = self.limits
+        return rows_at(
+            place, self._neighbours, limits.min_separation_m, BRAKING * limits.max_acceleration_mps2
+        )
+
+    def _keep_apart(self, velocity: Vector3, rows: Sequence[Row], reasons: list[str]) -> Vector3:
+        """Take away what would carry the vehicle nearer to another than they may be."""
+        left, because_of = apart(velocity, rows)
+        if because_of:
+            reasons.append(f"kept {self.limits.min_separation_m:g} m from {', '.join(because_of)}")
+        return left
+
+    def _what_slows(self, velocity: tuple[float, float]) -> str:
+        near = any(velocity[0] * row[0] + velocity[1] * row[1] > row[2] + 1e-9 for row in self.near)
+        return "slowed down before an obstacle" if near else "slowed down at the fence"
+
+    def _towards_fence(self, left_m: float) -> float:
+        """The speed from which the vehicle stops in so much way, which begins when it answers."""
+        braking = FENCE_BRAKING * self.limits.max_acceleration_mps2
+        late = braking * FENCE_DELAY_S
+        left_m = max(0.0, left_m)
+        return min(math.sqrt(late**2 + 2.0 * braking * left_m) - late, FENCE_GAIN_PER_S * left_m)
+
+    def _slew(self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]) -> Vector3:
+        """Let the velocity change by the greatest acceleration, without ever being more than asked for."""
+        previous = self._velocity or state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        step = (asked[0] - previous[0], asked[1] - previous[1], asked[2] - previous[2])
+        size, allowed = math.hypot(*step), self.limits.max_acceleration_mps2 * dt_s
+        if size <= allowed + 1e-9:
+            return asked
+        part = allowed / size
+        north, east, down = (p + s * part for p, s in zip(previous, step, strict=True))
+        north, east, _ = _shorten((north, east, 0.0), math.hypot(asked[0], asked[1]))
+        down = max(min(asked[2], 0.0), min(max(asked[2], 0.0), down))
+        if (north, east, down) != asked and math.dist((north, east, down), asked) > 1e-9:
+            reasons.append(f"acceleration limited to {self.limits.max_acceleration_mps2:g} m/s²")
+            return (north, east, down)
+        return asked
+
+    def _limit_position(
+        self, asked: Vector3, here: Vector3, state: VehicleState, reasons: list[str]
+    ) -> Vector3:
+        limits = self.limits
+        home = state.home_position_ned_m or (0.0, 0.0, 0.0)
+        lowest_down = math.inf if self._landing else home[2] - limits.min_altitude_m
+        down = max(home[2] - limits.max_altitude_m, min(lowest_down, asked[2]))
+        if down != asked[2]:
+            reasons.append(f"altitude kept within {limits.min_altitude_m:g} to {limits.max_altitude_m:g} m")
+        away = _shorten((asked[0] - home[0], asked[1] - home[1], 0.0), limits.max_distance_m)
+        place = (home[0] + away[0], home[1] + away[1], down)
+        if math.dist(place[:2], asked[:2]) > 1e-9:
+            reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
+        else:
+            place = (asked[0], asked[1], down)
+
+        goal = (place[0] - home[0], place[1] - home[1])
+        inside = limits.fence.clipped((here[0] - home[0], here[1] - home[1]), goal)
+        if inside != goal:
+            place = (home[0] + inside[0], home[1] + inside[1], down)
+            reasons.append("kept inside the fence")
+        way = (place[0] - here[0], place[1] - here[1])
+        flown = (way[0] * POSITION_GAIN_PER_S, way[1] * POSITION_GAIN_PER_S)
+        freed = NO_FENCE.slowed(flown, here[:2], abs, self.near)
+        if math.dist(freed, flown) > 1e-9:
+            reach_s = 1.0 / POSITION_GAIN_PER_S
+            place = (here[0] + freed[0] * reach_s, here[1] + freed[1] * reach_s, place[2])
+            reasons.append("slowed down before an obstacle")
+        offset = (place[0] - here[0], place[1] - here[1], 0.0)
+        carrot = _shorten(offset, limits.max_horizontal_speed_mps / POSITION_GAIN_PER_S)
+        if carrot != offset:
+            place = (here[0] + carrot[0], here[1] + carrot[1], place[2])
+            reasons.append(f"horizontal speed limited to {limits.max_horizontal_speed_mps:g} m/s")
+        highest = here[2] - limits.max_climb_mps / POSITION_GAIN_PER_S
+        lowest = here[2] + limits.max_descend_mps / POSITION_GAIN_PER_S
+        if place[2] < highest:
+            place = (place[0], place[1], highest)
+            reasons.append(f"climb limited to {limits.max_climb_mps:g} m/s")
+        elif place[2] > lowest:
+            place = (place[0], place[1], lowest)
+            reasons.append(f"descent limited to {limits.max_descend_mps:g} m/s")
+        # A place is flown to with a speed that goes with the way to it, so the same law holds for both.
+        north, east, down = (POSITION_GAIN_PER_S * (p - h) for p, h in zip(place, here, strict=True))
+        left = self._keep_apart((north, east, down), self._rows(here), reasons)
+        if left != (north, east, down):
+            north, east, down = (h + v / POSITION_GAIN_PER_S for h, v in zip(here, left, strict=True))
+            return (north, east, down)
+        return place
+
+    def _limit_yaw(
+        self, setpoint: Setpoint, state: VehicleState, dt_s: float, reasons: list[str]
+    ) -> Setpoint:
+        """Limit a yaw rate, or the rate at which a wanted heading runs ahead of the last one."""
+        limit = self.limits.max_yaw_rate_radps
+        if setpoint.yaw_rate_radps is not None:
+            self._yaw_rad = None
+            rate = max(-limit, min(limit, setpoint.yaw_rate_radps))
+            if rate == setpoint.yaw_rate_radps:
+                return setpoint
+            reasons.append(f"yaw rate limited to {limit:g} rad/s")
+            return replace(setpoint, yaw_rate_radps=rate)
+        previous = self._yaw_rad if self._yaw_rad is not None else state.yaw_rad
+        self._yaw_rad = setpoint.yaw_rad
+        if setpoint.yaw_rad is None or previous is None:
+            return setpoint
+        turn = wrap_angle(setpoint.yaw_rad - previous)
+        if abs(turn) <= limit * dt_s + 1e-9:
+            return setpoint
+        self._yaw_rad = wrap_angle(previous + math.copysign(limit * dt_s, turn))
+        reasons.append(f"yaw rate limited to {limit:g} rad/s")
+        return replace(setpoint, yaw_rad=self._yaw_rad)
+
+
+def _until_length(vector: Vector3, added: Vector3, longest: float) -> float:
+    """The part 0..1 of `added` that makes `vector` `longest` over ground, or all of it."""
+    square = added[0] ** 2 + added[1] ** 2
+    if square < 1e-12:
+        return 1.0
+    product = vector[0] * added[0] + vector[1] * added[1]
+    left = max(0.0, longest**2 - vector[0] ** 2 - vector[1] ** 2)
+    return max(0.0, min(1.0, (math.sqrt(product**2 + left * square) - product) / square))
+
+
+def _shorten(vector: Vector3, longest: float) -> Vector3:
+    """The same direction over ground, no longer than `longest`; down as it was."""
+    length = math.hypot(vector[0], vector[1])
+    if length <= longest * (1.0 + 1e-12):
+        return vector
+    scale = longest / length
+    return (vector[0] * scale, vector[1] * scale, vector[2])

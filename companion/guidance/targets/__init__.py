@@ -1,0 +1,1 @@
+"""What is seen as places in local NED: made from detections and markers, filtered, chosen."""

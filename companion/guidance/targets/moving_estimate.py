@@ -1,0 +1,136 @@
+"""What is known of one moving object: a constant-velocity Kalman filter over ground.
+
+The state is position and velocity (north, east), local NED, driven by white acceleration (Bar-Shalom, Li &
+Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", ch. 6.2). A measurement is a
+place with the ellipse of a bearing and a range, or a bearing alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.targets.track import NEAREST_M, measurement_noise
+from companion.vehicle.state import Vector3
+
+# Spectral density of the acceleration, m²/s³: what turns a walk round in a second or two.
+ACCELERATION_M2_PER_S3 = 1.5
+# Before two looks nothing is known of the velocity, one sigma.
+FIRST_VELOCITY_SIGMA_MPS = 2.0
+FASTEST_MPS = 15.0
+# What is off in a range by attitude, height and slope is off by the same from frame to frame: what one says
+# against the last is surer than what it says of the place, by so much of a sigma. Not so when the range comes
+# from somewhere else than in the last.
+FRAME_TO_FRAME = 0.35
+
+Vector = NDArray[np.float64]
+
+
+class Fit(NamedTuple):
+    """A detection against an estimate of its moment: how far it is off.
+
+    Attributes:
+        squared: Mahalanobis distance squared.
+        innovation: (2,) metres north and east of where the object is expected.
+        spread: (2, 2) its covariance.
+    """
+
+    squared: float
+    target: Target
+    innovation: Vector
+    spread: Vector
+
+    @property
+    def off_m(self) -> float:
+        """How far from where the object is expected."""
+        return float(np.hypot(*self.innovation))
+
+
+@dataclass(frozen=True, slots=True)
+class MovingEstimate:
+    """Place and velocity of an object at a moment.
+
+    Attributes:
+        state: (4,) north, east, metres; north, east, m/s. covariance: (4, 4).
+        captured_ns: the moment.
+        source: where the range of the newest measurement came from.
+    """
+
+    state: Vector
+    covariance: Vector
+    captured_ns: int
+    source: RangeSource
+
+    @classmethod
+    def begun(cls, target: Target, vehicle: Vector3) -> Self:
+        """The first. Raises ValueError: the target has no range."""
+        if target.position_ned_m is None:
+            raise ValueError(f"a track begins with a known place; this {target.class_name} has no range")
+        place = np.array(target.position_ned_m[:2], np.float64)
+        covariance = np.zeros((4, 4))
+        covariance[:2, :2] = measurement_noise(target, place - vehicle[:2])
+        covariance[2:, 2:] = np.eye(2) * FIRST_VELOCITY_SIGMA_MPS**2
+        return cls(np.concatenate([place, (0.0, 0.0)]), covariance, target.captured_ns, target.range_source)
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Over ground, m/s."""
+        return (float(self.state[2]), float(self.state[3]))
+
+    def at(self, stamp_ns: int) -> MovingEstimate:
+        """After a time of constant velocity and white acceleration."""
+        elapsed_s = max(0.0, (stamp_ns - self.captured_ns) / 1e9)
+        move = np.eye(4)
+        move[0, 2] = move[1, 3] = elapsed_s
+        q = ACCELERATION_M2_PER_S3
+        noise = np.zeros((4, 4))
+        for axis in (0, 1):
+            noise[axis, axis] = q * elapsed_s**3 / 3.0
+            noise[axis, axis + 2] = noise[axis + 2, axis] = q * elapsed_s**2 / 2.0
+            noise[axis + 2, axis + 2] = q * elapsed_s
+        return replace(
+            self,
+            state=move @ self.state,
+            covariance=move @ self.covariance @ move.T + noise,
+            captured_ns=stamp_ns,
+        )
+
+    def fit(self, target: Target, vehicle: Vector3) -> Fit:
+        """A detection of this moment against it; `vehicle`: its position then, local NED."""
+        if target.position_ned_m is not None:
+            measured = np.array(target.position_ned_m[:2])
+        else:
+            # A bearing alone: a place in that direction as far away as the object is thought to be.
+            range_m = max(NEAREST_M, float(np.hypot(*(self.state[:2] - vehicle[:2]))))
+            measured = np.array(
+                (
+                    vehicle[0] + range_m * math.cos(target.bearing_rad),
+                    vehicle[1] + range_m * math.sin(target.bearing_rad),
+                )
+            )
+        noise = measurement_noise(target, measured - vehicle[:2])
+        if target.range_source in (self.source, RangeSource.NONE):
+            noise = noise * FRAME_TO_FRAME**2
+        innovation = measured - self.state[:2]
+        spread = self.covariance[:2, :2] + noise
+        return Fit(float(innovation @ np.linalg.solve(spread, innovation)), target, innovation, spread)
+
+    def taking(self, fit: Fit) -> MovingEstimate:
+        """With a detection that fits taken in."""
+        gain = np.linalg.solve(fit.spread, self.covariance[:2, :]).T
+        state = self.state + gain @ fit.innovation
+        speed = math.hypot(state[2], state[3])
+        if speed > FASTEST_MPS:
+            state[2:] *= FASTEST_MPS / speed
+        # Joseph's form keeps it symmetric and positive.
+        kept = np.eye(4)
+        kept[:, :2] -= gain
+        noise = fit.spread - self.covariance[:2, :2]
+        covariance = kept @ self.covariance @ kept.T + gain @ noise @ gain.T
+        source = self.source if fit.target.position_ned_m is None else fit.target.range_source
+        return MovingEstimate(state, covariance, self.captured_ns, source)
