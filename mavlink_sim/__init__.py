@@ -2,6 +2,14 @@
 
 `LockstepVehicle` is one in your own process, stepped by you; `running_simulator` one in a process of its own;
 `mavlink-sim` on the command line is one on UDP.
+
+>>> from mavlink_sim import LockstepVehicle
+>>> vehicle = LockstepVehicle(seed=1)
+>>> vehicle.take_off(5.0)
+>>> vehicle.set_position(10.0, 0.0, -5.0)
+>>> vehicle.step(20.0)
+>>> abs(vehicle.truth.position_ned_m[0] - 10.0) < 1.0
+True
 """
 
 from __future__ import annotations
@@ -23,6 +31,7 @@ __all__ = [
     "RunningSimulator",
     "Truth",
     "Vehicle",
+    "__version__",
     "running_simulator",
 ]
 
@@ -40,6 +49,10 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for: who draws pictures alone shall not load MAVLink's dialect."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("mavlink-companion")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

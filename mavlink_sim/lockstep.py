@@ -5,6 +5,10 @@
 >>> vehicle.take_off(5.0)                           # arms, climbs, waits for HOLD: 13 s of flight in 0.1 s
 >>> vehicle.truth.position_ned_m[2] < -4.0
 True
+>>> vehicle.set_velocity(2.0, 0.0, 0.0)             # a setpoint stream in OFFBOARD, until another one
+>>> vehicle.step(5.0)
+>>> vehicle.truth.velocity_ned_mps[0] > 1.5
+True
 
 Anything else goes by MAVLink messages, as with a real vehicle: `send` one, `step`, look at what it sent. The
 same seed and the same calls give the same flight, and the same bytes, every time.
@@ -34,6 +38,12 @@ SECOND_ANSWER_S = 0.04  # Commander's own, after the receiver's
 # What nobody takes is kept up to this many messages a link: a minute of all streams.
 MAX_WAITING = 50_000
 _ARM_DISARM, _TAKEOFF, _LAND, _SET_MODE = 400, 22, 21, 176
+SETPOINT_RATE_HZ = 20.0
+NAN = math.nan
+# POSITION_TARGET_TYPEMASK: what is to be ignored.
+_ONLY_VELOCITY = 0b0001_1100_0111
+_ONLY_POSITION = 0b0001_1111_1000
+_IGNORE_YAW, _IGNORE_YAW_RATE = 0b0100_0000_0000, 0b1000_0000_0000
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 
 
@@ -116,6 +126,7 @@ class LockstepVehicle:
         self._repeated: list[_Repeated] = []
         self._answers: list[tuple[int, int]] = []
         self._owed_s = 0.0
+        self._setpoints: Repeat | None = None
         for name, rates in ({"onboard": ONBOARD_RATES_HZ} if links is None else links).items():
             self.vehicle.add_link(name, dict.fromkeys(ONBOARD_RATES_HZ, 0.0) | dict(rates))
             self.newest[name] = {}
@@ -344,6 +355,59 @@ class LockstepVehicle:
             names = ", ".join(mode.name for mode in self.vehicle.modes)
             raise ValueError(f"mode {name!r}: expected one of {names}") from None
         self._demand(f"mode {name}", _SET_MODE, 1.0, *self.vehicle.mode_parameters(mode))
+
+    # ---- setpoints --------------------------------------------------------------------------------------
+
+    def set_velocity(self, north_mps: float, east_mps: float, down_mps: float, yaw_rad: float = NAN) -> None:
+        """Fly with this velocity over ground from now on, local NED, metres a second.
+
+        SET_POSITION_TARGET_LOCAL_NED goes out SETPOINT_RATE_HZ times a second while time passes, in OFFBOARD
+        (ArduPilot: GUIDED), until another of these three is called.
+
+        Args:
+            yaw_rad: heading, clockwise from north; without one it stays as it is.
+
+        Raises:
+            CommandRefusedError: the mode cannot be flown now.
+        """
+        self._set_target(_ONLY_VELOCITY, (0.0, 0.0, 0.0, north_mps, east_mps, down_mps), yaw_rad)
+
+    def set_position(self, north_m: float, east_m: float, down_m: float, yaw_rad: float = NAN) -> None:
+        """Fly to this place and stay there, local NED, metres. Otherwise as `set_velocity`."""
+        self._set_target(_ONLY_POSITION, (north_m, east_m, down_m, 0.0, 0.0, 0.0), yaw_rad)
+
+    def stop_setpoints(self) -> None:
+        """Send no more setpoints; the vehicle does what it does when they end (PX4: COM_OBL_RC_ACT)."""
+        if self._setpoints is not None:
+            self._setpoints.stop()
+        self._setpoints = None
+
+    def _set_target(self, mask: int, values: tuple[float, ...], yaw_rad: float) -> None:
+        if not all(math.isfinite(value) for value in values):
+            raise ValueError(f"a setpoint needs finite numbers, got {values}")
+        heading = math.isfinite(yaw_rad)
+        mask |= _IGNORE_YAW_RATE if heading else _IGNORE_YAW  # a rate of 0 keeps the heading
+        message = dialect.MAVLink_set_position_target_local_ned_message(
+            0,
+            self.vehicle.system_id,
+            1,
+            dialect.MAV_FRAME_LOCAL_NED,
+            mask,
+            *values,
+            0.0,
+            0.0,
+            0.0,
+            yaw_rad if heading else 0.0,
+            0.0,
+        )
+        if self._setpoints is not None:
+            self._setpoints.message = message
+        else:
+            self._setpoints = self.repeat(message, SETPOINT_RATE_HZ)
+            self.step(0.1)  # PX4 takes OFFBOARD only with a stream
+        mode = self.vehicle.setpoint_mode
+        if self.truth.mode != mode:
+            self.set_mode(mode)
 
     def _demand(self, what: str, identifier: int, *parameters: float) -> None:
         result = self.command(identifier, *parameters)

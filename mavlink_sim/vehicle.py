@@ -242,6 +242,11 @@ class Vehicle:
         """DO_SET_MODE's parameters 2 and 3 for one of `modes`."""
         return mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24 & 0xFF
 
+    @property
+    def setpoint_mode(self) -> str:
+        """The name of the mode that flies setpoints."""
+        return Mode.OFFBOARD.name
+
     def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
         """The mode to be in, NAV_TAKEOFF's altitude for a height above home, and whether it is over."""
         return None, self.home_altitude_m + height_m, self._holds

@@ -1,1 +1,71 @@
-"""Frames to targets: sources, detection, tracking, geometry. Knows no MAVLink, no asyncio, no zenoh."""
+"""Frames to targets: sources, detection, tracking, geometry. Knows no MAVLink, no asyncio, no zenoh.
+
+>>> import numpy as np
+>>> from vision import Detector
+>>> detector = Detector(classes=["car"], image_size=320)
+>>> detections = detector.detect(np.zeros((240, 320, 3), np.uint8))     # BGR, rows × columns × 3
+>>> len(detections)
+0
+
+They are imported when they are first used: `import vision` itself costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vision.camera_model import CameraModel, CameraMount
+    from vision.detections import Detections
+    from vision.detector import Detector
+    from vision.frame import Frame
+    from vision.markers import MarkerDetector
+    from vision.pipeline import PerceptionResult, Pipeline
+    from vision.sources.opening import open_source
+    from vision.sources.source import Source, SourceError, SourceSettings
+    from vision.tracking.byte_track import Tracker
+
+_MODULES = {
+    "CameraModel": "vision.camera_model",
+    "CameraMount": "vision.camera_model",
+    "Detections": "vision.detections",
+    "Detector": "vision.detector",
+    "Frame": "vision.frame",
+    "MarkerDetector": "vision.markers",
+    "PerceptionResult": "vision.pipeline",
+    "Pipeline": "vision.pipeline",
+    "Source": "vision.sources.source",
+    "SourceError": "vision.sources.source",
+    "SourceSettings": "vision.sources.source",
+    "Tracker": "vision.tracking.byte_track",
+    "open_source": "vision.sources.opening",
+}
+
+__all__ = [
+    "CameraModel",
+    "CameraMount",
+    "Detections",
+    "Detector",
+    "Frame",
+    "MarkerDetector",
+    "PerceptionResult",
+    "Pipeline",
+    "Source",
+    "SourceError",
+    "SourceSettings",
+    "Tracker",
+    "__version__",
+    "open_source",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """PEP 562: the public names, and `__version__`."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("mavlink-companion")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -50,6 +50,10 @@ class CopterVehicle(Vehicle):
     def mode_parameters(self, mode: CopterMode) -> tuple[float, float]:
         return mode.custom_mode, 0.0
 
+    @property
+    def setpoint_mode(self) -> str:
+        return CopterMode.GUIDED.name
+
     def takeoff_plan(self, height_m: float) -> tuple[str | None, float, Callable[[], bool]]:
         """In GUIDED, to a height that is one above home."""
         return "GUIDED", height_m, self._flies_guided

@@ -308,3 +308,29 @@ def test_a_vehicle_with_a_fault_on_it_is_not_copied_and_says_which() -> None:
         vehicle.copy()
     vehicle.vehicle.faults.end()
     vehicle.copy().step(1.0)
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_setpoints_without_a_message_of_ones_own(autopilot: str) -> None:
+    vehicle = LockstepVehicle({"onboard": {}}, autopilot=autopilot, seed=3, wind_mps=0.0, gusts_mps=0.0)
+    vehicle.take_off(5.0)
+    vehicle.set_velocity(2.0, 0.0, 0.0)
+    vehicle.step(6.0)
+    assert vehicle.truth.velocity_ned_mps == pytest.approx((2.0, 0.0, 0.0), abs=0.3)
+    vehicle.set_position(5.0, -5.0, -6.0, yaw_rad=1.0)
+    vehicle.step(20.0)
+    assert vehicle.truth.position_ned_m == pytest.approx((5.0, -5.0, -6.0), abs=0.5)
+    assert vehicle.truth.yaw_rad == pytest.approx(1.0, abs=0.1)
+    with pytest.raises(ValueError, match="finite numbers"):
+        vehicle.set_velocity(math.nan, 0.0, 0.0)
+
+
+def test_a_px4_whose_setpoints_stop_leaves_offboard() -> None:
+    vehicle = LockstepVehicle({"onboard": {}}, seed=3)
+    vehicle.take_off(5.0)
+    vehicle.set_velocity(1.0, 0.0, 0.0)
+    vehicle.step(2.0)
+    assert vehicle.truth.mode == "OFFBOARD"
+    vehicle.stop_setpoints()
+    vehicle.step(2.0)
+    assert vehicle.truth.mode != "OFFBOARD"
