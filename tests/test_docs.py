@@ -21,6 +21,8 @@ from mavlink_sim.datasets.cli import app as dataset_app
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [
     ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "SECURITY.md",
     *sorted((ROOT / "docs").glob("**/*.md")),
     ROOT / "systemd" / "companion.service",
 ]
@@ -98,3 +100,20 @@ def test_every_flight_command_in_the_table_is_read_and_every_one_there_is_stands
     rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "flight.md").read_text(), re.MULTILINE)
     commands = [grammar.parse(text) for row in rows for text in re.findall(r"`([^`]+)`", row)]
     assert {type(command) for command in commands} == set(COMMANDS.values())
+
+
+def test_the_index_names_every_document() -> None:
+    index = (ROOT / "docs" / "README.md").read_text()
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").glob("**/*.md")}
+    assert not {page for page in pages - {"README.md"} if f"({page})" not in index}
+
+
+def test_the_readmes_python_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    (block,) = re.findall(
+        r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    exec(compile(block, "README.md", "exec"), {})
+    seen, position = capsys.readouterr().out.splitlines()
+    assert "car" in seen
+    assert float(position.strip("()").split(", ")[2]) < -4.0
