@@ -13,7 +13,7 @@ import zenoh
 from pydantic import ValidationError
 
 from companion.bus.session import zenoh_config
-from companion.bus.topics import ROOT, alive_key, command_key
+from companion.bus.topics import ROOT, TOPICS, alive_key, command_key
 from companion.settings import ZenohSection
 
 _DISCOVERY_S = 2.0
@@ -141,6 +141,15 @@ def _answer(
 
 def _is(news: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool:
     return isinstance(news, zenoh.Sample) and news.kind == kind
+
+
+def check_topic(key: str) -> None:
+    """Raises ValueError for a single word that is no topic: nothing would ever come."""
+    names = [topic.name for topic in TOPICS]
+    if not set("/*") & set(key) and key not in names:
+        raise ValueError(
+            f"no topic {key!r}: expected one of {', '.join(names)}, or a zenoh key with / or wildcards"
+        )
 
 
 def listen(

@@ -33,18 +33,34 @@ from vision.loading import uncollected
 if TYPE_CHECKING:
     from companion.service import Service
 
+# What concerns a client of a running service.
+CLIENT_SETTINGS = ("zenoh", "vehicle.name")
+# Of the help: in the order of use.
+ORDER = (
+    "play",
+    "run",
+    "demo",
+    "detect",
+    "send",
+    "echo",
+    "commands",
+    "mission",
+    "config",
+    "evaluate",
+    "train",
+)
+
 app = typer.Typer(
     name="companion",
     help="See, steer and share: the companion-computer service for PX4 vehicles.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
 app.add_typer(models, name="models")
 app.command()(evaluate)
-settings_command(app)(mission)
+settings_command(app, *CLIENT_SETTINGS, "plugins", "detector")(mission)
 settings_command(app)(play)
 app.add_typer(bench, name="bench")
 
@@ -356,7 +372,7 @@ def config(settings: Settings) -> None:
     typer.echo(to_toml(settings), nl=False)
 
 
-@settings_command(app)
+@settings_command(app, "plugins")
 def commands(
     settings: Settings,
     as_json: Annotated[bool, typer.Option("--json", help="as JSON Schema")] = False,
@@ -372,7 +388,13 @@ def commands(
     typer.echo(text, nl=not as_markdown)
 
 
-@settings_command(app)
+def _known_commands() -> str:
+    from companion.guidance.grammar import summary
+
+    return summary()
+
+
+@settings_command(app, *CLIENT_SETTINGS, epilog=_known_commands)
 def send(
     settings: Settings,
     command: Annotated[str, typer.Argument(help='such as "seek car" or "approach person distance=3"')],
@@ -391,7 +413,7 @@ def send(
         raise typer.Exit(EXIT_FAILED)
 
 
-@settings_command(app)
+@settings_command(app, *CLIENT_SETTINGS)
 def echo(
     settings: Settings,
     key: Annotated[str, typer.Argument(help="a topic (labels), or a zenoh key with wildcards")] = "**",
@@ -401,10 +423,11 @@ def echo(
     """Print what a running service publishes: key and message, one line each."""
     import queue
 
-    from companion.bus.client import NoAnswerError, client_settings, listen, open_client
+    from companion.bus.client import NoAnswerError, check_topic, client_settings, listen, open_client
 
     messages: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
-    with plain_errors(NoAnswerError):
+    with plain_errors(NoAnswerError, ValueError):
+        check_topic(key)
         where = client_settings(settings.zenoh, (connect,) if connect else ())
         with open_client(where) as session:
             subscriber = listen(session, key, lambda name, text: messages.put((name, text)))
@@ -418,6 +441,9 @@ def echo(
                 return
             finally:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+app.registered_commands.sort(key=lambda one: ORDER.index(one.name or one.callback.__name__))  # type: ignore[union-attr]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What the commands share: errors for a person, and every setting as a flag, `--detector-image-size 320`."""
+"""What the commands share: errors for a person, and settings as flags, `--detector-image-size 320`."""
 
 from __future__ import annotations
 
@@ -42,15 +42,22 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
         raise typer.Exit(EXIT_BAD_INPUT) from error
 
 
-def settings_command(app: typer.Typer) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command of `app` that takes `--config` and every setting as a flag.
+def settings_command(
+    app: typer.Typer, *keys: str, epilog: Callable[[], str] = lambda: ""
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function a command of `app` that takes `--config` and settings as flags.
 
     Its first parameter, `settings`, is what they come to, checked; `given`, if it has that, is what was given
     as flags, key → text; the others are its own.
+
+    Args:
+        keys: the settings that are flags, by key (`vehicle.name`) or by section (`zenoh`); none: all.
+        epilog: makes the text behind its help, line by line as it is to be shown.
     """
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
-        return app.command(cls=_WithSettings)(_given_settings(command))
+        kind = type("_WithSettings", (_WithSettings,), {"keys": keys, "make_epilog": staticmethod(epilog)})
+        return app.command(cls=kind)(_given_settings(command))
 
     return register
 
@@ -58,16 +65,25 @@ def settings_command(app: typer.Typer) -> Callable[[Callable[..., None]], Callab
 class _WithSettings(typer.core.TyperCommand):
     """Its flags are made when it is run, or its help is asked for: of all commands they are hundreds."""
 
+    keys: tuple[str, ...] = ()
+    make_epilog: Callable[[], str]
+
     def get_params(self, ctx: Any) -> list[Any]:
         """Its own parameters, the settings, and click's."""
         parameters = super().get_params(ctx)
         own = len(self.params)
-        return [*parameters[:own], *_setting_parameters(), *parameters[own:]]
+        return [*parameters[:own], *_setting_parameters(self.keys), *parameters[own:]]
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; what was given for the settings goes by way of the context."""
-        ctx.meta[_GIVEN] = {flag.key: ctx.params.pop(name) for name, flag in _flags_by_parameter().items()}
+        given = {flag.key: ctx.params.pop(name) for name, flag in _flags_by_parameter(self.keys).items()}
+        ctx.meta[_GIVEN] = given
         return super().invoke(ctx)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """The epilog is not wrapped."""
+        if text := type(self).make_epilog():
+            formatter.write(f"\n{text}\n")
 
 
 def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
@@ -105,19 +121,20 @@ def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
 
 
 @functools.cache
-def _flags_by_parameter() -> dict[str, Flag]:
-    return {flag.key.replace(".", "__"): flag for flag in flags()}
+def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
+    chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
+    return {flag.key.replace(".", "__"): flag for flag in chosen}
 
 
 @functools.cache
-def _setting_parameters() -> list[Any]:
-    """A flag for every setting, made by typer, as those of any command."""
+def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
+    """A flag for each setting, made by typer, as those of any command."""
 
     def settings(**_values: Any) -> None:
         """A command that is never run: typer makes parameters of commands alone."""
 
     parameters = []
-    for name, flag in _flags_by_parameter().items():
+    for name, flag in _flags_by_parameter(keys).items():
         names = [f"--{flag.key.replace('.', '-').replace('_', '-')}"]
         if short := SHORT_NAMES.get(flag.key):
             names.insert(0, short)

@@ -84,6 +84,12 @@ def usage(kind: type[Command]) -> str:
     return " ".join(words)
 
 
+def summary() -> str:
+    """Every command in two lines: how it is written, and what it does."""
+    lines = [f"  {usage(kind)}\n      {kind.help}" for kind in COMMANDS.values()]
+    return "\n".join(["Commands (`companion commands` tells their arguments; plug-ins add more):", *lines])
+
+
 def describe() -> str:
     """The help text: every command, its arguments, units, ranges and defaults."""
     lines = []

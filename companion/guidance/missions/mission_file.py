@@ -163,11 +163,14 @@ def plan_from(
             class or step, a step that is never reached, a loop that is never left.
     """
     try:
-        table = MissionTable.model_validate(tomllib.loads(text))
+        written = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise MissionError(f"{source}: no TOML: {error}") from error
+    try:
+        table = MissionTable.model_validate(written)
     except ValidationError as error:
-        raise MissionError(*(_said(source, dict(problem)) for problem in error.errors())) from error
+        said = [_said(source, dict(problem)) for problem in error.errors()]
+        raise MissionError(*said, *_bad_commands(written, source, class_names)) from error
     problems: list[str] = []
     read = _read_steps(table, source, class_names, problems)
     if problems:
@@ -245,6 +248,20 @@ def _said(source: str, problem: dict[str, object]) -> str:
         return f"{': '.join(words)}: {told}"
     came = str(problem.get("input"))[:60]
     return f"{': '.join(words)}: {key}: {problem['msg']}, got {came}"
+
+
+def _bad_commands(written: dict[str, object], source: str, class_names: Sequence[str] | None) -> list[str]:
+    """Of a file whose tables are wrong: the commands that are wrong too, to be mended at once."""
+    steps = written.get("step")
+    problems = []
+    for index, step in enumerate(steps if isinstance(steps, list) else []):
+        command = step.get("do") if isinstance(step, dict) else None
+        try:
+            if isinstance(command, str):
+                parse(command, class_names)
+        except GrammarError as error:
+            problems.append(f"{source}: step {index + 1}: {error}")
+    return problems
 
 
 def _read_steps(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import socket
 import subprocess
 import sys
@@ -18,8 +19,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from companion.bus.topics import TOPICS
 from companion.cli import commands as companion_commands
 from companion.cli.commands import app
+from companion.guidance.registry import COMMANDS
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 
@@ -264,3 +267,27 @@ def test_the_bundled_model_is_not_for_photographs_and_says_so_once(
     assert capsys.readouterr().err == ""
     warn([("shm://simulator", "default"), ("/dev/video0", "default"), ("/dev/video1", "default")])
     assert capsys.readouterr().err.count("models pull") == 1
+
+
+def test_help_has_the_commands_in_the_order_of_use() -> None:
+    shown = CliRunner().invoke(app, ["--help"]).stdout
+    listed = shown.partition("Commands:")[2].split("\n")
+    words = [line.split()[0] for line in listed if line.startswith("  ") and line.strip()]
+    assert words[:6] == ["play", "run", "demo", "detect", "send", "echo"]
+    assert "--install-completion" in shown
+
+
+def test_help_of_send_has_the_flight_commands_and_few_settings() -> None:
+    shown = CliRunner().invoke(app, ["send", "--help"]).stdout
+    assert len(shown.splitlines()) < 100
+    assert {f"  {word}" for word in COMMANDS} <= {
+        f"  {line.split()[0]}" for line in shown.splitlines() if line.split()
+    }
+    assert "--zenoh-connect" in shown
+    assert "--detector-model" not in shown
+    assert CliRunner().invoke(app, ["send", "hold", "--detector-model", "x.pt"]).exit_code == 2
+
+
+def test_echo_of_no_topic_lists_those_there_are(tmp_path: Path) -> None:
+    line = one_line_of_bad_input(companion("echo", "bogus", cwd=tmp_path))
+    assert {topic.name for topic in TOPICS} <= set(re.findall(r"[a-z]+", line))

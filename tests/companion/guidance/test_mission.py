@@ -269,3 +269,13 @@ def test_a_name_that_no_file_can_have_is_one_line(name: str) -> None:
     with pytest.raises(MissionError) as error:
         find_mission(name)
     assert "\n" not in str(error.value)
+
+
+def test_faults_of_tables_and_of_commands_are_told_at_once() -> None:
+    text = '[[step]]\ndo = "takeoff 500"\n[[step]]\ndo = "hovr"\nrepeat = 0\n'
+    text += '[[step]]\ndo = "land"\nspeed = 3\n'
+    with pytest.raises(MissionError) as failure:
+        plan_from(text, "m.toml")
+    problems = failure.value.problems
+    assert len(problems) == 4
+    assert [sum(f"step {step}" in problem for problem in problems) for step in (1, 2, 3)] == [1, 2, 1]
