@@ -193,7 +193,9 @@ class WorkerView(View):
         if calibration is not None:
             adopted = adopt_calibration(self._given, calibration)
             camera = adopted.camera
-            if adopted.conflict:
+            if not adopted.conflict:
+                self._tell("info", "lens and mount are those that the camera brings")
+            else:
                 key = "camera" if self.name is None else f"views.{self.name}.camera"
                 self._tell("warning", f"{key}: settings win over what the camera brings: {adopted.conflict}")
         self.settings = self.settings.model_copy(update={"camera": camera})

@@ -98,10 +98,9 @@ class Service:
         )
         self._notifier = SystemdNotifier()
         self._health = Health(self.driver, self.views, self._notifier, self.others, self._event)
-        self.ready = False
+        self.ready = self._ending = False
         self._status: dict[str, Any] | None = None
         self._stop = asyncio.Event()
-        self._ending = False
 
     async def run(self, ready: Callable[[], None] | None = None) -> None:
         """Start everything, call `ready`, and work until `stop()`; then let the autopilot hold and end.

@@ -171,7 +171,11 @@ class _Run:
                 signal.signal(number, handler)
 
     def _receive(self) -> None:
-        for message in self._link.receive(POLL_S):
+        try:
+            messages = self._link.receive(POLL_S)
+        except ConnectionError as error:
+            raise CameraError(f"the pose stopped: {error}", 1) from error
+        for message in messages:
             self._history.add(message, time.monotonic_ns())
         if not self._process.alive and not self._stopping:
             code = self._process.exit_code

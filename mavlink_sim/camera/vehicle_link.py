@@ -59,6 +59,8 @@ class _TcpEndpoint:
                 data = b""
             self._closed = not data
             messages += self._codec.parse_buffer(data) or []
+        if self._closed and not messages:
+            raise ConnectionError("the autopilot closed its TCP connection")
         return [message for message in messages if message.get_type() != "BAD_DATA"]
 
     def send(self, outgoing: list[Outgoing]) -> None:
@@ -117,7 +119,11 @@ class AutopilotLink:
             self._endpoint = endpoint
 
     def receive(self, timeout_s: float) -> list[Any]:
-        """The messages of the autopilot; waits up to `timeout_s` for the first. Requests what is missing."""
+        """The messages of the autopilot; waits up to `timeout_s` for the first. Requests what is missing.
+
+        Raises:
+            ConnectionError: its TCP connection has ended.
+        """
         select.select([self._endpoint], [], [], timeout_s)
         wanted = []
         for message in self._endpoint.receive():

@@ -7,6 +7,7 @@ import math
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,7 +22,7 @@ from mavlink_sim.camera.vehicle_link import AutopilotLink, LinkError
 from mavlink_sim.cli import main
 from mavlink_sim.testing import free_port, running_simulator
 from mavlink_sim.wire.endpoint import UdpEndpoint
-from mavlink_sim.wire.messages import Outgoing, dialect
+from mavlink_sim.wire.messages import Outgoing, dialect, parser
 from vision.shared_frame import SHARED_MEMORY_DIRECTORY, SharedFrameReader, segment_path
 
 pytestmark = pytest.mark.skipif(not SHARED_MEMORY_DIRECTORY.is_dir(), reason="needs Linux's /dev/shm")
@@ -42,6 +43,21 @@ def heartbeat(system: int) -> Outgoing:
         dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4, 0, 0, dialect.MAV_STATE_STANDBY, 3
     )
     return Outgoing(message, system, dialect.MAV_COMP_ID_AUTOPILOT1)
+
+
+def test_a_tcp_connection_that_ends_is_an_error_at_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = AutopilotLink(f"tcp://127.0.0.1:{server.getsockname()[1]}")
+        accepted, _ = server.accept()
+        with accepted:
+            accepted.sendall(heartbeat(7).pack(parser()))
+            accepted.shutdown(socket.SHUT_WR)
+            while not link.receive(1.0):
+                pass
+            assert link.systems == {7: False}
+            with pytest.raises(ConnectionError, match="closed"):
+                link.receive(1.0)
+        link.close()
 
 
 def received(endpoint: UdpEndpoint, link: AutopilotLink, count: int) -> list[Any]:
