@@ -16,6 +16,7 @@ from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
 from vision.sources.pipe import Fifo, PipeFeed, check_pipe_settings
+from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
 from vision.sources.shared import SharedFrameFeed, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
@@ -41,6 +42,8 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     | `udp://:5600?format=rtp-h264` | RTP: `rtp-h264`, `rtp-h265` or `rtp-jpeg` | the newest |
     | `shm://NAME` | shared memory of this host (`vision.shared_frame`), with depth | the newest |
 
+    Other schemes are those that plug-ins have registered with `vision.sources.registry.source`.
+
     Args:
         uri: the address.
         settings: see `SourceSettings`.
@@ -54,36 +57,62 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     if (device := camera_device(uri)) is not None:
         check_camera(device, settings)
         return LatestSource(str(device), lambda: CameraFeed(device, settings), settings)
-    scheme, separator, rest = uri.partition("://")
+    scheme, separator, _ = uri.partition("://")
     if not separator:
         return _open_path(Path(uri).expanduser(), settings)
-    if scheme == "file":
-        return _open_path(Path(rest), settings)
-    return _open_address(uri, scheme, rest, settings)
+    if (opener := SOURCES.get(scheme)) is None:
+        raise SourceError(
+            f"{without_password(uri)}: sources have no {scheme}://; known: {SOURCES.known()}, cameras "
+            "(/dev/video0), files, folders, FIFOs and - for standard input. The scheme of a plug-in is known "
+            "once its module is loaded (plugins.modules, --plugins-modules)"
+        )
+    return opener(uri, settings)
 
 
-def _open_address(uri: str, scheme: str, rest: str, settings: SourceSettings) -> Source:
+@source("file", "a file or folder")
+def _open_file_address(uri: str, settings: SourceSettings) -> Source:
+    return _open_path(Path(_rest(uri)), settings)
+
+
+@source("rtsp", "RTSP")
+@source("rtsps", "RTSP over TLS")
+def _open_rtsp(uri: str, settings: SourceSettings) -> Source:
     name = without_password(uri)
-    if scheme in ("rtsp", "rtsps"):
-        return LatestSource(name, lambda: open_rtsp(uri, settings), settings, advice="is the camera on?")
-    if scheme in ("http", "https"):
-        # What FFmpeg reads by HTTP may come faster than it is to be shown: a recording, or HLS's first
-        # pieces.
-        return LatestSource(
-            name, lambda: open_http(uri, settings), settings, paced=True, advice="is the server running?"
-        )
-    if scheme == "udp":
-        stream = UdpStream(uri, settings)
-        return LatestSource(name, stream.open_feed, settings, advice="is the sender sending here?")
-    if scheme == "shm":
-        check_name(rest)
-        return LatestSource(
-            name, lambda: SharedFrameFeed(rest, settings), settings, advice="is its writer running?"
-        )
-    raise SourceError(
-        f"{name}: sources have no {scheme}://; there are file, rtsp, rtsps, http, https, udp and shm, "
-        f"cameras (/dev/video0), files, folders, FIFOs and - for standard input"
+    return LatestSource(name, lambda: open_rtsp(uri, settings), settings, advice="is the camera on?")
+
+
+@source("http", "Motion JPEG, or what FFmpeg reads")
+@source("https", "the same over TLS")
+def _open_http(uri: str, settings: SourceSettings) -> Source:
+    # What FFmpeg reads by HTTP may come faster than it is to be shown: a recording, or HLS's first pieces.
+    return LatestSource(
+        without_password(uri),
+        lambda: open_http(uri, settings),
+        settings,
+        paced=True,
+        advice="is the server running?",
     )
+
+
+@source("udp", "MPEG-TS or RTP")
+def _open_udp(uri: str, settings: SourceSettings) -> Source:
+    stream = UdpStream(uri, settings)
+    return LatestSource(
+        without_password(uri), stream.open_feed, settings, advice="is the sender sending here?"
+    )
+
+
+@source("shm", "shared memory of this host")
+def _open_shared(uri: str, settings: SourceSettings) -> Source:
+    check_name(_rest(uri))
+    return LatestSource(
+        uri, lambda: SharedFrameFeed(_rest(uri), settings), settings, advice="is its writer running?"
+    )
+
+
+def _rest(uri: str) -> str:
+    """What stands behind `scheme://`."""
+    return uri.partition("://")[2]
 
 
 def _open_path(path: Path, settings: SourceSettings) -> Source:

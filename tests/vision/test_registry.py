@@ -1,0 +1,64 @@
+"""Schemes of sources, those of plug-ins too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from vision.sources import Feed, Picture, SequentialSource, Source, SourceError, SourceSettings, open_source
+from vision.sources.registry import SOURCES, source
+
+
+class OneGrey(Feed):
+    """One grey picture."""
+
+    def read(self, timeout_s: float) -> Picture | None:
+        return Picture(np.full((48, 64, 3), 128, np.uint8))
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+
+@pytest.fixture
+def grey() -> Iterator[str]:
+    """The scheme of a source that gives grey pictures."""
+
+    @source("grey", "grey pictures")
+    def open_grey(uri: str, settings: SourceSettings) -> Source:
+        return SequentialSource(uri, OneGrey, settings)
+
+    yield "grey"
+    SOURCES.remove("grey")
+
+
+def test_registered_scheme_is_opened_with_address_and_settings(grey: str) -> None:
+    seen: list[int] = []
+    settings = SourceSettings(on_frame=lambda frame: seen.append(frame.sequence))
+    with open_source(f"{grey}://any/where?x=1", settings) as frames:
+        frame = frames.read()
+    assert frames.uri == "grey://any/where?x=1"
+    assert frame is not None
+    assert (frame.width, frame.height, int(frame.image.mean())) == (64, 48, 128)
+    assert seen == [0]
+
+
+def test_unknown_scheme_lists_the_known_ones(grey: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        open_source("gray://x")
+    for scheme in ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", grey):
+        assert f" {scheme} (" in str(caught.value)
+    assert "plugins.modules" in str(caught.value)
+
+
+@pytest.mark.parametrize("scheme", ["shm", "Grey", "1grey", "grey://", ""])
+def test_scheme_that_is_taken_or_malformed_is_refused(scheme: str) -> None:
+    before = SOURCES.known()
+
+    def open_other(uri: str, settings: SourceSettings) -> Source:
+        raise SourceError(uri)
+
+    with pytest.raises(ValueError, match=r"test_registry\..*open_other"):
+        source(scheme, "another")(open_other)
+    assert SOURCES.known() == before
