@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 # Each room of `companion` and its floor; a room may import from lower floors alone.
 FLOORS = {
     "geometry": 0,
+    "plugins": 0,
     "settings": 1,
     "vehicle": 2,
     "bus": 3,

@@ -5,11 +5,9 @@ Torch is loaded for what it computes alone: an ONNX or OpenVINO file does withou
 
 from __future__ import annotations
 
-import difflib
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 from vision.detections import Detections
 from vision.letterbox import Letterbox, fit
 from vision.model_files import find_model
+from vision.object_detector import ObjectDetector, Timing, resolve_classes
 from vision.runtimes.contract import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
@@ -36,20 +35,7 @@ DEFAULT_MODEL = "default"
 _SPARSE_FROM = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """How long the parts of one detection took, milliseconds."""
-
-    preprocess_ms: float
-    inference_ms: float
-    postprocess_ms: float
-
-    @property
-    def total_ms(self) -> float:
-        return self.preprocess_ms + self.inference_ms + self.postprocess_ms
-
-
-class Detector:
+class Detector(ObjectDetector):
     """A YOLO network with its thresholds. Not to be shared between threads.
 
     Attributes:
@@ -59,6 +45,7 @@ class Detector:
         runtime_reason: why that one, in words.
         precision: what the network computes in, `float32`, `bfloat16` or `float16`.
         precision_reason: why, in words.
+        model_name: what `model` was given as.
         description: what the network was built from; None of an exported file.
         metadata: what the file tells about itself (licence, origin, score).
         last_timing: of the latest `detect`; None before the first.
@@ -113,11 +100,11 @@ class Detector:
         self.class_ids = None if classes is None else resolve_classes(classes, source.class_names)
         self.description: ModelDescription | None = source.description
         self.metadata: dict[str, Any] = source.metadata
+        self.model_name = str(model)
         self.confidence = confidence
         self.iou = iou
         self.image_size = image_size
         self.square = square
-        self.last_timing: Timing | None = None
         self._letterbox: Letterbox | None = None
         self._boxed: NDArray[np.uint8] | None = None
         started = start_runtime(
@@ -130,8 +117,11 @@ class Detector:
             sparse_boxes=confidence >= _SPARSE_FROM,
         )
         self._runtime = started.runtime
-        self.runtime, self.runtime_reason = self._runtime.name, started.reason
-        self.precision, self.precision_reason = self._runtime.precision, self._runtime.precision_reason
+        self.runtime: str = self._runtime.name
+        self.runtime_reason = started.reason
+        self.precision: str = self._runtime.precision
+        self.precision_reason = self._runtime.precision_reason
+        self.reason = f"{self.runtime_reason}; {self.precision}: {self.precision_reason}"
         logger.info(
             "model %s: %d classes, on %s (%s), in %s (%s)",
             path,
@@ -152,7 +142,7 @@ class Detector:
         box = self._fit(width, height)
         self._runtime.prepare(box.height, box.width)
 
-    def detect(self, image_bgr: NDArray[np.uint8]) -> Detections:
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
         """What is in one frame.
 
         Args:
@@ -196,28 +186,6 @@ class Detector:
             box = fit(width, height, self.image_size, square=self.square, stride=self._stride)
             self._letterbox, self._boxed = box, box.blank()
         return box
-
-
-def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) -> tuple[int, ...]:
-    """Class names or ids (also ids as text) → sorted ids.
-
-    Raises `ValueError` for an unknown one; the message names the nearest names.
-    """
-    if isinstance(classes, str) or not classes:
-        raise ValueError(f"classes must be a list of names or ids, or None for all; got {classes!r}")
-    ids: set[int] = set()
-    for wanted in classes:
-        named = [index for index, name in enumerate(class_names) if name == wanted]
-        if not named and isinstance(wanted, str) and not wanted.isdecimal():
-            near = difflib.get_close_matches(wanted.lower(), class_names, n=3, cutoff=0.0)
-            raise ValueError(
-                f"the model has no class {wanted!r}; nearest of its {len(class_names)}: {', '.join(near)}"
-            )
-        identity = int(wanted) if not named else named[0]
-        if not 0 <= identity < len(class_names):
-            raise ValueError(f"the model has classes 0..{len(class_names) - 1}, not {wanted}")
-        ids.update(named or [identity])
-    return tuple(sorted(ids))
 
 
 def class_names_of(model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice = "torch") -> tuple[str, ...]:

@@ -72,7 +72,7 @@ class Timing(Protocol):
 
 
 class FrameDetector(Protocol):
-    """What the pipeline needs of a detector; `vision.detector.Detector` is one."""
+    """What the pipeline needs of a detector; every `vision.object_detector.ObjectDetector` is one."""
 
     @property
     def class_names(self) -> tuple[str, ...]: ...

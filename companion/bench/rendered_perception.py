@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 
 from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
+from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.settings.perception import DetectorSection, TrackerSection
 from mavlink_sim.camera.scene import Scene
@@ -23,12 +24,10 @@ from mavlink_sim.spectators import camera_turn_rad
 from mavlink_sim.world.aircraft import Aircraft
 from vision.attitude import Quaternion
 from vision.frame import Frame
+from vision.object_detector import ObjectDetector
 from vision.pipeline import PerceptionResult
 from vision.rotation import matrix_from_quaternion
 from vision.sources import EndOfStream, Source, SourceStatistics
-
-if TYPE_CHECKING:
-    from vision.detector import Detector
 
 
 class RenderedPerception:
@@ -72,6 +71,7 @@ class RenderedPerception:
         cv2.setNumThreads(1)
         detector = None
         if settings.detector.enabled:
+            load_plugins(settings.plugins.modules)
             keys = (settings.detector.model_dump_json(), settings.tracker.model_dump_json())
             detector = _detector(*keys)
         self.scene = scene
@@ -159,7 +159,7 @@ class _OneFrame(Source):
 
 
 @lru_cache(maxsize=4)
-def _detector(detector_json: str, tracker_json: str) -> Detector:
+def _detector(detector_json: str, tracker_json: str) -> ObjectDetector:
     """Loading takes as long as many frames, and a network keeps nothing from one frame to the next."""
     detector = DetectorSection.model_validate_json(detector_json)
     changes: dict[str, Any] = {"threads": 1}

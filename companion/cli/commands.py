@@ -29,6 +29,7 @@ from companion.cli.play import play
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
 from vision.loading import uncollected
+from vision.object_detector import YOLO
 
 if TYPE_CHECKING:
     from companion.service import Service
@@ -91,10 +92,10 @@ def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
     with uncollected():
         from companion.bus.session import BusError
-        from companion.guidance.registry import PluginError
         from companion.operator.line_output import use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.keeper import PerceptionStartError
+        from companion.plugins import PluginError
         from companion.service import Service
         from companion.vehicle.driver import LinkError
 
@@ -143,7 +144,9 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
         _keep_what_is_loaded()
         views = [settings.of_view(name) for name in (None, *settings.views)]
         _warn_drawn_scenes_only(
-            (view.source.uri, view.detector.model) for view in views if view.detector.enabled
+            (view.source.uri, view.detector.model)
+            for view in views
+            if view.detector.enabled and view.detector.kind == YOLO
         )
 
     running = asyncio.ensure_future(service.run(on_ready))
@@ -242,6 +245,7 @@ def _say_with_time() -> Callable[[str], None]:
 @app.command()
 def detect(
     source: Annotated[str, typer.Argument(help="file, folder, /dev/video0, FIFO, - or network address")],
+    detector_kind: Annotated[str, typer.Option(help="yolo, or that of a plug-in")] = YOLO,
     model: Annotated[
         str, typer.Option(help="a checkpoint, an exported file, or a name in the models folder")
     ] = "default",
@@ -268,21 +272,25 @@ def detect(
     height: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
     rate: Annotated[float | None, typer.Option(min=0.1, help="of a camera or raw file, Hz")] = None,
     pixel_format: Annotated[str | None, typer.Option(help="bgr24, rgb24, gray8, y4m, mjpeg, YUYV…")] = None,
+    plugins_modules: Annotated[
+        str | None, typer.Option(help="modules or names of plug-ins to load, comma separated")
+    ] = None,
 ) -> None:
     """Detect objects in every frame of a source; one line a frame on standard output."""
     with uncollected():
         from companion.detect import detect_source
-        from vision.detector import Detector
+        from companion.plugins import PluginError, load_plugins
+        from vision.object_detector import DetectorSettings, open_detector
         from vision.pipeline import FrameDetector
         from vision.sources import SourceError, SourceSettings, open_source
         from vision.tiling import TiledDetector
         from vision.tracking import Tracker, TrackerSettings
-        from vision.yolo.safe_pickle import CheckpointError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
     following = TrackerSettings(keep_confidence=confidence)
-    with plain_errors(CheckpointError, ValueError):
-        detector = Detector(
+    with plain_errors(PluginError, ValueError):  # CheckpointError is a ValueError
+        load_plugins(parse_words(plugins_modules))
+        wanted = DetectorSettings(
             model,
             classes=parse_classes(classes),
             # A tracker wants to see the weak ones too, and leaves them out again.
@@ -293,8 +301,9 @@ def detect(
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )
-        if runtime == "auto":
-            typer.echo(f"companion: on {detector.runtime} ({detector.runtime_reason})", err=True)
+        detector = open_detector(detector_kind, wanted)
+        if runtime == "auto" and detector.runtime is not None:
+            typer.echo(f"companion: on {detector.runtime} ({detector.reason})", err=True)
         looking: FrameDetector = detector
         if tiles:
             looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
@@ -303,7 +312,8 @@ def detect(
         )
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
-        _warn_drawn_scenes_only([(source, model)])
+        if detector_kind == YOLO:
+            _warn_drawn_scenes_only([(source, model)])
         looked_at = detect_source(
             frames,
             looking,
@@ -319,12 +329,16 @@ def detect(
         raise typer.Exit(EXIT_BAD_INPUT)
 
 
-def parse_classes(text: str | None) -> list[str | int] | None:
+def parse_words(text: str | None) -> list[str]:
+    """`a, b` as a list; empty for None."""
+    return [word.strip() for word in (text or "").split(",") if word.strip()]
+
+
+def parse_classes(text: str | None) -> tuple[str | int, ...] | None:
     """`person,car` or `0,2` as a detector takes them; None for all."""
     if text is None or not text.strip():
         return None
-    words = [word.strip() for word in text.split(",") if word.strip()]
-    return [int(word) if word.isdigit() else word for word in words]
+    return tuple(int(word) if word.isdigit() else word for word in parse_words(text))
 
 
 @app.command()
@@ -380,7 +394,7 @@ def commands(
 ) -> None:
     """List what `companion send` takes, plug-ins included: words, arguments, units and ranges."""
     from companion.guidance.grammar import describe, json_schema, markdown
-    from companion.guidance.registry import PluginError, load_plugins
+    from companion.plugins import PluginError, load_plugins
 
     with plain_errors(PluginError):
         load_plugins(settings.plugins.modules)

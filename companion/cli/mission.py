@@ -8,6 +8,7 @@ import typer
 
 from companion.cli.flags import plain_errors
 from companion.settings import Settings
+from vision.object_detector import YOLO
 
 EXIT_FAILED = 1
 
@@ -32,7 +33,7 @@ def mission(
         plan_from,
         read_mission,
     )
-    from companion.guidance.registry import PluginError, load_plugins
+    from companion.plugins import PluginError, load_plugins
 
     with plain_errors(MissionError, NoAnswerError, PluginError, ValueError):
         load_plugins(settings.plugins.modules)
@@ -56,6 +57,10 @@ def _class_names(settings: Settings) -> tuple[str, ...] | None:
     """What the configured detector knows; None where nothing is to be detected."""
     if not settings.detector.enabled:
         return None
+    if settings.detector.kind != YOLO:
+        from companion.perception.assembly import load_detector
+
+        return load_detector(settings).class_names
     from vision.detector import class_names_of
 
     return class_names_of(settings.detector.model, settings.detector.runtime)

@@ -52,12 +52,12 @@ def play(
     started_s = time.monotonic()
     with uncollected():
         from companion.bus.session import BusError
-        from companion.guidance.registry import PluginError
         from companion.operator.line_output import LineOutput, use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.keeper import PerceptionStartError
         from companion.play import PlayOptions, SimulationLostError
         from companion.play import play as start
+        from companion.plugins import PluginError
         from companion.sim_session import SimSessionError
         from companion.vehicle.driver import LinkError
 

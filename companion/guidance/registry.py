@@ -1,4 +1,4 @@
-"""The table of commands: a decorator that adds one to it, and the plug-ins that bring their own.
+"""The table of commands: a decorator that adds one to it, for those of this package and of plug-ins.
 
 A behaviour is one file. It holds its command (word, arguments with unit, range and help) and the behaviour
 that the command becomes, and adds itself:
@@ -11,36 +11,24 @@ that the command becomes, and adds itself:
             return CircleBehaviour(self.radius_m)
 
 Grammar, help, documentation and JSON Schema are made from this table. A file outside of this package is
-loaded only where the setting `plugins` names it.
+loaded only where the setting `plugins` names it (`companion.plugins`).
 """
 
 from __future__ import annotations
 
-import importlib
-import logging
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from importlib.metadata import entry_points
 from typing import TypeVar, dataclass_transform, get_args, get_type_hints
 
 from companion.guidance.arguments import Argument
 from companion.guidance.command import Command
-
-logger = logging.getLogger(__name__)
-
-ENTRY_POINTS = "companion.plugins"
-"""The group of entry points in which an installed package may give its module a short name."""
 
 COMMANDS: dict[str, type[Command]] = {}
 """Word → command, in the order of registration."""
 
 _WORD = re.compile(r"[a-z][a-z0-9-]*")
 _Kind = TypeVar("_Kind", bound=Command)
-
-
-class PluginError(RuntimeError):
-    """A plug-in cannot be loaded. The message is one line for a person."""
 
 
 @dataclass_transform(frozen_default=True)
@@ -79,26 +67,3 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
 def _same(kind: type[Command], other: type[Command]) -> bool:
     """The same class again: its module was read twice."""
     return (kind.__module__, kind.__qualname__) == (other.__module__, other.__qualname__)
-
-
-def load_plugins(names: Iterable[str]) -> None:
-    """Import the modules that a user named: each the name of an entry point in ENTRY_POINTS, or of a module.
-
-    Raises:
-        PluginError: there is no such module, or it cannot be imported; the traceback is in the log.
-    """
-    installed = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
-    for name in names:
-        module = installed.get(name, name)
-        try:
-            importlib.import_module(module)
-        except Exception as error:
-            if isinstance(error, ModuleNotFoundError) and error.name == module:
-                known = ", ".join(sorted(installed)) or "none"
-                raise PluginError(
-                    f"plugins: no module {module!r} on the Python path; installed plug-ins: {known}"
-                ) from error
-            logger.exception("plug-in %s cannot be imported", name)
-            raise PluginError(
-                f"plugins: {name!r} cannot be imported: {type(error).__name__}: {error}"
-            ) from error

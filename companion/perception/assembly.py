@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,16 +13,13 @@ from companion.settings import Settings
 from vision.camera_model import CameraMount
 from vision.depth import nearest_points
 from vision.frame import Frame
-from vision.loading import uncollected
 from vision.markers import Marker, MarkerDetector
+from vision.object_detector import ObjectDetector, open_detector
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.pipeline import FrameDetector, FrameRecorder, Pipeline
 from vision.sources import Source
 from vision.tracking import AttitudeHistory, CameraView, Tracker
 from vision.tracking.camera_motion import Array
-
-if TYPE_CHECKING:
-    from vision.detector import Detector
 
 
 class CameraTelemetry:
@@ -42,7 +38,7 @@ class CameraTelemetry:
 def build_pipeline(
     settings: Settings,
     source: Source,
-    detector: Detector | None,
+    detector: ObjectDetector | None,
     telemetry: CameraTelemetry,
     *,
     recorder: FrameRecorder | None = None,
@@ -69,7 +65,7 @@ def build_pipeline(
     )
 
 
-def tiled(settings: Settings, detector: Detector | None) -> FrameDetector | None:
+def tiled(settings: Settings, detector: ObjectDetector | None) -> FrameDetector | None:
     """The detector as the pipeline uses it."""
     wanted = settings.detector
     if detector is None or not wanted.tiles:
@@ -79,25 +75,17 @@ def tiled(settings: Settings, detector: Detector | None) -> FrameDetector | None
     return TiledDetector(detector, tile_size=wanted.tile_size, overlap=wanted.tile_overlap)
 
 
-def load_detector(settings: Settings) -> Detector:
-    # Only here: a worker that only records needs none of it.
-    with uncollected():
-        from vision.detector import Detector
+def load_detector(settings: Settings) -> ObjectDetector:
+    """The detector of `detector.kind`, ready; the plug-ins must be loaded.
 
+    Raises:
+        ValueError: as `vision.object_detector.open_detector`.
+    """
     wanted = settings.detector
     if wanted.threads is not None:
         # Else its resizing takes every core, whatever the network was given.
         cv2.setNumThreads(wanted.threads)
-    return Detector(
-        wanted.model,
-        classes=wanted.classes or None,
-        confidence=_least_confidence(settings),
-        iou=wanted.iou,
-        image_size=wanted.image_size,
-        precision=wanted.precision,
-        threads=wanted.threads,
-        runtime=wanted.runtime,
-    )
+    return open_detector(wanted.kind, wanted.loading(_least_confidence(settings)))
 
 
 def _least_confidence(settings: Settings) -> float:

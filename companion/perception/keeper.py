@@ -437,10 +437,9 @@ class PerceptionKeeper:
             return
         model = "no detector"
         if ready.model is not None:
-            model = (
-                f"model {ready.model} with {len(ready.class_names)} classes by {ready.runtime} "
-                f"in {ready.precision}"
-            )
+            model = f"model {ready.model} with {len(ready.class_names)} classes"
+            model += f" by {ready.runtime}" if ready.runtime else ""
+            model += f" in {ready.precision}" if ready.precision else ""
         self._on_event("info", f"perception sees {ready.source}, {model} (process {process.pid})")
 
     def _take(self, report: Report) -> None:

@@ -79,8 +79,9 @@ class Stop:
 class Ready:
     """The model is loaded and the source has given its first frame.
 
-    `model`, `precision`, which the network computes in, and `runtime`, what computes it, are None without a
-    detector. `reason`: why these, in words. `calibration`: of the camera, where it brings one.
+    `model` is None without a detector; `precision`, which the network computes in, and `runtime`, what
+    computes it, also for a detector without a network. `reason`: why these, in words. `calibration`: of the
+    camera, where it brings one.
     """
 
     source: str

@@ -42,7 +42,7 @@ class PerceptionStatus:
         stuck_after_s: the silence after which the worker counts as stuck.
         class_names: what the model knows; empty before the start and without a detector.
         tracks: objects that are followed now and count as true.
-        runtime: what computes the network; None before the start and without a detector.
+        runtime: what computes the network; None before the start and without a network.
         runtime_reason: why that, and why in its precision, in words.
         problem: the last thing that went wrong, empty if nothing did.
     """

@@ -19,7 +19,6 @@ import time
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
 from companion.perception.messages import (
@@ -38,18 +37,17 @@ from companion.perception.messages import (
 )
 from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.preview import PreviewEncoder
+from companion.plugins import PluginError, load_plugins
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.object_detector import YOLO, ObjectDetector
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.sources import EndOfStream, Source, SourceError, open_source
 from vision.sources.sharing import FrameSharing
 from vision.video_writer import VideoWriterError
-
-if TYPE_CHECKING:
-    from vision.detector import Detector
 
 # The loop says at least this often that it turns.
 HEARTBEAT_S = 0.25
@@ -113,7 +111,7 @@ class Perception:
     """Everything that was opened."""
 
     source: Source
-    detector: Detector | None
+    detector: ObjectDetector | None
     recording: Recording | None
     preview: PreviewEncoder
 
@@ -164,6 +162,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             with _saying_that_it_loads(settings, outbox):
                 perception = _open(settings, stack, outbox)
         except (
+            PluginError,
             SourceError,
             VideoWriterError,
             ValueError,
@@ -203,14 +202,17 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
 
 @contextlib.contextmanager
 def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
-    """To convert a model for another runtime, and to try which is the fastest, may take minutes."""
+    """To convert a model for another runtime, and to try which is the fastest, may take minutes.
+
+    What a plug-in's detector does at its start is not known.
+    """
     loaded = threading.Event()
 
     def say() -> None:
         while not loaded.wait(_LOADING_PERIOD_S):
             outbox.put_newest(Heartbeat(0))
 
-    if settings.detector.runtime != "torch":
+    if settings.detector.runtime != "torch" or settings.detector.kind != YOLO:
         threading.Thread(target=say, name="loading", daemon=True).start()
     try:
         yield
@@ -219,6 +221,7 @@ def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
 
 
 def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Perception:
+    load_plugins(settings.plugins.modules)
     recording = None
     if settings.recording.video is not None:
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
@@ -242,11 +245,11 @@ def _ready(settings: Settings, perception: Perception) -> Ready:
         return Ready(perception.source.uri, None, (), None, calibration=calibration)
     return Ready(
         perception.source.uri,
-        settings.detector.model,
+        detector.model_name,
         detector.class_names,
         detector.precision,
         detector.runtime,
-        f"{detector.runtime_reason}; {detector.precision}: {detector.precision_reason}",
+        detector.reason,
         calibration,
     )
 

@@ -16,11 +16,11 @@ from companion.guidance.command import BuildContext, Command
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, GuidanceInput, StreamStatus
 from companion.guidance.pose_sharing import PoseSharing
-from companion.guidance.registry import load_plugins
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
 from companion.perception.views import View
 from companion.perception.views_markers import MarkerWatch
+from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report

@@ -14,6 +14,7 @@ from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.markers import MarkerKind, PadMarker, markers_in
+from vision.object_detector import YOLO, DetectorSettings
 from vision.sources.source import SourceSettings
 from vision.tracking.tracks import TrackerSettings
 
@@ -163,6 +164,8 @@ class DetectorSection(Section):
 
     enabled: bool = True
     """false: frames are read and nothing is looked for"""
+    kind: Annotated[str, KEY_WORD] = YOLO
+    """what detects: yolo, or a plug-in's kind; the keys of model and network then mean what it says"""
     model: Annotated[str, Field(min_length=1)] = DEFAULT_MODEL
     """a checkpoint or an exported file; default: the model of this package, which knows drawn scenes"""
     classes: tuple[str | int, ...] = ()
@@ -202,6 +205,19 @@ class DetectorSection(Section):
             if not 0 < height_m <= 100:
                 raise ValueError(f"known_heights: {name} must be above 0 and at most 100 m, got {height_m:g}")
         return self
+
+    def loading(self, confidence: float) -> DetectorSettings:
+        """The same, as `vision.object_detector.open_detector` takes it, with this least confidence."""
+        return DetectorSettings(
+            model=self.model,
+            classes=self.classes or None,
+            confidence=confidence,
+            iou=self.iou,
+            image_size=self.image_size,
+            precision=self.precision,
+            threads=self.threads,
+            runtime=self.runtime,
+        )
 
     def selection(self) -> Selection:
         """Which frames are looked at."""

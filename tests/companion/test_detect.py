@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.detect import detect_source
 from vision.detections import Detections
-from vision.detector import Timing
+from vision.object_detector import Timing
 from vision.sources import open_source
 from vision.tracking import Tracker, TrackerSettings
 

@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from vision import detector as detector_module
-from vision.detector import Detector, resolve_classes
+from vision.detector import Detector
+from vision.object_detector import resolve_classes
 from vision.yolo.architecture import YoloModel, build, yolov8_description
 from vision.yolo.checkpoint import CheckpointError, save_checkpoint
 

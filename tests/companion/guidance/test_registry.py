@@ -11,7 +11,8 @@ import pytest
 
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import describe, json_schema, markdown, parse
-from companion.guidance.registry import COMMANDS, PluginError, load_plugins
+from companion.guidance.registry import COMMANDS
+from companion.plugins import PluginError, load_plugins
 
 PLUGIN = """
 from typing import Annotated

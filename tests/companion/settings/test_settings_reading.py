@@ -194,7 +194,7 @@ def test_a_bad_file_names_the_key_and_the_file(tmp_path: Path, toml: str, expect
     [
         ("detector.confidense", "did you mean detector.confidence?"),
         ("source.confidence", "did you mean detector.confidence?"),
-        ("detector.qqqqqqqqqqqqqqqq", "known: detector.enabled, detector.model,"),
+        ("detector.qqqqqqqqqqqqqqqq", "known: detector.enabled, detector.kind, detector.model,"),
         ("zzz", "known: vehicle, source, camera,"),
     ],
 )

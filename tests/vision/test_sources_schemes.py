@@ -59,6 +59,6 @@ def test_scheme_that_is_taken_or_malformed_is_refused(scheme: str) -> None:
     def open_other(uri: str, settings: SourceSettings) -> Source:
         raise SourceError(uri)
 
-    with pytest.raises(ValueError, match=r"test_registry\..*open_other"):
+    with pytest.raises(ValueError, match=r"test_sources_schemes\..*open_other"):
         source(scheme, "another")(open_other)
     assert SOURCES.known() == before

@@ -1,0 +1,128 @@
+"""Kinds of detectors, and what becomes of what a plug-in's finds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from vision.detections import Detections
+from vision.detector import Detector
+from vision.object_detector import (
+    DETECTORS,
+    YOLO,
+    DetectorSettings,
+    ObjectDetector,
+    Timing,
+    detector,
+    open_detector,
+)
+
+FRAME = np.zeros((48, 64, 3), np.uint8)
+
+
+class Corners(ObjectDetector):
+    """Finds one of each class, ever less sure."""
+
+    class_names = ("a", "b", "c")
+
+    def __init__(self, settings: DetectorSettings) -> None:
+        self.settings = settings
+
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        boxes = np.array([(0, 0, 9, 9), (20, 0, 29, 9), (40, 0, 49, 9)], np.float32)
+        return Detections(
+            boxes, np.array([0.9, 0.6, 0.3], np.float32), np.arange(3, dtype=np.int64), self.class_names
+        )
+
+
+class Wrong(Corners):
+    """Says other class names than its own."""
+
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        return Detections.empty(("a", "b"))
+
+
+class Timed(Corners):
+    """Measures itself, and has a name and a runtime."""
+
+    model_name, runtime, precision, reason = "corners-2", "harris", "int8", "there is no other"
+    last_timing = Timing(1.0, 2.0, 3.0)
+
+
+@pytest.fixture(autouse=True)
+def _kinds() -> Iterator[None]:
+    kinds = {"corners": Corners, "wrong": Wrong, "timed": Timed}
+    for kind, opener in kinds.items():
+        detector(kind, "of a test")(opener)
+    yield
+    for kind in kinds:
+        DETECTORS.remove(kind)
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        (DetectorSettings(confidence=0.0), ["a", "b", "c"]),
+        (DetectorSettings(confidence=0.5), ["a", "b"]),
+        (DetectorSettings(confidence=0.0, classes=("b", 2)), ["b", "c"]),
+        (DetectorSettings(confidence=0.5, classes=("c",)), []),
+    ],
+)
+def test_classes_and_confidence_hold_for_a_plugin(settings: DetectorSettings, names: list[str]) -> None:
+    assert open_detector("corners", settings).detect(FRAME).names == names
+
+
+def test_unknown_class_of_a_plugin_is_refused() -> None:
+    with pytest.raises(ValueError, match="no class 'd'"):
+        open_detector("corners", DetectorSettings(classes=("d",)))
+
+
+def test_unknown_kind_lists_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"detector\.kind.*'yollo'.*yolo.*corners.*plugins\.modules"):
+        open_detector("yollo", DetectorSettings())
+
+
+@pytest.mark.parametrize("kind", [YOLO, "Corners", ""])
+def test_kind_that_is_taken_or_malformed_is_refused(kind: str) -> None:
+    before = DETECTORS.known()
+    with pytest.raises(ValueError, match=r"test_object_detector\.Corners"):
+        detector(kind, "of a test")(Corners)
+    assert DETECTORS.known() == before
+
+
+def test_detector_without_timing_is_timed_as_a_whole() -> None:
+    made = open_detector("corners", DetectorSettings())
+    assert made.last_timing is None
+    made.detect(FRAME)
+    timing = made.last_timing
+    assert timing is not None
+    assert 0.0 < timing.inference_ms == timing.total_ms
+    assert (made.model_name, made.runtime, made.precision) == ("corners", None, None)
+
+
+def test_detector_may_say_what_it_is() -> None:
+    made = open_detector("timed", DetectorSettings())
+    made.detect(FRAME)
+    assert (made.model_name, made.runtime, made.precision, made.reason) == (
+        "corners-2",
+        "harris",
+        "int8",
+        "there is no other",
+    )
+    assert made.last_timing == Timing(1.0, 2.0, 3.0)
+
+
+def test_other_class_names_than_declared_are_an_error() -> None:
+    with pytest.raises(TypeError, match="class names"):
+        open_detector("wrong", DetectorSettings()).detect(FRAME)
+
+
+def test_yolo_is_a_kind_like_any_other() -> None:
+    made = open_detector(YOLO, DetectorSettings(confidence=0.5, image_size=64, precision="float32"))
+    assert isinstance(made, Detector)
+    assert (made.model_name, made.runtime, made.precision) == ("default", "torch", "float32")
+    assert (made.confidence, made.image_size) == (0.5, 64)
+    assert made.reason

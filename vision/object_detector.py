@@ -1,0 +1,218 @@
+"""What a detector is, and the table of kinds: a decorator adds one, built in or of a plug-in."""
+
+from __future__ import annotations
+
+import difflib
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.detections import Detections
+from vision.loading import uncollected
+from vision.registry import Registry
+
+if TYPE_CHECKING:
+    from vision.runtimes.contract import Precision
+    from vision.runtimes.selection import RuntimeChoice
+
+YOLO = "yolo"
+"""The built-in kind."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSettings:
+    """What a detector is made of. A kind ignores what it has no use for.
+
+    Attributes:
+        model: for `yolo` as `vision.detector.Detector` takes it; a plug-in may give it any meaning.
+        classes: names or ids to report; None for all.
+        confidence: boxes less sure than this are dropped, 0..1.
+        iou: of two boxes of one class overlapping more than this the less confident is dropped, 0..1.
+        image_size: longer side of a network's input, pixels.
+        precision: what a network computes in, or `auto`.
+        threads: processor threads; None: the detector's own choice.
+        runtime: what computes a network.
+    """
+
+    model: str = "default"
+    classes: tuple[str | int, ...] | None = None
+    confidence: float = 0.25
+    iou: float = 0.7
+    image_size: int = 640
+    precision: Precision = "auto"
+    threads: int | None = None
+    runtime: RuntimeChoice = "torch"
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long the parts of one detection took, milliseconds."""
+
+    preprocess_ms: float
+    inference_ms: float
+    postprocess_ms: float
+
+    @property
+    def total_ms(self) -> float:
+        return self.preprocess_ms + self.inference_ms + self.postprocess_ms
+
+
+class ObjectDetector(ABC):
+    """Finds objects in single frames. Made and used in one thread.
+
+    A detector needs `class_names` and `detect`; the rest is what status and log say of it.
+
+    Attributes:
+        class_names: id → name, all that it can report; it stays as it is once the detector is made.
+        last_timing: of the latest `detect`; None where it measures nothing: all its time counts as inference.
+        model_name: what it computes with, for messages; empty: the name of its kind.
+        runtime: what computes it; None where there is no choice.
+        precision: what it computes in, `float32` for example; None where that says nothing.
+        reason: why this runtime and precision, in words.
+    """
+
+    class_names: tuple[str, ...]
+    last_timing: Timing | None = None
+    model_name: str = ""
+    runtime: str | None = None
+    precision: str | None = None
+    reason: str = ""
+
+    @abstractmethod
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        """What is in one frame.
+
+        Args:
+            image_bgr: (height, width, 3) uint8, BGR. Its size may change from frame to frame. It is the
+                frame itself: not to be written to, nor kept.
+
+        Returns:
+            The boxes in the frame's pixels (left, top, right, bottom; origin at the upper left corner), with
+            this detector's `class_names`; `Detections.empty(self.class_names)` for none.
+        """
+
+
+OpenDetector = Callable[[DetectorSettings], ObjectDetector]
+"""Makes a detector ready. Raises ValueError, in one line, where it cannot."""
+
+DETECTORS: Registry[OpenDetector] = Registry(
+    "kind of detector", r"[a-z][a-z0-9-]*", "lower-case letters, digits and `-`"
+)
+"""Kind → what makes such a detector."""
+
+_Opener = TypeVar("_Opener", bound=OpenDetector)
+
+
+def detector(kind: str, help_text: str) -> Callable[[_Opener], _Opener]:
+    """Let `detector.kind = "…"` choose the decorated class or function.
+
+    It is called with the `DetectorSettings` and returns an `ObjectDetector`. What a plug-in's detector finds
+    outside of `classes` or below `confidence` is dropped by the caller.
+
+        @detector("bright", "everything that is white")
+        class Bright(ObjectDetector):
+            class_names = ("bright",)
+
+            def __init__(self, settings: DetectorSettings) -> None: ...
+            def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections: ...
+
+    Args:
+        kind: lower-case letters, digits and hyphens.
+        help_text: what it finds and how, one line without a full stop.
+
+    Raises:
+        ValueError: the kind has another form, or another detector has it.
+    """
+
+    def register(opener: _Opener) -> _Opener:
+        DETECTORS.add(kind, help_text, opener)
+        return opener
+
+    return register
+
+
+def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
+    """Make a detector ready.
+
+    Raises:
+        ValueError: no such kind (the message lists the known ones), an unknown class, or what the kind itself
+            refuses: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors.
+    """
+    if (opener := DETECTORS.get(kind)) is None:
+        raise ValueError(
+            f"detector.kind: there is no {kind!r}; known: {DETECTORS.known()}. The kind of a plug-in "
+            "is known once its module is loaded (plugins.modules, --plugins-modules)"
+        )
+    made = opener(settings)
+    return made if kind == YOLO else _Selecting(made, kind, settings)
+
+
+@detector(YOLO, "a YOLO network, by detector.model")
+def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
+    with uncollected():  # only here: it imports half a second
+        from vision.detector import Detector
+
+    return Detector(
+        settings.model,
+        classes=settings.classes,
+        confidence=settings.confidence,
+        iou=settings.iou,
+        image_size=settings.image_size,
+        precision=settings.precision,
+        threads=settings.threads,
+        runtime=settings.runtime,
+    )
+
+
+class _Selecting(ObjectDetector):
+    """Drops what `classes` and `confidence` exclude: a plug-in need not do so, and cannot forget it."""
+
+    def __init__(self, inner: ObjectDetector, kind: str, settings: DetectorSettings) -> None:
+        self.class_names = tuple(inner.class_names)
+        self.model_name = inner.model_name or kind
+        self.runtime, self.precision, self.reason = inner.runtime, inner.precision, inner.reason
+        self._inner, self._confidence = inner, settings.confidence
+        wanted = settings.classes
+        self._class_ids = None if wanted is None else resolve_classes(wanted, self.class_names)
+
+    def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
+        started = time.perf_counter()
+        found = self._inner.detect(image_bgr)
+        elapsed_ms = (time.perf_counter() - started) * 1e3
+        self.last_timing = self._inner.last_timing or Timing(0.0, elapsed_ms, 0.0)
+        if found.class_names != self.class_names:
+            raise TypeError(
+                f"detector {self.model_name}: detections must have its class names {self.class_names}, "
+                f"got {found.class_names}"
+            )
+        kept = found.confidence >= self._confidence
+        if self._class_ids is not None:
+            kept &= np.isin(found.class_id, self._class_ids)
+        return found[kept]
+
+
+def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) -> tuple[int, ...]:
+    """Class names or ids (also ids as text) → sorted ids.
+
+    Raises `ValueError` for an unknown one; the message names the nearest names.
+    """
+    if isinstance(classes, str) or not classes:
+        raise ValueError(f"classes must be a list of names or ids, or None for all; got {classes!r}")
+    ids: set[int] = set()
+    for wanted in classes:
+        named = [index for index, name in enumerate(class_names) if name == wanted]
+        if not named and isinstance(wanted, str) and not wanted.isdecimal():
+            near = difflib.get_close_matches(wanted.lower(), class_names, n=3, cutoff=0.0)
+            raise ValueError(
+                f"the model has no class {wanted!r}; nearest of its {len(class_names)}: {', '.join(near)}"
+            )
+        identity = int(wanted) if not named else named[0]
+        if not 0 <= identity < len(class_names):
+            raise ValueError(f"the model has classes 0..{len(class_names) - 1}, not {wanted}")
+        ids.update(named or [identity])
+    return tuple(sorted(ids))
