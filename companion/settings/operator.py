@@ -23,7 +23,7 @@ class LogSection(Section):
 
 
 class PluginsSection(Section):
-    """Programs of others that are loaded into the service. Nothing is loaded that is not named here."""
+    """Behaviours, detectors and sources of others. Nothing is loaded that is not named here."""
 
     modules: tuple[str, ...] = ()
     """modules on the Python path, or names of installed plug-ins (entry points `companion.plugins`)"""

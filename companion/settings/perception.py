@@ -165,7 +165,7 @@ class DetectorSection(Section):
     enabled: bool = True
     """false: frames are read and nothing is looked for"""
     kind: Annotated[str, KEY_WORD] = YOLO
-    """what detects: yolo, or a plug-in's kind; the keys of model and network then mean what it says"""
+    """yolo, or the kind of a plug-in (plugins.modules), which then gives model, image_size… their meaning"""
     model: Annotated[str, Field(min_length=1)] = DEFAULT_MODEL
     """a checkpoint or an exported file; default: the model of this package, which knows drawn scenes"""
     classes: tuple[str | int, ...] = ()

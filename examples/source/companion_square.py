@@ -1,0 +1,39 @@
+"""A source as a plug-in: `--source square://640x480?rate=10` is a red square that goes round."""
+
+import math
+import re
+
+import numpy as np
+
+from vision.sources import Feed, LatestSource, Picture, Source, SourceError, SourceSettings
+from vision.sources.registry import source
+
+SIDE_PX, ROUND_S = 40, 8.0
+
+
+class SquareFeed(Feed):
+    def __init__(self, width: int, height: int, rate_hz: float) -> None:
+        self._size, self._rate_hz, self._count = (width, height), rate_hz, 0
+
+    def read(self, timeout_s: float) -> Picture:
+        width, height = self._size
+        time_s = self._count / self._rate_hz
+        angle = 2 * math.pi * time_s / ROUND_S
+        left = round((width - SIDE_PX) * (0.5 + 0.4 * math.cos(angle)))
+        top = round((height - SIDE_PX) * (0.5 + 0.4 * math.sin(angle)))
+        image = np.full((height, width, 3), 128, np.uint8)
+        image[top : top + SIDE_PX, left : left + SIDE_PX] = (20, 20, 230)
+        self._count += 1
+        return Picture(image, media_s=time_s)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@source("square", "a red square that goes round")
+def open_square(uri: str, settings: SourceSettings) -> Source:
+    match = re.fullmatch(r"square://(\d{2,4})x(\d{2,4})(?:\?rate=(\d{1,3}))?", uri)
+    if match is None or min(int(match[1]), int(match[2])) <= SIDE_PX or match[3] == "0":
+        raise SourceError(f"{uri}: expected square://WIDTHxHEIGHT?rate=HZ, such as square://640x480?rate=10")
+    width, height, rate_hz = int(match[1]), int(match[2]), float(match[3] or settings.rate_hz or 10)
+    return LatestSource(uri, lambda: SquareFeed(width, height, rate_hz), settings, paced=True)

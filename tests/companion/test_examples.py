@@ -1,0 +1,152 @@
+"""The examples, run as a person runs them; those that are plug-ins installed as packages of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from companion.bench.scenes import MOTIONS, scene_frames
+from companion.bus.client import listen
+from mavlink_sim.testing import RunningSimulator
+from tests.companion.command_line import companion
+from tests.companion.service_process import running_service
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+PLUGINS = ("--plugins-modules", "red,square")
+
+
+def run_python(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=100, check=False)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the source and the detector, as pip installs them."""
+    pytest.importorskip("setuptools")
+    folder = tmp_path_factory.mktemp("plugins")
+    copies = []
+    for name in ("detector", "source"):
+        (folder / name).mkdir()
+        for file in (EXAMPLES / name).iterdir():
+            if file.is_file():
+                (folder / name / file.name).write_bytes(file.read_bytes())
+        copies.append(str(folder / name))
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--no-index", "--target", str(folder / "site"), *copies], check=True, timeout=100)
+    return folder / "site"
+
+
+@pytest.fixture
+def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that the test starts find them."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]))
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.py")), ids=lambda path: path.name)
+def test_example_has_at_most_forty_lines(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 40
+
+
+@pytest.mark.usefixtures("installed")
+def test_detect_finds_the_square_of_the_plugins(tmp_path: Path) -> None:
+    options = ("--detector-kind", "red", *PLUGINS, "--limit", "4", "--track", "--json")
+    done = companion("detect", "square://320x240?rate=20", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""  # the warning of the bundled model is about the built-in kind
+    frames = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [(frame["width"], frame["height"]) for frame in frames] == [(320, 240)] * 4
+    for frame in frames:
+        (record,) = frame["detections"]
+        left, top, right, bottom = record["xyxy"]
+        assert (record["class_name"], right - left, bottom - top) == ("blob", 40, 40)
+    assert frames[-1]["detections"][0]["track_state"] == "confirmed"
+    assert frames[0]["detections"][0]["xyxy"] != frames[-1]["detections"][0]["xyxy"]
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("square://10x10", "--detector-kind", "red", *PLUGINS), "square://10x10: expected square://WIDTH"),
+        (("circle://10x10", "--detector-kind", "red", *PLUGINS), "no circle://; known: .* square"),
+        (("square://320x240", "--detector-kind", "blue", *PLUGINS), "no 'blue'; known: yolo .* red "),
+        (("square://320x240", "--detector-kind", "red"), "no 'red'; known: yolo "),
+        (
+            ("square://320x240", "--detector-kind", "red", "--classes", "car", *PLUGINS),
+            "no class 'car'.*blob",
+        ),
+        (("square://320x240", "--plugins-modules", "rad"), "no module 'rad'.* red, square"),
+    ],
+)
+def test_what_detect_cannot_do_is_one_line(arguments: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    done = companion("detect", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert re.search(words, done.stderr), done.stderr
+
+
+@pytest.mark.usefixtures("installed")
+def test_mission_is_checked_for_the_classes_of_the_plugin(tmp_path: Path) -> None:
+    options = ("--check", "--detector-kind", "red", *PLUGINS)
+    for name, code in (("blob", 0), ("car", 2)):
+        (tmp_path / "m.toml").write_text(f"[[step]]\ndo = 'takeoff 3'\n[[step]]\ndo = 'seek {name}'\n")
+        done = companion("mission", "m.toml", *options, cwd=tmp_path)
+        assert done.returncode == code, done.stderr
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.timeout(200)
+def test_service_publishes_what_the_plugins_see(vehicle: RunningSimulator, tmp_path: Path) -> None:
+    flags = [*("--source", "square://320x240?rate=10", "--detector-kind", "red"), *PLUGINS]
+    with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
+        with service.client() as session:
+            detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+            statuses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+            listen(session, "detections", lambda _key, text: detections.put(json.loads(text)))
+            listen(session, "status", lambda _key, text: statuses.put(json.loads(text)))
+            frame = detections.get(timeout=30)
+            perception = statuses.get(timeout=30)["perception"]
+        assert [record["class_name"] for record in frame["detections"]] == ["blob"]
+        assert frame["timing_ms"]["inference"] > 0
+        assert (perception["state"], perception["runtime"]) == ("running", None)
+        assert perception["class_names"] == ["blob"]
+        assert service.wait_for_line("model red with 1 classes")
+        service.take_off(3.0)
+        done = run_python(EXAMPLES / "subscribe.py", service.endpoint, "land", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    *lines, answer = done.stdout.splitlines()
+    assert answer.startswith("land: done")
+    assert lines
+    seen = re.compile(r"vehicle1 frame \d+: blob 0\.82 at \d+, \d+ px, track \d+")
+    assert all(seen.match(line) for line in lines)
+
+
+def test_film_is_detected_and_tracked(tmp_path: Path) -> None:
+    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (640, 480))
+    for frame in scene_frames(MOTIONS[0], seconds=1.6, rate_hz=5.0):
+        film.write(frame.image)
+    film.release()
+    done = run_python(EXAMPLES / "detect_video.py", "film.avi", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    seen = re.findall(r"^ +([\d.]+) s  (\w+) #(\d+) \d\.\d\d at \d", done.stdout, re.MULTILINE)
+    assert {name for _, name, _ in seen} & {"car", "person", "truck", "dog"}
+    # The same number in several frames.
+    assert len({(name, number) for _, name, number in seen}) < len(seen)
+
+
+def test_example_of_tests_passes(tmp_path: Path) -> None:
+    copy = tmp_path / "test_with_vehicle.py"
+    copy.write_bytes((EXAMPLES / copy.name).read_bytes())
+    done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", copy, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout
+    assert "2 passed" in done.stdout
