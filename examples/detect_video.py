@@ -2,9 +2,8 @@
 
 import sys
 
-from vision.detector import Detector
-from vision.sources import open_source
-from vision.tracking import Tracker, TrackerSettings, TrackEventKind
+from vision import Detector, Tracker, open_source
+from vision.tracking import TrackerSettings, TrackEventKind
 
 
 def main(film: str, model: str = "default") -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vision.detector import Detector
     from vision.frame import Frame
     from vision.markers import MarkerDetector
+    from vision.object_detector import DetectorSettings, ObjectDetector
     from vision.pipeline import PerceptionResult, Pipeline
     from vision.sources.opening import open_source
     from vision.sources.source import Source, SourceError, SourceSettings
@@ -31,8 +32,10 @@ _MODULES = {
     "CameraMount": "vision.camera_model",
     "Detections": "vision.detections",
     "Detector": "vision.detector",
+    "DetectorSettings": "vision.object_detector",
     "Frame": "vision.frame",
     "MarkerDetector": "vision.markers",
+    "ObjectDetector": "vision.object_detector",
     "PerceptionResult": "vision.pipeline",
     "Pipeline": "vision.pipeline",
     "Source": "vision.sources.source",
@@ -47,8 +50,10 @@ __all__ = [
     "CameraMount",
     "Detections",
     "Detector",
+    "DetectorSettings",
     "Frame",
     "MarkerDetector",
+    "ObjectDetector",
     "PerceptionResult",
     "Pipeline",
     "Source",

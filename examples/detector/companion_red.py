@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.detections import Detections
-from vision.object_detector import DetectorSettings, ObjectDetector, detector
+from vision import Detections, DetectorSettings, ObjectDetector
+from vision.object_detector import detector
 
 
 @detector("red", "everything that is red and larger than 30 pixels, by its colour")
