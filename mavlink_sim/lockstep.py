@@ -362,13 +362,15 @@ class LockstepVehicle:
         """Fly with this velocity over ground from now on, local NED, metres a second.
 
         SET_POSITION_TARGET_LOCAL_NED goes out SETPOINT_RATE_HZ times a second while time passes, in OFFBOARD
-        (ArduPilot: GUIDED), until another of these three is called.
+        (ArduPilot: GUIDED), until another of these three is called. The first call lets 0.1 s pass before it
+        asks for the mode. A vehicle on the ground has to take off first.
 
         Args:
             yaw_rad: heading, clockwise from north; without one it stays as it is.
 
         Raises:
-            CommandRefusedError: the mode cannot be flown now.
+            CommandRefusedError: the mode cannot be flown now; no setpoints are sent.
+            ValueError: a number is not finite.
         """
         self._set_target(_ONLY_VELOCITY, (0.0, 0.0, 0.0, north_mps, east_mps, down_mps), yaw_rad)
 
@@ -383,9 +385,9 @@ class LockstepVehicle:
         self._setpoints = None
 
     def _set_target(self, mask: int, values: tuple[float, ...], yaw_rad: float) -> None:
-        if not all(math.isfinite(value) for value in values):
-            raise ValueError(f"a setpoint needs finite numbers, got {values}")
-        heading = math.isfinite(yaw_rad)
+        if not all(math.isfinite(value) for value in values) or math.isinf(yaw_rad):
+            raise ValueError(f"a setpoint needs finite numbers, got {values} and yaw {yaw_rad}")
+        heading = not math.isnan(yaw_rad)
         mask |= _IGNORE_YAW_RATE if heading else _IGNORE_YAW  # a rate of 0 keeps the heading
         message = dialect.MAVLink_set_position_target_local_ned_message(
             0,
@@ -407,7 +409,11 @@ class LockstepVehicle:
             self.step(0.1)  # PX4 takes OFFBOARD only with a stream
         mode = self.vehicle.setpoint_mode
         if self.truth.mode != mode:
-            self.set_mode(mode)
+            try:
+                self.set_mode(mode)
+            except CommandRefusedError:
+                self.stop_setpoints()
+                raise
 
     def _demand(self, what: str, identifier: int, *parameters: float) -> None:
         result = self.command(identifier, *parameters)

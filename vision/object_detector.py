@@ -185,7 +185,7 @@ class _Selecting(ObjectDetector):
         found = self._inner.detect(image_bgr)
         elapsed_ms = (time.perf_counter() - started) * 1e3
         self.last_timing = self._inner.last_timing or Timing(0.0, elapsed_ms, 0.0)
-        if found.class_names != self.class_names:
+        if tuple(found.class_names) != self.class_names:
             raise TypeError(
                 f"detector {self.model_name}: detections must have its class names {self.class_names}, "
                 f"got {found.class_names}"

@@ -1,4 +1,4 @@
-"""The command line: `companion run|play|demo|detect|models|evaluate|send|mission|echo|config|train|bench`.
+"""The command line: `companion run`, `play`, `demo`, `detect`, `send`, `echo` and the others in ORDER.
 
 Heavy parts are imported when their command runs, so that `companion send` starts at once.
 What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
@@ -440,8 +440,9 @@ def echo(
     from companion.bus.client import NoAnswerError, check_topic, client_settings, listen, open_client
 
     messages: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
-    with plain_errors(NoAnswerError, ValueError):
+    with plain_errors(ValueError):
         check_topic(key)
+    with plain_errors(NoAnswerError):
         where = client_settings(settings.zenoh, (connect,) if connect else ())
         with open_client(where) as session:
             subscriber = listen(session, key, lambda name, text: messages.put((name, text)))
@@ -457,7 +458,12 @@ def echo(
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-app.registered_commands.sort(key=lambda one: ORDER.index(one.name or one.callback.__name__))  # type: ignore[union-attr]
+def _place(command: typer.models.CommandInfo) -> int:
+    name = command.name or getattr(command.callback, "__name__", "")
+    return ORDER.index(name) if name in ORDER else len(ORDER)
+
+
+app.registered_commands.sort(key=_place)
 
 
 def main() -> None:

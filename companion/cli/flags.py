@@ -122,6 +122,9 @@ def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
 
 @functools.cache
 def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
+    known = {name for flag in flags() for name in (flag.key, flag.key.partition(".")[0])}
+    if unknown := set(keys) - known:
+        raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
     chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
     return {flag.key.replace(".", "__"): flag for flag in chosen}
 

@@ -212,7 +212,8 @@ def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
         while not loaded.wait(_LOADING_PERIOD_S):
             outbox.put_newest(Heartbeat(0))
 
-    if settings.detector.runtime != "torch" or settings.detector.kind != YOLO:
+    others = settings.detector.kind != YOLO or bool(settings.plugins.modules)
+    if settings.detector.runtime != "torch" or others:
         threading.Thread(target=say, name="loading", daemon=True).start()
     try:
         yield

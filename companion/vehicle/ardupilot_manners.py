@@ -28,7 +28,7 @@ from companion.vehicle.ardupilot_modes import GUIDED, custom_mode_of_mode, mode_
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.manners import HOME_POSITION_ID, Manners
-from companion.vehicle.setpoint import IGNORE_YAW, IGNORE_YAW_RATE
+from companion.vehicle.setpoint import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry_fold import Fields
 
@@ -119,6 +119,10 @@ class ArduPilotManners(Manners):
         self._use, self._seen_guided = FlightMode.OFFBOARD, False
 
     def setpoint_fields(self, fields: dict[str, Any]) -> dict[str, Any]:
+        # Copter adds an acceleration to the velocity it is to fly, again and again: when setpoints end, for
+        # GUID_TIMEOUT (3 s). So it is given none.
+        fields = {**fields, "type_mask": fields["type_mask"] | IGNORE_ACCELERATION}
+        fields.update(dict.fromkeys(("afx", "afy", "afz"), 0.0))
         if not fields["type_mask"] & IGNORE_YAW or not fields["type_mask"] & IGNORE_YAW_RATE:
             return fields
         return {**fields, "type_mask": fields["type_mask"] & ~IGNORE_YAW_RATE, "yaw_rate": 0.0}

@@ -32,8 +32,8 @@ class SquareFeed(Feed):
 
 @source("square", "a red square that goes round")
 def open_square(uri: str, settings: SourceSettings) -> Source:
-    match = re.fullmatch(r"square://(\d{2,4})x(\d{2,4})(?:\?rate=(\d{1,3}))?", uri)
-    if match is None or min(int(match[1]), int(match[2])) <= SIDE_PX or match[3] == "0":
+    match = re.fullmatch(r"square://(\d{2,4})x(\d{2,4})(?:\?rate=([1-9]\d{0,2}))?", uri)
+    if match is None or min(int(match[1]), int(match[2])) <= SIDE_PX:
         raise SourceError(f"{uri}: expected square://WIDTHxHEIGHT?rate=HZ, such as square://640x480?rate=10")
     width, height, rate_hz = int(match[1]), int(match[2]), float(match[3] or settings.rate_hz or 10)
     return LatestSource(uri, lambda: SquareFeed(width, height, rate_hz), settings, paced=True)

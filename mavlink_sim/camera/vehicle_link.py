@@ -66,6 +66,8 @@ class _TcpEndpoint:
     def send(self, outgoing: list[Outgoing]) -> None:
         try:
             self._socket.sendall(b"".join(item.pack(self._codec) for item in outgoing))
+        except BlockingIOError:
+            pass  # requests are repeated every second
         except OSError:
             self._closed = True  # a request may be lost; a connection that is gone ends the pose
 

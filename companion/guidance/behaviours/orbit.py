@@ -39,14 +39,14 @@ VELOCITY_GAIN = 1.5
 ALONG_GAIN = 0.6
 SPEED_INTEGRAL_GAIN = 0.3
 HEADING_INTEGRAL_GAIN = 0.5
-# What drag may be found to take along the circle.
-MAX_DRAG_MPS2 = 3.0
+# What drag may be found to take along the circle, for each m/s flown.
+MAX_DRAG_PER_S = 0.75
 MAX_LEAD_RAD = 0.6
 # Farther than this from the circle it is only flown to.
 ON_CIRCLE_M = 1.5
 # On the circle the velocity that is asked for turns all the time. What that takes of the envelope's
 # acceleration is kept to this share of it, by flying slower: the rest is for corrections. An orbit of 8 m at
-# 4 m/s is not slowed at 3 m/s²; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
+# 4 m/s flies 3.7 m/s at 3 m/s²; its radius errs by 0.22 m (p95) in gusts of 0.6 m/s.
 TURNING_SHARE = 0.8
 # The speed is adapted to that by so many m/s² for each m/s² above or below, at most by so many, filtered.
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
@@ -187,8 +187,10 @@ class OrbitBehaviour(Behaviour):
             lead = self._lead_rad + HEADING_INTEGRAL_GAIN * behind * dt_s
             self._lead_rad = max(-MAX_LEAD_RAD, min(MAX_LEAD_RAD, lead))
         heading = wrap_angle(bearing + turn_radps * YAW_DELAY_S + self._lead_rad)
-        ahead = angle + turn_radps * ACCELERATION_DELAY_S
-        turning = self._acceleration(ahead, turn_radps * self._turn * along_mps if on_circle else 0.0)
+        turning = None
+        if on_circle:
+            ahead = angle + turn_radps * ACCELERATION_DELAY_S
+            turning = self._acceleration(ahead, turn_radps * self._turn * along_mps)
         return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=heading, acceleration_ned_mps2=turning)
 
     def _acceleration(self, angle_rad: float, inward_mps2: float) -> Vector3:
@@ -215,7 +217,7 @@ class OrbitBehaviour(Behaviour):
             self._out_mps += RADIUS_INTEGRAL_GAIN * missing_m * dt_s
             self._drag_mps2 += SPEED_INTEGRAL_GAIN * (wanted_along - along_mps) * dt_s
             self._out_mps = max(-self._speed_mps, min(self._speed_mps, self._out_mps))
-            self._drag_mps2 = max(0.0, min(MAX_DRAG_MPS2, self._drag_mps2))
+            self._drag_mps2 = max(0.0, min(MAX_DRAG_PER_S * along_mps, self._drag_mps2))
         # The vehicle flies what was asked a moment ago; that lacks the centripetal acceleration since then.
         late = VELOCITY_DELAY_S * wanted_along**2 / max(self._radius_m, self._radius_m - missing_m)
         asked_out = wanted_out + VELOCITY_GAIN * (wanted_out - out_mps) + self._out_mps - late

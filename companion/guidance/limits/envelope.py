@@ -3,8 +3,8 @@
 The envelope only ever takes away. A velocity that leaves it is never faster than the one that came, neither
 over ground nor upwards or downwards; braking is never delayed. A setpoint inside every limit passes as it is.
 
-A velocity's feed-forward acceleration carries a vehicle away from that velocity, so it passes only while what
-it makes of the velocity the vehicle has would pass too.
+A velocity's feed-forward acceleration may turn it, and hold it against drag. It never makes the vehicle
+faster than the velocity that is sent, nor leads it nearer to a fence than that.
 """
 
 from __future__ import annotations
@@ -28,6 +28,10 @@ POSITION_GAIN_PER_S = 1.0
 LONGEST_STEP_S = 0.2
 # So long a feed-forward acceleration acts before what it did is seen.
 FEED_FORWARD_S = 0.3
+# A velocity controller stands off its setpoint by the feed-forward over its gain (PX4: MPC_XY_VEL_P_ACC 1.8),
+# so that of a slow setpoint is small, and that of a stop is none. What an orbit needs is below this.
+FEED_FORWARD_PER_S = 1.0
+FEED_FORWARD_FADES_MPS = 0.3
 # Heights that differ by less are the same one.
 SAME_HEIGHT_M = 0.05
 # Part of the greatest acceleration that is kept for stopping at a fence, against a vehicle that answers late.
@@ -172,7 +176,7 @@ class Envelope:
             if velocity != setpoint.velocity_ned_mps:
                 sent = replace(sent, velocity_ned_mps=velocity)
             if setpoint.acceleration_ned_mps2 is not None:
-                forward = self._limit_feed_forward(setpoint.acceleration_ned_mps2, state, reasons)
+                forward = self._limit_feed_forward(setpoint.acceleration_ned_mps2, velocity, state, reasons)
                 sent = replace(sent, acceleration_ned_mps2=forward)
         elif setpoint.position_ned_m is not None and state.position_ned_m is not None:
             place = self._limit_position(setpoint.position_ned_m, state.position_ned_m, state, reasons)
@@ -201,21 +205,38 @@ class Envelope:
         # Last, so that no slew delays what a fence takes away.
         return self._slow_at_fences(velocity, state, reasons)
 
-    def _limit_feed_forward(self, asked: Vector3, state: VehicleState, reasons: list[str]) -> Vector3 | None:
-        """As much of it as the limits of acceleration and speed allow; none where it leads over a fence."""
-        limits, velocity = self.limits, state.velocity_ned_mps
-        if velocity is None:
-            reasons.append("velocity unknown: no acceleration ahead")
+    def _limit_feed_forward(
+        self, asked: Vector3, sent: Vector3, state: VehicleState, reasons: list[str]
+    ) -> Vector3 | None:
+        """What may be left of it beside the velocity that is sent: level, and only what turns or holds that.
+
+        It is no more than the greatest acceleration, and than FEED_FORWARD_PER_S times the sent speed. Along
+        the velocity it fades out as the vehicle reaches the sent speed. None is left where it leads nearer to
+        a fence, an obstacle or a neighbour than the limits allow.
+        """
+        speed, velocity = math.hypot(sent[0], sent[1]), state.velocity_ned_mps
+        if velocity is None or state.position_ned_m is None:
+            reasons.append("position or velocity unknown: no acceleration ahead")
             return None
-        scale = min(1.0, limits.max_acceleration_mps2 / max(math.hypot(*asked), 1e-9))
-        added = (asked[0] * FEED_FORWARD_S, asked[1] * FEED_FORWARD_S, asked[2] * FEED_FORWARD_S)
-        scale = min(scale, _until_length(velocity, added, limits.max_horizontal_speed_mps))
-        north, east, down = (v + scale * a for v, a in zip(velocity, added, strict=True))
-        slowed = self._slow_at_fences((north, east, down), state, []) != (north, east, down)
-        if slowed or not -limits.max_climb_mps <= down <= limits.max_descend_mps:
+        if speed < 1e-6:
+            return None
+        most = min(self.limits.max_acceleration_mps2, FEED_FORWARD_PER_S * speed)
+        north, east, _ = _shorten(asked, most)
+        way = (sent[0] / speed, sent[1] / speed)
+        along = north * way[0] + east * way[1]
+        if along > 0.0:
+            missing = speed - (velocity[0] * way[0] + velocity[1] * way[1])
+            taken = along * (1.0 - max(0.0, min(1.0, missing / FEED_FORWARD_FADES_MPS)))
+            north, east = north - taken * way[0], east - taken * way[1]
+        ahead = (velocity[0] + north * FEED_FORWARD_S, velocity[1] + east * FEED_FORWARD_S, velocity[2])
+        if self._cut_mps(ahead, state) > self._cut_mps(velocity, state) + 1e-6:
             reasons.append("no acceleration ahead of a limit")
             return None
-        return (asked[0] * scale, asked[1] * scale, asked[2] * scale)
+        return (north, east, 0.0)
+
+    def _cut_mps(self, velocity: Vector3, state: VehicleState) -> float:
+        """How much of a velocity fences, obstacles and neighbours take away."""
+        return math.dist(velocity, self._slow_at_fences(velocity, state, []))
 
     def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
         """Take away what would carry the vehicle over a fence: no more speed than the way left stops."""
@@ -360,16 +381,6 @@ class Envelope:
         self._yaw_rad = wrap_angle(previous + math.copysign(limit * dt_s, turn))
         reasons.append(f"yaw rate limited to {limit:g} rad/s")
         return replace(setpoint, yaw_rad=self._yaw_rad)
-
-
-def _until_length(vector: Vector3, added: Vector3, longest: float) -> float:
-    """The part 0..1 of `added` that makes `vector` `longest` over ground, or all of it."""
-    square = added[0] ** 2 + added[1] ** 2
-    if square < 1e-12:
-        return 1.0
-    product = vector[0] * added[0] + vector[1] * added[1]
-    left = max(0.0, longest**2 - vector[0] ** 2 - vector[1] ** 2)
-    return max(0.0, min(1.0, (math.sqrt(product**2 + left * square) - product) / square))
 
 
 def _shorten(vector: Vector3, longest: float) -> Vector3:

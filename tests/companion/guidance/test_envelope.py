@@ -352,15 +352,29 @@ def test_feed_forward_inside_the_limits_passes_as_it_is() -> None:
 
 
 def test_feed_forward_is_no_more_than_the_greatest_acceleration() -> None:
-    left, _ = feed_forward((0.0, 30.0, 0.0))
+    left, _ = feed_forward((0.0, 30.0, 0.0), (4.0, 0.0, 0.0))
     assert left == pytest.approx((0.0, 3.0, 0.0))
+    left, _ = feed_forward((0.0, 3.0, 0.0), (0.5, 0.0, 0.0))
+    assert left == pytest.approx((0.0, 0.5, 0.0))
+
+
+def test_a_stop_carries_no_feed_forward() -> None:
+    assert feed_forward((0.0, 3.0, 0.0))[0] is None
+
+
+def test_feed_forward_that_leads_away_from_a_fence_is_kept_before_it() -> None:
+    inwards, _ = feed_forward((-2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.0, 0.0, -5.0))
+    assert inwards == pytest.approx((-2.0, 0.0, 0.0))
+    outwards, why = feed_forward((2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.4, 0.0, -5.0))
+    assert outwards is None
+    assert why
 
 
 @pytest.mark.parametrize(
     ("acceleration", "velocity", "position"),
     [
         pytest.param((3.0, 0.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, -5.0), id="over the greatest speed"),
-        pytest.param((3.0, 0.0, 0.0), (0.0, 0.0, 0.0), (19.9, 0.0, -5.0), id="over the fence"),
+        pytest.param((3.0, 0.0, 0.0), (0.0, 1.0, 0.0), (19.9, 0.0, -5.0), id="over the fence"),
         pytest.param((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -49.9), id="above the greatest altitude"),
         pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -1.1), id="below the lowest altitude"),
         pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.9), (0.0, 0.0, -20.0), id="faster down than allowed"),
@@ -373,9 +387,14 @@ def test_feed_forward_does_not_lead_over_a_limit(
     assert math.hypot(*(left or (0.0,))) < 1e-6
 
 
-def test_feed_forward_of_a_vehicle_of_unknown_velocity_is_left_out() -> None:
-    state = replace(KinematicVehicle(position=[0.0, 0.0, -5.0]).state, velocity_ned_mps=None)
+KNOWN = KinematicVehicle(position=[0.0, 0.0, -5.0]).state
+
+
+@pytest.mark.parametrize(
+    "state", [replace(KNOWN, velocity_ned_mps=None), replace(KNOWN, position_ned_m=None)]
+)
+def test_feed_forward_of_a_vehicle_whose_motion_is_unknown_is_left_out(state: VehicleState) -> None:
     setpoint = Setpoint.velocity((1.0, 0.0, 0.0), 1, acceleration_ned_mps2=(1.0, 0.0, 0.0))
     sent, why = Envelope().apply(setpoint, state, 1, 0.2)
     assert sent.acceleration_ned_mps2 is None
-    assert any("velocity" in reason for reason in why)
+    assert any("unknown" in reason for reason in why)

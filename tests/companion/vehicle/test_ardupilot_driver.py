@@ -118,6 +118,14 @@ async def test_a_pilots_mode_is_seen_and_guided_by_somebody_else_shows_as_offboa
     ]
 
 
+def test_copter_is_never_given_an_acceleration() -> None:
+    """It would go on adding it to its velocity for GUID_TIMEOUT when our setpoints end."""
+    given = {"type_mask": 0b1000_0000_0111, "vx": 3.0, "afx": 1.0, "afy": -2.0, "afz": 0.0, "yaw_rate": 0.0}
+    sent = ArduPilotManners().setpoint_fields(given)
+    assert sent["type_mask"] == 0b1001_1100_0111
+    assert (sent["vx"], sent["afx"], sent["afy"], sent["afz"]) == (3.0, 0.0, 0.0, 0.0)
+
+
 async def test_a_quick_reboot_is_noticed_by_timesync_and_streams_come_again(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
