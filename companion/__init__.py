@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
-    from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+    from companion.guidance.behaviour import (
+        Behaviour,
+        BehaviourContext,
+        BehaviourOutput,
+        ModeRequest,
+        Outcome,
+        Requirement,
+    )
     from companion.guidance.command import BuildContext, Command
     from companion.guidance.registry import behaviour
     from companion.service import Service
@@ -28,8 +35,8 @@ _MODULES = {
         "ModeRequest",
         "Outcome",
         "Requirement",
-        "Situation",
-        "Step",
+        "BehaviourContext",
+        "BehaviourOutput",
     ),
     "companion.guidance.command": ("BuildContext", "Command"),
     "companion.guidance.registry": ("behaviour",),
@@ -41,6 +48,8 @@ _WHERE = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "Behaviour",
+    "BehaviourContext",
+    "BehaviourOutput",
     "BuildContext",
     "ClassName",
     "Command",
@@ -53,8 +62,6 @@ __all__ = [
     "Service",
     "Setpoint",
     "Settings",
-    "Situation",
-    "Step",
     "__version__",
     "behaviour",
 ]

@@ -157,19 +157,19 @@ async def _fly(
                 events.write(json.dumps(asdict(event)) + "\n")
                 say(event.text)
 
-            # Made while the camera starts: what it imports would hold up the relay's messages later.
+            # BuiltLayer while the camera starts: what it imports would hold up the relay's messages later.
             service = Service(settings, on_event=on_event)
             await vehicle.until_ready()
             say("the vehicle and its camera are running")
             try:
-                await _until_flown(service, vehicle, flight, limit_s, say)
+                await _until_finished(service, vehicle, flight, limit_s, say)
             finally:
                 flight.published = service.bus.published[DETECTIONS.name]
                 flight.frames = service.perception.status.frames
     return flight
 
 
-async def _until_flown(
+async def _until_finished(
     service: Service, vehicle: SimProcess, flight: _Flight, limit_s: float, say: Say
 ) -> None:
     """Until the mission has ended, or the time is up.

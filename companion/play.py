@@ -122,7 +122,7 @@ async def _until_stopped(
             nonlocal ready
             await vehicle.until_ready()
             ready = True
-            _say_what_to_type(services, scene, say)
+            _print_next_commands(services, scene, say)
             if terminal_is_free(settings.source.uri):
                 await run_console(
                     _commands_of(services), stop.set, grammar.describe(), lambda level, text: say(text)
@@ -214,7 +214,7 @@ def _commands_of(services: list[Service]) -> Callable[[str], Any]:
     return command
 
 
-def _say_what_to_type(services: list[Service], scene: Scene, say: Say) -> None:
+def _print_next_commands(services: list[Service], scene: Scene, say: Say) -> None:
     zenoh = services[0].settings.zenoh
     where = "" if zenoh == type(zenoh)() else f" --connect {(zenoh.listen or zenoh.connect)[0]}"
     known = services[0].perception.status.class_names

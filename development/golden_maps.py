@@ -11,26 +11,26 @@ import torch
 from ultralytics.nn.tasks import DetectionModel, yaml_model_load
 from ultralytics_parity import oracle_maps
 
-from tests.vision.test_generations import FEW, GOLDEN, facts, fill, picture
+from tests.vision.test_model_families import FEW, GOLDEN, facts, fill, picture
 
 
 def main() -> int:
     wrong = False
-    for (generation, scale), recorded in GOLDEN.items():
-        table = yaml_model_load(f"{generation.lower().removesuffix('u')}{scale}.yaml")
+    for (model_family, scale), recorded in GOLDEN.items():
+        table = yaml_model_load(f"{model_family.lower().removesuffix('u')}{scale}.yaml")
         table |= {"scale": scale, "scales": {scale: [0.34, 0.25, 1024]}}
         model = DetectionModel(table, nc=len(FEW), verbose=False).eval()
         state = model.state_dict()
         fill(state)
         model.load_state_dict(state)
-        end_to_end = generation in ("YOLOv10", "YOLO26")
+        end_to_end = model_family in ("YOLOv10", "YOLO26")
         with torch.inference_mode():
             output = model(picture())
         got = facts([oracle_maps(output, end_to_end)[..., None]])
         different = max(abs(a - b) for a, b in zip(got, recorded, strict=True)) > 1e-4 * got[1]
         wrong |= different
         numbers = ", ".join(f"{value:.6g}" for value in got)
-        print(f'    ("{generation}", "{scale}"): ({numbers}),{"  # differs" if different else ""}')
+        print(f'    ("{model_family}", "{scale}"): ({numbers}),{"  # differs" if different else ""}')
     return int(wrong)
 
 

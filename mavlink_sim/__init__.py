@@ -18,14 +18,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mavlink_sim.flock import Flock
+    from mavlink_sim.fleet_world import FleetWorld
     from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
     from mavlink_sim.testing import RunningSimulator, running_simulator
     from mavlink_sim.vehicle import Vehicle
 
 __all__ = [
     "CommandRefusedError",
-    "Flock",
+    "FleetWorld",
     "LockstepVehicle",
     "NotReachedError",
     "RunningSimulator",
@@ -37,7 +37,7 @@ __all__ = [
 
 _HOMES = {
     "CommandRefusedError": "lockstep",
-    "Flock": "flock",
+    "FleetWorld": "fleet_world",
     "LockstepVehicle": "lockstep",
     "NotReachedError": "lockstep",
     "RunningSimulator": "testing",

@@ -1,8 +1,8 @@
 """`python -m mavlink_sim` is `mavlink-sim`."""
 
-from vision.loading import uncollected
+from vision.gc_pause import gc_paused
 
-with uncollected():
+with gc_paused():
     from mavlink_sim.cli import main
 
 if __name__ == "__main__":

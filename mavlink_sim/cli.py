@@ -16,8 +16,8 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
+from mavlink_sim.firmware import AUTOPILOTS, PX4
 from mavlink_sim.fleet import Fleet, instance_options
-from mavlink_sim.personality import AUTOPILOTS, PX4
 from mavlink_sim.physics.midair import REACH_M
 from mavlink_sim.px4.parameters import UnknownParameterError
 from mavlink_sim.releases import NEWEST, RELEASES
@@ -59,7 +59,7 @@ def _parameters(assignments: list[str]) -> dict[str, float]:
     return values
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
@@ -137,7 +137,7 @@ def simulate(
     ready_after: Annotated[
         float, typer.Option(help="Seconds after boot until the vehicle can be armed.")
     ] = 3.0,
-    autopilot: Annotated[str, typer.Option(help="Whose manners it has: px4 or ardupilot (Copter).")] = PX4,
+    autopilot: Annotated[str, typer.Option(help="Whose profile it has: px4 or ardupilot (Copter).")] = PX4,
     px4: Annotated[
         str | None, typer.Option(help=f"PX4 release to be like: {', '.join(RELEASES)}; default: {NEWEST}.")
     ] = None,
@@ -179,7 +179,7 @@ def simulate(
     verbose: Annotated[bool, typer.Option("--verbose", help="Log the links too.")] = False,
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_say_version, is_eager=True, help="Show the version."),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
     """Fly a PX4-like multirotor on UDP until interrupted (Ctrl-C)."""

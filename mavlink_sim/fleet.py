@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from mavlink_sim.flock import Flock
+from mavlink_sim.fleet_world import FleetWorld
 from mavlink_sim.real_time import run_together
 from mavlink_sim.simulation import Simulation, SimulationOptions
 
@@ -88,11 +88,13 @@ class Fleet:
         self._stopped = False
         self._on_event = on_event
         self.simulations: list[Simulation] = []
-        self._flock = Flock(len(options))
+        self._fleet_world = FleetWorld(len(options))
         try:
             for one in options:
                 told = on_event if len(options) == 1 else _named(on_event, one.system_id)
-                self.simulations.append(self._resources.enter_context(Simulation(one, told, self._flock)))
+                self.simulations.append(
+                    self._resources.enter_context(Simulation(one, told, self._fleet_world))
+                )
         except BaseException:
             self._resources.close()
             raise
@@ -112,7 +114,7 @@ class Fleet:
 
     def run(self) -> None:
         """Run until `stop`."""
-        run_together(self.simulations, lambda: self._stopped, self._on_event, self._flock.meet)
+        run_together(self.simulations, lambda: self._stopped, self._on_event, self._fleet_world.meet)
 
 
 def _named(on_event: Callable[[str], None], system_id: int) -> Callable[[str], None]:

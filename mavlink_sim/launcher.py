@@ -29,7 +29,7 @@ import traceback
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 
-from vision.loading import uncollected
+from vision.gc_pause import gc_paused
 
 LARGEST_REQUEST = 1 << 17  # less than any socket's buffer
 STARTED = struct.Struct("!i")  # the process's id; below zero: an errno, it could not be forked
@@ -75,7 +75,7 @@ class _Child:
     descriptor: int
     answers: socket.socket
 
-    def tell_start(self) -> None:
+    def report_start(self) -> None:
         with suppress(OSError):  # who asked does not want to know any more, or sees the end of the answers
             socket.send_fds(self.answers, [STARTED.pack(self.pid)], [self.descriptor])
 
@@ -107,7 +107,7 @@ def main(requests: int, program: int) -> None:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where that was ignored, no exit code could be had
-    with uncollected():
+    with gc_paused():
         from mavlink_sim import cli
 
         cli.load()
@@ -192,7 +192,7 @@ class _Launcher:
             raise
         self._children.append(child)
         self._selector.register(child.descriptor, selectors.EVENT_READ, child)
-        child.tell_start()
+        child.report_start()
         return pid
 
     def _become(self, request: Request, standard_input: int, standard_output: int) -> None:

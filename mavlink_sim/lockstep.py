@@ -23,8 +23,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from mavlink_sim.firmware import PX4, vehicle_class
 from mavlink_sim.lockstep_wire import LockstepWire
-from mavlink_sim.personality import PX4, vehicle_class
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import Outgoing, dialect
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
@@ -65,7 +65,7 @@ class Truth:
         rates_radps: body FRD.
         mode: PX4's name of the flight mode. on_ground: touching it, or on top of something.
         landed: as the land detector has it.
-        collisions: how often it met something of the scene, or another vehicle of its flock.
+        collisions: how often it met something of the scene, or another vehicle of its fleet_world.
         collision: the newest; None before the first.
     """
 
@@ -97,7 +97,7 @@ class LockstepVehicle:
         links: its connections by name, each with the rates of its streams in Hz; None is one link "onboard"
             with a companion's full rates. `streams.GCS_RATES_HZ` is a ground station's; `{}` sends
             answers alone (and what is told once: the origin, parameters set at the start), the fastest.
-        autopilot: whose manners it has, "px4" or "ardupilot" (`personality`); the latter's streams are asked
+        autopilot: whose profile it has, "px4" or "ardupilot" (`firmware`); the latter's streams are asked
             for by messages, whatever `links` says.
         options: those of `Vehicle`: `seed`, `noise`, `wind_mps`, `gusts_mps`, `parameters`, `system_id`,
             `scene` (a scene file, an example's name, a `Scene` or a `World`), `obstacle_sensor`…

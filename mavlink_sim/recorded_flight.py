@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink import mavutil
 
-from mavlink_sim.services.telemetry_of_system import PREARM_CHECK
+from mavlink_sim.services.system_streams import PREARM_CHECK
 from mavlink_sim.vehicle import STEP_S, Vehicle
 from mavlink_sim.wire.messages import parser
 
@@ -107,7 +107,7 @@ def read_flight(path: Path) -> Flight:
     heard: list[Heard] = []
     told: list[tuple[float, Any]] = []
     for stamp_s, message in stamped:
-        found = heard_of(stamp_s - booted_s, bytes(message.get_msgbuf()), message)
+        found = received_by(stamp_s - booted_s, bytes(message.get_msgbuf()), message)
         if found is not None:
             heard.append(found)
         elif message.get_type() != "BAD_DATA":
@@ -115,7 +115,7 @@ def read_flight(path: Path) -> Flight:
     return Flight(heard, told)
 
 
-def heard_of(time_s: float, frame: bytes, message: Any) -> Heard | None:
+def received_by(time_s: float, frame: bytes, message: Any) -> Heard | None:
     """What the autopilot (1/1) said in a frame; None if somebody else did."""
     if frame[0] != 0xFD or (frame[5], frame[6]) != (1, 1):
         return None
@@ -152,7 +152,7 @@ def fly_again(flight: Flight, **options: Any) -> list[Heard]:
         for item in vehicle.outgoing("onboard"):
             frame = item.pack(codec)
             (message,) = reader.parse_buffer(frame)
-            found = heard_of(vehicle.now_s, frame, message)
+            found = received_by(vehicle.now_s, frame, message)
             if found is not None and found.time_s >= began_s:
                 answers.append(found)
     return answers

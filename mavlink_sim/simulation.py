@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavlink_sim.faults.room import fault_room
-from mavlink_sim.flock import Flock
-from mavlink_sim.personality import PX4, vehicle_class
+from mavlink_sim.faults.injector import fault_injector
+from mavlink_sim.firmware import PX4, vehicle_class
+from mavlink_sim.fleet_world import FleetWorld
 from mavlink_sim.real_time import run_together
-from mavlink_sim.spectators import Spectators, camera_turn_rad, loaded_scene
+from mavlink_sim.sim_outputs import SimOutputs, camera_turn_rad, loaded_scene
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.streams import GCS_RATES_HZ
@@ -53,7 +53,7 @@ class SimulationOptions:
         truth: file for the truth, one JSON object a line; None for none.
         record: folder for the traffic of each link, `<link>-<system id>.tlog`; None for none.
         ready_after_s: how long after boot the estimator allows arming.
-        autopilot: whose manners it has, `personality.AUTOPILOTS`.
+        autopilot: whose profile it has, `firmware.AUTOPILOTS`.
         px4: the release of PX4 to be like, where they differ; None: the newest.
         speed: simulated seconds per real second.
         noise: whether sensors and estimates err as a real vehicle's do.
@@ -107,7 +107,7 @@ class Simulation:
     """One vehicle running in real time. Use as a context manager; `run` returns after `stop`.
 
     Args:
-        flock: among whom it flies, seeing and seen; None: it is alone.
+        fleet_world: among whom it flies, seeing and seen; None: it is alone.
 
     Raises (when made):
         PortInUseError: a port to bind is taken.
@@ -117,7 +117,10 @@ class Simulation:
     """
 
     def __init__(
-        self, options: SimulationOptions, on_event: Callable[[str], None], flock: Flock | None = None
+        self,
+        options: SimulationOptions,
+        on_event: Callable[[str], None],
+        fleet_world: FleetWorld | None = None,
     ) -> None:
         self.options = options
         scene = loaded_scene(options)
@@ -162,11 +165,11 @@ class Simulation:
                 files = {f"{name}-{options.system_id}": link for name, link in self.endpoints.items()}
                 self._resources.enter_context(recording(files, options.record))
             self._faults = self._resources.enter_context(
-                fault_room(self.vehicle, self.endpoints, options, on_event)
+                fault_injector(self.vehicle, self.endpoints, options, on_event)
             )
-            flock = Flock(1) if flock is None else flock
-            flock.join(self.vehicle, 0 if scene is None else identifier_offset(scene.world))
-            self._spectators = Spectators(self.vehicle, scene, flock, options, on_event, self._resources)
+            fleet_world = FleetWorld(1) if fleet_world is None else fleet_world
+            fleet_world.join(self.vehicle, 0 if scene is None else identifier_offset(scene.world))
+            self._outputs = SimOutputs(self.vehicle, scene, fleet_world, options, on_event, self._resources)
         except BaseException:
             self._resources.close()
             raise
@@ -261,7 +264,7 @@ class Simulation:
 
     def show(self, now_ns: int) -> None:
         """The pose to the camera and the truth to its file, each at its rate, stamped with the moment."""
-        self._spectators.show(self._simulated_s, now_ns)
+        self._outputs.show(self._simulated_s, now_ns)
 
     @property
     def camera_turn_rad(self) -> Vector | None:
@@ -270,4 +273,4 @@ class Simulation:
 
     def truth(self) -> dict[str, Any]:
         """What is really so now: pose, mode, and the range to every object of the world, the others too."""
-        return self._spectators.truth(self._simulated_s, time.monotonic_ns())
+        return self._outputs.truth(self._simulated_s, time.monotonic_ns())

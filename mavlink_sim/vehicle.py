@@ -33,7 +33,7 @@ from mavlink_sim.services.gimbal_protocol import GimbalManager
 from mavlink_sim.services.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.services.vehicle_files import vehicle_files
-from mavlink_sim.shared_air import SharedAir
+from mavlink_sim.wind_model import WindModel
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 from mavlink_sim.wire.messages import Outgoing, dialect, link_node_status
 from mavlink_sim.wire.signing import Signing, timestamp_now
@@ -42,8 +42,8 @@ from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_C
 
 if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
+    from mavlink_sim.collision_world import CollisionWorld
     from mavlink_sim.physics.neighbours import Neighbours
-    from mavlink_sim.surroundings import Surroundings
     from mavlink_sim.world.world import World
 
 # When a stepped vehicle boots, as it believes: midnight of the day its PX4 was built.
@@ -87,15 +87,15 @@ class Vehicle:
         SceneError: the scene cannot be used.
 
     Attributes:
-        airframe: the motion (truth). surroundings: the scene, None without one. neighbours: the others of its
-            flock, None in none.
+        airframe: the motion (truth). collision_world: the scene, None without one. neighbours: the other
+            vehicles of its fleet, None without a fleet.
         estimate: what the vehicle knows of it. faults: what goes wrong.
         autopilot: the decisions. parameters: the parameter set. links: by name.
         clock_ns: the boot clock that TIMESYNC tells; by default the stepped time.
         utc_ns: the time of day that SYSTEM_TIME tells; by default stepped too, from a day of 2026.
         events: the newest EVENTs. files: what MAVLink FTP reaches.
 
-    What another autopilot does otherwise, a subclass says (see `personality`): the classes of its autopilot
+    What another autopilot does otherwise, a subclass says (see `firmware`): the classes of its autopilot
     and parameters, who answers which message, and what is sent.
     """
 
@@ -136,16 +136,16 @@ class Vehicle:
             gusts_mps = BACKGROUND_GUSTS_MPS + GUST_SHARE_OF_WIND * wind_mps
         if obstacle_sensor and scene is None:
             raise ValueError("an obstacle sensor has nothing to measure without a scene: give it one")
-        self.surroundings: Surroundings | None = None
+        self.collision_world: CollisionWorld | None = None
         self.neighbours: Neighbours | None = None
         self._obstacle_sensor = obstacle_sensor
         if scene is None:
             self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
         else:
             # imported here: without a scene neither the shapes nor their libraries are needed
-            from mavlink_sim.surroundings import Surroundings
+            from mavlink_sim.collision_world import CollisionWorld
 
-            self.surroundings = Surroundings(
+            self.collision_world = CollisionWorld(
                 scene,
                 seed=seed,
                 gusts_mps=gusts_mps,
@@ -153,10 +153,10 @@ class Vehicle:
                 start_ned_m=start_ned_m,
                 clock=self._scene_time_s,
             )
-            self.airframe = self.surroundings.airframe
+            self.airframe = self.collision_world.airframe
         self.airframe.on_touch = self._touched
         self.airframe.on_collision = self._collided
-        self._air = None if air_seed is None else SharedAir(air_seed, gusts_mps)
+        self._air = None if air_seed is None else WindModel(air_seed, gusts_mps)
         self.estimate = FallibleEstimate(self.airframe, seed, noise)
         self.links: dict[str, Link] = {}
         self.files = vehicle_files(self.parameters)
@@ -164,7 +164,7 @@ class Vehicle:
         self.clock_ns: Callable[[], int] = self._simulated_clock_ns
         self.utc_ns: Callable[[], int] = self._simulated_utc_ns
         self.start_ned_m = start_ned_m
-        self._on_event = on_event or _tell_nobody
+        self._on_event = on_event or _no_observer
         self.ready_after_s = ready_after_s
         self.faults = Faults(self, seed, self._on_event)
         self._leftover_s = 0.0
@@ -173,7 +173,7 @@ class Vehicle:
         self.gimbal_manager = GimbalManager(self) if gimbal else None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy of it is made of: that is in no flock."""
+        """What a copy of it is made of: that is in no fleet_world."""
         return {**vars(self), "neighbours": None}
 
     def _boot(self) -> None:
@@ -191,7 +191,7 @@ class Vehicle:
         self._origin_told = False
         self._later: list[tuple[float, int, Callable[[], object]]] = []
         self._later_count = itertools.count()
-        self.after(parameter_protocol.TOLD_AT_START_S, self._tell_parameters)
+        self.after(parameter_protocol.TOLD_AT_START_S, self._send_parameters)
         if self._obstacle_sensor:
             self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
 
@@ -360,9 +360,9 @@ class Vehicle:
         """Do something in a later step."""
         heapq.heappush(self._later, (self.now_s + delay_s, next(self._later_count), action))
 
-    def _tell_parameters(self) -> None:
+    def _send_parameters(self) -> None:
         """What differs from the defaults is told to everyone shortly after the start."""
-        parameter_protocol.tell_everyone(self, [item.name for item in self.parameters.customised()])
+        parameter_protocol.broadcast(self, [item.name for item in self.parameters.customised()])
 
     def companion_heard(self) -> None:
         """An onboard controller's heartbeat arrived."""
@@ -385,10 +385,10 @@ class Vehicle:
 
     def _look_around(self) -> None:
         """What the obstacle sensor measures goes into the map of collision prevention."""
-        assert self.surroundings is not None
+        assert self.collision_world is not None
         self.estimate.look()
         autopilot = self.autopilot
-        self.surroundings.sense_obstacles(
+        self.collision_world.sense_obstacles(
             autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s, self.neighbours
         )
         self.after(OBSTACLE_SENSOR_PERIOD_S, self._look_around)
@@ -444,7 +444,7 @@ class Vehicle:
             mission_link.update(self)
             if self.gimbal_manager is not None:
                 self.gimbal_manager.step(CONTROL_STEP_S)
-            self._watch_companion()
+            self._check_companion()
         if self._air is not None:
             self.airframe.blow(self._air.gust_at(self.faults.elapsed_us))
         self.airframe.advance(STEP_S)
@@ -471,7 +471,7 @@ class Vehicle:
             if link.file_transfer is not None:
                 file_transfer.continue_transfer(link, self.now_s)
 
-    def _watch_companion(self) -> None:
+    def _check_companion(self) -> None:
         seen = self._companion_seen_s
         if seen is None or self._companion_lost:
             return
@@ -502,5 +502,5 @@ class Vehicle:
                 )
 
 
-def _tell_nobody(text: str) -> None:
+def _no_observer(text: str) -> None:
     """What happens without a listener."""

@@ -35,7 +35,7 @@ FLOORS = {
 # The same inside `companion.guidance`: its folders, and its own files.
 GUIDANCE_FLOORS = {
     "arguments": 0,
-    "gimbal_sight": 0,
+    "gimbal_status": 0,
     "motion": 0,
     "search_pattern": 0,
     "targets": 0,
@@ -54,7 +54,7 @@ GUIDANCE_FLOORS = {
     "authority": 8,
     "command_queue": 8,
     "mode_sequence": 8,
-    "refusal": 8,
+    "requirements": 8,
     "core": 9,
 }
 # The same for `mavlink_sim`; its modules at the top, and the ArduPilot made of them, stand above every room.
@@ -77,7 +77,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.camera_model",
     "vision.frame",
     "vision.geolocation",
-    "vision.loading",
+    "vision.gc_pause",
     "vision.rotation",
     "vision.shared_frame",
 }

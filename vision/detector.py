@@ -18,11 +18,11 @@ from vision.detections import Detections
 from vision.letterbox import Letterbox, fit
 from vision.model_files import find_model
 from vision.object_detector import ObjectDetector, Timing, resolve_classes
-from vision.runtimes.contract import PRECISIONS, Precision
+from vision.runtimes.base import PRECISIONS, Precision
 from vision.runtimes.selection import RuntimeChoice, check_runtime, start_runtime
 from vision.runtimes.source import read_source
 from vision.weights import DEFAULT_WEIGHTS
-from vision.yolo.postprocess import boxes_from, candidates_of, sides_of
+from vision.yolo.postprocess import boxes_from, candidates_of, decode_ltrb
 from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class Detector(ObjectDetector):
         candidates = candidates_of(head, maps, self.confidence, self.class_ids)
         selected = time.perf_counter()
         # The network's last part, where only the cells that matter are computed.
-        sides = sides_of(head, maps, candidates, self._runtime.product)
+        sides = decode_ltrb(head, maps, candidates, self._runtime.product)
         inferred = time.perf_counter()
         boxes = boxes_from(head, maps, candidates, sides, self.iou)
         detections = Detections(box.to_frame(boxes.xyxy), boxes.confidence, boxes.class_id, self.class_names)

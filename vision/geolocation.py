@@ -18,7 +18,7 @@ DEPTH_OF_WIDTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightlines:
+class PixelRays:
     """Where pixels look, given the vehicle's attitude when they were captured.
 
     All float64; offsets are metres from the vehicle.
@@ -40,14 +40,14 @@ class Sightlines:
         mount: CameraMount,
         ned_from_body: NDArray[np.float64],
         pixels: NDArray[Any],
-    ) -> Sightlines:
+    ) -> PixelRays:
         """Those of (N, 2) pixels; `ned_from_body` is the (3, 3) attitude."""
         rays = camera.rays(pixels)
         directions = rays @ mount.ned_from_optical(ned_from_body).T
         return cls(directions, rays[:, 2], ned_from_body @ mount.position_frd_m)
 
-    def __getitem__(self, part: slice) -> Sightlines:
-        return Sightlines(self.directions[part], self.cosines[part], self.camera_ned_m)
+    def __getitem__(self, part: slice) -> PixelRays:
+        return PixelRays(self.directions[part], self.cosines[part], self.camera_ned_m)
 
     def at_depth(self, depth_m: NDArray[Any]) -> NDArray[np.float64]:
         """(N, 3) NED offsets of the points with these depths (N,) along the optical axis."""
@@ -72,7 +72,7 @@ class Sightlines:
         return offsets
 
 
-def foot_of_upright(
+def range_from_known_height(
     camera: CameraModel,
     mount: CameraMount,
     ned_from_body: NDArray[np.float64],
@@ -93,7 +93,7 @@ def foot_of_upright(
     left, top, right, bottom = (edge - 0.5 for edge in xyxy)
     x, y = (left + right) / 2, (top + bottom) / 2
     pixels = np.array([[x, top], [x, bottom], [left, y], [right, y]])
-    lines = Sightlines.of(camera, mount, ned_from_body, pixels)
+    lines = PixelRays.of(camera, mount, ned_from_body, pixels)
     directions = lines.directions
     level = np.hypot(directions[:, 0], directions[:, 1])
     # Nearly straight above something its height is not seen.

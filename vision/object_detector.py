@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.detections import Detections
-from vision.loading import uncollected
+from vision.gc_pause import gc_paused
 from vision.registry import Registry
 
 if TYPE_CHECKING:
-    from vision.runtimes.contract import Precision
+    from vision.runtimes.base import Precision
     from vision.runtimes.selection import RuntimeChoice
 
 YOLO = "yolo"
@@ -63,7 +63,7 @@ class Timing:
 
 
 class ObjectDetector(ABC):
-    """Finds objects in single frames. Made and used in one thread.
+    """Finds objects in single frames. BuiltLayer and used in one thread.
 
     A detector needs `class_names` and `detect`; the rest is what status and log say of it.
 
@@ -154,7 +154,7 @@ def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
 
 @detector(YOLO, "a YOLO network, by detector.model")
 def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
-    with uncollected():  # only here: it imports half a second
+    with gc_paused():  # only here: it imports half a second
         from vision.detector import Detector
 
     return Detector(

@@ -175,12 +175,12 @@ class Pipeline:
             self._newest = result.detections
             deliver(result)
         if self._selector.left_out[TOO_OLD] > too_old:
-            self._say_too_old((picked_ns - frame.captured_ns) / 1e9, picked_ns)
+            self._log_too_old((picked_ns - frame.captured_ns) / 1e9, picked_ns)
         if self._recorder is not None:
             self._recorder.write(frame, self._newest)
         return True
 
-    def _say_too_old(self, age_s: float, now_ns: int) -> None:
+    def _log_too_old(self, age_s: float, now_ns: int) -> None:
         if now_ns >= self._say_again_ns:
             self._say_again_ns = now_ns + _SAY_AGAIN_NS
             logger.warning(

@@ -218,11 +218,11 @@ def _range_to_target(world: World, vehicle: LockstepVehicle) -> tuple[float, flo
 
 def _faced(world: World, flight: LockstepFlight) -> str | None:
     """Class of the object that stands where guidance believes the one it faces to be; None: none is seen."""
-    situation = flight.guidance.situation
-    if situation is None or not situation.targets:
+    context = flight.guidance.context
+    if context is None or not context.targets:
         return None
-    yaw_rad = situation.state.yaw_rad or 0.0
-    seen = [t for t in situation.targets if t.class_name == TARGET_CLASS and t.position_ned_m is not None]
+    yaw_rad = context.state.yaw_rad or 0.0
+    seen = [t for t in context.targets if t.class_name == TARGET_CLASS and t.position_ned_m is not None]
     if not seen:
         return None
     faced = min(seen, key=lambda target: abs(wrap_angle(target.bearing_rad - yaw_rad)))

@@ -181,7 +181,7 @@ def draw_pictures(path: Path, width: int, height: int) -> Path:
 
 def machine() -> dict[str, Any]:
     """What the figures hang on."""
-    from vision.runtimes.trial import board
+    from vision.runtimes.autotune import board
 
     return {"board": board(), "processors": len(os.sched_getaffinity(0)), "python": platform.python_version()}
 

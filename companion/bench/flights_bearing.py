@@ -89,7 +89,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
     judged: set[int] = set()
 
     def judge(moment: Moment) -> None:
-        for target in moment.situation.targets:
+        for target in moment.context.targets:
             if moment.seconds < SETTLED_S or target.captured_ns in judged:
                 continue
             judged.add(target.captured_ns)
@@ -99,7 +99,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
             )
             truth = cameras[0].ned_from_body[target.captured_ns]
             true_rad = _bearing_rad(truth @ ray)
-            newest = moment.situation.state.attitude
+            newest = moment.context.state.attitude
             assert newest is not None
             told = {
                 "at_capture": target.bearing_rad,

@@ -27,7 +27,7 @@ from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.limits.envelope import Limits
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.lockstep import Truth
-from mavlink_sim.world.plates import Print
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import Marker, MarkerDetector, MarkerKind, marker_from_corners, square

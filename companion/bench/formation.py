@@ -27,7 +27,7 @@ from companion.service.factory import guidance_options
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES
+from companion.vehicle.telemetry import TELEMETRY_MESSAGES
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.lockstep import COMPANION
 from mavlink_sim.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
@@ -36,7 +36,7 @@ from vision.attitude import quaternion_from_euler, wrap_angle
 
 POSES_HZ = 10.0
 # Of what PX4 sends a companion by itself, what its state is made of.
-_FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in FOLDED_MESSAGES}
+_FOLDED_RATES_HZ = {name: rate_hz for name, rate_hz in ONBOARD_RATES_HZ.items() if name in TELEMETRY_MESSAGES}
 # Where the fleet's common frame has its origin; any place away from the poles would do.
 _ORIGIN = Anchor(47.3977, 8.5456, 488.0, (0.0, 0.0, 0.0))
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from companion.bench.simulated_driver import GIMBAL_RATES_HZ, RATES_HZ, LockstepDriver, SimulatedDriver
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
 from companion.guidance.interface import CommandInput, GuidanceEvent, StreamStatus
 from companion.guidance.limits.envelope import Limits
@@ -67,7 +67,7 @@ class Moment:
 
     seconds: float
     truth: Truth
-    situation: Situation
+    context: BehaviourContext
     asked: Setpoint
     sent: Setpoint
     limited_by: tuple[str, ...]
@@ -268,7 +268,7 @@ class LockstepFlight:
             self._step_due_ns = now_ns + round(1e9 / self.settings.guidance.rate_hz)
             self.step()
         if seen:
-            self.streamer.hasten(now_ns)
+            self.streamer.send_now(now_ns)
         if now_ns >= self._stream_due_ns:
             self._stream_due_ns += round(1e9 / self.settings.guidance.setpoint_rate_hz)
             self.streamer.tick(now_ns)
@@ -330,13 +330,13 @@ class LockstepFlight:
 
     def _moment(self) -> Moment | None:
         guidance = self.guidance
-        flown = guidance.phase is Phase.OFFBOARD and guidance.sent is not None and guidance.busy
-        if not flown or guidance.asked is None or guidance.sent is None or guidance.situation is None:
+        active = guidance.phase is Phase.OFFBOARD and guidance.sent is not None and guidance.busy
+        if not active or guidance.asked is None or guidance.sent is None or guidance.context is None:
             return None
         return Moment(
             self.seconds,
             self.vehicle.truth,
-            guidance.situation,
+            guidance.context,
             guidance.asked,
             guidance.sent,
             guidance.limited_by,
@@ -346,11 +346,11 @@ class LockstepFlight:
         """Against the limits: what was sent, exactly; what was flown, by the truth, within the tolerances."""
         limits, truth = self.guidance.options.limits, moment.truth
         north, east, down = truth.velocity_ned_mps
-        home = moment.situation.state.home_position_ned_m or (0.0, 0.0, 0.0)
+        home = moment.context.state.home_position_ned_m or (0.0, 0.0, 0.0)
         height_m = truth.height_m
         away = (truth.position_ned_m[0] - home[0], truth.position_ned_m[1] - home[1])
-        landing = self.guidance.behaviour is not None and self.guidance.behaviour.flown.landing
-        flown = {
+        landing = self.guidance.behaviour is not None and self.guidance.behaviour.active.landing
+        active = {
             "speed": math.hypot(north, east) - limits.max_horizontal_speed_mps - SPEED_TOLERANCE_MPS,
             "climb": -down - limits.max_climb_mps - SPEED_TOLERANCE_MPS,
             "descent": down - limits.max_descend_mps - SPEED_TOLERANCE_MPS,
@@ -362,10 +362,10 @@ class LockstepFlight:
         }
         if moment.sent.velocity_ned_mps is not None:
             north, east, down = moment.sent.velocity_ned_mps
-            flown["speed sent"] = math.hypot(north, east) - limits.max_horizontal_speed_mps * (1 + 1e-9)
-            flown["climb sent"] = -down - limits.max_climb_mps * (1 + 1e-9)
-            flown["descent sent"] = down - limits.max_descend_mps * (1 + 1e-9)
-        for what, by in flown.items():
+            active["speed sent"] = math.hypot(north, east) - limits.max_horizontal_speed_mps * (1 + 1e-9)
+            active["climb sent"] = -down - limits.max_climb_mps * (1 + 1e-9)
+            active["descent sent"] = down - limits.max_descend_mps * (1 + 1e-9)
+        for what, by in active.items():
             if by > 0.0:
                 log.violations[what] = max(by, log.violations.get(what, 0.0))
 
@@ -408,10 +408,10 @@ class _Turn(Behaviour):
         self._yaw_rad = yaw_rad
         self._place: Vector3 | None = None
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        position, yaw_rad = position_and_yaw(situation.state)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        position, yaw_rad = position_and_yaw(context.state)
         if self._place is None:
             self._place = position
         if abs(math.remainder(yaw_rad - self._yaw_rad, math.tau)) < 0.05:
             return Outcome(True, "turned")
-        return Setpoint.position(self._place, situation.now_ns, yaw_rad=self._yaw_rad)
+        return Setpoint.position(self._place, context.now_ns, yaw_rad=self._yaw_rad)

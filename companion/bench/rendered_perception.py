@@ -18,9 +18,9 @@ from companion.settings import Settings
 from companion.settings.perception import DetectorSection, TrackerSection
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera
-from mavlink_sim.flock import place_in_world
+from mavlink_sim.fleet_world import place_in_world
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.spectators import camera_turn_rad
+from mavlink_sim.sim_outputs import camera_turn_rad
 from mavlink_sim.world.aircraft import Aircraft
 from vision.attitude import Quaternion
 from vision.frame import Frame
@@ -65,9 +65,9 @@ class RenderedPerception:
 
     def __init__(self, settings: Settings, vehicle: LockstepVehicle, scene: Scene | None = None) -> None:
         if scene is None:
-            if vehicle.vehicle.surroundings is None:
+            if vehicle.vehicle.collision_world is None:
                 raise ValueError("the vehicle flies in no scene: give one, as scene_or_demo(None, seed)")
-            scene = vehicle.vehicle.surroundings.scene
+            scene = vehicle.vehicle.collision_world.scene
         cv2.setNumThreads(1)
         detector = None
         if settings.detector.enabled:

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
+from companion.vehicle.scheduler_slice import set_scheduler_slice
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.short_turns import take_short_turns
 from companion.vehicle.streamer import Streamer
 
 # SET_POSITION_TARGET_LOCAL_NED in MAVLink 2: what a setpoint weighs on the wire.
@@ -53,7 +53,7 @@ async def _stream(seconds: float, rate_hz: float) -> list[int]:
     arrivals_ns: list[int] = []
 
     def receive() -> None:
-        take_short_turns()
+        set_scheduler_slice()
         while receiver.recv(256):
             arrivals_ns.append(time.monotonic_ns())
 

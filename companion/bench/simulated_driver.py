@@ -18,15 +18,15 @@ from companion.guidance.interface import (
     TakeGimbal,
     TakeOff,
 )
-from companion.vehicle.ardupilot_manners import ArduPilotManners
+from companion.vehicle.ardupilot_profile import ArduPilotProfile
+from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, FOLLOWING_NOSE, PITCHYAW, RELEASE, UNCHANGED
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
-from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 from mavlink_sim.ardupilot.copter import CopterVehicle
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
 from mavlink_sim.wire.messages import dialect
@@ -37,7 +37,7 @@ SHOWN_TIMEOUT_S = 3.0
 GIMBAL_INFORMATION_ID = 280
 # What the drivers ask of an autopilot, and the same where there is a gimbal (`gimbal_commands`).
 RATES_HZ = {
-    **{dialect.mavlink_map[number].msgname: rate_hz for number, rate_hz in Px4Manners.rates_hz.items()},
+    **{dialect.mavlink_map[number].msgname: rate_hz for number, rate_hz in Px4Profile.rates_hz.items()},
     "HEARTBEAT": 1.0,
 }
 COPTER_STREAMS_S = 2.5  # until even the slowest stream has come
@@ -96,8 +96,8 @@ class SimulatedDriver:
         self.vehicle, self._boot_ns = vehicle, boot_ns
         copter = isinstance(vehicle.vehicle, CopterVehicle)
         self._kind = ARDUPILOT if copter else PX4
-        self._manners: Manners = ArduPilotManners() if copter else Px4Manners()
-        self._state = VehicleState(autopilot=self._manners.name)
+        self._profile: AutopilotProfile = ArduPilotProfile() if copter else Px4Profile()
+        self._state = VehicleState(autopilot=self._profile.name)
         self._mode_ns = 0
         self._pending: list[_Pending] = []
         self._answers: list[Answer] = []
@@ -106,7 +106,7 @@ class SimulatedDriver:
             self.vehicle.send(self._long(dialect.MAV_CMD_REQUEST_MESSAGE, GIMBAL_INFORMATION_ID))
             self.vehicle.step(0.1)
         if copter:
-            for number, rate_hz in self._manners.rates_hz.items():
+            for number, rate_hz in self._profile.rates_hz.items():
                 self.vehicle.send(self._long(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz))
             self.vehicle.step(COPTER_STREAMS_S)
         self.receive()
@@ -124,7 +124,7 @@ class SimulatedDriver:
         message = setpoint_message(moved, self.vehicle.vehicle.system_id)
         fields = message.to_dict()
         del fields["mavpackettype"]
-        self.vehicle.send(type(message)(**self._manners.setpoint_fields(fields)))
+        self.vehicle.send(type(message)(**self._profile.setpoint_fields(fields)))
 
     def send_landing_target(self, target: LandingTarget) -> None:
         fields = landing_target_fields(target, self._kind, self._state.reset_offset_ned_m)
@@ -135,7 +135,7 @@ class SimulatedDriver:
         match request.action:
             case SetMode(mode):
                 asked_ns = self.now_ns
-                shown_mode, main, sub = self._manners.mode_request(mode, state)
+                shown_mode, main, sub = self._profile.mode_request(mode, state)
                 self._command(
                     request,
                     f"the vehicle refused mode {mode}",
@@ -152,7 +152,7 @@ class SimulatedDriver:
                 )
             case TakeOff(altitude_m):
                 try:
-                    values = self._manners.takeoff_parameters(altitude_m, state)
+                    values = self._profile.takeoff_parameters(altitude_m, state)
                 except CommandRefusedError as error:
                     self._answers.append(Answer(request.identifier, str(error)))
                     return
@@ -203,11 +203,11 @@ class SimulatedDriver:
             name = message.get_type()
             if name == "COMMAND_ACK":
                 self._acknowledge(message)
-            elif name in FOLDED_MESSAGES or self._kind == ARDUPILOT:
-                for told, fields in self._manners.heard(name, message.to_dict(), self._state):
+            elif name in TELEMETRY_MESSAGES or self._kind == ARDUPILOT:
+                for told, fields in self._profile.translate(name, message.to_dict(), self._state):
                     if told in ("HEARTBEAT", "CURRENT_MODE"):
                         self._mode_ns = now_ns
-                    self._state = fold(self._state, told, fields, now_ns)
+                    self._state = apply_message(self._state, told, fields, now_ns)
         for pending in list(self._pending):
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)

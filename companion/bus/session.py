@@ -215,11 +215,11 @@ class Bus:
         self._token = session.liveliness().declare_token(alive_key(self._vehicle))
         self._queryable = session.declare_queryable(command_key(self._vehicle), self._from_zenoh_thread)
         self._subscribers = [
-            session.declare_subscriber(everybodys_key(topic), partial(self._heard_on_zenoh_thread, listener))
+            session.declare_subscriber(everybodys_key(topic), partial(self._on_sample, listener))
             for topic, listener in self._listeners
         ]
 
-    def _heard_on_zenoh_thread(self, listener: Callable[[bytes], None], sample: zenoh.Sample) -> None:
+    def _on_sample(self, listener: Callable[[bytes], None], sample: zenoh.Sample) -> None:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(listener, sample.payload.to_bytes())
 

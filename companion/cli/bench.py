@@ -33,7 +33,7 @@ def bench_detector(
 ) -> None:
     """Milliseconds a frame, pixels in, boxes out, of each runtime, measured in turn."""
     from companion.bench.detector import BenchError, measure_detectors, read_result, table
-    from vision.runtimes.contract import RUNTIMES, installed
+    from vision.runtimes.base import RUNTIMES, installed
 
     try:
         width, height = (int(number) for number in frame.split("x"))
@@ -70,7 +70,7 @@ def bench_latency(
     """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
     from companion.bench.latency import measure_latency
     from companion.bus.session import BusError
-    from companion.perception.keeper import PerceptionStartError
+    from companion.perception.supervisor import PerceptionStartError
     from companion.settings.reading import ConfigurationError
     from companion.sim_session import SimSessionError
     from companion.vehicle.driver import LinkError

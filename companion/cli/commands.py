@@ -28,7 +28,7 @@ from companion.cli.models import models
 from companion.cli.play import play
 from companion.settings import Settings
 from companion.settings.perception import DEFAULT_MODEL, NO_SOURCE
-from vision.loading import uncollected
+from vision.gc_pause import gc_paused
 from vision.object_detector import YOLO
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ EXIT_FAILED = 1
 _DEMO_S, _DEMO_ELSEWHERE_S = 150.0, 300.0
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
@@ -81,7 +81,7 @@ def _say_version(wanted: bool) -> None:
 def every_command(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_say_version, is_eager=True, help="show the version"),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="show the version"),
     ] = False,
 ) -> None:
     """What holds for every command."""
@@ -90,11 +90,11 @@ def every_command(
 @settings_command(app)
 def run(settings: Settings) -> None:
     """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
-    with uncollected():
+    with gc_paused():
         from companion.bus.session import BusError
         from companion.operator.line_output import use_for_standard_error
         from companion.operator.metrics import MetricsError
-        from companion.perception.keeper import PerceptionStartError
+        from companion.perception.supervisor import PerceptionStartError
         from companion.plugins import PluginError
         from companion.service import Service
         from companion.vehicle.driver import LinkError
@@ -120,7 +120,7 @@ def _keep_what_is_loaded() -> None:
     gc.freeze()
 
 
-def _warn_drawn_scenes_only(looked_at: Iterable[tuple[str, str]]) -> None:
+def _warn_synthetic_model(looked_at: Iterable[tuple[str, str]]) -> None:
     """Say once that the bundled model is not for real pictures, if it is to look at any.
 
     Args:
@@ -143,7 +143,7 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
     def on_ready() -> None:
         _keep_what_is_loaded()
         views = [settings.of_view(name) for name in (None, *settings.views)]
-        _warn_drawn_scenes_only(
+        _warn_synthetic_model(
             (view.source.uri, view.detector.model)
             for view in views
             if view.detector.enabled and view.detector.kind == YOLO
@@ -193,7 +193,7 @@ def demo(
         return
     from companion.bus.session import BusError
     from companion.demo import run_demo
-    from companion.perception.keeper import PerceptionStartError
+    from companion.perception.supervisor import PerceptionStartError
     from companion.sim_session import SimSessionError
     from companion.vehicle.driver import LinkError
 
@@ -205,7 +205,9 @@ def demo(
     with plain_errors(SimSessionError, LinkError, PerceptionStartError, BusError, OSError):
         # PX4 comes home at 30 m (RTL_RETURN_ALT), and nobody's parameters are set unasked.
         limit_s = duration or (_DEMO_S if vehicle_url is None else _DEMO_ELSEWHERE_S)
-        summary = run_demo(output, seed=seed, limit_s=limit_s, say=_say_with_time(), vehicle_url=vehicle_url)
+        summary = run_demo(
+            output, seed=seed, limit_s=limit_s, say=_print_with_time(), vehicle_url=vehicle_url
+        )
     if not summary.success:
         typer.echo(f"the demonstration failed: {summary.failure}; see {output}", err=True)
         raise typer.Exit(EXIT_FAILED)
@@ -237,7 +239,7 @@ def _fly_seeds(text: str, processes: int, *, synthetic: bool, as_json: bool) -> 
         raise typer.Exit(EXIT_FAILED)
 
 
-def _say_with_time() -> Callable[[str], None]:
+def _print_with_time() -> Callable[[str], None]:
     started = time.monotonic()
     return lambda text: typer.echo(f"{time.monotonic() - started:6.1f} s  {text}")
 
@@ -277,7 +279,7 @@ def detect(
     ] = None,
 ) -> None:
     """Detect objects in every frame of a source; one line a frame on standard output."""
-    with uncollected():
+    with gc_paused():
         from companion.detect import detect_source
         from companion.plugins import PluginError, load_plugins
         from vision.object_detector import DetectorSettings, open_detector
@@ -313,7 +315,7 @@ def detect(
     write = functools.partial(print, flush=True)
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         if detector_kind == YOLO:
-            _warn_drawn_scenes_only([(source, model)])
+            _warn_synthetic_model([(source, model)])
         looked_at = detect_source(
             frames,
             looking,

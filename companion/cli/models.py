@@ -101,15 +101,15 @@ def export(
     image_size: Annotated[int, typer.Option(min=32, help="what it is tuned and checked for, pixels")] = 640,
 ) -> None:
     """Write a model for another runtime; the file is checked against the model before it is kept."""
-    from vision.runtimes.contract import RuntimeUnusableError
+    from vision.runtimes.base import RuntimeUnusableError
     from vision.runtimes.export import export
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
-    from vision.yolo.generation import generation_of
+    from vision.yolo.model_family import model_family_of
 
     path = _path(file)
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
-        generation = generation_of(load_checkpoint(path).model)
-        written = export(path, to, output, image_size, generation=generation)  # type: ignore[arg-type]
+        model_family = model_family_of(load_checkpoint(path).model)
+        written = export(path, to, output, image_size, model_family=model_family)  # type: ignore[arg-type]
     reader = {"onnx": "onnxruntime", "torchscript": "torch"}.get(to, to)
     typer.echo(f"{written} ({written.stat().st_size} bytes), for --model with --runtime {reader}")
 
@@ -130,7 +130,7 @@ def verify(
 ) -> None:
     """Whether an exported model finds what its source finds. Exit code 1 if not."""
     from companion.models.verify import parity_lines, sample_pictures, verify
-    from vision.runtimes.contract import RuntimeUnusableError
+    from vision.runtimes.base import RuntimeUnusableError
     from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):

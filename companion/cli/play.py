@@ -12,7 +12,7 @@ import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
 from companion.settings import Settings
-from vision.loading import uncollected
+from vision.gc_pause import gc_paused
 
 EXIT_FAILED = 1
 # What play brings itself.
@@ -50,11 +50,11 @@ def play(
         )
         raise typer.Exit(EXIT_BAD_INPUT)
     started_s = time.monotonic()
-    with uncollected():
+    with gc_paused():
         from companion.bus.session import BusError
         from companion.operator.line_output import LineOutput, use_for_standard_error
         from companion.operator.metrics import MetricsError
-        from companion.perception.keeper import PerceptionStartError
+        from companion.perception.supervisor import PerceptionStartError
         from companion.play import PlayOptions, SimulationLostError
         from companion.play import play as start
         from companion.plugins import PluginError

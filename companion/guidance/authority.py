@@ -126,7 +126,7 @@ class Authority:
             return "the vehicle was disarmed"
         return ignored
 
-    def reason_is_told(self, state: VehicleState, now_ns: int) -> bool:
+    def reason_is_logged(self, state: VehicleState, now_ns: int) -> bool:
         """Whether what `lost` said is all that the autopilot will say of it.
 
         A HEARTBEAT may show a new mode a moment before CURRENT_MODE tells whose it was, and either before
@@ -134,14 +134,14 @@ class Authority:
         """
         if state.mode is self._mode:
             return True  # not for a mode
-        silent = not state.reports or bool(self.said_of_it(state, now_ns))
+        silent = not state.reports or bool(self.reasons_for(state, now_ns))
         if state.reports and self._holds_by_itself(state):
             # What is wrong is said first; whether the hold is to last, only in the event of the failsafe.
             silent = any(one.name.startswith(_FAILSAFES) for one in _warnings(state, now_ns))
         whose = state.intended_beside in (FlightMode.UNKNOWN, state.mode) or state.failsafe
         return whose and (silent or state.intended_mode is state.mode)
 
-    def said_of_it(self, state: VehicleState, now_ns: int) -> str:
+    def reasons_for(self, state: VehicleState, now_ns: int) -> str:
         """What the autopilot warned of when it took command, in its own words; empty if it did not."""
         warnings = _warnings(state, now_ns)
         return words_of(one for one in warnings if self._mode is None or among_modes(self._mode, one.modes))

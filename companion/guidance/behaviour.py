@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
-from companion.guidance.gimbal_sight import NO_GIMBAL, GimbalSight
+from companion.guidance.gimbal_status import NO_GIMBAL, GimbalStatus
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -34,7 +34,7 @@ class Requirement(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class BehaviourContext:
     """Everything a behaviour may look at in one update.
 
     Attributes:
@@ -64,7 +64,7 @@ class Situation:
     markers: MarkerSight = NO_MARKERS
     neighbourhood: Neighbourhood | None = None
     min_separation_m: float = 3.0
-    gimbal: GimbalSight = NO_GIMBAL
+    gimbal: GimbalStatus = NO_GIMBAL
     ranging: RangeMeans = ALL_MEANS
     max_acceleration_mps2: float = 3.0
     goal_ned_m: Vector3 | None = None
@@ -111,7 +111,7 @@ class ModeRequest:
 
 
 # What an update may answer: a setpoint to fly, a mode of the autopilot's own, or the end.
-Step = Setpoint | ModeRequest | Outcome
+BehaviourOutput = Setpoint | ModeRequest | Outcome
 
 
 class Behaviour(ABC):
@@ -126,15 +126,15 @@ class Behaviour(ABC):
     # Above the horizon, radians; what the gimbal must reach, where it requires GIMBAL.
     gimbal_pitches_rad: tuple[float, ...] = ()
 
-    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """Where it would fly to if it began now, local NED metres, as far as that is known before."""
         return ()
 
-    def on_activate(self, situation: Situation) -> None:  # noqa: B027  (a hook that may be left out)
+    def on_activate(self, context: BehaviourContext) -> None:  # noqa: B027  (a hook that may be left out)
         """Called once, before the first update."""
 
     @abstractmethod
-    def update(self, dt_s: float, situation: Situation) -> Step:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Called at the guidance rate. `dt_s` is the time since the last update (0 at the first)."""
 
     def on_deactivate(self) -> None:  # noqa: B027  (a hook that may be left out)
@@ -149,7 +149,7 @@ class Behaviour(ABC):
         return ()
 
     @property
-    def flown(self) -> Behaviour:
+    def active(self) -> Behaviour:
         """What flies now: itself, or of several in turn the one whose turn it is."""
         return self
 

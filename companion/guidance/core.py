@@ -16,7 +16,14 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from companion.guidance.authority import Authority, silence
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    ModeRequest,
+    Outcome,
+    Requirement,
+)
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command_queue import CommandQueue
 from companion.guidance.gimbal.controller import ENDING, GimbalController, GimbalMounting
@@ -29,11 +36,11 @@ from companion.guidance.interface import (
     OutputCollector,
     SetMode,
 )
-from companion.guidance.limits.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryWatch
+from companion.guidance.limits.battery import ENDINGS, NO_MINIMUM, BatteryMinimum, BatteryMonitor
 from companion.guidance.limits.envelope import Envelope, Limits
 from companion.guidance.limits.obstacles import NO_RULES, ObstacleMemory, ObstacleRules
 from companion.guidance.mode_sequence import ModeSequence
-from companion.guidance.refusal import refusal
+from companion.guidance.requirements import check_requirements
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
@@ -105,14 +112,14 @@ class Guidance:
         self._out = OutputCollector()
         self._envelope = Envelope(options.limits)
         self._authority = Authority()
-        self._battery = BatteryWatch(options.battery)
+        self._battery = BatteryMonitor(options.battery)
         self._memory = ObstacleMemory()
         self._queue = CommandQueue(self.gimbal)
         self._behaviour: Behaviour | None = None
         self._command: CommandInput | None = None
         self._busy = self._after_battery = False
         self._activated = False
-        self._situation: Situation | None = None
+        self._context: BehaviourContext | None = None
         self._class_names: tuple[str, ...] | None = None
         self._stepped_ns: int | None = None
         self._streaming = False
@@ -128,14 +135,14 @@ class Guidance:
         self._mode_changes = 0
         self._landing_target_ns = 0
         # Read once in each step, where an exception is handled.
-        self._flown: Behaviour | None = None
+        self._active: Behaviour | None = None
         self._landing = False
         self._gimbal_user = ""
 
     @property
-    def flown(self) -> Behaviour | None:
+    def active(self) -> Behaviour | None:
         """The behaviour whose turn it is, of several in turn; None: none has been updated yet."""
-        return self._flown
+        return self._active
 
     @property
     def behaviour(self) -> Behaviour | None:
@@ -143,9 +150,9 @@ class Guidance:
         return self._behaviour
 
     @property
-    def situation(self) -> Situation | None:
+    def context(self) -> BehaviourContext | None:
         """What behaviours saw at the newest step; None before the first."""
-        return self._situation
+        return self._context
 
     @property
     def busy(self) -> bool:
@@ -184,8 +191,8 @@ class Guidance:
         if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
             self._goal_ned_m = None  # somebody else has flown since
         self._mode_changes = inputs.mode_changes
-        before, situation = self._situation, self._observe(now_ns, inputs)
-        self._situation, self._class_names = situation, inputs.class_names
+        before, context = self._context, self._observe(now_ns, inputs)
+        self._context, self._class_names = context, inputs.class_names
         if inputs.ending:
             self._queue.close(out)
             for command in inputs.commands:
@@ -198,37 +205,39 @@ class Guidance:
         for command in inputs.commands:
             self._queue.add(command, now_ns, inputs.state, self._gimbal_user, out)
         for command in self._queue.take_due(now_ns, inputs.state, out):
-            self._begin_command(command, situation)
+            self._begin_command(command, context)
         landing_target = None
         try:
             if self._behaviour is not None:
                 paused_s = 0.0 if before is None else (now_ns - before.now_ns) / 1e9
-                self._tell_reset(self._behaviour, before, situation)
-                self._update(situation, inputs, paused_s)
+                self._report_reset(self._behaviour, before, context)
+                self._update(context, inputs, paused_s)
             landing_target = self._new_landing_target()
-            self.gimbal.update(now_ns, inputs.state, self._flown, out)
+            self.gimbal.update(now_ns, inputs.state, self._active, out)
         except Exception as error:
-            self._behaviour_failed(error, situation, inputs.stream.sent_count)
+            self._behaviour_failed(error, context, inputs.stream.sent_count)
         self._answer_endless(inputs)
         return self._output(landing_target)
 
     def check_requirements(self, behaviour: Behaviour) -> str | None:
         """Why this behaviour could not begin now, in words; None: it could."""
-        options, situation = self.options, self._situation
-        missing = refusal(behaviour, situation, self._class_names, options.battery, options.obstacles)
-        if missing is not None or situation is None:
+        options, context = self.options, self._context
+        missing = check_requirements(
+            behaviour, context, self._class_names, options.battery, options.obstacles
+        )
+        if missing is not None or context is None:
             return missing
-        for goal in behaviour.goals(situation):
-            if (why := self._envelope.why_not_there(goal, situation.state)) is not None:
+        for goal in behaviour.goals(context):
+            if (why := self._envelope.why_not_there(goal, context.state)) is not None:
                 return f"{behaviour.name} would leave the limits: {why}"
         return None
 
-    def _observe(self, now_ns: int, inputs: GuidanceInput) -> Situation:
+    def _observe(self, now_ns: int, inputs: GuidanceInput) -> BehaviourContext:
         """What behaviours see, without targets that are too old or whose camera has no known direction."""
         gimbal = self.gimbal.sight(now_ns, inputs.state)
         age_s = None if inputs.seen_ns is None else (now_ns - inputs.seen_ns) / 1e9
         fresh = age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.undirected
-        return Situation(
+        return BehaviourContext(
             now_ns,
             inputs.state,
             inputs.targets if fresh else (),
@@ -259,7 +268,7 @@ class Guidance:
 
     # --- commands ----------------------------------------------------------------------------------------
 
-    def _begin_command(self, command: CommandInput, situation: Situation) -> None:
+    def _begin_command(self, command: CommandInput, context: BehaviourContext) -> None:
         """Let a command's behaviour take the place of the active one; refused, the active one goes on."""
         behaviour = command.behaviour
         assert behaviour is not None
@@ -275,7 +284,7 @@ class Guidance:
             return
         self._end(Outcome(False, f"replaced by {behaviour.name}"))
         if self.phase is Phase.IDLE:
-            self._authority.take(situation.state)
+            self._authority.take(context.state)
             self.phase = Phase.READY
         elif self.phase is Phase.REQUESTING:
             self._drop_request()
@@ -304,73 +313,73 @@ class Guidance:
 
     # --- one step of what is active ----------------------------------------------------------------------
 
-    def _update(self, situation: Situation, inputs: GuidanceInput, paused_s: float) -> None:
+    def _update(self, context: BehaviourContext, inputs: GuidanceInput, paused_s: float) -> None:
         assert self._behaviour is not None
         fresh = inputs.stream.state is StreamState.FRESH
         why = (
-            silence(inputs.stream.state, situation.state, paused_s) if self._streaming else None
+            silence(inputs.stream.state, context.state, paused_s) if self._streaming else None
         ) or self._authority.lost(
-            situation.state,
-            situation.now_ns,
+            context.state,
+            context.now_ns,
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
             sent=self.sent if fresh and self.phase is Phase.OFFBOARD else None,
             landing=self._landing,
         )
         if why is not None or self._yielded is not None:
-            self._yield(why, situation)
+            self._yield(why, context)
             return
         # Before any hook of the behaviour: what the autopilot has answered must not be lost by its exception.
         for answer in inputs.answers:
             if answer.identifier == self._request:
-                self._take_answer(answer, situation)
+                self._take_answer(answer, context)
         if self._behaviour is not None:
-            self._watch_battery(self._behaviour, situation)
-        self._ask_next(situation)
+            self._monitor_battery(self._behaviour, context)
+        self._ask_next(context)
         if self.phase is Phase.ENGAGING and self._activated:
-            self._engage(situation, inputs.stream.sent_count)
+            self._engage(context, inputs.stream.sent_count)
         elif self._behaviour is not None:
-            self._run(self._behaviour, situation, inputs.stream.sent_count)
+            self._run(self._behaviour, context, inputs.stream.sent_count)
         if self._streaming and self.phase is not Phase.OFFBOARD:
-            self._brake(situation)
+            self._brake(context)
 
     def _begin(self, behaviour: Behaviour, command: CommandInput | None, *, busy: bool = True) -> None:
         self._behaviour, self._command, self._busy = behaviour, command, busy
         self._activated, self._position_lost_ns, self._blind = False, None, False
-        self._flown, self._landing, self._gimbal_user = None, False, ""
+        self._active, self._landing, self._gimbal_user = None, False, ""
 
-    def _run(self, behaviour: Behaviour, situation: Situation, sent_count: int) -> None:
+    def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """One update of the behaviour, and what follows from it."""
-        if Requirement.POSITION in behaviour.requirements and not self._position_known(situation):
+        if Requirement.POSITION in behaviour.requirements and not self._position_known(context):
             return
         if not self._activated:
             self._activated, self._stepped_ns = True, None
-            behaviour.on_activate(situation)
+            behaviour.on_activate(context)
             if self.busy:
                 self._goal_ned_m = None
-        dt_s = 0.0 if self._stepped_ns is None else (situation.now_ns - self._stepped_ns) / 1e9
-        step: Step = behaviour.update(dt_s, situation)
+        dt_s = 0.0 if self._stepped_ns is None else (context.now_ns - self._stepped_ns) / 1e9
+        step: BehaviourOutput = behaviour.update(dt_s, context)
         for note in behaviour.take_notes():
             self._out.event(EventKind.NOTED, behaviour.name, note)
-        self._stepped_ns = situation.now_ns
-        self._flown = flown = behaviour.flown
-        self._landing = flown.landing
-        self._gimbal_user = flown.name if flown.gimbal_aim is not None else ""
+        self._stepped_ns = context.now_ns
+        self._active = active = behaviour.active
+        self._landing = active.landing
+        self._gimbal_user = active.name if active.gimbal_aim is not None else ""
         match step:
             case Outcome():
-                self._conclude(step, situation, sent_count)
+                self._conclude(step, context, sent_count)
             case ModeRequest():
                 if step != self._requested:
-                    self._start_request(step, situation)
+                    self._start_request(step, context)
             case Setpoint() if self.phase is Phase.OFFBOARD:
-                self._limit(behaviour, step, situation, dt_s)
+                self._limit(behaviour, step, context, dt_s)
             case Setpoint():
                 if self.phase is not Phase.ENGAGING:
-                    self._start_engaging(situation, sent_count)
+                    self._start_engaging(context, sent_count)
             case _:
                 got = type(step).__name__
                 raise TypeError(f"update returned {got}, expected Setpoint, ModeRequest or Outcome")
 
-    def _behaviour_failed(self, error: Exception, situation: Situation, sent_count: int) -> None:
+    def _behaviour_failed(self, error: Exception, context: BehaviourContext, sent_count: int) -> None:
         """A hook of the behaviour raised: the vehicle is held. To be called where an exception is handled."""
         name = "guidance" if self._behaviour is None else self._behaviour.name
         logger.exception("%s failed", name)
@@ -379,36 +388,38 @@ class Guidance:
             self._lose(self._yielded[1])
         elif self.busy:
             try:
-                self._conclude(Outcome(False, why), situation, sent_count)
+                self._conclude(Outcome(False, why), context, sent_count)
             except Exception:
                 logger.exception("the hold after %s failed", name)
                 self._lose(why)
         else:
             self._lose(why)
 
-    def _limit(self, behaviour: Behaviour, setpoint: Setpoint, situation: Situation, dt_s: float) -> None:
+    def _limit(
+        self, behaviour: Behaviour, setpoint: Setpoint, context: BehaviourContext, dt_s: float
+    ) -> None:
         """What the envelope leaves of a setpoint is streamed; without the depth that it needs, a brake."""
         rules = self.options.obstacles
         # How long a setpoint counts is the operator's setting, whatever its behaviour wrote.
-        asked = replace(setpoint, deadline_ns=situation.now_ns + round(self.options.lifetime_s * 1e9))
-        blind = rules.blind(situation)
-        self._tell_blindness(behaviour, blind)
+        asked = replace(setpoint, deadline_ns=context.now_ns + round(self.options.lifetime_s * 1e9))
+        blind = rules.blind(context)
+        self._report_perception_fault(behaviour, blind)
         if blind is not None:
-            self._brake(situation)
+            self._brake(context)
             self.asked, self.limited_by = asked, (blind,)
             return
-        self._envelope.near = rules.rows(self._memory.filled(situation))
+        self._envelope.near = rules.rows(self._memory.filled(context))
         self.asked = asked
         self.sent, self.limited_by = self._envelope.apply(
             asked,
-            situation.state,
-            situation.now_ns,
+            context.state,
+            context.now_ns,
             dt_s,
-            situation.neighbours,
+            context.neighbours,
             landing=self._landing,
         )
 
-    def _tell_blindness(self, behaviour: Behaviour, blind: str | None) -> None:
+    def _report_perception_fault(self, behaviour: Behaviour, blind: str | None) -> None:
         """Tell once that the vehicle brakes for want of depth, and once that it flies on."""
         if (blind is not None) is not self._blind:
             self._blind = blind is not None
@@ -417,15 +428,17 @@ class Guidance:
             else:
                 self._out.event(EventKind.BLIND, behaviour.name, f"braking: {blind}", warning=True)
 
-    def _tell_reset(self, behaviour: Behaviour, before: Situation | None, situation: Situation) -> None:
+    def _report_reset(
+        self, behaviour: Behaviour, before: BehaviourContext | None, context: BehaviourContext
+    ) -> None:
         """Tell that the estimate was reset. Goals stay on the ground where they are (`vehicle.state`)."""
-        if before is not None and situation.state.reset_count > before.state.reset_count:
-            words = situation.state.reset_words(before.state)
+        if before is not None and context.state.reset_count > before.state.reset_count:
+            words = context.state.reset_words(before.state)
             self._out.event(
                 EventKind.NOTED, behaviour.name, f"position estimate {words}; goals moved with it"
             )
 
-    def _conclude(self, outcome: Outcome, situation: Situation, sent_count: int) -> None:
+    def _conclude(self, outcome: Outcome, context: BehaviourContext, sent_count: int) -> None:
         """It ended by itself: hold where setpoints are flown, else leave it to the autopilot."""
         self._end(outcome)
         self._goal_ned_m = outcome.goal_ned_m
@@ -437,11 +450,11 @@ class Guidance:
         hold = HoldBehaviour()
         self._begin(hold, None, busy=False)
         if self.phase is Phase.OFFBOARD:
-            self._run(hold, replace(situation, goal_ned_m=self._goal_ned_m), sent_count)
+            self._run(hold, replace(context, goal_ned_m=self._goal_ned_m), sent_count)
 
-    def _watch_battery(self, behaviour: Behaviour, situation: Situation) -> None:
+    def _monitor_battery(self, behaviour: Behaviour, context: BehaviourContext) -> None:
         """Too little charge ends what is flown; the vehicle brakes until what the operator chose begins."""
-        state, now_ns = situation.state, situation.now_ns
+        state, now_ns = context.state, context.now_ns
         if (why := self._battery.unknown(behaviour, state, now_ns)) is not None:
             self._battery_event(behaviour, why)
         if (why := self._battery.ending(behaviour, state, now_ns)) is None:
@@ -458,60 +471,60 @@ class Guidance:
         self._out.event(EventKind.BATTERY, behaviour.name, message, warning=True)
         self._queue.supersede(f"an event ({message})", self._out)
 
-    def _position_known(self, situation: Situation) -> bool:
+    def _position_known(self, context: BehaviourContext) -> bool:
         """False: brake for now; for too long: give the command up."""
-        fault = situation.state.position_fault(situation.now_ns)
+        fault = context.state.position_fault(context.now_ns)
         if fault is None:
             self._position_lost_ns = None
             return True
         if self._position_lost_ns is None:
             logger.warning("no position or attitude to fly by (%s): braking", fault)
-            self._position_lost_ns = situation.now_ns
-        if situation.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
+            self._position_lost_ns = context.now_ns
+        if context.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
             self._lose(f"no position or attitude to fly by for {POSITION_LOSS_S:g} s ({fault})")
         elif self.phase is Phase.OFFBOARD:
-            self._brake(situation)
+            self._brake(context)
         return False
 
-    def _brake(self, situation: Situation) -> None:
+    def _brake(self, context: BehaviourContext) -> None:
         self.asked, self.limited_by = None, ()
-        self.sent = Setpoint.brake(situation.now_ns, self.options.lifetime_s)
+        self.sent = Setpoint.brake(context.now_ns, self.options.lifetime_s)
         self._envelope.reset()
 
     # --- requests to the vehicle -------------------------------------------------------------------------
 
-    def _start_engaging(self, situation: Situation, sent_count: int) -> None:
+    def _start_engaging(self, context: BehaviourContext, sent_count: int) -> None:
         """Setpoints first; OFFBOARD is requested when some have left."""
         self._drop_request()
         self.phase, self._streaming = Phase.ENGAGING, True
-        self._engaging_since_ns = situation.now_ns
+        self._engaging_since_ns = context.now_ns
         self._sent_before_engaging = sent_count
-        self._authority.request(FlightMode.OFFBOARD, situation.state)
+        self._authority.request(FlightMode.OFFBOARD, context.state)
 
-    def _engage(self, situation: Situation, sent_count: int) -> None:
+    def _engage(self, context: BehaviourContext, sent_count: int) -> None:
         if self._request is not None:
             return
         if sent_count - self._sent_before_engaging >= SETPOINTS_BEFORE_OFFBOARD:
             self._request = self._out.request(SetMode(FlightMode.OFFBOARD))
-        elif situation.now_ns - self._engaging_since_ns > ENGAGE_TIMEOUT_S * 1e9:
+        elif context.now_ns - self._engaging_since_ns > ENGAGE_TIMEOUT_S * 1e9:
             self._fail(f"offboard not requested: no setpoint left within {ENGAGE_TIMEOUT_S:g} s")
 
-    def _start_request(self, request: ModeRequest, situation: Situation) -> None:
+    def _start_request(self, request: ModeRequest, context: BehaviourContext) -> None:
         """Request a mode of the autopilot's own. Out of OFFBOARD, a brake is streamed until it shows."""
         self._drop_request()
         self.phase, self._requested = Phase.REQUESTING, request
-        self._authority.request(request.mode, situation.state, request.altitude_m)
-        self._sequence = ModeSequence(request, situation.state)
-        self._ask_next(situation)
+        self._authority.request(request.mode, context.state, request.altitude_m)
+        self._sequence = ModeSequence(request, context.state)
+        self._ask_next(context)
 
-    def _ask_next(self, situation: Situation) -> None:
+    def _ask_next(self, context: BehaviourContext) -> None:
         """The next action of a requested mode, once the one before is done."""
         if self._sequence is not None and self._request is None:
-            action = self._sequence.next(situation.now_ns, situation.state)
+            action = self._sequence.next(context.now_ns, context.state)
             if action is not None:
                 self._request = self._out.request(action)
 
-    def _take_answer(self, answer: Answer, situation: Situation) -> None:
+    def _take_answer(self, answer: Answer, context: BehaviourContext) -> None:
         """The request is over: it was done, or refused."""
         self._request = None
         if answer.refused is not None:
@@ -521,7 +534,7 @@ class Guidance:
         if self._sequence is not None and not self._sequence.finished:
             return
         self._sequence = None
-        self._authority.settled(situation.now_ns)
+        self._authority.settled(context.now_ns)
         if self.phase is Phase.ENGAGING:
             self.phase, self._stepped_ns = Phase.OFFBOARD, None
             self._envelope.reset()
@@ -533,13 +546,13 @@ class Guidance:
 
     def _fail(self, why: str) -> None:
         """The autopilot did not do what was requested."""
-        behaviour, situation = self._behaviour, self._situation
-        if behaviour is not None and situation is not None and behaviour.request_failed(why):
+        behaviour, context = self._behaviour, self._context
+        if behaviour is not None and context is not None and behaviour.request_failed(why):
             flying = self.phase is Phase.REQUESTING and self._streaming
             if not flying:
                 self._silence()
             # What shows now is the mode from before: a pilot's would have ended our command already.
-            self._authority.refused(FlightMode.OFFBOARD if flying else situation.state.mode)
+            self._authority.refused(FlightMode.OFFBOARD if flying else context.state.mode)
             self.phase, self._requested = Phase.OFFBOARD if flying else Phase.READY, None
             return
         self._end(Outcome(False, why))
@@ -553,15 +566,15 @@ class Guidance:
 
     # --- the end of a behaviour, or of our command -------------------------------------------------------
 
-    def _yield(self, why: str | None, situation: Situation) -> None:
+    def _yield(self, why: str | None, context: BehaviourContext) -> None:
         """Fall silent at once; say why when the autopilot has told whose change of mode it was."""
-        since_ns, first = self._yielded or (situation.now_ns, why or "")
+        since_ns, first = self._yielded or (context.now_ns, why or "")
         self._yielded = (since_ns, why or first)
         self._silence()
-        state, now_ns = situation.state, situation.now_ns
+        state, now_ns = context.state, context.now_ns
         waited_s = (now_ns - since_ns) / 1e9
-        if why is None or waited_s >= REASON_WAIT_S or self._authority.reason_is_told(state, now_ns):
-            said = self._authority.said_of_it(state, now_ns)
+        if why is None or waited_s >= REASON_WAIT_S or self._authority.reason_is_logged(state, now_ns):
+            said = self._authority.reasons_for(state, now_ns)
             if self._authority.chose_hold(state, now_ns):
                 # PX4 would take our silence for lost setpoints, and leave its hold for a return after 1.2 s.
                 self._out.request(SetMode(FlightMode.HOLD))
@@ -584,7 +597,7 @@ class Guidance:
         """Take the active behaviour off, and answer the command that asked for it."""
         behaviour, command, busy = self._behaviour, self._command, self._busy
         after_battery, self._after_battery = self._after_battery, False
-        self._behaviour = self._command = self._flown = None
+        self._behaviour = self._command = self._active = None
         self._busy, self._landing, self._gimbal_user = False, False, ""
         if behaviour is None:
             return
@@ -622,7 +635,7 @@ class Guidance:
         if self._request is not None:
             self._out.cancel(self._request)
             self._request = None
-        if pending and self._situation is not None:
-            self._authority.dropped(self._situation.now_ns)
+        if pending and self._context is not None:
+            self._authority.dropped(self._context.now_ns)
         if self.phase in (Phase.REQUESTING, Phase.DELEGATED):
             self.phase = Phase.READY

@@ -62,17 +62,17 @@ class PoseSharing:
         """The other vehicles now."""
         return self._neighbours.around(state, now_ns)
 
-    def pose(self, state: VehicleState, flown: Behaviour | None, now_ns: int) -> Pose | None:
+    def pose(self, state: VehicleState, active: Behaviour | None, now_ns: int) -> Pose | None:
         """The pose to publish; None while the global position is unknown. `flown`: the active behaviour."""
-        note = flown.note if isinstance(flown, FormationBehaviour) else None
+        note = active.note if isinstance(active, FormationBehaviour) else None
         role = "follower" if note is not None else "alone"
         if note is None and self._neighbours.leads():
             role = "leader"
         return pose_of(state, now_ns, vehicle=self.vehicle, source=self.source, role=role, formation=note)
 
-    def message(self, state: VehicleState, flown: Behaviour | None, now_ns: int) -> dict[str, Any] | None:
+    def message(self, state: VehicleState, active: Behaviour | None, now_ns: int) -> dict[str, Any] | None:
         """The same as it is published."""
-        pose = self.pose(state, flown, now_ns)
+        pose = self.pose(state, active, now_ns)
         return None if pose is None else pose_message(pose)
 
     def status(self, now_ns: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from vision.runtimes.selection import RuntimeChoice
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.checkpoint import load_checkpoint
 from vision.yolo.checkpoint_pair import is_pair, pair_paths, weights_sha256
-from vision.yolo.generation import describe
+from vision.yolo.model_family import describe
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class ModelInfo:
 
     Attributes:
         file, size_bytes, sha256: of the file that holds the weights.
-        generation, scale: such as YOLOv8 and n; a network of no published size has the scale "own".
+        model family, scale: such as YOLOv8 and n; a network of no published size has the scale "own".
         parameters: numbers that training sets.
         gflops: a multiplication and an addition each counted, for one image of `image_size` square.
         end_to_end: the head needs no suppression of overlaps.
@@ -37,7 +37,7 @@ class ModelInfo:
     file: str
     size_bytes: int
     sha256: str
-    generation: str
+    model_family: str
     scale: str
     parameters: int
     gflops: float
@@ -77,7 +77,7 @@ def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torc
         file=str(weights),
         size_bytes=weights.stat().st_size,
         sha256=digest,
-        generation=facts.generation,
+        model_family=facts.model_family,
         scale=facts.scale or "own",
         parameters=facts.parameters,
         gflops=round(facts.gflops, 2),
@@ -103,7 +103,7 @@ def info_lines(info: ModelInfo) -> list[str]:
         "official": f"{info.official} ({KNOWN[info.official].url})"
         if info.official
         else "no file of the catalogue",
-        "generation": f"{info.generation}, scale {info.scale}",
+        "family": f"{info.model_family}, scale {info.scale}",
         "head": "end to end, without suppression" if info.end_to_end else "with suppression of overlaps",
         "parameters": f"{info.parameters / 1e6:.2f} million",
         "work": f"{info.gflops:.1f} GFLOPs for {info.image_size}x{info.image_size}",

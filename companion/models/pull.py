@@ -75,7 +75,7 @@ def pull(
     return Pulled(target, found, fetched=True)
 
 
-def by_hand(model: KnownModel, target: Path) -> str:
+def manual_instructions(model: KnownModel, target: Path) -> str:
     """How to get the file without a network here."""
     return (
         f"Without a network: download {model.url} elsewhere and put it at {target}. It must have the SHA-256 "
@@ -107,21 +107,23 @@ def _fetch_all(model: KnownModel, target: Path, partial: Path, progress: Progres
                 partial.unlink()
                 continue
             raise PullError(
-                f"{model.url}: the server says {error.code} {error.reason}. {by_hand(model, target)}"
+                f"{model.url}: HTTP {error.code} {error.reason}. {manual_instructions(model, target)}"
             ) from None
         except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
             reason = getattr(error, "reason", error)
             failure = f"{reason or type(error).__name__}"
             if isinstance(error, urllib.error.URLError) and not partial.exists():
                 host = urllib.parse.urlsplit(model.url).hostname
-                raise PullError(f"cannot reach {host} ({failure}). {by_hand(model, target)}") from None
+                raise PullError(
+                    f"cannot reach {host} ({failure}). {manual_instructions(model, target)}"
+                ) from None
         have = partial.stat().st_size if partial.exists() else 0
         if have <= had:
             break
     have = partial.stat().st_size if partial.exists() else 0
     raise PullError(
         f"{model.url}: interrupted after {have} of {model.size_bytes} bytes ({failure}). They are kept: pull "
-        f"again to go on. {by_hand(model, target)}"
+        f"again to go on. {manual_instructions(model, target)}"
     )
 
 

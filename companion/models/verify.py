@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from mavlink_sim.datasets.training_scenes import random_scene
 from vision.evaluation.samples import image_files, read_image
 from vision.letterbox import fit
-from vision.runtimes.contract import Precision, Runtime, RuntimeUnusableError
+from vision.runtimes.base import Precision, Runtime, RuntimeUnusableError
 from vision.runtimes.exported import KEY
 from vision.runtimes.selection import start_runtime
 from vision.runtimes.source import ModelSource, read_source
 from vision.yolo.checkpoint_pair import weights_sha256
-from vision.yolo.maps import LevelMaps
+from vision.yolo.level_outputs import LevelOutput
 from vision.yolo.metrics import box_iou
-from vision.yolo.postprocess import Boxes, Candidates, boxes_of, sides_of
+from vision.yolo.postprocess import Boxes, Candidates, boxes_of, decode_ltrb
 
 CONFIDENCE = 0.25
 # A box so near the threshold may be said by one and not by the other without meaning anything.
@@ -153,16 +153,16 @@ def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:
         )
 
 
-def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelMaps]:
+def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelOutput]:
     """With the sides of every cell, which a runtime may leave to be computed for the cells that matter."""
     levels = runtime.infer(pixels)
     everywhere = [
         Candidates(np.arange(cells), np.zeros(cells, np.float32), np.zeros(cells, np.int64))
         for cells in (level.classes[0].size for level in levels)
     ]
-    sides = sides_of(runtime.head, levels, everywhere)
+    sides = decode_ltrb(runtime.head, levels, everywhere)
     return [
-        LevelMaps(level.classes.copy(), np.asarray(side).reshape(-1, *level.classes.shape[1:]))
+        LevelOutput(level.classes.copy(), np.asarray(side).reshape(-1, *level.classes.shape[1:]))
         for level, side in zip(levels, sides, strict=True)
     ]
 
@@ -175,7 +175,7 @@ class _Largest:
         self.maps = self.scores = self.boxes_px = 0.0
 
     def compare(
-        self, first: Sequence[LevelMaps], second: Sequence[LevelMaps], one: Runtime, other: Runtime
+        self, first: Sequence[LevelOutput], second: Sequence[LevelOutput], one: Runtime, other: Runtime
     ) -> None:
         self.images += 1
         for a, b in zip(first, second, strict=True):

@@ -49,13 +49,13 @@ class PerceptionProcess:
         self,
         process: asyncio.subprocess.Process,
         reports: tuple[asyncio.StreamReader, asyncio.StreamWriter],
-        orders: tuple[asyncio.StreamReader, asyncio.StreamWriter],
+        control: tuple[asyncio.StreamReader, asyncio.StreamWriter],
         printed: int,
     ) -> None:
         self._process = process
         self._reports = reports[0]
-        self._orders = orders[1]
-        self._ends = (reports[1], orders[1])
+        self._orders = control[1]
+        self._ends = (reports[1], control[1])
         self._printing = threading.Thread(
             target=log_printed, args=(printed, process.pid), name="worker's standard error", daemon=True
         )
@@ -84,8 +84,8 @@ class PerceptionProcess:
             saying.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             reports = await asyncio.open_connection(sock=said)
             failing.callback(reports[1].close)
-            orders = await asyncio.open_connection(sock=telling)
-            failing.callback(orders[1].close)
+            control = await asyncio.open_connection(sock=telling)
+            failing.callback(control[1].close)
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-P",  # the search path below, and not the working directory, says what is imported
@@ -103,7 +103,7 @@ class PerceptionProcess:
                 process_group=0,
             )
             failing.pop_all()
-        worker = cls(process, reports, orders, printed)
+        worker = cls(process, reports, control, printed)
         worker._put(Begin(settings, first_track_id))
         return worker
 

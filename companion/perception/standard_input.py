@@ -113,7 +113,7 @@ class StandardInput:
                         return
                 if framing.has_lines:
                     line = self._line()
-                handed_on = self._hand_on(line, framing.frame_bytes, writer)
+                handed_on = self._forward(line, framing.frame_bytes, writer)
                 line = b""
                 if not handed_on:
                     os.close(writer)
@@ -154,7 +154,7 @@ class StandardInput:
                 return writer
             os.close(writer)
 
-    def _hand_on(self, line: bytes, frame_bytes: int | None, writer: int) -> bool:
+    def _forward(self, line: bytes, frame_bytes: int | None, writer: int) -> bool:
         """Move one frame. False if the worker has died; the rest of its frame is passed over then."""
         alive = _written(writer, line)
         remaining = 0 if frame_bytes is None else frame_bytes

@@ -11,7 +11,7 @@ from vision.pipeline import PerceptionResult
 
 
 class PerceptionState(StrEnum):
-    """What the keeper is doing."""
+    """What the supervisor is doing."""
 
     STOPPED = "stopped"
     STARTING = "starting"

@@ -17,9 +17,9 @@ import numpy as np
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, targets_from_detections
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
-from companion.perception.keeper import PerceptionKeeper, PerceptionStartError, PerceptionState
 from companion.perception.messages import Preview
-from companion.perception.pulse import START_S
+from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
+from companion.perception.watchdog import START_S
 from companion.settings import DetectorSection, Section, Settings
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
@@ -114,7 +114,7 @@ class View:
 
 
 class WorkerView(View):
-    """A view whose results come from a perception worker, a process of its own, which `keeper` supervises."""
+    """A view whose results come from a perception worker, a separate process run by `supervisor`."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class WorkerView(View):
         self._on_result = on_result
         self._on_event = on_event
         self._gimbal_ns = 0
-        self.keeper = PerceptionKeeper(
+        self.supervisor = PerceptionSupervisor(
             settings,
             on_result=self._on_report,
             on_event=self._tell,
@@ -143,12 +143,12 @@ class WorkerView(View):
 
     @property
     def class_names(self) -> tuple[str, ...] | None:
-        return self.keeper.class_names or None
+        return self.supervisor.class_names or None
 
     def seeing(self, now_ns: int) -> bool:
         return (
             self.settings.source.uri == NO_SOURCE
-            or self.keeper.state is PerceptionState.FINISHED
+            or self.supervisor.state is PerceptionState.FINISHED
             or super().seeing(now_ns)
         )
 
@@ -157,7 +157,7 @@ class WorkerView(View):
         if self.settings.source.uri == NO_SOURCE:
             return
         try:
-            await self.keeper.start()
+            await self.supervisor.start()
         except PerceptionStartError as error:
             if self.name is None:
                 raise
@@ -166,14 +166,14 @@ class WorkerView(View):
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
         """The worker's tracker needs to know where its camera looked."""
         if state.attitude is not None:
-            self.keeper.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
+            self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
         gimbal = state.gimbal
         if gimbal is None or not self.settings.camera.gimbal or gimbal.attitude is None:
             return
         if gimbal.attitude_ns != self._gimbal_ns:
             self._gimbal_ns = gimbal.attitude_ns
             with contextlib.suppress(HistoryError):
-                self.keeper.send_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
+                self.supervisor.send_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
 
     def _on_report(self, result: PerceptionResult) -> None:
         self.take(result)

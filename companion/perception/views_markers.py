@@ -23,7 +23,7 @@ class _Seen:
     looks_down: bool
 
 
-class MarkerWatch:
+class MarkerTracker:
     """The markers of all views that look for some; any may look down, not only the one that steers."""
 
     def __init__(self, views: Sequence[View]) -> None:

@@ -35,8 +35,8 @@ from companion.perception.messages import (
     Watched,
     receive,
 )
-from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.preview import PreviewEncoder
+from companion.perception.result_sender import ResultLogHandler, ResultSender
 from companion.plugins import PluginError, load_plugins
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
@@ -60,7 +60,7 @@ NICENESS = 5
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class Orders:
+class ControlChannel:
     """What the service wants, taken from its socket by a thread.
 
     Attributes:
@@ -135,13 +135,13 @@ def main(arguments: list[str]) -> int:
     begin = receive(connection)
     if not isinstance(begin, Begin):
         return 1
-    orders = Orders(connection)
-    signal.signal(signal.SIGTERM, lambda _signal, _frame: orders.stop())
-    outbox = Outbox(socket.socket(fileno=reports), on_lost=orders.stop)
-    logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[OutboxHandler(outbox)])
-    last = _work(begin, orders, outbox)
-    outbox.close(last, FAREWELL_S)
-    orders.finished()
+    control = ControlChannel(connection)
+    signal.signal(signal.SIGTERM, lambda _signal, _frame: control.stop())
+    sender = ResultSender(socket.socket(fileno=reports), on_lost=control.stop)
+    logging.basicConfig(level=begin.settings.log.level.upper(), handlers=[ResultLogHandler(sender)])
+    last = _work(begin, control, sender)
+    sender.close(last, FAREWELL_S)
+    control.finished()
     return 0 if isinstance(last, Ended) and last.finished else 1
 
 
@@ -154,13 +154,13 @@ def _end_with(service_pid: int) -> None:
         os._exit(1)
 
 
-def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
+def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended | StartFailed:
     settings = begin.settings
     frames = 0
     with contextlib.ExitStack() as stack:
         try:
-            with _saying_that_it_loads(settings, outbox):
-                perception = _open(settings, stack, outbox)
+            with _heartbeat_while_loading(settings, sender):
+                perception = _open(settings, stack, sender)
         except (
             PluginError,
             SourceError,
@@ -175,7 +175,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
         # What was loaded stays: looking through it would take the garbage collector the time of a frame.
         gc.collect()
         gc.freeze()
-        outbox.put(_ready(settings, perception))
+        sender.put(_ready(settings, perception))
         if perception.source.calibration is not None:
             adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
             settings = settings.model_copy(update={"camera": adopted})
@@ -183,12 +183,12 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
             settings,
             perception.source,
             perception.detector,
-            orders.telemetry,
+            control.telemetry,
             recorder=perception,
             first_track_id=begin.first_track_id,
         )
         try:
-            _run(pipeline, perception, orders, outbox)
+            _run(pipeline, perception, control, sender)
         except EndOfStream:
             return Ended(True, "end of stream", pipeline.frames)
         except SourceError as error:
@@ -201,7 +201,7 @@ def _work(begin: Begin, orders: Orders, outbox: Outbox) -> Ended | StartFailed:
 
 
 @contextlib.contextmanager
-def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
+def _heartbeat_while_loading(settings: Settings, sender: ResultSender) -> Iterator[None]:
     """To convert a model for another runtime, and to try which is the fastest, may take minutes.
 
     What a plug-in's detector does at its start is not known.
@@ -210,7 +210,7 @@ def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
 
     def say() -> None:
         while not loaded.wait(_LOADING_PERIOD_S):
-            outbox.put_newest(Heartbeat(0))
+            sender.put_newest(Heartbeat(0))
 
     others = settings.detector.kind != YOLO or bool(settings.plugins.modules)
     if settings.detector.runtime != "torch" or others:
@@ -221,7 +221,7 @@ def _saying_that_it_loads(settings: Settings, outbox: Outbox) -> Iterator[None]:
         loaded.set()
 
 
-def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Perception:
+def _open(settings: Settings, stack: contextlib.ExitStack, sender: ResultSender) -> Perception:
     load_plugins(settings.plugins.modules)
     recording = None
     if settings.recording.video is not None:
@@ -235,7 +235,7 @@ def _open(settings: Settings, stack: contextlib.ExitStack, outbox: Outbox) -> Pe
     if recording is not None:
         # Once more, to be finished before the source closes, which may take its time in a driver.
         stack.callback(recording.close)
-    preview = PreviewEncoder(settings.preview, outbox.put_preview)
+    preview = PreviewEncoder(settings.preview, sender.put_preview)
     stack.callback(preview.close)
     return Perception(source, detector, recording, preview)
 
@@ -255,22 +255,22 @@ def _ready(settings: Settings, perception: Perception) -> Ready:
     )
 
 
-def _run(pipeline: Pipeline, perception: Perception, orders: Orders, outbox: Outbox) -> None:
+def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, sender: ResultSender) -> None:
     said_s = time.monotonic()
 
     def deliver(result: PerceptionResult) -> None:
         nonlocal said_s
-        outbox.put_newest(Report(result, pipeline.frames, replaced=0))
+        sender.put_newest(Report(result, pipeline.frames, replaced=0))
         said_s = time.monotonic()
 
-    while not orders.stopping:
+    while not control.stopping:
         if perception.recording is not None:
-            perception.recording.lines = orders.hud.lines
-            perception.recording.highlight = orders.hud.highlight
-        perception.preview.watched = orders.watched
+            perception.recording.lines = control.hud.lines
+            perception.recording.highlight = control.hud.highlight
+        perception.preview.watched = control.watched
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - said_s >= HEARTBEAT_S:
-            outbox.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.left_out))
+            sender.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.left_out))
             said_s = time.monotonic()
 
 

@@ -30,10 +30,10 @@ class CommandHandler:
         on_command: Callable[[], None],
         on_event: Callable[[str, str], None],
         *,
-        refusal: Callable[[CommandInput], str | None],
+        check_requirements: Callable[[CommandInput], str | None],
     ) -> None:
         self._read, self._on_command, self._on_event = read, on_command, on_event
-        self._refusal = refusal
+        self._refusal = check_requirements
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}

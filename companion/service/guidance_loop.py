@@ -65,7 +65,7 @@ class GuidanceLoop:
             ),
             self._wake.set,
             on_event,
-            refusal=lambda command: others.refusal(
+            check_requirements=lambda command: others.check_requirements(
                 command, driver.state, in_command=guidance.in_command, now_ns=time.monotonic_ns()
             ),
         )
@@ -88,7 +88,7 @@ class GuidanceLoop:
             seen, self._seen = self._seen, False
             self._step(now_ns)
             if seen:
-                self._streamer.hasten(now_ns)
+                self._streamer.send_now(now_ns)
             self._on_step(now_ns)
             await self._something_new_until(now_ns / 1e9 + self._period_s)
 

@@ -81,4 +81,4 @@ class Health:
             self._hud_due_ns = now_ns + round(HUD_PERIOD_S * 1e9)
             lines = hud_lines(self._driver.state, guidance.status)
             for view in self._views:
-                view.keeper.send_hud(lines)
+                view.supervisor.send_hud(lines)

@@ -19,7 +19,7 @@ from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
 from companion.perception.views import View
-from companion.perception.views_markers import MarkerWatch
+from companion.perception.views_markers import MarkerTracker
 from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.vehicle.px4_modes import among_modes
@@ -60,7 +60,7 @@ class InputAssembler:
         self.steering = next(view for view in views if view.name == settings.guidance.view)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
-        self._markers = MarkerWatch(views)
+        self._markers = MarkerTracker(views)
         self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
@@ -71,13 +71,13 @@ class InputAssembler:
     def on_state(self, state: VehicleState) -> None:
         """A new snapshot of the vehicle."""
         if state.reports is not self._reported:
-            self._tell_reports(state)
+            self._log_reports(state)
         if (state.mode, state.armed) != self._shown:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1
         self.history.add(state)
 
-    def _tell_reports(self, state: VehicleState) -> None:
+    def _log_reports(self, state: VehicleState) -> None:
         """What the autopilot warns of, if it is about the mode that is flown."""
         last_ns = self._reported[-1].stamp_ns if self._reported else 0
         self._reported = state.reports

@@ -110,7 +110,7 @@ class OtherCommanders:
                 self._on_event("info", f"the other service has gone: {one.identity} by {one.via}")
         self._told = present
 
-    def refusal(
+    def check_requirements(
         self, command: CommandInput, state: VehicleState, *, in_command: bool, now_ns: int
     ) -> str | None:
         """Why this command may not begin; None: it may. What ends a flight always may, and what goes on."""

@@ -59,7 +59,7 @@ class Publisher:
             bus.publish(topics.MARKERS, {**markers, "published_ns": now_ns}, view.name)
         if view is self._inputs.steering and result.obstacles is not None:
             bus.publish(topics.OBSTACLES, obstacles_message(result.obstacles, name))
-        view.keeper.published(result)
+        view.supervisor.published(result)
 
     def publish_preview(self, view: WorkerView, preview: Preview) -> None:
         """A picture for whoever watches, with what it is of."""
@@ -74,11 +74,11 @@ class Publisher:
         while True:
             now_ns, state = time.monotonic_ns(), self._driver.state
             self._bus.publish(topics.VEHICLE, vehicle_message(state, now_ns))
-            pose = self._inputs.poses.message(state, guidance.flown, now_ns)
+            pose = self._inputs.poses.message(state, guidance.active, now_ns)
             if pose is not None:
                 self._bus.publish(topics.POSE, pose)
             for view in views:
-                view.keeper.watch(self._bus.watched(topics.IMAGE, view.name))
+                view.supervisor.watch(self._bus.watched(topics.IMAGE, view.name))
             if guidance.in_command:
                 self._bus.publish(
                     topics.SETPOINT,

@@ -16,7 +16,7 @@ from companion.guidance import grammar
 from companion.guidance.core import Guidance
 from companion.operator.console import run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
-from companion.perception.keeper import PerceptionKeeper
+from companion.perception.supervisor import PerceptionSupervisor
 from companion.perception.views import WorkerView, open_views
 from companion.service.event import Event, EventLog
 from companion.service.factory import driver_of, gimbal_mounting, guidance_options, streamer_of
@@ -141,7 +141,7 @@ class Service:
             if metrics is not None:
                 await asyncio.to_thread(metrics.close)
             await self.bus.close()  # first: it lets answers go out
-            await asyncio.gather(*(view.keeper.stop() for view in self.views), self.driver.close())
+            await asyncio.gather(*(view.supervisor.stop() for view in self.views), self.driver.close())
             self._notifier.close()
 
     def stop(self) -> None:
@@ -175,9 +175,9 @@ class Service:
         )
 
     @property
-    def perception(self) -> PerceptionKeeper:
+    def perception(self) -> PerceptionSupervisor:
         """Of the view that steers."""
-        return next(view for view in self.views if view is self.inputs.steering).keeper
+        return next(view for view in self.views if view is self.inputs.steering).supervisor
 
     async def _start(self) -> None:
         starts = [

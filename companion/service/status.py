@@ -58,8 +58,8 @@ def status_message(
             "stream": streamer.state.value,
             "setpoints_sent": streamer.sent_count,
         },
-        "perception": views[0].keeper.status.as_dict(),
-        "views": {view.name: view.keeper.status.as_dict() for view in views if view.name},
+        "perception": views[0].supervisor.status.as_dict(),
+        "views": {view.name: view.supervisor.status.as_dict() for view in views if view.name},
         "targets": {
             "view": steering.name,
             "count": len(steering.targets),

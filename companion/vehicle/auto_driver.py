@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable
 
 from companion.vehicle.autopilot_driver import AutopilotDriver
+from companion.vehicle.autopilot_profile import PX4
 from companion.vehicle.driver import SystemStatus
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
-from companion.vehicle.manners import PX4
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 

@@ -17,24 +17,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from companion.vehicle.autopilot_profile import ARDUPILOT, PX4, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
-from companion.vehicle.connection_advice import why_no_answer, why_no_autopilot, why_not_flown
+from companion.vehicle.connection_advice import unsupported_autopilot, why_no_answer, why_no_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
 from companion.vehicle.framing import Frame, Framer, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.gimbal_commands import GimbalCommands
-from companion.vehicle.heard_state import HeardState
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
-from companion.vehicle.manners import ARDUPILOT, PX4, Manners, Px4Manners
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
 from companion.vehicle.stream_requests import StreamRequests
-from companion.vehicle.telemetry_fold import Fields
+from companion.vehicle.telemetry import Fields
+from companion.vehicle.telemetry_state import TelemetryState
 
 logger = logging.getLogger(__name__)
 
@@ -75,15 +75,15 @@ class AutopilotDriver(ABC):
         self._own_system_id = own_system_id
         self._own_component_id = own_component_id
         self._started_ns = time.monotonic_ns()
-        self._heard = HeardState(url, self._two_autopilots_heard)
-        self._flight_commands = FlightCommands(url, self._heard, self._command, self._ack_is_ours)
-        self._gimbal_commands = GimbalCommands(url, self._heard, self._command, self.own_address)
+        self._telemetry = TelemetryState(url, self._warn_other_autopilot)
+        self._flight_commands = FlightCommands(url, self._telemetry, self._command, self._ack_is_ours)
+        self._gimbal_commands = GimbalCommands(url, self._telemetry, self._command, self.own_address)
         self._command_locks: dict[int, asyncio.Lock] = {}
         self._link: ByteLink | None = None
         self._reset()
 
     def _reset(self) -> None:
-        self._heard.reset()
+        self._telemetry.reset()
         self._framer = Framer()
         self._system_id: int | None = None
         self._autopilot_kind: int | None = None
@@ -97,7 +97,7 @@ class AutopilotDriver(ABC):
         self._streams: StreamRequests | None = None
         self._reports = ReportReader(
             self.url,
-            self._heard,
+            self._telemetry,
             self._transmit_payload,
             self._command,
             lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
@@ -175,26 +175,26 @@ class AutopilotDriver(ABC):
 
     def share_subscribers(self, other: AutopilotDriver) -> None:
         """Call back whoever has subscribed to the state of another driver."""
-        self._heard.share_subscribers(other._heard)
+        self._telemetry.share_subscribers(other._telemetry)
 
     async def start(self, timeout_s: float) -> None:
         """The second half of `connect`: exchange messages with the autopilot that was heard."""
         try:
             if self._autopilot_kind not in self.flown_autopilots:
-                raise LinkError(why_not_flown(self.url, self._system_id, self._autopilot_kind))
+                raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
             await self._attach(timeout_s)
         except BaseException:
             await self.close()
             raise
-        name = self._heard.manners.name
+        name = self._telemetry.profile.name
         logger.info("%s: %s, system %s, answers: %s driver", self.url, name, self._system_id, self.library)
-        self._streams = StreamRequests(self.url, self._heard, self._command)
+        self._streams = StreamRequests(self.url, self._telemetry, self._command)
         for loop, what in (
-            (self._keep(self._streams), "keeper"),
+            (self._keep(self._streams), "supervisor"),
             (self._streams.keep(), "streams"),
             (self._synchronise(), "clock"),
             (self._gimbal_commands.keep(), "gimbal"),
-            *([(self._reports.learn_events(), "events")] if self._heard.manners.has_events else []),
+            *([(self._reports.learn_events(), "events")] if self._telemetry.profile.has_events else []),
         ):
             self._tasks.append(asyncio.create_task(loop, name=f"{what} of {self.url}"))
 
@@ -253,7 +253,7 @@ class AutopilotDriver(ABC):
                         self._time_from(frame)
                     elif frame.message_id == _SYSTEM_TIME_ID:
                         _, boot_ms = _SYSTEM_TIME.unpack(frame.padded(_SYSTEM_TIME.size))
-                        self._heard.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
+                        self._telemetry.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
                     elif self._reports.take(frame):
                         continue
                 ours.append(frame)
@@ -274,13 +274,13 @@ class AutopilotDriver(ABC):
             echo = sender == self.own_address and sent
             commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
             if commander is not None and frame.system_id == self._own_system_id and not echo:
-                self._heard.take_commander(commander)
+                self._telemetry.take_commander(commander)
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
-            self._heard.manners = manners_of(autopilot)
-            self._heard.state = replace(self._heard.state, autopilot=self._heard.manners.name)
-        elif source != self._source and self._heard.state.connected(time.monotonic_ns()):
+            self._telemetry.profile = profile_of(autopilot)
+            self._telemetry.state = replace(self._telemetry.state, autopilot=self._telemetry.profile.name)
+        elif source != self._source and self._telemetry.state.connected(time.monotonic_ns()):
             # Obeying whoever spoke last would fly two vehicles by turns.
             self._note_other(
                 (*sender, source), "a second autopilot %d/%d sends from %s; it is ignored: give it its own id"
@@ -291,7 +291,7 @@ class AutopilotDriver(ABC):
             self._link.answer_to(source)
         self._newest_heartbeat = frame
         fields = {"custom_mode": custom_mode, "base_mode": base_mode, "system_status": system_status}
-        self._heard.handle("HEARTBEAT", fields)
+        self._telemetry.handle("HEARTBEAT", fields)
         self._first_heard.set()
 
     def _no_answer(self, text: str) -> NoAnswerError:
@@ -308,9 +308,9 @@ class AutopilotDriver(ABC):
         for_us = (system, component) in ((0, 0), (self._own_system_id, self._own_component_id))
         if not (boot_ns > 0 and asked_ns == self._asked_ns and for_us):
             return
-        self._heard.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
-        if self._heard.clock.answer(asked_ns, boot_ns, now_ns):
-            self._heard.state = replace(self._heard.state, clock=self._heard.clock.offset(now_ns))
+        self._telemetry.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
+        if self._telemetry.clock.answer(asked_ns, boot_ns, now_ns):
+            self._telemetry.state = replace(self._telemetry.state, clock=self._telemetry.clock.offset(now_ns))
 
     def _note_other(self, sender: tuple[Any, ...], text: str) -> None:
         if sender not in self._others:
@@ -320,13 +320,13 @@ class AutopilotDriver(ABC):
     @property
     def state(self) -> VehicleState:
         """See Driver."""
-        return self._heard.state
+        return self._telemetry.state
 
     def subscribe(self, callback: Callable[[VehicleState], None]) -> Callable[[], None]:
         """See Driver."""
-        return self._heard.subscribe(callback)
+        return self._telemetry.subscribe(callback)
 
-    def _two_autopilots_heard(self) -> None:
+    def _warn_other_autopilot(self) -> None:
         logger.error(
             "%s: two autopilots send as system %s from one address: give each an id of its own",
             self.url,
@@ -343,14 +343,14 @@ class AutopilotDriver(ABC):
         # PX4 would go back to OFFBOARD for it.
         made_ms = _setpoint_made_ms(frame)
         if made_ms is not None and (self._boot_ms() - made_ms) & 0xFFFF_FFFF > LEAVES_WITHIN_S * 1e3:
-            self._say_late()
+            self._warn_stale_setpoint()
             return
         self._link.send(ready)
 
     def _boot_ms(self) -> int:
         return (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF
 
-    def _say_late(self) -> None:
+    def _warn_stale_setpoint(self) -> None:
         logger.warning("%s: a setpoint is not sent: its time was over before it left", self.url)
 
     def _next_sequence(self) -> int:
@@ -384,9 +384,9 @@ class AutopilotDriver(ABC):
         made_ms = self._boot_ms()
         # after the stamp: a stop between the two shows at one of them
         if setpoint.expired(time.monotonic_ns()):
-            self._say_late()
+            self._warn_stale_setpoint()
             return
-        setpoint = setpoint.moved(self._heard.state.reset_offset_ned_m)
+        setpoint = setpoint.moved(self._telemetry.state.reset_offset_ned_m)
         zero = (0.0, 0.0, 0.0)  # the type mask says what counts
         kinematics = (
             *(setpoint.position_ned_m or zero),
@@ -395,7 +395,7 @@ class AutopilotDriver(ABC):
         )
         self._send_message(
             "SET_POSITION_TARGET_LOCAL_NED",
-            self._heard.manners.setpoint_fields(
+            self._telemetry.profile.setpoint_fields(
                 {
                     "time_boot_ms": made_ms,
                     "target_system": self._system_id,
@@ -414,7 +414,7 @@ class AutopilotDriver(ABC):
     def send_landing_target(self, target: LandingTarget) -> None:
         """See Driver."""
         if self._link is not None and self._system_id is not None:
-            offset = self._heard.state.reset_offset_ned_m
+            offset = self._telemetry.state.reset_offset_ned_m
             fields = landing_target_fields(target, self._autopilot_kind or 0, offset)
             self._send_message("LANDING_TARGET", fields)
 
@@ -475,7 +475,7 @@ class AutopilotDriver(ABC):
     async def _keep(self, streams: StreamRequests) -> None:
         """Say when the autopilot goes silent, restarts and comes back, and ask for its streams anew then."""
         while True:
-            self._heard.restarted.clear()
+            self._telemetry.restarted.clear()
             streams.restart()
             self._gimbal_commands.look_for_one()
             if not await self._silence():
@@ -487,7 +487,7 @@ class AutopilotDriver(ABC):
                 self._system_id,
                 HEARTBEAT_MAX_AGE_S,
             )
-            await self._heard.until(lambda: self._heard.state.connected(time.monotonic_ns()), None)
+            await self._telemetry.until(lambda: self._telemetry.state.connected(time.monotonic_ns()), None)
             logger.warning("%s: system %s is back", self.url, self._system_id)
 
     async def _synchronise(self) -> None:
@@ -500,9 +500,9 @@ class AutopilotDriver(ABC):
 
     async def _silence(self) -> bool:
         """Wait until the newest heartbeat is too old (True) or the autopilot's clock began anew (False)."""
-        while self._heard.state.connected(time.monotonic_ns()):
-            left_s = (self._heard.state.heartbeat_ns - time.monotonic_ns()) / 1e9 + HEARTBEAT_MAX_AGE_S
-            if await _happens(self._heard.restarted, max(left_s, 0.0) + 1e-3):
+        while self._telemetry.state.connected(time.monotonic_ns()):
+            left_s = (self._telemetry.state.heartbeat_ns - time.monotonic_ns()) / 1e9 + HEARTBEAT_MAX_AGE_S
+            if await _happens(self._telemetry.restarted, max(left_s, 0.0) + 1e-3):
                 return False
         return True
 
@@ -514,13 +514,13 @@ def _setpoint_made_ms(frame: bytes) -> int | None:
     return int.from_bytes(frame[10 : 10 + min(4, frame[1])], "little")
 
 
-def manners_of(autopilot: int) -> Manners:
+def profile_of(autopilot: int) -> AutopilotProfile:
     """The ways of a MAV_AUTOPILOT; PX4's for one that is not flown at all."""
     if autopilot == ARDUPILOT:
-        from companion.vehicle.ardupilot_manners import ArduPilotManners
+        from companion.vehicle.ardupilot_profile import ArduPilotProfile
 
-        return ArduPilotManners()
-    return Px4Manners()
+        return ArduPilotProfile()
+    return Px4Profile()
 
 
 async def _happens(event: asyncio.Event, timeout_s: float) -> bool:

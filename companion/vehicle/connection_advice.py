@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from companion.vehicle.autopilot_profile import ARDUPILOT
 from companion.vehicle.link_url import LinkScheme, LinkUrl
-from companion.vehicle.manners import ARDUPILOT
 from companion.vehicle.signing import FrameSigner
 
 _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
@@ -64,7 +64,7 @@ def why_no_answer(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
     )
 
 
-def why_not_flown(url: LinkUrl, system_id: int | None, kind: int | None) -> str:
+def unsupported_autopilot(url: LinkUrl, system_id: int | None, kind: int | None) -> str:
     """An autopilot of a kind (MAV_AUTOPILOT) that this driver does not fly."""
     name = _AUTOPILOT_NAMES.get(kind or 0, f"MAV_AUTOPILOT {kind}")
     if kind == ARDUPILOT:

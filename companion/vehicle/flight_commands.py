@@ -7,14 +7,14 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 
+from companion.vehicle.autopilot_profile import HOME_POSITION_ID
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.heard_state import HeardState
-from companion.vehicle.manners import HOME_POSITION_ID
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import words_of
 from companion.vehicle.state import FlightMode
-from companion.vehicle.telemetry_fold import Fields
+from companion.vehicle.telemetry import Fields
+from companion.vehicle.telemetry_state import TelemetryState
 
 _MODE_FLAG_CUSTOM = 1
 _DO_SET_MODE = 176
@@ -30,7 +30,7 @@ class FlightCommands:
     """What a driver asks of its autopilot. All methods raise CommandRefusedError; see Driver.
 
     Args:
-        url: of the link, for messages. heard: what the autopilot shows.
+        url: of the link, for messages. telemetry: what the autopilot shows.
         command: sends one command with its parameters; the MAV_RESULT.
         ack_is_ours: whether a COMMAND_ACK with these fields answers us.
     """
@@ -38,18 +38,18 @@ class FlightCommands:
     def __init__(
         self,
         url: object,
-        heard: HeardState,
+        telemetry: TelemetryState,
         command: Callable[..., Awaitable[int]],
         ack_is_ours: Callable[[Fields], bool],
     ) -> None:
-        self._url, self._heard = url, heard
+        self._url, self._telemetry = url, telemetry
         self._command, self._ack_is_ours = command, ack_is_ours
 
     async def arm_or_disarm(self, armed: bool, system_id: int | None) -> None:
         """Return when the vehicle shows it. `system_id`: whose."""
-        heard = self._heard
+        telemetry = self._telemetry
         word = "arm" if armed else "disarm"
-        if armed and heard.two_autopilots(time.monotonic_ns()):
+        if armed and telemetry.two_autopilots(time.monotonic_ns()):
             raise CommandRefusedError(
                 f"{self._url}: two autopilots answer as system {system_id}, so neither is armed; "
                 "give each an id of its own (MAV_SYS_ID)"
@@ -58,28 +58,28 @@ class FlightCommands:
         result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
         if result != ACCEPTED:
             if not armed:
-                reason = f"it is {heard.state.landed.replace('_', ' ')}"
+                reason = f"it is {telemetry.state.landed.replace('_', ' ')}"
             elif checks := await self._failing_checks(asked_ns):
                 reason = checks
-            elif heard.state.ready_to_arm:
-                reason = f"in mode {heard.state.mode}"
+            elif telemetry.state.ready_to_arm:
+                reason = f"in mode {telemetry.state.mode}"
             else:
-                reason = f"its pre-arm checks fail in mode {heard.state.mode}"
+                reason = f"its pre-arm checks fail in mode {telemetry.state.mode}"
             raise CommandRefusedError(f"the vehicle refused to {word} ({result_name(result)}): {reason}")
-        if not await heard.until(lambda: heard.state.armed is armed, _SHOWN_TIMEOUT_S):
+        if not await telemetry.until(lambda: telemetry.state.armed is armed, _SHOWN_TIMEOUT_S):
             raise CommandRefusedError(
                 f"the vehicle accepted to {word} but does not show it after {_SHOWN_TIMEOUT_S:g} s"
             )
 
     async def _failing_checks(self, asked_ns: int) -> str:
         """What keeps it from arming, in its own words; empty if it does not say."""
-        heard = self._heard
-        if heard.manners.has_events:
+        telemetry = self._telemetry
+        if telemetry.profile.has_events:
             # PX4 tells its checks when they change, and all of them when it is asked to run them.
             with contextlib.suppress(CommandRefusedError):
                 await self._command(_RUN_PREARM_CHECKS)
-        await heard.until(lambda: False, _REASONS_S)
-        state = heard.state
+        await telemetry.until(lambda: False, _REASONS_S)
+        state = telemetry.state
         said = [
             one for one in state.reports if one.stamp_ns >= asked_ns and among_modes(state.mode, one.modes)
         ]
@@ -89,8 +89,8 @@ class FlightCommands:
 
     async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
         """Return when the vehicle shows the mode."""
-        heard = self._heard
-        shown_mode, main, sub = heard.manners.mode_request(mode, heard.state)
+        telemetry = self._telemetry
+        shown_mode, main, sub = telemetry.profile.mode_request(mode, telemetry.state)
         refusals: list[int] = []
 
         def watch(name: str, fields: Fields) -> None:
@@ -104,52 +104,55 @@ class FlightCommands:
         deadline = time.monotonic() + timeout_s
 
         def shown() -> bool:
-            return heard.mode_ns > asked_ns and heard.state.mode is shown_mode
+            return telemetry.mode_ns > asked_ns and telemetry.state.mode is shown_mode
 
-        async with heard.watching(watch):
+        async with telemetry.watching(watch):
             result = await self._command(_DO_SET_MODE, _MODE_FLAG_CUSTOM, main, sub)
             if result != ACCEPTED:
                 refusals.append(result)
-            await heard.until(lambda: bool(refusals) or shown(), max(deadline - time.monotonic(), 0.0))
+            await telemetry.until(lambda: bool(refusals) or shown(), max(deadline - time.monotonic(), 0.0))
         if refusals:
-            heard.manners.forget()
+            telemetry.profile.forget()
             hint = " (is a setpoint stream running?)" if mode is FlightMode.OFFBOARD else ""
             raise CommandRefusedError(
                 f"the vehicle refused mode {mode} ({result_name(refusals[0])}){hint}: "
-                f"it shows {heard.state.mode}"
+                f"it shows {telemetry.state.mode}"
             )
         if not shown():
-            heard.manners.forget()
+            telemetry.profile.forget()
             raise CommandRefusedError(
-                f"the vehicle did not enter mode {mode} within {timeout_s:g} s: it shows {heard.state.mode}"
+                f"the vehicle did not enter mode {mode} within {timeout_s:g} s: "
+                f"it shows {telemetry.state.mode}"
             )
 
     async def takeoff(self, altitude_m: float) -> None:
         """The autopilot's own take-off, to a height above home."""
-        heard = self._heard
+        telemetry = self._telemetry
         if not (math.isfinite(altitude_m) and altitude_m > 0.0):
             raise CommandRefusedError(f"a take-off altitude must be above 0 m, got {altitude_m}")
-        if heard.manners.takes_off_by_home:
-            await self._hear_home()
-        result = await self._command(_NAV_TAKEOFF, *heard.manners.takeoff_parameters(altitude_m, heard.state))
+        if telemetry.profile.takes_off_by_home:
+            await self._on_home_position()
+        result = await self._command(
+            _NAV_TAKEOFF, *telemetry.profile.takeoff_parameters(altitude_m, telemetry.state)
+        )
         if result != ACCEPTED:
             raise CommandRefusedError(
-                f"the vehicle refused to take off ({result_name(result)}) in mode {heard.state.mode}"
+                f"the vehicle refused to take off ({result_name(result)}) in mode {telemetry.state.mode}"
             )
-        for told, fields in heard.manners.takes_off():
-            heard.take_in(told, fields)
+        for told, fields in telemetry.profile.takes_off():
+            telemetry.take_in(told, fields)
 
-    async def _hear_home(self) -> None:
+    async def _on_home_position(self) -> None:
         """Let home be told as it is now: PX4 moves it when it arms, and tells it every two seconds only."""
-        heard, told = self._heard, False
+        telemetry, told = self._telemetry, False
 
         def watch(name: str, _fields: Fields) -> None:
             nonlocal told
             told |= name == "HOME_POSITION"
 
-        async with heard.watching(watch):
+        async with telemetry.watching(watch):
             result = await self._command(_REQUEST_MESSAGE, HOME_POSITION_ID)
-            if not await heard.until(lambda: told, _SHOWN_TIMEOUT_S):
+            if not await telemetry.until(lambda: told, _SHOWN_TIMEOUT_S):
                 raise CommandRefusedError(
                     "take-off needs home's altitude, and the vehicle has not told it "
                     f"({result_name(result)}; no position yet?)"

@@ -13,8 +13,8 @@ from collections.abc import Awaitable, Callable
 
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal import Address, GimbalAim
-from companion.vehicle.heard_state import HeardState
 from companion.vehicle.mav_result import ACCEPTED, result_name
+from companion.vehicle.telemetry_state import TelemetryState
 
 logger = logging.getLogger(__name__)
 
@@ -35,15 +35,19 @@ class GimbalCommands:
     """What a driver asks of its autopilot's gimbal manager.
 
     Args:
-        url: of the link, for messages. heard: what the autopilot shows.
+        url: of the link, for messages. telemetry: what the autopilot shows.
         command: sends one command with its parameters; the MAV_RESULT.
         own_address: from whom our commands come.
     """
 
     def __init__(
-        self, url: object, heard: HeardState, command: Callable[..., Awaitable[int]], own_address: Address
+        self,
+        url: object,
+        telemetry: TelemetryState,
+        command: Callable[..., Awaitable[int]],
+        own_address: Address,
     ) -> None:
-        self._url, self._heard, self._command = url, heard, command
+        self._url, self._telemetry, self._command = url, telemetry, command
         self._own_address = own_address
         self._finding = asyncio.Lock()
         self._wanted = False
@@ -54,7 +58,7 @@ class GimbalCommands:
             try:
                 if not self._known():
                     result = await self._command(_REQUEST_MESSAGE, _INFORMATION_ID)
-                    if result != ACCEPTED or not await self._heard.until(self._known, _TOLD_TIMEOUT_S):
+                    if result != ACCEPTED or not await self._telemetry.until(self._known, _TOLD_TIMEOUT_S):
                         return False
                     logger.info("%s: the autopilot has a gimbal", self._url)
                 for message_id, rate_hz in _RATES_HZ.items():
@@ -80,8 +84,8 @@ class GimbalCommands:
         Not in the task that watches the link: whoever does not answer takes seconds not to.
         """
         while True:
-            await self._heard.until(
-                lambda: self._wanted or (self._heard.state.gimbal is not None and not self._known()), None
+            await self._telemetry.until(
+                lambda: self._wanted or (self._telemetry.state.gimbal is not None and not self._known()), None
             )
             self._wanted = False
             if not await self.find():
@@ -105,11 +109,11 @@ class GimbalCommands:
         await self._demand("to point the gimbal", PITCHYAW, pitch, yaw, nan, nan, FOLLOWING_NOSE)
 
     def _known(self) -> bool:
-        gimbal = self._heard.state.gimbal
+        gimbal = self._telemetry.state.gimbal
         return gimbal is not None and gimbal.information_ns > 0
 
     async def _demand(self, what: str, number: int, *parameters: float) -> None:
-        gimbal = self._heard.state.gimbal
+        gimbal = self._telemetry.state.gimbal
         device = 0.0 if gimbal is None else float(gimbal.device)
         filled = (*parameters, *[0.0] * (6 - len(parameters)), device)
         result = await self._command(number, *filled)

@@ -31,15 +31,15 @@ from mavsdk.plugins.param import Param, ParamError, ParamResult
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, LinkError
 from companion.vehicle.framing import Frame, frames_of, with_sequence
-from companion.vehicle.gimbal_fold import ATTITUDE_STATUS
+from companion.vehicle.gimbal_telemetry import ATTITUDE_STATUS
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES
+from companion.vehicle.telemetry import TELEMETRY_MESSAGES
 
 logger = logging.getLogger(__name__)
 _library_logger = logging.getLogger("mavsdk")
 
 _T = TypeVar("_T")
-_SUBSCRIBED = sorted(FOLDED_MESSAGES - {"HEARTBEAT"} | {"COMMAND_ACK"})
+_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT"} | {"COMMAND_ACK"})
 # After a hang of the loop: neither a setpoint nor a repeated command may arrive late.
 _STALE_NS = round(DEFAULT_LIFETIME_S * 1e9)
 _PARAM_REASONS = {
@@ -131,9 +131,9 @@ class MavsdkDriver(AutopilotDriver):
         if self._mavsdk is None:
             return
         if message.component_id == AUTOPILOT_COMPONENT:
-            self._heard.handle(message.message_name, json.loads(message.fields_json))
+            self._telemetry.handle(message.message_name, json.loads(message.fields_json))
         elif message.message_name == ATTITUDE_STATUS:
-            self._heard.handle_device(
+            self._telemetry.handle_device(
                 message.message_name, json.loads(message.fields_json), message.component_id
             )
 

@@ -12,12 +12,12 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
+from companion.vehicle.autopilot_profile import ARDUPILOT, PX4
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import CURRENT_MODE_ID, EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
-from companion.vehicle.manners import ARDUPILOT, PX4
 from companion.vehicle.mav_result import IN_PROGRESS
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, Fields
+from companion.vehicle.telemetry import TELEMETRY_MESSAGES, Fields
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,8 @@ _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; stand
 _DECODED_IDS = {
     message_id
     for message_id, message in mavlink.mavlink_map.items()
-    if message.msgname in FOLDED_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
+    if message.msgname
+    in TELEMETRY_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
 } - {HEARTBEAT_ID}
 
 # Command protocol: 5 attempts half a second apart; after IN_PROGRESS no more attempts, only patience.
@@ -92,10 +93,12 @@ class PymavlinkDriver(AutopilotDriver):
                 continue
             if frame.message_id == CURRENT_MODE_ID:
                 shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
-                self._heard.handle("CURRENT_MODE", {"custom_mode": shown, "intended_custom_mode": intended})
+                self._telemetry.handle(
+                    "CURRENT_MODE", {"custom_mode": shown, "intended_custom_mode": intended}
+                )
             elif frame.message_id == EKF_STATUS_REPORT_ID:
                 *_, flags = _EKF_STATUS_REPORT.unpack(frame.padded(_EKF_STATUS_REPORT.size))
-                self._heard.handle("EKF_STATUS_REPORT", {"flags": flags})
+                self._telemetry.handle("EKF_STATUS_REPORT", {"flags": flags})
             elif frame.message_id in _DECODED_IDS:
                 try:
                     message = self._codec.decode(bytearray(frame.raw))
@@ -107,9 +110,9 @@ class PymavlinkDriver(AutopilotDriver):
                     # An integer's bytes read as a float may be a signalling NaN, which the reading changes.
                     fields["value_bytes"] = frame.padded(4)
                 if autopilots:
-                    self._heard.handle(message.get_type(), fields)
+                    self._telemetry.handle(message.get_type(), fields)
                 else:
-                    self._heard.handle_device(message.get_type(), fields, frame.component_id)
+                    self._telemetry.handle_device(message.get_type(), fields, frame.component_id)
 
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
@@ -125,7 +128,7 @@ class PymavlinkDriver(AutopilotDriver):
             if name == "COMMAND_ACK" and fields["command"] == command and self._ack_is_ours(fields):
                 results.put_nowait(fields["result"])
 
-        async with self._heard.watching(watch):
+        async with self._telemetry.watching(watch):
             for attempt in range(_ATTEMPTS):
                 if self._link is None:
                     raise CommandRefusedError(f"{self.url}: the link was closed before an answer came")
@@ -163,7 +166,7 @@ class PymavlinkDriver(AutopilotDriver):
     async def set_parameter(self, name: str, value: float) -> None:
         """See Driver."""
         _, kind = await self._read_parameter(name)
-        wanted = _parameter_bytes(name, value, kind, bytewise=self._heard.manners.parameters_bytewise)
+        wanted = _parameter_bytes(name, value, kind, bytewise=self._telemetry.profile.parameters_bytewise)
         payload = _PARAM_SET.pack(
             wanted, self._system_id or 0, AUTOPILOT_COMPONENT, _parameter_id(name), kind
         )
@@ -193,7 +196,7 @@ class PymavlinkDriver(AutopilotDriver):
         kind = fields["param_type"]
         if kind not in _PARAM_LAYOUT:
             raise CommandRefusedError(f"parameter {name} has type {kind}, which no autopilot here uses")
-        layout = _PARAM_LAYOUT[kind if self._heard.manners.parameters_bytewise else _REAL32]
+        layout = _PARAM_LAYOUT[kind if self._telemetry.profile.parameters_bytewise else _REAL32]
         return float(struct.unpack(layout, fields["value_bytes"])[0]), kind
 
     async def _exchange_parameter(
@@ -213,7 +216,7 @@ class PymavlinkDriver(AutopilotDriver):
                 reason = _PARAM_ERRORS.get(fields["error"], f"PARAM_ERROR {fields['error']}")
                 answer.set_exception(CommandRefusedError(f"parameter {name}: {reason}"))
 
-        async with self._heard.watching(watch):
+        async with self._telemetry.watching(watch):
             for _ in range(_ATTEMPTS):
                 send()
                 await asyncio.wait([answer], timeout=_ATTEMPT_S)

@@ -23,8 +23,8 @@ from companion.vehicle.framing import (
     REQUEST_EVENT_ID,
     Frame,
 )
-from companion.vehicle.heard_state import HeardState
 from companion.vehicle.status_texts import STATUSTEXT_ID, StatusTexts
+from companion.vehicle.telemetry_state import TelemetryState
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class ReportReader:
     """Takes the frames that report, and finds out what events mean.
 
     Args:
-        url: of the link, for the log. heard: where reports go.
+        url: of the link, for the log. telemetry: where reports go.
         send: puts a message's payload on the wire. command: sends one command; the MAV_RESULT.
         target: system and component id of the autopilot.
     """
@@ -52,12 +52,12 @@ class ReportReader:
     def __init__(
         self,
         url: object,
-        heard: HeardState,
+        telemetry: TelemetryState,
         send: Callable[[int, bytes], None],
         command: Callable[..., Awaitable[int]],
         target: Callable[[], tuple[int, int]],
     ) -> None:
-        self._url, self._heard, self._send = url, heard, send
+        self._url, self._telemetry, self._send = url, telemetry, send
         self._command, self._target = command, target
         self._texts, self._files = StatusTexts(), FileReader(send, target)
         self._catalogue: EventCatalogue | None = None
@@ -70,16 +70,16 @@ class ReportReader:
         now_ns = time.monotonic_ns()
         kind = frame.message_id
         if kind == STATUSTEXT_ID:
-            self._heard.take_report(self._texts.take(frame, now_ns))
+            self._telemetry.take_report(self._texts.take(frame, now_ns))
         elif kind == EVENT_ID:
             identifier, _, sequence, _, _, levels, arguments = _EVENT.unpack(frame.padded(_EVENT.size))
             self._take_event(Event(identifier, sequence, levels, arguments), now_ns)
         elif kind == CURRENT_EVENT_SEQUENCE_ID:
-            self._ask_for_missed(int.from_bytes(frame.padded(2), "little") + 1 & 0xFFFF)
+            self._request_missed(int.from_bytes(frame.padded(2), "little") + 1 & 0xFFFF)
         elif kind == COMPONENT_METADATA_ID:
             _, crc, uri = _METADATA.unpack(frame.padded(_METADATA.size))
             self._metadata = (crc, uri.split(b"\0")[0].decode("ascii", "replace"))
-            self._heard.take_in("COMPONENT_METADATA", {})
+            self._telemetry.take_in("COMPONENT_METADATA", {})
         elif kind == FTP_ID:
             self._files.take(frame)
         else:
@@ -87,16 +87,16 @@ class ReportReader:
         return True
 
     def _take_event(self, event: Event, now_ns: int) -> None:
-        self._ask_for_missed(event.sequence)
+        self._request_missed(event.sequence)
         ahead = 1 if self._newest is None else event.sequence - self._newest & 0xFFFF
         if 0 < ahead < 0x8000:
             self._newest = event.sequence
         if self._catalogue is None:
             self._waiting.append((event, now_ns))
         else:
-            self._heard.take_report(self._catalogue.report(event, now_ns))
+            self._telemetry.take_report(self._catalogue.report(event, now_ns))
 
-    def _ask_for_missed(self, following: int) -> None:
+    def _request_missed(self, following: int) -> None:
         """REQUEST_EVENT for what lies between the newest event that came and this number."""
         if self._newest is None:
             self._newest = following - 1 & 0xFFFF  # what was before we came is not news
@@ -116,12 +116,12 @@ class ReportReader:
         self._catalogue = catalogue
         while self._waiting:
             event, now_ns = self._waiting.popleft()
-            self._heard.take_report(catalogue.report(event, now_ns))
+            self._telemetry.take_report(catalogue.report(event, now_ns))
 
     async def _read_metadata(self) -> bytes:
         self._metadata = None
         await self._command(_REQUEST_MESSAGE, COMPONENT_METADATA_ID)
-        if not await self._heard.until(lambda: self._metadata is not None, _METADATA_S):
+        if not await self._telemetry.until(lambda: self._metadata is not None, _METADATA_S):
             raise FileReadError("it tells no COMPONENT_METADATA (PX4 1.13 and newer do)")
         assert self._metadata is not None
         crc, uri = self._metadata

@@ -34,7 +34,7 @@ class Setpoint:
         position_ned_m: metres, local NED.
         velocity_ned_mps: metres a second, local NED.
         acceleration_ned_mps2: feed-forward of a velocity setpoint, m/s², local NED: PX4 adds it to what its
-            velocity controller asks for. ArduPilot is not sent it (`ardupilot_manners`). None: none.
+            velocity controller asks for. ArduPilot is not sent it (`ardupilot_profile`). None: none.
         yaw_rad: heading, clockwise from north.
         yaw_rate_radps: clockwise seen from above.
 

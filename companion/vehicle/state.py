@@ -2,7 +2,7 @@
 
 A reset of the autopilot's estimator changes its local coordinates of every place on the ground at once. Here,
 and in everything above the drivers, local NED is the frame in which the vehicle was first heard:
-`telemetry_fold` takes the sum of all resets (`VehicleState.reset_offset_ned_m`) off every position that is
+`telemetry` takes the sum of all resets (`VehicleState.reset_offset_ned_m`) off every position that is
 received, and a driver adds it to every position that it sends. So goals, paths, targets, tracks and the
 history of poses stay where they are on the ground, and none of them handles resets. The autopilot keeps home
 in its own coordinates, so here home moves at a reset.

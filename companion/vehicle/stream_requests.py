@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import CURRENT_MODE_ID, EKF_STATUS_REPORT_ID
-from companion.vehicle.heard_state import HeardState
 from companion.vehicle.mav_result import ACCEPTED, result_name
 from companion.vehicle.stream_monitor import StreamMonitor
+from companion.vehicle.telemetry_state import TelemetryState
 
 logger = logging.getLogger(__name__)
 
@@ -30,18 +30,20 @@ class StreamRequests:
     """SET_MESSAGE_INTERVAL for what comes too slowly, and home's position until it is known.
 
     Args:
-        url: of the link, for the log. heard: what the autopilot shows; its manners are known.
+        url: of the link, for the log. telemetry: what the autopilot shows; its profile are known.
         command: sends one command with its parameters; the MAV_RESULT.
     """
 
-    def __init__(self, url: object, heard: HeardState, command: Callable[..., Awaitable[int]]) -> None:
-        self._url, self._heard, self._command = url, heard, command
+    def __init__(
+        self, url: object, telemetry: TelemetryState, command: Callable[..., Awaitable[int]]
+    ) -> None:
+        self._url, self._telemetry, self._command = url, telemetry, command
         self._refused: set[int] = set()
         self._asked_before = self._unanswered = False
         self.monitor = StreamMonitor(
-            {**heard.manners.rates_hz, **heard.manners.expected_hz},
+            {**telemetry.profile.rates_hz, **telemetry.profile.expected_hz},
             time.monotonic_ns(),
-            optional=heard.manners.optional,
+            optional=telemetry.profile.optional,
             first_window_s=_MEASURE_S,
         )
 
@@ -55,15 +57,15 @@ class StreamRequests:
             await asyncio.sleep(_CHECK_S)
             due = self.monitor.due(time.monotonic_ns())
             self._show()
-            if due and self._heard.state.connected(time.monotonic_ns()):
+            if due and self._telemetry.state.connected(time.monotonic_ns()):
                 await self._ask_for(due)
 
     def _show(self) -> None:
         """What is missing into the state, and into the log when it changes."""
         names = tuple(message_name(message_id) for message_id in self.monitor.missing)
-        if names == self._heard.state.missing_streams:
+        if names == self._telemetry.state.missing_streams:
             return
-        self._heard.state = replace(self._heard.state, missing_streams=names)
+        self._telemetry.state = replace(self._telemetry.state, missing_streams=names)
         if not names:
             logger.info("%s: every stream comes", self._url)
             return
@@ -73,12 +75,12 @@ class StreamRequests:
         self._asked_before = True
 
     async def _ask_for(self, due: list[int]) -> None:
-        manners = self._heard.manners
+        profile = self._telemetry.profile
         for message_id in due:
             requests: list[tuple[float, ...]] = [
-                (_SET_MESSAGE_INTERVAL, message_id, round(1e6 / manners.rates_hz[message_id]))
+                (_SET_MESSAGE_INTERVAL, message_id, round(1e6 / profile.rates_hz[message_id]))
             ]
-            if message_id in manners.requested and self._heard.state.home_altitude_amsl_m is None:
+            if message_id in profile.requested and self._telemetry.state.home_altitude_amsl_m is None:
                 requests.append((_REQUEST_MESSAGE, message_id))
             for number, *parameters in requests:
                 try:

@@ -18,8 +18,8 @@ from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
 
 from companion.vehicle.precise_sleep import Sleep, precise_sleep
+from companion.vehicle.scheduler_slice import set_scheduler_slice
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.short_turns import take_short_turns
 
 logger = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ class Streamer:
         self._newest = None
         self._enter(StreamState.SILENT)
 
-    def hasten(self, now_ns: int) -> None:
+    def send_now(self, now_ns: int) -> None:
         """Send the newest setpoint now, between two ticks, if it has not left yet. The ticks do not move."""
         if self._newest is not self._sent and self._state is StreamState.FRESH:
             self.tick(now_ns)
@@ -117,7 +117,7 @@ class Streamer:
 
     async def run(self) -> None:
         """Tick at the rate until cancelled. Missed ticks are skipped, never sent in a burst."""
-        take_short_turns()
+        set_scheduler_slice()
         async with self._sleeper() as sleep:
             due_ns = self._clock_ns()
             while True:

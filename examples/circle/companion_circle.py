@@ -3,7 +3,16 @@
 import math
 from typing import Annotated
 
-from companion import Behaviour, BuildContext, Command, Number, Requirement, Setpoint, Situation, behaviour
+from companion import (
+    Behaviour,
+    BehaviourContext,
+    BuildContext,
+    Command,
+    Number,
+    Requirement,
+    Setpoint,
+    behaviour,
+)
 
 
 @behaviour("circle", "fly a circle about the point ahead, nose to its centre")
@@ -23,16 +32,16 @@ class CircleBehaviour(Behaviour):
     def __init__(self, command: Circle) -> None:
         self._radius_m, self._speed_mps = command.radius_m, command.speed_mps
 
-    def on_activate(self, situation: Situation) -> None:
-        north, east, self._down_m = situation.state.position_ned_m or (0.0, 0.0, 0.0)
-        yaw = situation.state.yaw_rad or 0.0
+    def on_activate(self, context: BehaviourContext) -> None:
+        north, east, self._down_m = context.state.position_ned_m or (0.0, 0.0, 0.0)
+        yaw = context.state.yaw_rad or 0.0
         self._centre = (north + self._radius_m * math.cos(yaw), east + self._radius_m * math.sin(yaw))
 
-    def update(self, dt_s: float, situation: Situation) -> Setpoint:
-        north, east, down = situation.state.position_ned_m or (0.0, 0.0, 0.0)
+    def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
+        north, east, down = context.state.position_ned_m or (0.0, 0.0, 0.0)
         angle = math.atan2(east - self._centre[1], north - self._centre[0])
         out = 0.8 * (self._radius_m - math.hypot(east - self._centre[1], north - self._centre[0]))
         north_mps = out * math.cos(angle) - self._speed_mps * math.sin(angle)
         east_mps = out * math.sin(angle) + self._speed_mps * math.cos(angle)
         velocity = (north_mps, east_mps, self._down_m - down)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=angle + math.pi)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=angle + math.pi)

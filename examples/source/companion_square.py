@@ -5,17 +5,17 @@ import re
 
 import numpy as np
 
-from vision.sources import Feed, LatestSource, Picture, Source, SourceError, SourceSettings
+from vision.sources import Capture, LatestSource, RawFrame, Source, SourceError, SourceSettings
 from vision.sources.registry import source
 
 SIDE_PX, ROUND_S = 40, 8.0
 
 
-class SquareFeed(Feed):
+class SquareCapture(Capture):
     def __init__(self, width: int, height: int, rate_hz: float) -> None:
         self._size, self._rate_hz, self._count = (width, height), rate_hz, 0
 
-    def read(self, timeout_s: float) -> Picture:
+    def read(self, timeout_s: float) -> RawFrame:
         width, height = self._size
         time_s = self._count / self._rate_hz
         angle = 2 * math.pi * time_s / ROUND_S
@@ -24,7 +24,7 @@ class SquareFeed(Feed):
         image = np.full((height, width, 3), 128, np.uint8)
         image[top : top + SIDE_PX, left : left + SIDE_PX] = (20, 20, 230)
         self._count += 1
-        return Picture(image, media_s=time_s)
+        return RawFrame(image, media_s=time_s)
 
     def close(self) -> None:
         """Nothing is open."""
@@ -36,4 +36,4 @@ def open_square(uri: str, settings: SourceSettings) -> Source:
     if match is None or min(int(match[1]), int(match[2])) <= SIDE_PX:
         raise SourceError(f"{uri}: expected square://WIDTHxHEIGHT?rate=HZ, such as square://640x480?rate=10")
     width, height, rate_hz = int(match[1]), int(match[2]), float(match[3] or settings.rate_hz or 10)
-    return LatestSource(uri, lambda: SquareFeed(width, height, rate_hz), settings, paced=True)
+    return LatestSource(uri, lambda: SquareCapture(width, height, rate_hz), settings, paced=True)

@@ -1,4 +1,4 @@
-"""An ArduPilot Copter's manners over the same airframe, estimator, links and clock as the PX4-like vehicle.
+"""An ArduPilot Copter's profile over the same airframe, estimator, links and clock as the PX4-like vehicle.
 
 `CopterVehicle` (`copter.py`) is the vehicle; everything that makes it speak and decide as Copter 4.5 does is
 in this package, from ArduPilot's public documentation and the behaviour of its released versions:

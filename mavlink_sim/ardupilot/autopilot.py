@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from mavlink_sim.ardupilot.failsafes import Failsafes
 from mavlink_sim.ardupilot.guided import Guided
 from mavlink_sim.ardupilot.landing import Land
 from mavlink_sim.ardupilot.modes import (
@@ -20,7 +21,6 @@ from mavlink_sim.ardupilot.modes import (
     CopterMode,
 )
 from mavlink_sim.ardupilot.return_to_launch import ReturnToLaunch
-from mavlink_sim.ardupilot.watch import FailsafeWatch
 from mavlink_sim.autopilot.commander import ACCEPTED, IDLE_THRUST_MPS2, Autopilot
 from mavlink_sim.autopilot.ground_contact import TAKEOFF_DETECTION_HEIGHT_M
 from mavlink_sim.autopilot.position_failsafe import Descend
@@ -94,7 +94,7 @@ class CopterAutopilot(Autopilot):
         self.mode = self.intended_mode = CopterMode.STABILIZE
         self.mode_changes = 0
         self._next_prearm_s = PREARM_DISPLAY_PERIOD_S / 2
-        self.watch = FailsafeWatch(self, parameters)
+        self.watch = Failsafes(self, parameters)
 
     # ---- what others read -------------------------------------------------------------------------------
 
@@ -251,9 +251,9 @@ class CopterAutopilot(Autopilot):
         self.watch.update()
         if not self.armed and self.now_s >= self._next_prearm_s:
             self._next_prearm_s += PREARM_DISPLAY_PERIOD_S
-            self.tell_prearm()
+            self.send_prearm()
 
-    def tell_prearm(self) -> None:
+    def send_prearm(self) -> None:
         """Say what speaks against arming. That the mode does not allow it is said at arming alone."""
         refusal = self._refusal()
         if refusal is not None and "mode not armable" not in refusal:

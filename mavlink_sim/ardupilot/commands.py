@@ -202,7 +202,7 @@ def _set_home(vehicle: CopterVehicle, link: Link, command: Command, frame: int) 
         return DENIED
     # ArduPilot locks it either way: arming elsewhere does not move it.
     vehicle.copter.home.is_at(place, (math.nan,) * 3)
-    vehicle.tell_home()
+    vehicle.send_home()
     return ACCEPTED
 
 
@@ -255,7 +255,7 @@ def _flight_termination(vehicle: CopterVehicle, link: Link, command: Command, fr
 def _run_prearm_checks(vehicle: CopterVehicle, link: Link, command: Command, frame: int) -> int:
     if vehicle.copter.armed:
         return TEMPORARILY_REJECTED
-    vehicle.copter.tell_prearm()
+    vehicle.copter.send_prearm()
     return ACCEPTED
 
 

@@ -83,7 +83,7 @@ class CopterVehicle(Vehicle):
             self._said.add(text)
             self.say(severity, text)
 
-    def tell_home(self) -> None:
+    def send_home(self) -> None:
         """HOME_POSITION to every link, as when it changes."""
         for link in self.links.values():
             self.send_built(link, "HOME_POSITION")
@@ -116,10 +116,10 @@ class CopterVehicle(Vehicle):
         super().reboot()
         streams.forget_requests(self)
 
-    def _tell_parameters(self) -> None:
+    def _send_parameters(self) -> None:
         """Nothing is told unasked."""
 
-    def _watch_companion(self) -> None:
+    def _check_companion(self) -> None:
         """A companion's heartbeat is nothing that Copter misses."""
 
     def _step(self) -> None:
@@ -130,7 +130,7 @@ class CopterVehicle(Vehicle):
             for link in self.links.values():
                 self.send_built(link, "HEARTBEAT")
         if copter.armed and not self._was_armed:
-            self.tell_home()  # home is where it was armed
+            self.send_home()  # home is where it was armed
         self._was_armed = copter.armed
 
     def _tell(self) -> None:

@@ -55,7 +55,7 @@ def line_of_sight(message: Any) -> Vector | None:
     return (sight[0] * scale, sight[1] * scale, sight[2] * scale)
 
 
-def place_of_target(message: Any, position: Vector, quaternion: Quaternion, height_m: float) -> Vector | None:
+def target_position(message: Any, position: Vector, quaternion: Quaternion, height_m: float) -> Vector | None:
     """Where the target is, local NED; None where the line of sight does not lead down.
 
     Without a distance it is where the line meets the ground, `height_m` below by the rangefinder.

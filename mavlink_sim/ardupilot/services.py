@@ -16,7 +16,7 @@ from mavlink_sim.flight.setpoints import (
     ROLL_RATE_IGNORE,
     THROTTLE_IGNORE,
 )
-from mavlink_sim.services import microservices, pilot_link
+from mavlink_sim.services import manual_control_service, microservices
 from mavlink_sim.wire.announcements import INFO
 from mavlink_sim.wire.messages import dialect
 
@@ -88,7 +88,7 @@ def _landing_target(vehicle: CopterVehicle, link: Link, message: Any) -> None:
     frame = vehicle.estimate
     height = -vehicle.airframe.position[2]
     try:
-        place = landing.place_of_target(message, frame.position, frame.quaternion, height)
+        place = landing.target_position(message, frame.position, frame.quaternion, height)
     except landing.UnsupportedTargetError as error:
         vehicle.say_once(INFO, str(error))
         return
@@ -125,8 +125,8 @@ HANDLERS: dict[str, Handler] = {
     "SET_POSITION_TARGET_LOCAL_NED": _local_target,
     "SET_POSITION_TARGET_GLOBAL_INT": _global_target,
     "SET_ATTITUDE_TARGET": _attitude_target,
-    "MANUAL_CONTROL": pilot_link.manual_control,
-    "RC_CHANNELS_OVERRIDE": pilot_link.rc_channels_override,
+    "MANUAL_CONTROL": manual_control_service.manual_control,
+    "RC_CHANNELS_OVERRIDE": manual_control_service.rc_channels_override,
     "TIMESYNC": microservices.HANDLERS["TIMESYNC"],
     "PING": microservices.HANDLERS["PING"],
     "REQUEST_DATA_STREAM": streams.request_data_stream,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pymavlink.dialects.v20 import ardupilotmega
 
 from mavlink_sim.physics.geography import geographic
-from mavlink_sim.services import telemetry, telemetry_of_system
+from mavlink_sim.services import system_streams, telemetry
 from mavlink_sim.wire.messages import dialect
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ VERSION = 0x040500FF  # 4.5.0, an official release
 CAPABILITIES = 2 | 8 | 64 | 128 | 256 | 2048 | 8192 | 131072
 # gyros, accelerometers, compass, barometer, GPS, attitude, yaw, height and position control, motors, AHRS
 SENSORS = 0x20FC2F
-PREARM_CHECK = telemetry_of_system.PREARM_CHECK
+PREARM_CHECK = system_streams.PREARM_CHECK
 BATTERY = 0x2000000
 # EKF_STATUS_REPORT.flags: attitude to predicted absolute position; while starting: attitude alone
 EKF_READY, EKF_STARTING, EKF_BLIND = 831, 1, 167

@@ -196,7 +196,7 @@ class Autopilot:
             if not self.sensors_ready:
                 self._say(CRITICAL, "Preflight Fail: heading estimate not stable")
             self._say(CRITICAL, "Arming denied: Resolve system health failures first\t", ARMING_DENIED_EVENT)
-            self.tell_checks()
+            self.report_checks()
             return TEMPORARILY_REJECTED
         self.armed = True
         self.ground.arm(self.now_s)
@@ -206,7 +206,7 @@ class Autopilot:
         self._start_task()
         return ACCEPTED
 
-    def tell_checks(self) -> None:
+    def report_checks(self) -> None:
         """RUN_PREARM_CHECKS, and a refusal to arm: the checks that fail, by their events."""
         self.texts.extend(arming_checks.failing_checks(self))
 
@@ -225,7 +225,7 @@ class Autopilot:
         """MAV_RESULT of a request for a mode; with `tell`, a refusal is also a text."""
         if self.armed and not self.can_run(mode):
             if tell:
-                self.tell_unavailable(mode)
+                self.report_unavailable(mode)
             return TEMPORARILY_REJECTED
         self._intend(mode)
         return ACCEPTED
@@ -239,10 +239,10 @@ class Autopilot:
         """Whether a command that would switch to this mode is refused; if so, that is told."""
         refused = self.armed and not self.can_run(mode)
         if refused:
-            self.tell_unavailable(mode)
+            self.report_unavailable(mode)
         return refused
 
-    def tell_unavailable(self, mode: Mode) -> None:
+    def report_unavailable(self, mode: Mode) -> None:
         """A mode was refused: PX4 says so at most once a second, whatever the mode."""
         if self.now_s - self._refusal_told_s > REFUSALS_APART_S:
             self._refusal_told_s = self.now_s

@@ -208,17 +208,17 @@ class Supervision:
         for request in self.manual_control.update(now_s):
             self._carry_out(request)
         self.battery.step(dt_s, autopilot.armed, thrust_mps2)
-        self._watch_manual_control()
-        self._watch_ground_station()
-        self._watch_battery()
-        self._watch_position()
+        self._check_manual_control()
+        self._check_ground_station()
+        self._monitor_battery()
+        self._check_position()
         breached = autopilot.navigator.is_breached
         if breached and not self.conditions.geofence_breached:
             autopilot.texts.extend(
                 failing_checks(autopilot, GEOFENCE_CHECKS)
             )  # PX4 tells a check when it changes
         self.conditions.geofence_breached = breached
-        sticks_request = self._watch_sticks()
+        sticks_request = self._check_sticks()
         autopilot.follow_failsafes(self.run_failsafes(dt_s, sticks_request))
         killed_s = now_s - self._killed_since_s
         if self.killed and autopilot.armed and killed_s >= self._parameters.number("COM_KILL_DISARM"):
@@ -265,7 +265,7 @@ class Supervision:
 
     # ---- watching ---------------------------------------------------------------------------------------
 
-    def _watch_manual_control(self) -> None:
+    def _check_manual_control(self) -> None:
         autopilot = self._autopilot
         lost = not self.pilot_has_sticks
         if lost != self.conditions.manual_control_lost:
@@ -281,14 +281,14 @@ class Supervision:
             self._had_manual_control = True
             self._manual_control_seen_s = autopilot.now_s
 
-    def _watch_position(self) -> None:
+    def _check_position(self) -> None:
         """Which modes can be flown without a position is asked for by `_can_fly`; here it is only told."""
         autopilot = self._autopilot
         if autopilot.position_valid is not self._had_position:
             self._had_position = autopilot.position_valid
             autopilot.announce("the position is " + ("back" if self._had_position else "lost"))
 
-    def _watch_ground_station(self) -> None:
+    def _check_ground_station(self) -> None:
         autopilot = self._autopilot
         seen_s = self.ground_station_seen_s
         lost = autopilot.now_s - seen_s > self._parameters.number("COM_DL_LOSS_T")
@@ -305,7 +305,7 @@ class Supervision:
             autopilot.texts.append(Text(INFO, "GCS connection regained\t", event))
             autopilot.announce("the ground station's heartbeat is back")
 
-    def _watch_battery(self) -> None:
+    def _monitor_battery(self) -> None:
         autopilot = self._autopilot
         warning = self.battery.checked_warning
         before = self.conditions.battery_warning
@@ -319,7 +319,7 @@ class Supervision:
             autopilot.texts.append(Text(severity, text))
             autopilot.announce(f"battery {warning.name.lower()}: {self.battery.remaining:.0%}")
 
-    def _watch_sticks(self) -> bool:
+    def _check_sticks(self) -> bool:
         """Sticks moved in AUTO or OFFBOARD give the vehicle to the pilot. True: a failsafe has to yield."""
         autopilot = self._autopilot
         moved = self.manual_control.take_moved()

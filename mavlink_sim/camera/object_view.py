@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.camera.ground_view import Matrix, View
-from mavlink_sim.world.painting_order import clip_polygon
-from mavlink_sim.world.palettes import palette_of
-from mavlink_sim.world.plates import Print, printed_side, reflectance
+from mavlink_sim.world.depth_sort import clip_polygon
+from mavlink_sim.world.fiducials import Print, printed_side, reflectance
+from mavlink_sim.world.materials import palette_of
 from mavlink_sim.world.shapes import Shape
 from mavlink_sim.world.textures import Plane
 from mavlink_sim.world.world import Light, Sky, WorldObject

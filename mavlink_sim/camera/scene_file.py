@@ -21,7 +21,7 @@ from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.lens import Lens, Shutter
 from mavlink_sim.camera.scene import CameraSettings, Path, Scene
-from mavlink_sim.world.plates import DICTIONARIES, Print
+from mavlink_sim.world.fiducials import DICTIONARIES, Print
 from mavlink_sim.world.textures import KINDS
 from mavlink_sim.world.world import (
     OBJECT_NAMES,

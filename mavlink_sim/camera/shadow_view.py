@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mavlink_sim.camera.ground_view import View
 from mavlink_sim.camera.object_view import FAR_PX, NEAR_M, SUBPIXEL_BITS, PlacedObject, within_view
-from mavlink_sim.world.painting_order import clip_polygon
+from mavlink_sim.world.depth_sort import clip_polygon
 from mavlink_sim.world.textures import Image
 
 MAX_SHADOW_SOLIDS_AT_PX = 14.0

@@ -20,7 +20,7 @@ from mavlink_sim.camera.image_effects import MILD_EFFECTS, ImageEffects
 from mavlink_sim.camera.renderer import Rendered, Renderer
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import example_scenes, load_scene
-from mavlink_sim.world.plates import Print
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.shapes import CLASS_NAMES, CLUTTER_NAMES
 from mavlink_sim.world.textures import KINDS, Image
 from mavlink_sim.world.world import Ground, Light, Patch, Sky, World, WorldObject, demo_world, range_to

@@ -50,7 +50,7 @@ def _impair(vehicle: Vehicle, one: ActiveFault, make: Callable[[str], Impairment
     for seed, channel in _channels(vehicle, one):
         impairment = make(seed)
         channel.impair(impairment)
-        one.undo.append(partial(channel.mend, impairment))
+        one.undo.append(partial(channel.clear, impairment))
 
 
 def link_loss(vehicle: Vehicle, one: ActiveFault) -> None:

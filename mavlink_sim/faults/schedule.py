@@ -24,7 +24,7 @@ from mavlink_sim.faults.effects_link import chosen_links
 from mavlink_sim.faults.effects_messages import shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
-from mavlink_sim.physics.estimate_errors import as_told
+from mavlink_sim.physics.estimate_errors import as_reported
 from mavlink_sim.wire.link_faults import LinkStage
 
 if TYPE_CHECKING:
@@ -281,7 +281,7 @@ class Faults:
                 return None
         estimate = self.vehicle.estimate
         if estimate.reset_counter or estimate.fix_lost:
-            message = as_told(estimate, message)
+            message = as_reported(estimate, message)
         if self.boot_offset_us:
             message = shifted(message, self.boot_offset_us)
         return message

@@ -90,7 +90,7 @@ class Navigator:
         self.commands: deque[MissionItem] = deque()
         self._checked_with: object = None
         self._state = MissionState.NO_MISSION
-        self._flown = False  # the mission on board was begun
+        self._active = False  # the mission on board was begun
         self._disarmed_since_flown = False
         self._breaches: list[str] = []
         self._next_fence_check_s = 0.0
@@ -198,7 +198,7 @@ class Navigator:
         last = max(len(plan.items) - 1, 0)
         kept = min(self.mission.current, last)
         self.mission = Mission(plan.items, kept if current < 0 else current)
-        self._flown = False
+        self._active = False
         self._check_mission()
         self.announcements.append(Current())
         if self._flies_mission():
@@ -250,7 +250,7 @@ class Navigator:
     def mission_task(self) -> flight.Task:
         """The task of Mode.MISSION, from the current item on."""
         mission = self.mission
-        if self._flown and self._disarmed_since_flown and mission.current + 1 == len(mission.items):
+        if self._active and self._disarmed_since_flown and mission.current + 1 == len(mission.items):
             mission.current = 0  # flown to its end before
             mission.jumps.clear()
         self._check_mission()
@@ -259,7 +259,7 @@ class Navigator:
             self.say(CRITICAL, f"No valid mission available, {then}\t")
             return flight.Hold(self._airframe, self._parameters)
         self.say(INFO, "Executing Mission\t")
-        self._flown, self._disarmed_since_flown = True, False
+        self._active, self._disarmed_since_flown = True, False
         mission.finished, mission.reached = False, -1
         self.current_changed()
         return MissionFlight(self, self._airframe, self._parameters)
@@ -329,7 +329,7 @@ class Navigator:
     def update(self) -> None:
         """Look after the mission's end, its validity and the fence."""
         autopilot = self._autopilot
-        if not autopilot.armed and self._flown:
+        if not autopilot.armed and self._active:
             self._disarmed_since_flown = True
         task = autopilot.task
         if isinstance(task, MissionFlight) and task.ended and not self.landed:

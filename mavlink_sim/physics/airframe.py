@@ -22,7 +22,7 @@ from mavlink_sim.physics.contact import (
     RESTITUTION,
     Collision,
 )
-from mavlink_sim.physics.normal_numbers import BITS, NORMAL
+from mavlink_sim.physics.gaussian import BITS, NORMAL
 from mavlink_sim.physics.rate_loop import MAX_YAW_RATE_RADPS, demanded_rates, mixed_thrusts
 
 Vector = tuple[float, float, float]

@@ -141,7 +141,7 @@ def _sum(vectors: Iterable[Vector]) -> Vector:
 # ---- what the messages say of it
 
 
-def as_told(estimate: FallibleEstimate, message: Any) -> Any:
+def as_reported(estimate: FallibleEstimate, message: Any) -> Any:
     """The message as PX4 sends it while, or after, the estimate is spoiled."""
     amend = _AMENDMENTS.get(message.get_type())
     if amend is None:

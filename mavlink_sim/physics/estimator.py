@@ -12,7 +12,7 @@ import math
 import random
 
 from mavlink_sim.physics.airframe import Multirotor, Quaternion, Vector
-from mavlink_sim.physics.normal_numbers import BITS, NORMAL
+from mavlink_sim.physics.gaussian import BITS, NORMAL
 
 # Standard deviations. Position: metres, the smoothed drift of the filter, (north, east, down).
 POSITION_DRIFT_M = (0.16, 0.16, 0.06)

@@ -116,7 +116,7 @@ class Midair:
         """Part them, each by its share, and take what they ran into each other with."""
         if first.stands_on is second or second.stands_on is first:
             return
-        push, normal = _parting(first, second)
+        push, normal = _occlusion(first, second)
         share = _share(first.airframe, second.airframe)
         before = _difference(first.airframe.velocity, second.airframe.velocity)
         into = -(before[0] * normal[0] + before[1] * normal[1] + before[2] * normal[2])
@@ -148,7 +148,7 @@ def _fall_unless_carried(upper: Body, lower: Body) -> None:
         upper.airframe.on_ground = False
 
 
-def _parting(first: Body, second: Body) -> tuple[Vector, Vector]:
+def _occlusion(first: Body, second: Body) -> tuple[Vector, Vector]:
     """How far the first has to go, if it alone goes, until the hulls touch; and the second's normal there."""
     dx, dy, dz = _difference(first.place_ned_m, second.place_ned_m)
     distance = apart(first, second)

@@ -1,4 +1,4 @@
-"""The other vehicles of a flock as the range sensors of one of them meet them: upright ellipsoids.
+"""The other vehicles of a fleet_world as the range sensors of one of them meet them: upright ellipsoids.
 
 Everything is NED metres in the world's frame.
 """

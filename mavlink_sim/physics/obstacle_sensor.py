@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
-from mavlink_sim.physics.normal_numbers import BITS, NORMAL
+from mavlink_sim.physics.gaussian import BITS, NORMAL
 from mavlink_sim.world.obstacles import Obstacles, Segment
 from mavlink_sim.world.world import Vector
 

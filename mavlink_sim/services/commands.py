@@ -13,8 +13,8 @@ from mavlink_sim.physics.geography import geographic, local
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.mission_start import mission_start
+from mavlink_sim.services.system_streams import available_modes
 from mavlink_sim.services.telemetry import MESSAGE_IDS
-from mavlink_sim.services.telemetry_of_system import available_modes
 from mavlink_sim.wire.announcements import CRITICAL, Text
 from mavlink_sim.wire.messages import dialect, protocol_version
 
@@ -179,7 +179,7 @@ def _accept(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _run_prearm_checks(vehicle: Vehicle, link: Link, command: Command) -> int:
     if not vehicle.autopilot.armed:
-        vehicle.autopilot.tell_checks()
+        vehicle.autopilot.report_checks()
     return ACCEPTED
 
 
@@ -217,7 +217,7 @@ def _preflight_storage(vehicle: Vehicle, link: Link, command: Command) -> int:
 
 def _request_message(vehicle: Vehicle, link: Link, command: Command) -> int:
     if _identifier(command.parameters[0]) == MESSAGE_INTERVAL:
-        return _tell_interval(vehicle, link, command.parameters[1])
+        return _send_interval(vehicle, link, command.parameters[1])
     if _identifier(command.parameters[0]) == AVAILABLE_MODES:
         modes = available_modes(_identifier(command.parameters[1]))
         for message in modes:
@@ -280,10 +280,10 @@ def _set_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int
 
 
 def _get_message_interval(vehicle: Vehicle, link: Link, command: Command) -> int:
-    return _tell_interval(vehicle, link, command.parameters[0])
+    return _send_interval(vehicle, link, command.parameters[0])
 
 
-def _tell_interval(vehicle: Vehicle, link: Link, message_id: float) -> int:
+def _send_interval(vehicle: Vehicle, link: Link, message_id: float) -> int:
     identifier = _identifier(message_id)
     name = MESSAGE_IDS.get(identifier)
     interval = -1 if name is None else link.streams.interval_us(name)  # -1: no such stream, or off

@@ -20,10 +20,10 @@ from mavlink_sim.services import (
     event_protocol,
     file_transfer,
     gimbal_protocol,
+    manual_control_service,
     mission_link,
     mission_transfer,
     parameter_protocol,
-    pilot_link,
 )
 from mavlink_sim.wire import signing
 from mavlink_sim.wire.announcements import CRITICAL, Text
@@ -142,8 +142,8 @@ HANDLERS: dict[str, Handler] = {
     "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
     "SET_POSITION_TARGET_GLOBAL_INT": _global_setpoint,
     "SET_ATTITUDE_TARGET": _attitude_setpoint,
-    "MANUAL_CONTROL": pilot_link.manual_control,
-    "RC_CHANNELS_OVERRIDE": pilot_link.rc_channels_override,
+    "MANUAL_CONTROL": manual_control_service.manual_control,
+    "RC_CHANNELS_OVERRIDE": manual_control_service.rc_channels_override,
     "GIMBAL_MANAGER_SET_ATTITUDE": gimbal_protocol.set_attitude,
     "GIMBAL_MANAGER_SET_PITCHYAW": gimbal_protocol.set_pitchyaw,
     "GIMBAL_MANAGER_SET_MANUAL_CONTROL": gimbal_protocol.set_manual_control,

@@ -26,5 +26,5 @@ def mission_start(autopilot: Autopilot, first: float) -> int:
         autopilot.navigator.set_current(int(first))
     if autopilot.set_mode(Mode.MISSION) == ACCEPTED and autopilot.arm() == ACCEPTED:
         return ACCEPTED
-    autopilot.tell_unavailable(Mode.MISSION)
+    autopilot.report_unavailable(Mode.MISSION)
     return TEMPORARILY_REJECTED

@@ -98,10 +98,10 @@ def set_parameter(vehicle: Vehicle, link: Link, message: Any) -> None:
         logger.info("PARAM_SET refused, the old value stands: %s", error)
     _send(link, vehicle.parameters, parameter)
     if parameter.value != before:
-        vehicle.after(SECOND_ECHO_S, partial(tell_everyone, vehicle, [name]))
+        vehicle.after(SECOND_ECHO_S, partial(broadcast, vehicle, [name]))
 
 
-def tell_everyone(vehicle: Vehicle, names: Iterable[str]) -> None:
+def broadcast(vehicle: Vehicle, names: Iterable[str]) -> None:
     """PARAM_VALUE of changed parameters on every link, as PX4 tells all its clients of a change."""
     for name in names:
         for link in vehicle.links.values():

@@ -184,7 +184,7 @@ class Channel:
         self._impairments.append(impairment)
         self._impairments.sort(key=lambda one: one.rank)
 
-    def mend(self, impairment: Impairment) -> None:
+    def clear(self, impairment: Impairment) -> None:
         """Take an impairment off. Does nothing if it is not on."""
         if impairment in self._impairments:
             self._impairments.remove(impairment)

@@ -15,8 +15,8 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from mavlink_sim.world import clutter, creatures, vehicles
-from mavlink_sim.world.painting_order import PaintingTree, painting_tree
+from mavlink_sim.world import distractors, people_and_animals, vehicles
+from mavlink_sim.world.depth_sort import DepthSortTree, depth_sort_tree
 from mavlink_sim.world.solids import Body, Points, Triple, ground_shadows
 from mavlink_sim.world.structures import DEFAULT_SIZES_M, SIZED_BUILDERS, check_size
 
@@ -24,24 +24,24 @@ CLASS_NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair")
 """COCO's names of what the detector is to find."""
 
 BUILDERS: dict[str, Callable[[np.random.Generator], Body]] = {
-    "person": creatures.person,
+    "person": people_and_animals.person,
     "bicycle": vehicles.bicycle,
     "car": vehicles.car,
     "truck": vehicles.truck,
     "boat": vehicles.boat,
-    "dog": creatures.dog,
-    "chair": creatures.chair,
-    "tree": clutter.tree,
-    "bush": clutter.bush,
-    "rock": clutter.rock,
-    "pole": clutter.pole,
-    "crate": clutter.crate,
-    "barrel": clutter.barrel,
-    "shed": clutter.shed,
-    "fence": clutter.fence,
-    "table": clutter.table,
-    "bale": clutter.bale,
-    "tarpaulin": clutter.tarpaulin,
+    "dog": people_and_animals.dog,
+    "chair": people_and_animals.chair,
+    "tree": distractors.tree,
+    "bush": distractors.bush,
+    "rock": distractors.rock,
+    "pole": distractors.pole,
+    "crate": distractors.crate,
+    "barrel": distractors.barrel,
+    "shed": distractors.shed,
+    "fence": distractors.fence,
+    "table": distractors.table,
+    "bale": distractors.bale,
+    "tarpaulin": distractors.tarpaulin,
 }
 CLUTTER_NAMES = tuple(name for name in BUILDERS if name not in CLASS_NAMES)
 
@@ -73,7 +73,7 @@ class Shape:
         low, high: (3,) the bounding box.
     """
 
-    tree: PaintingTree
+    tree: DepthSortTree
     faces_of: tuple[tuple[int, ...], ...]
     corners: Points
     first: NDArray[np.int64]
@@ -143,7 +143,7 @@ def shape_of(class_name: str, variant: int, size_m: Triple | None = None) -> Sha
     counts = [len(solid.faces) + len(solid.decals) for solid in body.solids]
     ends = np.cumsum(counts).tolist()
     return Shape(
-        tree=painting_tree(body.solids),
+        tree=depth_sort_tree(body.solids),
         faces_of=tuple(tuple(range(end - count, end)) for count, end in zip(counts, ends, strict=True)),
         corners=corners,
         first=np.cumsum([0] + [len(face.points) for face in faces]),

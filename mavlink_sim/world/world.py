@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from mavlink_sim.world.plates import Print
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.shapes import CLASS_NAMES, CLUTTER_NAMES, Shape, shape_of, variant_of
 from mavlink_sim.world.structures import STRUCTURE_NAMES, check_size
 

@@ -29,7 +29,7 @@ def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) 
     for package in ("onnx", "onnxruntime"):
         pytest.importorskip(package, reason=f"{package} is an optional extra")
     path = tmp_path_factory.mktemp("exported") / "small.onnx"
-    return export(small_model, "onnx", path, 160, generation="YOLOv8")
+    return export(small_model, "onnx", path, 160, model_family="YOLOv8")
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""A cockpit for the vehicle in lockstep: send it messages, let time pass, look at what it answered."""
+"""A harness for the vehicle in lockstep: send it messages, let time pass, look at what it answered."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAN = math.nan
 COMPANION = (1, 191)
 GROUND_STATION = (245, 190)
 # Most of a flight in lockstep is to build these messages, up to a hundred of each a second. A test hears
-# those that it says it reads: `@pytest.mark.hears("ATTITUDE")`, `hears("everything")`.
+# those that it says it reads: `@pytest.mark.streams("ATTITUDE")`, `hears("everything")`.
 FAST_HZ = 5.0
 FAST_STREAMS = {
     name
@@ -30,7 +30,7 @@ FAST_STREAMS = {
 EVERYTHING = "everything"
 
 
-class Cockpit:
+class SimHarness:
     """A vehicle with an onboard and a ground-station link, without sockets and without a clock.
 
     Args:
@@ -128,7 +128,7 @@ class Cockpit:
     def received(self, kind: str, link: str = "onboard") -> list[Any]:
         if kind in self._unheard:
             raise LookupError(
-                f'{kind} is not heard: mark the test with hears("{kind}"), or make_cockpit(["{kind}"])'
+                f'{kind} is not heard: mark the test with hears("{kind}"), or make_harness(["{kind}"])'
             )
         return [item.message for _, item in self._inbox[link] if item.message.get_type() == kind]
 
@@ -136,7 +136,7 @@ class Cockpit:
     def inbox(self) -> dict[str, list[tuple[float, Any]]]:
         """Every message received on each link since the last `forget`, as (time, message)."""
         if self._unheard:
-            raise LookupError('not all is heard: mark the test with hears("everything"), or make_cockpit so')
+            raise LookupError('not all is heard: mark the test with hears("everything"), or make_harness so')
         return self._inbox
 
     def forget(self) -> None:
@@ -257,16 +257,16 @@ def position(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
 
 
 @pytest.fixture
-def cockpit(request: pytest.FixtureRequest) -> Cockpit:
+def harness(request: pytest.FixtureRequest) -> SimHarness:
     """A vehicle in still air, on the ground, just booted."""
     marker = request.node.get_closest_marker("hears")
-    return Cockpit(hears=() if marker is None else marker.args)
+    return SimHarness(hears=() if marker is None else marker.args)
 
 
 @pytest.fixture(scope="session")
-def make_cockpit() -> type[Cockpit]:
+def make_harness() -> type[SimHarness]:
     """Makes vehicles with other options."""
-    return Cockpit
+    return SimHarness
 
 
 @pytest.fixture

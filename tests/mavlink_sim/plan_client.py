@@ -7,7 +7,7 @@ from typing import Any
 
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 NAN = math.nan
 COMPANION = (1, 191)
@@ -78,54 +78,54 @@ def message(sequence: int, fields: dict[str, Any], current: int = 0) -> Any:
     return dialect.MAVLink_mission_item_int_message(1, 1, sequence, current=current, **fields)
 
 
-def newest(cockpit: Cockpit, kind: str, before: int) -> Any:
+def newest(harness: SimHarness, kind: str, before: int) -> Any:
     """The one message of a kind that came after the `before`th, waited for."""
-    if len(cockpit.received(kind)) <= before:
-        cockpit.until(lambda: len(cockpit.received(kind)) > before, 1.0)
-    return cockpit.received(kind)[before]
+    if len(harness.received(kind)) <= before:
+        harness.until(lambda: len(harness.received(kind)) > before, 1.0)
+    return harness.received(kind)[before]
 
 
-def upload(cockpit: Cockpit, items: list[dict[str, Any]], plan: int = 0, current: int = 0) -> int:
+def upload(harness: SimHarness, items: list[dict[str, Any]], plan: int = 0, current: int = 0) -> int:
     """Upload a plan; the MAV_MISSION_RESULT."""
-    requests = len(cockpit.received("MISSION_REQUEST_INT"))
-    acks = len(cockpit.received("MISSION_ACK"))
-    cockpit.send(dialect.MAVLink_mission_count_message(1, 1, len(items), plan))
+    requests = len(harness.received("MISSION_REQUEST_INT"))
+    acks = len(harness.received("MISSION_ACK"))
+    harness.send(dialect.MAVLink_mission_count_message(1, 1, len(items), plan))
     for sequence, fields in enumerate(items):
-        request = newest(cockpit, "MISSION_REQUEST_INT", requests + sequence)
+        request = newest(harness, "MISSION_REQUEST_INT", requests + sequence)
         assert (request.seq, request.mission_type) == (sequence, plan)
         assert (request.target_system, request.target_component) == COMPANION
-        cockpit.send(message(sequence, fields, int(plan == 0 and sequence == current)))
-        if len(cockpit.received("MISSION_ACK")) > acks:
+        harness.send(message(sequence, fields, int(plan == 0 and sequence == current)))
+        if len(harness.received("MISSION_ACK")) > acks:
             break
-    ack = newest(cockpit, "MISSION_ACK", acks)
+    ack = newest(harness, "MISSION_ACK", acks)
     assert ack.mission_type == plan
     return int(ack.type)
 
 
-def download(cockpit: Cockpit, plan: int = 0) -> list[Any]:
+def download(harness: SimHarness, plan: int = 0) -> list[Any]:
     """The MISSION_ITEM_INTs on board."""
-    counts = len(cockpit.received("MISSION_COUNT"))
-    cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, plan))
-    count = newest(cockpit, "MISSION_COUNT", counts)
+    counts = len(harness.received("MISSION_COUNT"))
+    harness.send(dialect.MAVLink_mission_request_list_message(1, 1, plan))
+    count = newest(harness, "MISSION_COUNT", counts)
     found = []
     for sequence in range(count.count):
-        items = len(cockpit.received("MISSION_ITEM_INT"))
-        cockpit.send(dialect.MAVLink_mission_request_int_message(1, 1, sequence, plan))
-        found.append(newest(cockpit, "MISSION_ITEM_INT", items))
-    cockpit.send(dialect.MAVLink_mission_ack_message(1, 1, 0, plan))
+        items = len(harness.received("MISSION_ITEM_INT"))
+        harness.send(dialect.MAVLink_mission_request_int_message(1, 1, sequence, plan))
+        found.append(newest(harness, "MISSION_ITEM_INT", items))
+    harness.send(dialect.MAVLink_mission_ack_message(1, 1, 0, plan))
     return found
 
 
-def reached(cockpit: Cockpit) -> list[int]:
+def reached(harness: SimHarness) -> list[int]:
     """The items reached, in order, repetitions left out."""
     found: list[int] = []
-    for told in cockpit.received("MISSION_ITEM_REACHED"):
+    for told in harness.received("MISSION_ITEM_REACHED"):
         if found[-1:] != [told.seq]:
             found.append(told.seq)
     return found
 
 
-def listen(cockpit: Cockpit) -> None:
+def listen(harness: SimHarness) -> None:
     """A ground station on the second link, so that status texts are sent."""
-    cockpit.heartbeats.append(("gcs", (245, 190), 6))
-    cockpit.fly(1.1)
+    harness.heartbeats.append(("gcs", (245, 190), 6))
+    harness.fly(1.1)

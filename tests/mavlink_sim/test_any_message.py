@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 HANDLED = {m.id: m for m in dialect.mavlink_map.values() if m.msgname in HANDLERS}
 OTHERS = {m.id: m for m in dialect.mavlink_map.values() if m.msgname not in HANDLERS}
@@ -47,33 +47,33 @@ def _offsets(kind: Any) -> dict[str, int]:
     return found
 
 
-def fly_through(cockpit: Cockpit, datagrams: list[bytes]) -> None:
+def fly_through(harness: SimHarness, datagrams: list[bytes]) -> None:
     reader = parser()
     for datagram in datagrams:
         for message in reader.parse_buffer(datagram) or []:
-            cockpit.vehicle.handle("onboard", message)
-        cockpit.fly(0.05)
-    cockpit.fly(0.5)
+            harness.vehicle.handle("onboard", message)
+        harness.fly(0.05)
+    harness.fly(0.5)
     codec = parser()
     for link in ("onboard", "gcs"):
-        for _, item in cockpit.inbox[link]:
+        for _, item in harness.inbox[link]:
             assert item.pack(codec)
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(packets(HANDLED), min_size=1, max_size=12))
-def test_messages_it_handles(make_cockpit: type[Cockpit], datagrams: list[bytes]) -> None:
-    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
-    cockpit.command(400, 1)
-    fly_through(cockpit, datagrams)
+def test_messages_it_handles(make_harness: type[SimHarness], datagrams: list[bytes]) -> None:
+    harness = make_harness(["everything"], ready_after_s=0.0)
+    harness.command(400, 1)
+    fly_through(harness, datagrams)
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(packets(OTHERS), min_size=1, max_size=12))
-def test_messages_it_does_not_handle(make_cockpit: type[Cockpit], datagrams: list[bytes]) -> None:
-    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
-    cockpit.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", (245, 190))
-    fly_through(cockpit, datagrams)
+def test_messages_it_does_not_handle(make_harness: type[SimHarness], datagrams: list[bytes]) -> None:
+    harness = make_harness(["everything"], ready_after_s=0.0)
+    harness.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", (245, 190))
+    fly_through(harness, datagrams)
 
 
 finite = st.floats(-1e30, 1e30)
@@ -104,13 +104,13 @@ PARAMETERS = [
 
 @settings(max_examples=10, deadline=None)
 @given(st.dictionaries(st.sampled_from(PARAMETERS), finite, min_size=1, max_size=5))
-def test_parameters_out_of_every_range(make_cockpit: type[Cockpit], values: dict[str, float]) -> None:
-    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
+def test_parameters_out_of_every_range(make_harness: type[SimHarness], values: dict[str, float]) -> None:
+    harness = make_harness(["everything"], ready_after_s=0.0)
     for name, value in values.items():
-        cockpit.vehicle.parameters.set(name, value)
-    cockpit.fly(0.1)
-    cockpit.command(400, 1)
-    cockpit.command(22, *[float("nan")] * 7)
-    cockpit.fly(4.0)
-    cockpit.command(20)
-    fly_through(cockpit, [])
+        harness.vehicle.parameters.set(name, value)
+    harness.fly(0.1)
+    harness.command(400, 1)
+    harness.command(22, *[float("nan")] * 7)
+    harness.fly(4.0)
+    harness.command(20)
+    fly_through(harness, [])

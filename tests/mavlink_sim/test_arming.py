@@ -5,91 +5,91 @@ from typing import Any
 
 import pytest
 
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 PREARM_CHECK = 0x10000000
 REJECTED = 1
 
 
-def prearm(cockpit: Cockpit) -> bool:
-    cockpit.forget()
-    cockpit.fly(0.25)
-    return bool(cockpit.received("SYS_STATUS")[-1].onboard_control_sensors_health & PREARM_CHECK)
+def prearm(harness: SimHarness) -> bool:
+    harness.forget()
+    harness.fly(0.25)
+    return bool(harness.received("SYS_STATUS")[-1].onboard_control_sensors_health & PREARM_CHECK)
 
 
-def test_it_boots_in_hold_and_becomes_ready_after_a_moment(cockpit: Cockpit) -> None:
-    assert not prearm(cockpit)
-    first = cockpit.heartbeat()
+def test_it_boots_in_hold_and_becomes_ready_after_a_moment(harness: SimHarness) -> None:
+    assert not prearm(harness)
+    first = harness.heartbeat()
     assert (first.type, first.autopilot, first.mavlink_version) == (2, 12, 3)
     assert (first.custom_mode, first.base_mode, first.system_status) == (0x03040000, 29, 0)
-    cockpit.wait_ready()
-    assert prearm(cockpit)
-    assert cockpit.heartbeat().system_status == 3
+    harness.wait_ready()
+    assert prearm(harness)
+    assert harness.heartbeat().system_status == 3
 
 
-def test_arming_too_early_is_temporarily_rejected(cockpit: Cockpit) -> None:
-    cockpit.fly(1.0)
-    assert cockpit.command(400, 1) == [REJECTED]
-    assert not cockpit.armed
+def test_arming_too_early_is_temporarily_rejected(harness: SimHarness) -> None:
+    harness.fly(1.0)
+    assert harness.command(400, 1) == [REJECTED]
+    assert not harness.armed
 
 
-def test_arming_when_ready_is_accepted_and_shown(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert cockpit.command(400, 1) == [0]
-    beat = cockpit.heartbeat()
+def test_arming_when_ready_is_accepted_and_shown(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert harness.command(400, 1) == [0]
+    beat = harness.heartbeat()
     assert (beat.base_mode, beat.system_status) == (157, 4)
-    assert cockpit.command(400, 1) == [0]  # once more is no error
+    assert harness.command(400, 1) == [0]  # once more is no error
 
 
-def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    cockpit.command(400, 1)
-    assert cockpit.command(400, 0) == [0]
-    assert not cockpit.armed
-    assert cockpit.command(400, 0) == [0]
+def test_disarming_on_the_ground_is_accepted_and_so_is_disarming_twice(harness: SimHarness) -> None:
+    harness.wait_ready()
+    harness.command(400, 1)
+    assert harness.command(400, 0) == [0]
+    assert not harness.armed
+    assert harness.command(400, 0) == [0]
 
 
-def test_disarming_in_the_air_is_refused_without_the_magic_number(cockpit: Cockpit) -> None:
-    cockpit.take_off()
-    assert cockpit.command(400, 0) == [REJECTED]
-    assert cockpit.armed
-    assert cockpit.command(400, 0, 21196) == [0]
-    assert not cockpit.armed
-    cockpit.until(lambda: "landed" in cockpit.events, 5.0)
-    assert cockpit.height_m == 0.0
+def test_disarming_in_the_air_is_refused_without_the_magic_number(harness: SimHarness) -> None:
+    harness.take_off()
+    assert harness.command(400, 0) == [REJECTED]
+    assert harness.armed
+    assert harness.command(400, 0, 21196) == [0]
+    assert not harness.armed
+    harness.until(lambda: "landed" in harness.events, 5.0)
+    assert harness.height_m == 0.0
 
 
-def test_a_strange_arming_value_is_told_in_words_and_not_answered(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), 6))
-    cockpit.wait_ready()
+def test_a_strange_arming_value_is_told_in_words_and_not_answered(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), 6))
+    harness.wait_ready()
     for value, told in ((2.0, "2.000"), (-1.4, "-1.400"), (1.5, "1.500")):
-        assert cockpit.command(400, value) == []
-        assert cockpit.texts()[-1] == f"Unsupported ARM_DISARM param: {told}\t"
-    assert not cockpit.armed
+        assert harness.command(400, value) == []
+        assert harness.texts()[-1] == f"Unsupported ARM_DISARM param: {told}\t"
+    assert not harness.armed
 
 
 @pytest.mark.parametrize(("arms", "disarms"), [(0.5, 0.4), (257.0, 256.0), (1.4, math.nan), (1.0, math.inf)])
 def test_the_arming_value_is_rounded_and_kept_in_a_byte(
-    cockpit: Cockpit, arms: float, disarms: float
+    harness: SimHarness, arms: float, disarms: float
 ) -> None:
-    cockpit.wait_ready()
-    assert cockpit.command(400, arms) == [0]
-    assert cockpit.armed
-    assert cockpit.command(400, disarms) == [0]
-    assert not cockpit.armed
+    harness.wait_ready()
+    assert harness.command(400, arms) == [0]
+    assert harness.armed
+    assert harness.command(400, disarms) == [0]
+    assert not harness.armed
 
 
-def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    cockpit.command(400, 1)
-    assert 10.8 < cockpit.until(lambda: not cockpit.armed, 15.0) < 11.6
+def test_without_a_take_off_it_disarms_itself_after_eleven_seconds(harness: SimHarness) -> None:
+    harness.wait_ready()
+    harness.command(400, 1)
+    assert 10.8 < harness.until(lambda: not harness.armed, 15.0) < 11.6
 
 
-def test_the_time_to_the_preflight_disarm_is_a_parameter(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters={"COM_DISARM_PRFLT": 2.0})
-    cockpit.wait_ready()
-    cockpit.command(400, 1)
-    assert 2.9 < cockpit.until(lambda: not cockpit.armed, 15.0) < 3.5
+def test_the_time_to_the_preflight_disarm_is_a_parameter(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters={"COM_DISARM_PRFLT": 2.0})
+    harness.wait_ready()
+    harness.command(400, 1)
+    assert 2.9 < harness.until(lambda: not harness.armed, 15.0) < 3.5
 
 
 @pytest.mark.parametrize(
@@ -104,27 +104,27 @@ def test_the_time_to_the_preflight_disarm_is_a_parameter(make_cockpit: type[Cock
         (6, 0, False),  # OFFBOARD, without setpoints
     ],
 )
-def test_readiness_depends_on_the_mode(cockpit: Cockpit, main: int, sub: int, ready: bool) -> None:
-    cockpit.wait_ready()
-    assert cockpit.set_mode(main, sub) == [0, 0]
-    assert prearm(cockpit) is ready
-    assert cockpit.heartbeat().system_status == (3 if ready else 0)
-    assert cockpit.command(400, 1) == [0 if ready else REJECTED]
+def test_readiness_depends_on_the_mode(harness: SimHarness, main: int, sub: int, ready: bool) -> None:
+    harness.wait_ready()
+    assert harness.set_mode(main, sub) == [0, 0]
+    assert prearm(harness) is ready
+    assert harness.heartbeat().system_status == (3 if ready else 0)
+    assert harness.command(400, 1) == [0 if ready else REJECTED]
 
 
-def test_a_remote_control_makes_position_mode_ready(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert cockpit.vehicle.autopilot.pilot_takes_over() == 0
-    assert cockpit.mode == "POSCTL"
-    assert cockpit.command(400, 1) == [0]
+def test_a_remote_control_makes_position_mode_ready(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert harness.vehicle.autopilot.pilot_takes_over() == 0
+    assert harness.mode == "POSCTL"
+    assert harness.command(400, 1) == [0]
 
 
-def test_an_offboard_stream_makes_offboard_ready(cockpit: Cockpit, velocity_setpoint: Any) -> None:
-    cockpit.wait_ready()
-    cockpit.offboard(velocity_setpoint(0, 0, 0))
-    assert prearm(cockpit)
-    cockpit.fly(1.1)  # the stream has stopped
-    assert cockpit.heartbeat().base_mode == 17  # the newest setpoint counts here, however old
-    assert not prearm(cockpit)
-    assert cockpit.heartbeat().system_status == 0
-    assert cockpit.command(400, 1) == [REJECTED]
+def test_an_offboard_stream_makes_offboard_ready(harness: SimHarness, velocity_setpoint: Any) -> None:
+    harness.wait_ready()
+    harness.offboard(velocity_setpoint(0, 0, 0))
+    assert prearm(harness)
+    harness.fly(1.1)  # the stream has stopped
+    assert harness.heartbeat().base_mode == 17  # the newest setpoint counts here, however old
+    assert not prearm(harness)
+    assert harness.heartbeat().system_status == 0
+    assert harness.command(400, 1) == [REJECTED]

@@ -14,7 +14,7 @@ from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_TH
 from mavlink_sim.physics.quaternions import inverse, product, third_axis, unit
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from vision.attitude import euler_from_quaternion, quaternion_from_euler
 from vision.rotation import matrix_from_quaternion
 
@@ -64,45 +64,45 @@ def test_a_thrust_vector_counts_by_its_vertical_part() -> None:
 
 @pytest.mark.parametrize(("mask", "counts"), [(7, True), (128, True), (0, True), (129, False), (135, False)])
 def test_what_controls_something_keeps_the_offboard_signal_alive(
-    cockpit: Cockpit, mask: int, counts: bool
+    harness: SimHarness, mask: int, counts: bool
 ) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), 6))
-    cockpit.fly(0.1)
-    cockpit.send(attitude(mask=mask))
-    cockpit.fly(0.05)
-    assert cockpit.vehicle.autopilot.has_setpoints is counts
-    assert cockpit.texts() == []  # what counts for nothing is dropped without a word
+    harness.heartbeats.append(("gcs", (245, 190), 6))
+    harness.fly(0.1)
+    harness.send(attitude(mask=mask))
+    harness.fly(0.05)
+    assert harness.vehicle.autopilot.has_setpoints is counts
+    assert harness.texts() == []  # what counts for nothing is dropped without a word
 
 
 @pytest.mark.parametrize(("system", "component", "counts"), [(1, 0, True), (0, 0, True), (2, 1, False)])
 def test_it_counts_if_it_is_addressed_to_the_autopilot(
-    cockpit: Cockpit, system: int, component: int, counts: bool
+    harness: SimHarness, system: int, component: int, counts: bool
 ) -> None:
-    cockpit.fly(0.1)
+    harness.fly(0.1)
     message = attitude()
     message.target_system, message.target_component = system, component
-    cockpit.send(message)
-    assert cockpit.vehicle.autopilot.has_setpoints is counts
+    harness.send(message)
+    assert harness.vehicle.autopilot.has_setpoints is counts
 
 
 # ---- flying by attitude
 
 
-def test_level_at_hover_thrust_it_stays_where_it_is(cockpit: Cockpit) -> None:
-    cockpit.take_off(10.0)
-    cockpit.offboard(attitude())
-    before = cockpit.vehicle.airframe.position
-    cockpit.fly(5.0, attitude())
-    assert math.dist(cockpit.vehicle.airframe.position, before) < 0.3
-    assert cockpit.mode == "OFFBOARD"
+def test_level_at_hover_thrust_it_stays_where_it_is(harness: SimHarness) -> None:
+    harness.take_off(10.0)
+    harness.offboard(attitude())
+    before = harness.vehicle.airframe.position
+    harness.fly(5.0, attitude())
+    assert math.dist(harness.vehicle.airframe.position, before) < 0.3
+    assert harness.mode == "OFFBOARD"
 
 
-def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpit: Cockpit) -> None:
-    cockpit.take_off(20.0)
+def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(harness: SimHarness) -> None:
+    harness.take_off(20.0)
     tilted = attitude(roll=20.0, pitch=-10.0, yaw=60.0)
-    cockpit.offboard(tilted)
-    cockpit.fly(4.0, tilted)
-    airframe = cockpit.vehicle.airframe
+    harness.offboard(tilted)
+    harness.fly(4.0, tilted)
+    airframe = harness.vehicle.airframe
     seen = [math.degrees(angle) for angle in (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)]
     assert seen == pytest.approx([20.0, -10.0, 60.0], abs=1.0)
     down = third_axis(quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad))
@@ -113,172 +113,176 @@ def test_the_attitude_is_taken_and_the_thrust_is_not_adjusted_to_the_tilt(cockpi
     assert airframe.velocity[2] > 0.2  # hover thrust, tilted, does not carry the weight
 
 
-def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(cockpit: Cockpit) -> None:
-    cockpit.take_off(10.0)
-    cockpit.offboard(attitude(yaw=170.0))
-    cockpit.fly(5.0, attitude(yaw=170.0))
+def test_a_turn_takes_the_short_way_and_keeps_the_vehicle_level(harness: SimHarness) -> None:
+    harness.take_off(10.0)
+    harness.offboard(attitude(yaw=170.0))
+    harness.fly(5.0, attitude(yaw=170.0))
     turns = []
     for _ in range(100):
-        cockpit.fly(0.02, attitude(yaw=-170.0))
-        turns.append(cockpit.vehicle.airframe.rates[2])
-        assert abs(cockpit.vehicle.airframe.roll_rad) < 0.02
+        harness.fly(0.02, attitude(yaw=-170.0))
+        turns.append(harness.vehicle.airframe.rates[2])
+        assert abs(harness.vehicle.airframe.roll_rad) < 0.02
     assert min(turns) > -0.02
-    assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(-170.0, abs=3.0)
+    assert math.degrees(harness.vehicle.airframe.yaw_rad) == pytest.approx(-170.0, abs=3.0)
 
 
-def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(cockpit: Cockpit) -> None:
-    cockpit.take_off(30.0)
-    cockpit.offboard(attitude())
-    cockpit.fly(1.0, attitude())
-    cockpit.fly(1.0, attitude(thrust=HOVER + 0.05))
+def test_more_thrust_climbs_less_sinks_and_an_ignored_throttle_is_none(harness: SimHarness) -> None:
+    harness.take_off(30.0)
+    harness.offboard(attitude())
+    harness.fly(1.0, attitude())
+    harness.fly(1.0, attitude(thrust=HOVER + 0.05))
     gained = 0.05 * MAX_THRUST_MPS2 / LINEAR_DRAG_PER_S * (1 - math.exp(-LINEAR_DRAG_PER_S * 1.0))
-    assert cockpit.vehicle.airframe.velocity[2] == pytest.approx(-gained, abs=0.08)
-    cockpit.fly(0.6, attitude(mask=RATES_IGNORED | 64))
-    assert cockpit.vehicle.airframe.thrust_mps2 < 0.01
+    assert harness.vehicle.airframe.velocity[2] == pytest.approx(-gained, abs=0.08)
+    harness.fly(0.6, attitude(mask=RATES_IGNORED | 64))
+    assert harness.vehicle.airframe.thrust_mps2 < 0.01
 
 
-def test_a_tumbling_vehicle_comes_upright(cockpit: Cockpit) -> None:
-    cockpit.take_off(60.0)
+def test_a_tumbling_vehicle_comes_upright(harness: SimHarness) -> None:
+    harness.take_off(60.0)
     flip = rates(8.0, 0.0, 0.0)
-    cockpit.offboard(flip)
-    cockpit.until(lambda: abs(cockpit.vehicle.airframe.roll_rad) > 3.0, 2.0, flip)
-    cockpit.fly(2.0, attitude(thrust=0.6))
-    assert abs(cockpit.vehicle.airframe.roll_rad) < 0.02
-    assert abs(cockpit.vehicle.airframe.pitch_rad) < 0.02
+    harness.offboard(flip)
+    harness.until(lambda: abs(harness.vehicle.airframe.roll_rad) > 3.0, 2.0, flip)
+    harness.fly(2.0, attitude(thrust=0.6))
+    assert abs(harness.vehicle.airframe.roll_rad) < 0.02
+    assert abs(harness.vehicle.airframe.pitch_rad) < 0.02
 
 
-def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(cockpit: Cockpit) -> None:
-    cockpit.take_off(10.0)
-    cockpit.offboard(rates(0.0, 0.0, 0.5))
-    cockpit.fly(3.0, rates(0.0, 0.0, 0.5))
+def test_a_quaternion_that_is_no_rotation_leaves_the_vehicle_turning_as_it_turned(
+    harness: SimHarness,
+) -> None:
+    harness.take_off(10.0)
+    harness.offboard(rates(0.0, 0.0, 0.5))
+    harness.fly(3.0, rates(0.0, 0.0, 0.5))
     for values in ([0.0] * 4, [math.nan] * 4):
         nothing = attitude()
         nothing.q = values
-        cockpit.fly(1.0, nothing)
-        assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.5, abs=0.05)
-    assert cockpit.mode == "OFFBOARD"
+        harness.fly(1.0, nothing)
+        assert harness.vehicle.airframe.rates[2] == pytest.approx(0.5, abs=0.05)
+    assert harness.mode == "OFFBOARD"
 
 
 # ---- flying by rates
 
 
-def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(cockpit: Cockpit) -> None:
-    cockpit.take_off(10.0)
+def test_body_rates_are_followed_and_an_ignored_yaw_rate_stays_what_it_is(harness: SimHarness) -> None:
+    harness.take_off(10.0)
     spin = rates(0.0, 0.0, 0.8)
-    cockpit.offboard(spin)
-    cockpit.fly(3.0, spin)
-    assert cockpit.vehicle.airframe.rates == pytest.approx((0.0, 0.0, 0.8), abs=0.02)
-    cockpit.fly(1.0, rates(0.0, 0.0, 0.0, mask=128 | 4))
-    assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.8, abs=0.1)
-    cockpit.fly(2.0, rates(0.0, 0.0, 0.0))
-    assert cockpit.vehicle.airframe.rates[2] == pytest.approx(0.0, abs=0.02)
+    harness.offboard(spin)
+    harness.fly(3.0, spin)
+    assert harness.vehicle.airframe.rates == pytest.approx((0.0, 0.0, 0.8), abs=0.02)
+    harness.fly(1.0, rates(0.0, 0.0, 0.0, mask=128 | 4))
+    assert harness.vehicle.airframe.rates[2] == pytest.approx(0.8, abs=0.1)
+    harness.fly(2.0, rates(0.0, 0.0, 0.0))
+    assert harness.vehicle.airframe.rates[2] == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_whole_flip_is_possible_by_rates(cockpit: Cockpit) -> None:
-    cockpit.take_off(60.0)
-    cockpit.offboard(attitude())
+def test_a_whole_flip_is_possible_by_rates(harness: SimHarness) -> None:
+    harness.take_off(60.0)
+    harness.offboard(attitude())
     flip = rates(0.0, 6.0, 0.0, thrust=0.3)
-    cockpit.until(lambda: cockpit.vehicle.airframe.roll_rad > 3.0, 2.0, flip)  # past the vertical
-    cockpit.until(lambda: abs(cockpit.vehicle.airframe.roll_rad) < 0.1, 2.0, flip)
-    cockpit.fly(2.0, attitude(thrust=0.7))
-    assert abs(cockpit.vehicle.airframe.pitch_rad) < 0.02
-    assert cockpit.armed
+    harness.until(lambda: harness.vehicle.airframe.roll_rad > 3.0, 2.0, flip)  # past the vertical
+    harness.until(lambda: abs(harness.vehicle.airframe.roll_rad) < 0.1, 2.0, flip)
+    harness.fly(2.0, attitude(thrust=0.7))
+    assert abs(harness.vehicle.airframe.pitch_rad) < 0.02
+    assert harness.armed
 
 
 @pytest.mark.parametrize("first", [attitude(roll=5.0), rates(0.1, 0.0, 0.0)], ids=["attitude", "rates"])
 def test_a_position_may_follow_an_attitude_and_is_flown(
-    cockpit: Cockpit, position_setpoint: Any, first: Any
+    harness: SimHarness, position_setpoint: Any, first: Any
 ) -> None:
-    cockpit.take_off(8.0)
-    cockpit.offboard(first)
-    cockpit.fly(1.0, first)
+    harness.take_off(8.0)
+    harness.offboard(first)
+    harness.fly(1.0, first)
     there = position_setpoint(0, 0, -8)
-    cockpit.fly(15.0, there)
-    assert math.dist(cockpit.vehicle.airframe.position, (0, 0, -8)) < 0.3
+    harness.fly(15.0, there)
+    assert math.dist(harness.vehicle.airframe.position, (0, 0, -8)) < 0.3
 
 
 # ---- taking off, landing, losing it
 
 
-def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_ground(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
+def test_it_takes_off_by_thrust_alone_and_is_disarmed_after_sinking_to_the_ground(
+    harness: SimHarness,
+) -> None:
+    harness.wait_ready()
     climb = attitude(thrust=HOVER + 0.03)
-    cockpit.offboard(climb)
-    assert cockpit.command(400, 1) == [0]
-    cockpit.until(lambda: cockpit.height_m > 2.0, 15.0, climb)
-    assert "takeoff" in cockpit.events
+    harness.offboard(climb)
+    assert harness.command(400, 1) == [0]
+    harness.until(lambda: harness.height_m > 2.0, 15.0, climb)
+    assert "takeoff" in harness.events
     sink = attitude(thrust=HOVER - 0.04)
-    cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 15.0, sink)
-    cockpit.until(lambda: not cockpit.armed, 6.0, attitude(thrust=0.0))
-    assert "landed" in cockpit.events
+    harness.until(lambda: harness.vehicle.airframe.on_ground, 15.0, sink)
+    harness.until(lambda: not harness.armed, 6.0, attitude(thrust=0.0))
+    assert "landed" in harness.events
 
 
-def test_without_the_stream_the_failsafe_flies_home_by_position(cockpit: Cockpit) -> None:
-    cockpit.take_off(8.0)
+def test_without_the_stream_the_failsafe_flies_home_by_position(harness: SimHarness) -> None:
+    harness.take_off(8.0)
     stream = attitude(roll=3.0)
-    cockpit.offboard(stream)
-    cockpit.fly(1.0, stream)
-    cockpit.send(stream)
-    assert 1.0 <= cockpit.until(lambda: cockpit.mode == "RTL", 3.0) <= 1.15
-    cockpit.until(lambda: not cockpit.armed, 60.0)
+    harness.offboard(stream)
+    harness.fly(1.0, stream)
+    harness.send(stream)
+    assert 1.0 <= harness.until(lambda: harness.mode == "RTL", 3.0) <= 1.15
+    harness.until(lambda: not harness.armed, 60.0)
 
 
 # ---- what is echoed
 
 
-@pytest.mark.hears("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
+@pytest.mark.streams("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
 def test_the_attitude_target_tells_the_setpoint_and_there_is_no_position_target(
-    cockpit: Cockpit, position_setpoint: Any
+    harness: SimHarness, position_setpoint: Any
 ) -> None:
-    cockpit.take_off(10.0)
+    harness.take_off(10.0)
     wanted = attitude(roll=6.0, yaw=30.0, thrust=0.52)
-    cockpit.offboard(wanted)
-    cockpit.fly(1.0, wanted)
-    cockpit.forget()
-    cockpit.fly(1.0, wanted)
-    assert cockpit.received("POSITION_TARGET_LOCAL_NED") == []
-    assert cockpit.received("POSITION_TARGET_GLOBAL_INT") == []
-    echo = cockpit.received("ATTITUDE_TARGET")[-1]
+    harness.offboard(wanted)
+    harness.fly(1.0, wanted)
+    harness.forget()
+    harness.fly(1.0, wanted)
+    assert harness.received("POSITION_TARGET_LOCAL_NED") == []
+    assert harness.received("POSITION_TARGET_GLOBAL_INT") == []
+    echo = harness.received("ATTITUDE_TARGET")[-1]
     assert (echo.type_mask, echo.thrust) == (0, pytest.approx(0.52))
     assert echo.q == pytest.approx(wanted.q, abs=1e-6)
 
     turning = rates(0.0, 0.0, 0.4, thrust=0.5)
-    cockpit.forget()
-    cockpit.fly(0.5, turning)
-    echo = cockpit.received("ATTITUDE_TARGET")[-1]
+    harness.forget()
+    harness.fly(0.5, turning)
+    echo = harness.received("ATTITUDE_TARGET")[-1]
     assert (echo.body_roll_rate, echo.body_yaw_rate) == pytest.approx((0.0, 0.4))
     assert echo.q == pytest.approx(wanted.q, abs=1e-6)  # as PX4: the last attitude setpoint stays in it
     assert echo.thrust == pytest.approx(0.52)
 
-    cockpit.forget()
-    cockpit.fly(0.5, position_setpoint(0, 0, -10))
-    assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 0
+    harness.forget()
+    harness.fly(0.5, position_setpoint(0, 0, -10))
+    assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 0
 
 
-@pytest.mark.hears("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
+@pytest.mark.streams("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT")
 def test_flown_by_position_the_attitude_target_tells_the_rates_that_correct_the_attitude(
-    cockpit: Cockpit, position_setpoint: Any
+    harness: SimHarness, position_setpoint: Any
 ) -> None:
-    cockpit.take_off(5.0)
+    harness.take_off(5.0)
     facing_north = position_setpoint(0, 0, -5, 0.0)
-    cockpit.offboard(facing_north)
-    cockpit.fly(1.0, facing_north)
-    cockpit.forget()
-    cockpit.fly(0.11, position_setpoint(0, 0, -5, 1.4))
-    echo = cockpit.received("ATTITUDE_TARGET")[0]
+    harness.offboard(facing_north)
+    harness.fly(1.0, facing_north)
+    harness.forget()
+    harness.fly(0.11, position_setpoint(0, 0, -5, 1.4))
+    echo = harness.received("ATTITUDE_TARGET")[0]
     assert echo.q[3] == pytest.approx(math.sin(0.7), abs=0.01)
     assert echo.body_yaw_rate > 1.0  # a PX4 told 2.5 rad/s at the beginning of such a turn
 
 
 @pytest.mark.parametrize(("setpoint", "base"), [(attitude(), 145), (rates(0, 0, 0), 129)])
 def test_the_heartbeat_is_stabilized_unless_rates_alone_are_flown(
-    cockpit: Cockpit, setpoint: Any, base: int
+    harness: SimHarness, setpoint: Any, base: int
 ) -> None:
-    cockpit.take_off(10.0)
-    cockpit.offboard(setpoint)
-    cockpit.forget()
-    cockpit.until(lambda: bool(cockpit.received("HEARTBEAT")), 1.5, setpoint)
-    beat = cockpit.received("HEARTBEAT")[-1]
+    harness.take_off(10.0)
+    harness.offboard(setpoint)
+    harness.forget()
+    harness.until(lambda: bool(harness.received("HEARTBEAT")), 1.5, setpoint)
+    beat = harness.received("HEARTBEAT")[-1]
     assert (beat.custom_mode, beat.base_mode, beat.system_status) == (0x00060000, base, 4)
 
 
@@ -339,17 +343,17 @@ def test_what_is_no_rotation_has_no_unit_quaternion(values: tuple[float, float, 
     )
 )
 def test_no_attitude_target_can_stop_the_vehicle(
-    make_cockpit: type[Cockpit], requests: list[tuple[int, list[float]]]
+    make_harness: type[SimHarness], requests: list[tuple[int, list[float]]]
 ) -> None:
-    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
-    cockpit.offboard(attitude())
-    cockpit.command(400, 1)
+    harness = make_harness(["everything"], ready_after_s=0.0)
+    harness.offboard(attitude())
+    harness.command(400, 1)
     for mask, values in requests:
         message = dialect.MAVLink_set_attitude_target_message(0, 1, 1, mask, values[:4], *values[4:])
-        cockpit.fly(0.3, message)
-    airframe = cockpit.vehicle.airframe
+        harness.fly(0.3, message)
+    airframe = harness.vehicle.airframe
     attitude_rad = (airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
     assert all(map(math.isfinite, (*airframe.position, *airframe.velocity, *attitude_rad)))
     codec = dialect.MAVLink(None, 1, 1)
-    for _, item in cockpit.inbox["onboard"]:
+    for _, item in harness.inbox["onboard"]:
         assert item.pack(codec)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
 from mavlink_sim.physics.battery import Battery, BatteryWarning
 from mavlink_sim.px4.parameters import Parameters
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 GROUND_STATION = (245, 190)
 CHECKED = {"CBRK_SUPPLY_CHK": 0, "SIM_BAT_MIN_PCT": 0}
@@ -94,68 +94,68 @@ def test_a_battery_that_is_not_checked_warns_nobody() -> None:
     assert battery.checked_warning is BatteryWarning.NONE
 
 
-def flying(make_cockpit: type[Cockpit], **values: float) -> Cockpit:
-    cockpit = make_cockpit(parameters={**CHECKED, "COM_FAIL_ACT_T": 1, **values})
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.take_off(11.0)
-    return cockpit
+def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
+    harness = make_harness(parameters={**CHECKED, "COM_FAIL_ACT_T": 1, **values})
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.take_off(11.0)
+    return harness
 
 
-def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_cockpit: type[Cockpit]) -> None:
-    cockpit = flying(make_cockpit, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
-    cockpit.vehicle.autopilot.supervision.battery.charge = 0.12
-    cockpit.until(lambda: any(line.startswith("battery low") for line in cockpit.events), 8.0)
-    cockpit.fly(0.1)
-    assert "Low battery\t" in cockpit.texts()
-    assert cockpit.mode == "HOLD"
-    cockpit.vehicle.autopilot.supervision.battery.charge = 0.06
-    cockpit.until(lambda: "failsafe: battery critical, HOLD" in cockpit.events, 10.0)
-    cockpit.until(lambda: "failsafe: battery critical, RTL" in cockpit.events, 2.0)
-    cockpit.vehicle.autopilot.supervision.battery.charge = 0.04
-    cockpit.until(lambda: cockpit.mode == "LAND", 8.0)
-    assert cockpit.heartbeat().system_status == 5
-    cockpit.fly(2.1)
-    assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4
+def test_a_flight_on_an_emptying_battery_is_warned_returns_and_lands(make_harness: type[SimHarness]) -> None:
+    harness = flying(make_harness, RTL_RETURN_ALT=12, SIM_BAT_DRAIN=3000)
+    harness.vehicle.autopilot.supervision.battery.charge = 0.12
+    harness.until(lambda: any(line.startswith("battery low") for line in harness.events), 8.0)
+    harness.fly(0.1)
+    assert "Low battery\t" in harness.texts()
+    assert harness.mode == "HOLD"
+    harness.vehicle.autopilot.supervision.battery.charge = 0.06
+    harness.until(lambda: "failsafe: battery critical, HOLD" in harness.events, 10.0)
+    harness.until(lambda: "failsafe: battery critical, RTL" in harness.events, 2.0)
+    harness.vehicle.autopilot.supervision.battery.charge = 0.04
+    harness.until(lambda: harness.mode == "LAND", 8.0)
+    assert harness.heartbeat().system_status == 5
+    harness.fly(2.1)
+    assert harness.received("BATTERY_STATUS")[-1].charge_state == 4
 
 
-def test_by_default_a_battery_does_not_end_a_flight(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters={"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 10})
-    cockpit.take_off()
-    cockpit.fly(4.0)
-    assert cockpit.mode == "HOLD"
-    assert cockpit.received("BATTERY_STATUS")[-1].charge_state == 4
+def test_by_default_a_battery_does_not_end_a_flight(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters={"SIM_BAT_MIN_PCT": 0, "SIM_BAT_DRAIN": 10})
+    harness.take_off()
+    harness.fly(4.0)
+    assert harness.mode == "HOLD"
+    assert harness.received("BATTERY_STATUS")[-1].charge_state == 4
 
 
-def test_arming_is_refused_on_an_empty_battery(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters=CHECKED)
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.wait_ready()
-    cockpit.vehicle.autopilot.supervision.battery.forced_charge = 0.0
-    cockpit.fly(6.0)
-    assert not cockpit.vehicle.autopilot.can_arm
-    assert cockpit.command(400, 1) == [1]
-    assert "Emergency battery level\t" in cockpit.texts()
-    cockpit.vehicle.autopilot.supervision.battery.forced_charge = None
-    cockpit.fly(6.0)
-    assert cockpit.command(400, 1) == [0]
+def test_arming_is_refused_on_an_empty_battery(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters=CHECKED)
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.wait_ready()
+    harness.vehicle.autopilot.supervision.battery.forced_charge = 0.0
+    harness.fly(6.0)
+    assert not harness.vehicle.autopilot.can_arm
+    assert harness.command(400, 1) == [1]
+    assert "Emergency battery level\t" in harness.texts()
+    harness.vehicle.autopilot.supervision.battery.forced_charge = None
+    harness.fly(6.0)
+    assert harness.command(400, 1) == [0]
 
 
-def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters={**CHECKED, "COM_ARM_BAT_MIN": 0.9, "BAT1_V_CHARGED": 4.2})
-    cockpit.wait_ready()
-    battery = cockpit.vehicle.autopilot.supervision.battery
+def test_com_arm_bat_min_sets_the_charge_that_arming_needs(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters={**CHECKED, "COM_ARM_BAT_MIN": 0.9, "BAT1_V_CHARGED": 4.2})
+    harness.wait_ready()
+    battery = harness.vehicle.autopilot.supervision.battery
     battery.forced_charge = 0.0
-    cockpit.until(lambda: battery.remaining < 0.9, 2.0)
+    harness.until(lambda: battery.remaining < 0.9, 2.0)
     assert battery.warning is BatteryWarning.NONE
-    assert cockpit.command(400, 1) == [1]
+    assert harness.command(400, 1) == [1]
     battery.forced_charge = None
-    cockpit.until(lambda: battery.remaining > 0.91, 5.0)
-    assert cockpit.command(400, 1) == [0]
+    harness.until(lambda: battery.remaining > 0.91, 5.0)
+    assert harness.command(400, 1) == [0]
 
 
-def test_a_vehicle_without_a_battery_says_so(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters={"SIM_BAT_ENABLE": 0})
-    cockpit.fly(2.2)
-    assert cockpit.received("BATTERY_STATUS") == []
-    status = cockpit.received("SYS_STATUS")[-1]
+def test_a_vehicle_without_a_battery_says_so(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters={"SIM_BAT_ENABLE": 0})
+    harness.fly(2.2)
+    assert harness.received("BATTERY_STATUS") == []
+    status = harness.received("SYS_STATUS")[-1]
     assert (status.voltage_battery, status.current_battery, status.battery_remaining) == (65535, -1, -1)

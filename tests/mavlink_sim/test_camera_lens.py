@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
 from mavlink_sim.camera.renderer import Renderer
-from mavlink_sim.world.plates import Print
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_euler

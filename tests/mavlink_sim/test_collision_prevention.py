@@ -20,7 +20,7 @@ from mavlink_sim.flight.collision_prevention import (
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import listen
 
 FAR_CM = 2100  # nothing within the 20 m of the sensor
@@ -186,40 +186,40 @@ def test_whatever_is_around_the_answer_is_finite(
 
 
 def test_the_vehicle_limits_its_pilot_and_holds_when_the_sensor_falls_silent(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
-    cockpit.take_off()
-    cockpit.vehicle.autopilot.pilot_takes_over()
-    allowed = cockpit.vehicle.autopilot.navigator.allowed_acceleration
+    harness = make_harness(ready_after_s=0.0, parameters={"CP_DIST": 3.0, "CP_GUIDE_ANG": 0.0})
+    harness.take_off()
+    harness.vehicle.autopilot.pilot_takes_over()
+    allowed = harness.vehicle.autopilot.navigator.allowed_acceleration
     assert allowed((3.0, 0.0), STILL) == STILL
     free = dialect.MAVLink_obstacle_distance_message(0, 0, [FAR_CM] * SECTORS, 5, 20, 2000, 0.0, 0.0, 12)
-    cockpit.send(free)
+    harness.send(free)
     assert allowed((3.0, 0.0), STILL)[0] > 2.9
-    cockpit.fly(4.0)
+    harness.fly(4.0)
     assert allowed((3.0, 0.0), STILL) == STILL
-    assert cockpit.mode == "POSCTL"
-    cockpit.fly(1.5)
+    assert harness.mode == "POSCTL"
+    harness.fly(1.5)
     allowed((3.0, 0.0), STILL)
-    assert cockpit.mode == "HOLD"
+    assert harness.mode == "HOLD"
 
 
 def test_the_message_fills_the_vehicles_map_and_offboard_does_not_care(
-    make_cockpit: type[Cockpit], velocity_setpoint: Any
+    make_harness: type[SimHarness], velocity_setpoint: Any
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
-    listen(cockpit)
+    harness = make_harness(ready_after_s=0.0, parameters={"CP_DIST": 3.0})
+    listen(harness)
     near = [150] * SECTORS
-    cockpit.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 12))
-    assert cockpit.vehicle.autopilot.navigator.obstacles.distances_cm == near
-    cockpit.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 7))
-    cockpit.fly(0.1)
-    assert cockpit.texts()[-1] == "Obstacle message received in unsupported frame 7\t"
-    cockpit.take_off()
+    harness.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 12))
+    assert harness.vehicle.autopilot.navigator.obstacles.distances_cm == near
+    harness.send(dialect.MAVLink_obstacle_distance_message(0, 0, near, 5, 20, 2000, 0.0, 0.0, 7))
+    harness.fly(0.1)
+    assert harness.texts()[-1] == "Obstacle message received in unsupported frame 7\t"
+    harness.take_off()
     north = velocity_setpoint(2, 0, 0)
-    cockpit.offboard(north)
-    cockpit.fly(2.0, north)
-    assert cockpit.vehicle.airframe.velocity[0] > 1.5
+    harness.offboard(north)
+    harness.fly(2.0, north)
+    assert harness.vehicle.airframe.velocity[0] > 1.5
 
 
 class Wall:
@@ -228,12 +228,12 @@ class Wall:
     `at_m`: north of where the vehicle was when the wall was put up.
     """
 
-    def __init__(self, make_cockpit: type[Cockpit], at_m: float, **values: float) -> None:
-        self.cockpit = make_cockpit(parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, **values})
-        self.vehicle = self.cockpit.vehicle
+    def __init__(self, make_harness: type[SimHarness], at_m: float, **values: float) -> None:
+        self.harness = make_harness(parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, **values})
+        self.vehicle = self.harness.vehicle
         self.vehicle.transmitter.on = True
-        self.cockpit.take_off(5.0)
-        self.cockpit.fly(1.0)
+        self.harness.take_off(5.0)
+        self.harness.fly(1.0)
         self.start_m = self.north_m
         self.at_m = at_m
 
@@ -254,19 +254,19 @@ class Wall:
                 away = self.distance_m / math.cos(math.radians(5.0 * sector))
                 distances[sector % SECTORS] = min(max(round(away * 100), 21), FAR_CM)
             if seen:
-                self.cockpit.send(
+                self.harness.send(
                     dialect.MAVLink_obstacle_distance_message(
                         0, 0, distances, 5, 20, 2000, frame=FRAME_LOCAL_NED
                     )
                 )
-            self.cockpit.fly(0.1, setpoint)
+            self.harness.fly(0.1, setpoint)
 
 
-def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: type[Cockpit]) -> None:
-    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
-    assert wall.cockpit.set_mode(3, 0) == [0, 0]
+def test_full_stick_towards_a_wall_stops_before_it(make_harness: type[SimHarness]) -> None:
+    wall = Wall(make_harness, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+    assert wall.harness.set_mode(3, 0) == [0, 0]
     wall.fly(8.0, pitch=1.0)
-    assert wall.cockpit.mode == "POSCTL"
+    assert wall.harness.mode == "POSCTL"
     assert 0.7 < wall.distance_m < 2.5
     assert abs(wall.vehicle.airframe.velocity[0]) < 0.2
     wall.fly(2.0, pitch=-1.0)  # and away from it as fast as the pilot likes
@@ -274,29 +274,29 @@ def test_full_stick_towards_a_wall_stops_before_it(make_cockpit: type[Cockpit]) 
 
 
 def test_without_collision_prevention_the_same_stick_leads_through_the_wall(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
 ) -> None:
-    wall = Wall(make_cockpit, 3.0, CP_DIST=-1.0)
-    wall.cockpit.set_mode(3, 0)
+    wall = Wall(make_harness, 3.0, CP_DIST=-1.0)
+    wall.harness.set_mode(3, 0)
     wall.fly(4.0, pitch=1.0)
     assert wall.distance_m < 0.0
 
 
-def test_in_offboard_nothing_is_held_back(make_cockpit: type[Cockpit], velocity_setpoint: Any) -> None:
-    wall = Wall(make_cockpit, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+def test_in_offboard_nothing_is_held_back(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
+    wall = Wall(make_harness, 3.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
     north = velocity_setpoint(2, 0, 0)
-    wall.cockpit.offboard(north)
+    wall.harness.offboard(north)
     wall.fly(4.0, north)
-    assert wall.cockpit.mode == "OFFBOARD"
+    assert wall.harness.mode == "OFFBOARD"
     assert wall.distance_m < 0.0
 
 
-def test_a_sensor_that_falls_silent_ends_position_mode(make_cockpit: type[Cockpit]) -> None:
-    wall = Wall(make_cockpit, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
-    wall.cockpit.set_mode(3, 0)
+def test_a_sensor_that_falls_silent_ends_position_mode(make_harness: type[SimHarness]) -> None:
+    wall = Wall(make_harness, 10.0, CP_DIST=1.0, CP_GUIDE_ANG=0)
+    wall.harness.set_mode(3, 0)
     wall.fly(1.0)
     wall.fly(4.5, seen=False)
-    assert wall.cockpit.mode == "POSCTL"
+    assert wall.harness.mode == "POSCTL"
     assert wall.distance_m > 9.0
     wall.fly(1.5, seen=False)
-    assert wall.cockpit.mode == "HOLD"
+    assert wall.harness.mode == "HOLD"

@@ -27,8 +27,8 @@ from mavlink_sim.physics.contact import (
 from mavlink_sim.simulation import Simulation, SimulationOptions
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.obstacles import Obstacles
-from mavlink_sim.world.plates import Print
 from mavlink_sim.world.world import World, WorldObject
 
 WALL = WorldObject(2, "wall", (8.0, 0.0, 0.0), math.pi, size_m=(8.0, 0.3, 5.0))
@@ -104,7 +104,7 @@ def test_without_a_scene_there_is_nothing_of_this_and_the_flight_is_the_same_to_
     plain = flying(scene=None, seed=4, gusts_mps=None)
     among = flying(WorldObject(0, "wall", (500.0, 0.0, 0.0)), seed=4, gusts_mps=None)
     assert type(plain.vehicle.airframe) is Multirotor
-    assert plain.vehicle.surroundings is None
+    assert plain.vehicle.collision_world is None
     for vehicle in (plain, among):
         steer(vehicle, velocity(2.0, 1.0), 5.0)
         vehicle.land()
@@ -395,11 +395,11 @@ def test_the_demo_world_is_there_to_be_looked_at_alone(tmp_path: FilePath) -> No
     options = SimulationOptions(onboard_bind=0, gcs_bind=0, truth=tmp_path / "truth.jsonl")
     with Simulation(options, lambda text: None) as simulation:
         assert simulation.truth()["objects"]
-        assert simulation.vehicle.surroundings is None
+        assert simulation.vehicle.collision_world is None
 
 
 def test_a_scene_may_be_given_as_what_it_is() -> None:
     scene = Scene(World((WALL,)))
     for form in (scene, scene.world, "obstacle_course"):
         vehicle = LockstepVehicle(scene=form)
-        assert vehicle.vehicle.surroundings is not None
+        assert vehicle.vehicle.collision_world is not None

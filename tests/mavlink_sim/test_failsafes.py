@@ -15,7 +15,7 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import Text, event_identifier
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 GROUND_STATION = (245, 190)
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4}
@@ -267,83 +267,85 @@ def test_a_flickering_condition_uses_up_the_delay() -> None:
 # ---- on the vehicle
 
 
-def flying(make_cockpit: type[Cockpit], **values: float) -> Cockpit:
-    cockpit = make_cockpit(parameters={**REMOTE_CONTROL, **values})
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.vehicle.transmitter.on = True
-    cockpit.take_off(12.0)
-    cockpit.set_mode(3)
-    cockpit.fly(1.0)
-    assert cockpit.mode == "POSCTL"
-    return cockpit
+def flying(make_harness: type[SimHarness], **values: float) -> SimHarness:
+    harness = make_harness(parameters={**REMOTE_CONTROL, **values})
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.vehicle.transmitter.on = True
+    harness.take_off(12.0)
+    harness.set_mode(3)
+    harness.fly(1.0)
+    assert harness.mode == "POSCTL"
+    return harness
 
 
-def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_cockpit: type[Cockpit]) -> None:
-    cockpit = flying(make_cockpit)
-    cockpit.vehicle.transmitter.on = False
-    holding_s = cockpit.until(lambda: cockpit.mode == "HOLD", 2.0)
+def test_a_remote_control_switched_off_in_flight_ends_in_a_return(make_harness: type[SimHarness]) -> None:
+    harness = flying(make_harness)
+    harness.vehicle.transmitter.on = False
+    holding_s = harness.until(lambda: harness.mode == "HOLD", 2.0)
     assert holding_s == pytest.approx(0.5, abs=0.1)
-    returning_s = cockpit.until(lambda: cockpit.mode == "RTL", 6.0)
+    returning_s = harness.until(lambda: harness.mode == "RTL", 6.0)
     assert returning_s == pytest.approx(5.0, abs=0.1)
-    cockpit.fly(0.1)
-    assert "Failsafe activated: entering Hold for 5 seconds\t" in cockpit.texts()
-    assert "Failsafe activated\t" in cockpit.texts()
-    assert cockpit.heartbeat().system_status == 5
-    assert "failsafe: manual control lost, RTL" in cockpit.events
+    harness.fly(0.1)
+    assert "Failsafe activated: entering Hold for 5 seconds\t" in harness.texts()
+    assert "Failsafe activated\t" in harness.texts()
+    assert harness.heartbeat().system_status == 5
+    assert "failsafe: manual control lost, RTL" in harness.events
 
 
-def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(make_cockpit: type[Cockpit]) -> None:
-    cockpit = flying(make_cockpit)
-    transmitter = cockpit.vehicle.transmitter
+def test_a_pilot_whose_remote_control_is_back_takes_over_with_the_sticks(
+    make_harness: type[SimHarness],
+) -> None:
+    harness = flying(make_harness)
+    transmitter = harness.vehicle.transmitter
     transmitter.on = False
-    cockpit.until(lambda: cockpit.mode == "RTL", 7.0)
+    harness.until(lambda: harness.mode == "RTL", 7.0)
     transmitter.on = True
-    cockpit.fly(1.0)
-    assert cockpit.mode == "RTL"
+    harness.fly(1.0)
+    assert harness.mode == "RTL"
     transmitter.sticks = Sticks(pitch=0.9)
-    cockpit.until(lambda: cockpit.mode == "POSCTL", 1.0)
+    harness.until(lambda: harness.mode == "POSCTL", 1.0)
     assert any(
-        message.id == event_identifier("failsafe_rc_override") for message in cockpit.received("EVENT")
+        message.id == event_identifier("failsafe_rc_override") for message in harness.received("EVENT")
     )
 
 
 def test_nobody_misses_a_remote_control_in_offboard(
-    make_cockpit: type[Cockpit], velocity_setpoint: Any
+    make_harness: type[SimHarness], velocity_setpoint: Any
 ) -> None:
-    cockpit = flying(make_cockpit)
-    cockpit.offboard(velocity_setpoint(0, 0, 0))
-    cockpit.vehicle.transmitter.on = False
-    cockpit.fly(3.0, velocity_setpoint(0, 0, 0))
-    assert cockpit.mode == "OFFBOARD"
+    harness = flying(make_harness)
+    harness.offboard(velocity_setpoint(0, 0, 0))
+    harness.vehicle.transmitter.on = False
+    harness.fly(3.0, velocity_setpoint(0, 0, 0))
+    assert harness.mode == "OFFBOARD"
 
 
-def test_losing_the_ground_station_returns_after_the_hold(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 3})
-    cockpit.until(lambda: cockpit.vehicle.autopilot.sensors_ready, 5.0)
-    cockpit.fly(0.2)
-    assert not cockpit.vehicle.autopilot.can_arm
-    cockpit.vehicle.autopilot.arm()
-    cockpit.fly(0.2)
-    events = [event.id for event in cockpit.received("EVENT")]
+def test_losing_the_ground_station_returns_after_the_hold(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters={"NAV_DLL_ACT": 2, "COM_DL_LOSS_T": 3})
+    harness.until(lambda: harness.vehicle.autopilot.sensors_ready, 5.0)
+    harness.fly(0.2)
+    assert not harness.vehicle.autopilot.can_arm
+    harness.vehicle.autopilot.arm()
+    harness.fly(0.2)
+    events = [event.id for event in harness.received("EVENT")]
     assert event_identifier("check_rc_dl_no_dllink") in events
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.take_off(12.0)
-    cockpit.heartbeats.clear()
-    lost_s = cockpit.until(lambda: "failsafe: ground station lost, HOLD" in cockpit.events, 5.0)
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.take_off(12.0)
+    harness.heartbeats.clear()
+    lost_s = harness.until(lambda: "failsafe: ground station lost, HOLD" in harness.events, 5.0)
     assert 2.0 < lost_s < 3.1
-    cockpit.until(lambda: cockpit.mode == "RTL", 6.0)
-    assert "the ground station's heartbeat is lost" in cockpit.events
-    cockpit.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", GROUND_STATION)
-    cockpit.fly(0.2)
-    assert "GCS connection regained\t" in cockpit.texts()
-    assert cockpit.mode == "RTL"
+    harness.until(lambda: harness.mode == "RTL", 6.0)
+    assert "the ground station's heartbeat is lost" in harness.events
+    harness.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), "gcs", GROUND_STATION)
+    harness.fly(0.2)
+    assert "GCS connection regained\t" in harness.texts()
+    assert harness.mode == "RTL"
 
 
-def test_a_ground_station_that_never_was_is_not_missed_by_default(cockpit: Cockpit) -> None:
-    cockpit.take_off()
-    cockpit.fly(15.0)
-    assert cockpit.mode == "HOLD"
-    assert not any("ground station" in line for line in cockpit.events)
+def test_a_ground_station_that_never_was_is_not_missed_by_default(harness: SimHarness) -> None:
+    harness.take_off()
+    harness.fly(15.0)
+    assert harness.mode == "HOLD"
+    assert not any("ground station" in line for line in harness.events)
 
 
 # ---- a pilot taking over
@@ -358,35 +360,35 @@ def test_a_ground_station_that_never_was_is_not_missed_by_default(cockpit: Cockp
     ],
 )
 def test_sticks_moved_in_an_auto_mode_take_over(
-    make_cockpit: type[Cockpit], override: int, taken: bool
+    make_harness: type[SimHarness], override: int, taken: bool
 ) -> None:
-    cockpit = flying(make_cockpit, COM_RC_OVERRIDE=override)
-    cockpit.set_mode(4, 3)
-    cockpit.fly(0.5)
-    cockpit.vehicle.transmitter.sticks = Sticks(roll=0.5)
-    cockpit.fly(0.3)
-    assert cockpit.mode == ("POSCTL" if taken else "HOLD")
-    assert ("Pilot took over using sticks\t" in cockpit.texts()) is taken
+    harness = flying(make_harness, COM_RC_OVERRIDE=override)
+    harness.set_mode(4, 3)
+    harness.fly(0.5)
+    harness.vehicle.transmitter.sticks = Sticks(roll=0.5)
+    harness.fly(0.3)
+    assert harness.mode == ("POSCTL" if taken else "HOLD")
+    assert ("Pilot took over using sticks\t" in harness.texts()) is taken
 
 
 @pytest.mark.parametrize(
     ("override", "taken"), [pytest.param(3, True, id="offboard too"), pytest.param(1, False, id="auto only")]
 )
 def test_sticks_moved_in_offboard_take_over_if_asked_for(
-    make_cockpit: type[Cockpit], velocity_setpoint: Any, override: int, taken: bool
+    make_harness: type[SimHarness], velocity_setpoint: Any, override: int, taken: bool
 ) -> None:
-    cockpit = flying(make_cockpit, COM_RC_OVERRIDE=override)
-    cockpit.offboard(velocity_setpoint(0.5, 0, 0))
-    cockpit.vehicle.transmitter.sticks = Sticks(yaw=0.6)
-    cockpit.fly(0.5, velocity_setpoint(0.5, 0, 0))
-    assert cockpit.mode == ("POSCTL" if taken else "OFFBOARD")
+    harness = flying(make_harness, COM_RC_OVERRIDE=override)
+    harness.offboard(velocity_setpoint(0.5, 0, 0))
+    harness.vehicle.transmitter.sticks = Sticks(yaw=0.6)
+    harness.fly(0.5, velocity_setpoint(0.5, 0, 0))
+    assert harness.mode == ("POSCTL" if taken else "OFFBOARD")
 
 
-def test_sticks_moved_slowly_do_not_take_over(make_cockpit: type[Cockpit]) -> None:
-    cockpit = flying(make_cockpit)
-    cockpit.set_mode(4, 3)
-    cockpit.fly(0.5)
+def test_sticks_moved_slowly_do_not_take_over(make_harness: type[SimHarness]) -> None:
+    harness = flying(make_harness)
+    harness.set_mode(4, 3)
+    harness.fly(0.5)
     for number in range(100):  # 20 % a second; COM_RC_STICK_OV is 30
-        cockpit.vehicle.transmitter.sticks = Sticks(pitch=0.004 * number)
-        cockpit.fly(0.02)
-    assert cockpit.mode == "HOLD"
+        harness.vehicle.transmitter.sticks = Sticks(pitch=0.004 * number)
+        harness.fly(0.02)
+    assert harness.mode == "HOLD"

@@ -10,15 +10,15 @@ from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.lockstep_link import LockstepLink
 from mavlink_sim.vehicle import STEP_S
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 
-def fly(cockpit: Cockpit, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
+def fly(harness: SimHarness, link: LockstepLink, seconds: float) -> list[tuple[float, bytes]]:
     """What a client gets, and when."""
     got = []
     for _ in range(round(seconds / STEP_S)):
-        cockpit.vehicle.step(STEP_S)
-        got += [(cockpit.vehicle.faults.now_s, datagram) for datagram in link.receive()]
+        harness.vehicle.step(STEP_S)
+        got += [(harness.vehicle.faults.now_s, datagram) for datagram in link.receive()]
     return got
 
 
@@ -27,20 +27,20 @@ def decoded(datagrams: list[tuple[float, bytes]]) -> list[Any]:
     return [message for _, data in datagrams for message in codec.parse_buffer(data) or []]
 
 
-def test_a_fault_begins_and_ends_at_its_time(cockpit: Cockpit) -> None:
-    faults = cockpit.vehicle.faults
+def test_a_fault_begins_and_ends_at_its_time(harness: SimHarness) -> None:
+    faults = harness.vehicle.faults
     number = faults.begin("heartbeat_only", at_s=2.0, duration_s=3.0)
     assert [one.number for one in faults.scheduled] == [number]
-    cockpit.until(lambda: bool(faults.active), 5.0)
+    harness.until(lambda: bool(faults.active), 5.0)
     assert faults.now_s == pytest.approx(2.0, abs=STEP_S)
-    assert cockpit.events[-1] == "fault 1 heartbeat_only for=3 begins"
-    cockpit.until(lambda: not faults.active, 5.0)
+    assert harness.events[-1] == "fault 1 heartbeat_only for=3 begins"
+    harness.until(lambda: not faults.active, 5.0)
     assert faults.now_s == pytest.approx(5.0, abs=STEP_S)
-    assert cockpit.events[-1] == "fault 1 heartbeat_only for=3 ends"
+    assert harness.events[-1] == "fault 1 heartbeat_only for=3 ends"
 
 
-def test_faults_are_ended_by_number_by_name_and_all_together(cockpit: Cockpit) -> None:
-    faults = cockpit.vehicle.faults
+def test_faults_are_ended_by_number_by_name_and_all_together(harness: SimHarness) -> None:
+    faults = harness.vehicle.faults
     numbers = [faults.begin(line) for line in ("link_delay 0.1", "link_delay 0.2", "wind 3", "stall at=99")]
     assert faults.end(numbers[0]) == 1
     assert faults.end("link_delay") == 1
@@ -51,8 +51,8 @@ def test_faults_are_ended_by_number_by_name_and_all_together(cockpit: Cockpit) -
         faults.end(1)
 
 
-def test_values_may_be_given_in_python(cockpit: Cockpit) -> None:
-    faults = cockpit.vehicle.faults
+def test_values_may_be_given_in_python(harness: SimHarness) -> None:
+    faults = harness.vehicle.faults
     faults.begin("packet_loss", 0.25, link="gcs", way="out", duration_s=2.0, seed=5)
     assert str(faults.active[0]) == "1 packet_loss 0.25 link=gcs way=out for=2"
     assert faults.active[0].seed == 5
@@ -62,23 +62,23 @@ def test_values_may_be_given_in_python(cockpit: Cockpit) -> None:
     ("line", "said"),
     [("link_loss link=usb", "there are: all, onboard, gcs"), ("wind 3 at=0.5", "at=0.5 is over")],
 )
-def test_a_fault_that_cannot_begin_is_refused_at_once(cockpit: Cockpit, line: str, said: str) -> None:
-    cockpit.fly(1.0)
+def test_a_fault_that_cannot_begin_is_refused_at_once(harness: SimHarness, line: str, said: str) -> None:
+    harness.fly(1.0)
     with pytest.raises(FaultError, match=said):
-        cockpit.vehicle.faults.begin(line)
-    assert cockpit.vehicle.faults.listing() == ["no faults"]
+        harness.vehicle.faults.begin(line)
+    assert harness.vehicle.faults.listing() == ["no faults"]
 
 
-def test_a_scheduled_fault_that_cannot_begin_then_is_told_of(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert cockpit.command(400, 1) == [0]
-    cockpit.vehicle.faults.begin("pilot_takeover MISSION at=5")
-    cockpit.until(lambda: any("did not begin" in event for event in cockpit.events), 5.0)
-    assert not cockpit.vehicle.faults.active
+def test_a_scheduled_fault_that_cannot_begin_then_is_told_of(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert harness.command(400, 1) == [0]
+    harness.vehicle.faults.begin("pilot_takeover MISSION at=5")
+    harness.until(lambda: any("did not begin" in event for event in harness.events), 5.0)
+    assert not harness.vehicle.faults.active
 
 
-def test_commands_of_the_grammar_are_answered_for_a_person(cockpit: Cockpit) -> None:
-    command = cockpit.vehicle.faults.command
+def test_commands_of_the_grammar_are_answered_for_a_person(harness: SimHarness) -> None:
+    command = harness.vehicle.faults.command
     assert command("list").text == "no faults"
     assert command("link_delay 0.2 for=3").text == "fault 1 link_delay 0.2 for=3"
     assert command("gust 5 at=9").text == "fault 2 gust 5 at 9 s"
@@ -97,10 +97,10 @@ def test_commands_of_the_grammar_are_answered_for_a_person(cockpit: Cockpit) -> 
     assert not command("help nothing").ok
 
 
-def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit: type[Cockpit]) -> None:
+def test_the_same_seed_has_the_same_faults_to_the_byte(make_harness: type[SimHarness]) -> None:
     def flight(seed: int) -> list[tuple[float, bytes]]:
-        cockpit = make_cockpit(["everything"], seed=seed)
-        link = LockstepLink(cockpit.vehicle, "onboard")
+        harness = make_harness(["everything"], seed=seed)
+        link = LockstepLink(harness.vehicle, "onboard")
         for line in (
             "packet_loss 0.2",
             "corrupt 0.1",
@@ -108,8 +108,8 @@ def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit: type[Cockpi
             "duplicate 0.1",
             "gust 6",
         ):
-            cockpit.vehicle.faults.begin(line)
-        return [(at, data) for at, data in fly(cockpit, link, 2.0) if data[7:10] != b"\x02\0\0"]
+            harness.vehicle.faults.begin(line)
+        return [(at, data) for at, data in fly(harness, link, 2.0) if data[7:10] != b"\x02\0\0"]
 
     one, again, other = flight(3), flight(3), flight(4)
     assert len(one) > 500
@@ -119,23 +119,23 @@ def test_the_same_seed_has_the_same_faults_to_the_byte(make_cockpit: type[Cockpi
     assert [at for at, _ in one] != [at for at, _ in other]
 
 
-@pytest.mark.hears("everything")
-def test_a_dead_link_carries_nothing_either_way(cockpit: Cockpit) -> None:
-    link = LockstepLink(cockpit.vehicle, "onboard")
-    assert fly(cockpit, link, 0.5)
-    cockpit.vehicle.faults.begin("link_loss link=onboard for=1")
+@pytest.mark.streams("everything")
+def test_a_dead_link_carries_nothing_either_way(harness: SimHarness) -> None:
+    link = LockstepLink(harness.vehicle, "onboard")
+    assert fly(harness, link, 0.5)
+    harness.vehicle.faults.begin("link_loss link=onboard for=1")
     link.send(dialect.MAVLink_command_long_message(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0))
-    assert not fly(cockpit, link, 0.99)
-    kinds = {message.get_type() for message in decoded(fly(cockpit, link, 0.5))}
+    assert not fly(harness, link, 0.99)
+    kinds = {message.get_type() for message in decoded(fly(harness, link, 0.5))}
     assert "ATTITUDE" in kinds
     assert "AUTOPILOT_VERSION" not in kinds
 
 
-def test_a_delay_holds_back_the_answer_both_ways(cockpit: Cockpit) -> None:
-    link = LockstepLink(cockpit.vehicle, "onboard")
-    cockpit.vehicle.faults.begin("link_delay 0.3")
+def test_a_delay_holds_back_the_answer_both_ways(harness: SimHarness) -> None:
+    link = LockstepLink(harness.vehicle, "onboard")
+    harness.vehicle.faults.begin("link_delay 0.3")
     link.send(dialect.MAVLink_timesync_message(0, 77))
-    for at_s, data in fly(cockpit, link, 1.0):
+    for at_s, data in fly(harness, link, 1.0):
         for message in parser().parse_buffer(data) or []:
             if message.get_type() == "TIMESYNC" and message.tc1:
                 assert message.ts1 == 77
@@ -144,12 +144,12 @@ def test_a_delay_holds_back_the_answer_both_ways(cockpit: Cockpit) -> None:
     raise AssertionError("no answer")
 
 
-def test_one_direction_of_one_link_can_be_meant(cockpit: Cockpit) -> None:
-    onboard, gcs = LockstepLink(cockpit.vehicle, "onboard"), LockstepLink(cockpit.vehicle, "gcs")
-    cockpit.vehicle.faults.begin("link_loss link=onboard way=in")
+def test_one_direction_of_one_link_can_be_meant(harness: SimHarness) -> None:
+    onboard, gcs = LockstepLink(harness.vehicle, "onboard"), LockstepLink(harness.vehicle, "gcs")
+    harness.vehicle.faults.begin("link_loss link=onboard way=in")
     onboard.send(dialect.MAVLink_timesync_message(0, 77))
     gcs.send(dialect.MAVLink_timesync_message(0, 78), (245, 190))
-    heard_onboard, heard_gcs = decoded(fly(cockpit, onboard, 0.5)), decoded([(0.0, d) for d in gcs.receive()])
+    heard_onboard, heard_gcs = decoded(fly(harness, onboard, 0.5)), decoded([(0.0, d) for d in gcs.receive()])
     assert heard_onboard
     assert not [m for m in heard_onboard if m.get_type() == "TIMESYNC" and m.ts1 == 77]
     assert [m for m in heard_gcs if m.get_type() == "TIMESYNC" and m.ts1 == 78]

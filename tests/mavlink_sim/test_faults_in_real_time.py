@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from mavlink_sim.faults.zenoh_door import ControlError, FaultControl
+from mavlink_sim.faults.zenoh_control import ControlError, FaultControl
 from mavlink_sim.testing import free_port, running_simulator
 from mavlink_sim.vehicle import Vehicle
 from mavlink_sim.wire.faulty_socket import FaultySocket
@@ -53,7 +53,7 @@ def test_a_socket_goes_through_its_stage_and_back_to_itself() -> None:
         link.pump()
         far.settimeout(5.0)
         assert far.recv(100) == b"two"
-        stage.outbound.mend(delay)
+        stage.outbound.clear(delay)
         assert not stage.outbound.engaged
 
         late = Delay(0.5)
@@ -65,13 +65,13 @@ def test_a_socket_goes_through_its_stage_and_back_to_itself() -> None:
         now_s = 1.0
         assert link.has_arrivals
         assert link.recvfrom(100) == (b"three", far.getsockname())
-        stage.inbound.mend(late)
+        stage.inbound.clear(late)
         lost = Loss(1.0, 1)
         stage.inbound.impair(lost)
         far.sendto(b"four", near.getsockname())
         with pytest.raises(BlockingIOError):
             link.recvfrom(100)
-        stage.inbound.mend(lost)
+        stage.inbound.clear(lost)
         far.sendto(b"five", near.getsockname())
         assert link.recvfrom(100)[0] == b"five"
 

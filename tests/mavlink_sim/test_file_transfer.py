@@ -25,15 +25,15 @@ from mavlink_sim.services.file_transfer import DATA_BYTES, Failure, Opcode, Pack
 from mavlink_sim.services.vehicle_files import bson, offer_packed_parameters, packed_parameters
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.mavsdk_client import mavsdk_client
 
 
 class Client:
     """A client in lockstep: one request, and the packets that came back within 20 ms."""
 
-    def __init__(self, cockpit: Cockpit) -> None:
-        self.cockpit = cockpit
+    def __init__(self, harness: SimHarness) -> None:
+        self.harness = harness
         self.sequence = 0
 
     def ask(
@@ -49,12 +49,12 @@ class Client:
         payload = struct.pack(
             "<HBBBBBBI", self.sequence, session, opcode, len(data) if size < 0 else size, 0, 0, 0, offset
         )
-        self.cockpit.forget()
-        self.cockpit.send(
+        self.harness.forget()
+        self.harness.send(
             dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, (payload + data).ljust(251, b"\0"))
         )
-        self.cockpit.fly(0.02)
-        messages = self.cockpit.received("FILE_TRANSFER_PROTOCOL")
+        self.harness.fly(0.02)
+        messages = self.harness.received("FILE_TRANSFER_PROTOCOL")
         assert all((message.target_system, message.target_component) == (1, 191) for message in messages)
         return [Packet.unpack(bytes(message.payload)) for message in messages]
 
@@ -81,15 +81,15 @@ class Client:
 
 
 @pytest.fixture
-def client(cockpit: Cockpit) -> Client:
-    cockpit.fly(0.1)
-    return Client(cockpit)
+def client(harness: SimHarness) -> Client:
+    harness.fly(0.1)
+    return Client(harness)
 
 
 def test_the_root_lists_what_px4_has_there(client: Client) -> None:
     entries = client.list(b"/")
     assert entries[:2] == [b"S", b"S"]  # "." and ".."
-    size = len(bson(client.cockpit.vehicle.parameters.customised()))
+    size = len(bson(client.harness.vehicle.parameters.customised()))
     assert entries[2:] == [
         b"Detc",
         b"Dlog",
@@ -137,17 +137,17 @@ def test_what_is_written_is_read_and_bursts(client: Client) -> None:
 
 def test_a_burst_pauses_after_35_kilobytes_and_goes_on_where_it_is_asked_to(client: Client) -> None:
     content = os.urandom(100_000)
-    files = client.cockpit.vehicle.files
+    files = client.harness.vehicle.files
     files.write(files.create("big", True), 0, content)
     client.ack(Opcode.OPEN_FILE_RO, b"big")
     got = b""
     rounds = 0
     while len(got) < len(content):
         packets = client.ask(Opcode.BURST_READ_FILE, b"", len(got), size=239)
-        client.cockpit.fly(0.4)
+        client.harness.fly(0.4)
         packets = [
             Packet.unpack(bytes(message.payload))
-            for message in client.cockpit.received("FILE_TRANSFER_PROTOCOL")
+            for message in client.harness.received("FILE_TRANSFER_PROTOCOL")
         ]
         assert [packet.burst_complete for packet in packets[:-1]] == [False] * (len(packets) - 1)
         assert packets[-1].burst_complete or packets[-1].opcode == Opcode.NAK
@@ -160,9 +160,9 @@ def test_a_burst_pauses_after_35_kilobytes_and_goes_on_where_it_is_asked_to(clie
 def test_a_session_is_one_a_link_and_closes_after_ten_seconds_of_silence(client: Client) -> None:
     client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
     assert client.nak(Opcode.OPEN_FILE_RO, b"parameters.bson") == (Failure.NO_SESSIONS_AVAILABLE,)
-    client.cockpit.fly(9.0)
+    client.harness.fly(9.0)
     assert client.nak(Opcode.CREATE_FILE, b"x") == (Failure.NO_SESSIONS_AVAILABLE,)
-    client.cockpit.fly(10.1)
+    client.harness.fly(10.1)
     assert client.nak(Opcode.READ_FILE, size=4) == (Failure.INVALID_SESSION,)
     client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
     client.ack(Opcode.RESET_SESSIONS)
@@ -283,8 +283,8 @@ def test_the_parameter_file_holds_what_differs_from_the_defaults_as_bson() -> No
     )  # fmt: skip
 
 
-def test_packed_parameters_are_read_by_pymavlinks_own_decoder(cockpit: Cockpit) -> None:
-    parameters = cockpit.vehicle.parameters
+def test_packed_parameters_are_read_by_pymavlinks_own_decoder(harness: SimHarness) -> None:
+    parameters = harness.vehicle.parameters
     decoded = mavftp.MAVFTP.ftp_param_decode(packed_parameters(parameters))
     assert decoded is not None
     found = {name.decode(): (value, kind) for name, value, kind in decoded.params}
@@ -296,20 +296,20 @@ def test_packed_parameters_are_read_by_pymavlinks_own_decoder(cockpit: Cockpit) 
 
 
 def test_packed_parameters_are_offered_on_wish(client: Client) -> None:
-    vehicle = client.cockpit.vehicle
+    vehicle = client.harness.vehicle
     offer_packed_parameters(vehicle.files, vehicle.parameters)
     size = len(packed_parameters(vehicle.parameters))
     assert client.ack(Opcode.OPEN_FILE_RO, b"@PARAM/param.pck").data == struct.pack("<I", size)
 
 
-def test_the_metadata_is_found_through_component_metadata(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.command(512, 397) == [0]
-    (message,) = cockpit.received("COMPONENT_METADATA")
+def test_the_metadata_is_found_through_component_metadata(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    assert harness.command(512, 397) == [0]
+    (message,) = harness.received("COMPONENT_METADATA")
     assert message.uri.startswith("mftp://")
 
     def content(uri: str) -> bytes:
-        return lzma.decompress(bytes(cockpit.vehicle.files.read(uri.removeprefix("mftp://"))))
+        return lzma.decompress(bytes(harness.vehicle.files.read(uri.removeprefix("mftp://"))))
 
     def crc(data: bytes) -> int:
         return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF

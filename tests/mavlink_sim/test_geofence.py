@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mavlink_sim.missions.geofence import Area, inside_polygon
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.wire.announcements import event_identifier
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import circle, listen, polygon, upload
 
 FENCE = [(-20.0, -20.0), (-20.0, 20.0), (20.0, 20.0), (20.0, -20.0)]
@@ -23,9 +23,9 @@ centimetres = st.integers(-10_000, 10_000)
 
 
 @pytest.fixture
-def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
+def harness(make_harness: type[SimHarness]) -> SimHarness:
     """A vehicle that is ready at once."""
-    return make_cockpit(ready_after_s=0.0)
+    return make_harness(ready_after_s=0.0)
 
 
 # ---- geometry
@@ -73,65 +73,65 @@ def test_a_polygon_of_nothing_holds_nothing() -> None:
 # ---- upload
 
 
-def test_a_fence_without_home_is_left_out_and_said(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    assert upload(cockpit, polygon(FENCE, inclusion=False), 1) == 0
-    cockpit.fly(0.1)
-    assert cockpit.texts()[-1] == "Geofence invalid, doesn't contain Home position\t"
-    cockpit.fly(0.5)
-    assert cockpit.vehicle.autopilot.can_arm
+def test_a_fence_without_home_is_left_out_and_said(harness: SimHarness) -> None:
+    listen(harness)
+    assert upload(harness, polygon(FENCE, inclusion=False), 1) == 0
+    harness.fly(0.1)
+    assert harness.texts()[-1] == "Geofence invalid, doesn't contain Home position\t"
+    harness.fly(0.5)
+    assert harness.vehicle.autopilot.can_arm
 
 
-def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    cockpit.take_off(4.0)
-    cockpit.vehicle.airframe.position = (0.0, 40.0, -4.0)
-    cockpit.fly(0.01)  # until the estimate knows
-    upload(cockpit, polygon(FENCE), 1)
-    cockpit.fly(0.5)
-    assert "Geofence invalid, doesn't contain current vehicle position\t" in cockpit.texts()
-    assert cockpit.mode == "HOLD"
-    assert not cockpit.vehicle.autopilot.failsafe
+def test_a_fence_that_the_flying_vehicle_would_break_is_left_out_and_said(harness: SimHarness) -> None:
+    listen(harness)
+    harness.take_off(4.0)
+    harness.vehicle.airframe.position = (0.0, 40.0, -4.0)
+    harness.fly(0.01)  # until the estimate knows
+    upload(harness, polygon(FENCE), 1)
+    harness.fly(0.5)
+    assert "Geofence invalid, doesn't contain current vehicle position\t" in harness.texts()
+    assert harness.mode == "HOLD"
+    assert not harness.vehicle.autopilot.failsafe
 
 
 # ---- arming
 
 
-def test_outside_the_fence_nobody_arms(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0)
-    listen(cockpit)
-    upload(cockpit, [circle(0, 0, 10.0)], 1)
-    cockpit.fly(0.3)
-    assert cockpit.vehicle.autopilot.can_arm
-    cockpit.vehicle.airframe.position = (15.0, 0.0, 0.0)
-    cockpit.fly(0.3)
-    assert cockpit.texts()[-1] == "Geofence: approaching or outside geofence"
-    assert cockpit.command(400, 1) == [1]
-    assert cockpit.heartbeat().system_status == 0
+def test_outside_the_fence_nobody_arms(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(ready_after_s=0.0)
+    listen(harness)
+    upload(harness, [circle(0, 0, 10.0)], 1)
+    harness.fly(0.3)
+    assert harness.vehicle.autopilot.can_arm
+    harness.vehicle.airframe.position = (15.0, 0.0, 0.0)
+    harness.fly(0.3)
+    assert harness.texts()[-1] == "Geofence: approaching or outside geofence"
+    assert harness.command(400, 1) == [1]
+    assert harness.heartbeat().system_status == 0
 
 
-def test_without_an_action_the_fence_is_not_looked_at(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 0})
-    upload(cockpit, [circle(0, 0, 10.0)], 1)
-    cockpit.vehicle.airframe.position = (15.0, 0.0, 0.0)
-    cockpit.fly(0.3)
-    assert cockpit.vehicle.autopilot.can_arm
+def test_without_an_action_the_fence_is_not_looked_at(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 0})
+    upload(harness, [circle(0, 0, 10.0)], 1)
+    harness.vehicle.airframe.position = (15.0, 0.0, 0.0)
+    harness.fly(0.3)
+    assert harness.vehicle.autopilot.can_arm
 
 
 # ---- breaches
 
 
-def fly_out(cockpit: Cockpit, velocity_setpoint: Any, **parameters: float) -> None:
+def fly_out(harness: SimHarness, velocity_setpoint: Any, **parameters: float) -> None:
     """Into the air, and north in OFFBOARD until the fence at 8 m is broken."""
-    listen(cockpit)
-    cockpit.take_off(4.0)
-    upload(cockpit, [circle(0, 0, 8.0)], 1)
+    listen(harness)
+    harness.take_off(4.0)
+    upload(harness, [circle(0, 0, 8.0)], 1)
     north = velocity_setpoint(4, 0, 0)
-    cockpit.offboard(north)
-    cockpit.until(
-        lambda: cockpit.vehicle.autopilot.failsafe or cockpit.vehicle.airframe.position[0] > 14.0, 20.0, north
+    harness.offboard(north)
+    harness.until(
+        lambda: harness.vehicle.autopilot.failsafe or harness.vehicle.airframe.position[0] > 14.0, 20.0, north
     )
-    cockpit.fly(0.3, north)
+    harness.fly(0.3, north)
 
 
 @pytest.mark.parametrize(
@@ -139,64 +139,64 @@ def fly_out(cockpit: Cockpit, velocity_setpoint: Any, **parameters: float) -> No
     [(1, "OFFBOARD"), (2, "HOLD"), (3, "RTL"), (5, "LAND")],
 )
 def test_a_breach_does_what_gf_action_says(
-    make_cockpit: type[Cockpit], velocity_setpoint: Any, action: int, mode: str
+    make_harness: type[SimHarness], velocity_setpoint: Any, action: int, mode: str
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
-    fly_out(cockpit, velocity_setpoint)
-    assert cockpit.mode == mode
-    assert "Geofence: approaching or outside geofence" in cockpit.texts()
-    assert ("Failsafe activated\t" in cockpit.texts()) is (action != 1)
-    events = [event.id for event in cockpit.received("EVENT")]
+    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": action, "COM_FAIL_ACT_T": 0})
+    fly_out(harness, velocity_setpoint)
+    assert harness.mode == mode
+    assert "Geofence: approaching or outside geofence" in harness.texts()
+    assert ("Failsafe activated\t" in harness.texts()) is (action != 1)
+    events = [event.id for event in harness.received("EVENT")]
     assert (event_identifier("commander_failsafe_enter_generic_warn") in events) is (action == 1)
     assert event_identifier("check_gf_violation_custom_gf") in events
-    assert cockpit.heartbeat().system_status == (4 if action == 1 else 5)
-    assert any("geofence breached" in event for event in cockpit.events)
+    assert harness.heartbeat().system_status == (4 if action == 1 else 5)
+    assert any("geofence breached" in event for event in harness.events)
 
 
 def test_before_it_returns_it_holds_for_a_pilot_to_take_over(
-    make_cockpit: type[Cockpit], velocity_setpoint: Any
+    make_harness: type[SimHarness], velocity_setpoint: Any
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 3})
-    fly_out(cockpit, velocity_setpoint)
-    assert cockpit.mode == "HOLD"
-    assert "Failsafe activated: entering Hold for 5 seconds\t" in cockpit.texts()
-    assert cockpit.until(lambda: cockpit.mode == "RTL", 6.0) == pytest.approx(4.8, abs=0.3)
+    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 3})
+    fly_out(harness, velocity_setpoint)
+    assert harness.mode == "HOLD"
+    assert "Failsafe activated: entering Hold for 5 seconds\t" in harness.texts()
+    assert harness.until(lambda: harness.mode == "RTL", 6.0) == pytest.approx(4.8, abs=0.3)
 
 
 def test_after_a_breach_the_offboard_stream_does_not_take_the_vehicle_back(
-    cockpit: Cockpit, velocity_setpoint: Any
+    harness: SimHarness, velocity_setpoint: Any
 ) -> None:
     north = velocity_setpoint(4, 0, 0)
-    fly_out(cockpit, velocity_setpoint)
-    cockpit.fly(3.0, north)
-    assert cockpit.mode == "HOLD"
-    assert cockpit.vehicle.airframe.position[0] < 16.0
+    fly_out(harness, velocity_setpoint)
+    harness.fly(3.0, north)
+    assert harness.mode == "HOLD"
+    assert harness.vehicle.airframe.position[0] < 16.0
     home = velocity_setpoint(-3, 0, 0)
-    cockpit.offboard(home)  # the user may, on purpose, still outside
-    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] < 6.0, 10.0, home)
-    assert cockpit.mode == "OFFBOARD"
-    cockpit.until(lambda: cockpit.mode == "HOLD", 10.0, north)  # and the next breach counts anew
+    harness.offboard(home)  # the user may, on purpose, still outside
+    harness.until(lambda: harness.vehicle.airframe.position[0] < 6.0, 10.0, home)
+    assert harness.mode == "OFFBOARD"
+    harness.until(lambda: harness.mode == "HOLD", 10.0, north)  # and the next breach counts anew
 
 
-def test_a_place_outside_the_fence_is_not_flown_to(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    cockpit.take_off(4.0)
-    upload(cockpit, [circle(0, 0, 8.0)], 1)
+def test_a_place_outside_the_fence_is_not_flown_to(harness: SimHarness) -> None:
+    listen(harness)
+    harness.take_off(4.0)
+    upload(harness, [circle(0, 0, 8.0)], 1)
     latitude, longitude, altitude = geographic((20.0, 0.0, -4.0))
     place = (round(latitude * 1e7), round(longitude * 1e7), altitude)
-    assert cockpit.command_int(192, (-1, 1, 0, math.nan), *place) == [0]
-    cockpit.fly(2.0)
-    assert cockpit.texts()[-1] == "Reposition is outside geofence\t"
-    assert math.hypot(*cockpit.vehicle.airframe.position[:2]) < 1.0
+    assert harness.command_int(192, (-1, 1, 0, math.nan), *place) == [0]
+    harness.fly(2.0)
+    assert harness.texts()[-1] == "Reposition is outside geofence\t"
+    assert math.hypot(*harness.vehicle.airframe.position[:2]) < 1.0
 
 
-def test_termination_stops_the_motors(make_cockpit: type[Cockpit], velocity_setpoint: Any) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"GF_ACTION": 4})
-    fly_out(cockpit, velocity_setpoint)
-    assert cockpit.heartbeat().system_status == 8
-    cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 5.0)
-    assert cockpit.vehicle.airframe.thrust_mps2 < 0.1
-    assert cockpit.armed
+def test_termination_stops_the_motors(make_harness: type[SimHarness], velocity_setpoint: Any) -> None:
+    harness = make_harness(ready_after_s=0.0, parameters={"GF_ACTION": 4})
+    fly_out(harness, velocity_setpoint)
+    assert harness.heartbeat().system_status == 8
+    harness.until(lambda: harness.vehicle.airframe.on_ground, 5.0)
+    assert harness.vehicle.airframe.thrust_mps2 < 0.1
+    assert harness.armed
 
 
 @pytest.mark.parametrize(
@@ -207,18 +207,18 @@ def test_termination_stops_the_motors(make_cockpit: type[Cockpit], velocity_setp
     ],
 )
 def test_the_greatest_distances_from_home_are_a_fence_too(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
     velocity_setpoint: Any,
     parameter: str,
     setpoint: tuple[float, ...],
     words: str,
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={parameter: 8.0})
-    listen(cockpit)
-    cockpit.take_off(4.0)
+    harness = make_harness(ready_after_s=0.0, parameters={parameter: 8.0})
+    listen(harness)
+    harness.take_off(4.0)
     away = velocity_setpoint(*setpoint)
-    cockpit.offboard(away)
-    cockpit.until(lambda: cockpit.mode == "HOLD", 20.0, away)
-    cockpit.fly(0.1)
-    assert words in cockpit.texts()
-    assert cockpit.vehicle.autopilot.failsafe
+    harness.offboard(away)
+    harness.until(lambda: harness.mode == "HOLD", 20.0, away)
+    harness.fly(0.1)
+    assert words in harness.texts()
+    assert harness.vehicle.autopilot.failsafe

@@ -15,7 +15,7 @@ from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.simulation import Simulation, SimulationOptions
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from vision.attitude import quaternion_from_euler
 from vision.rotation import matrix_from_quaternion
 
@@ -134,64 +134,64 @@ def test_a_rate_against_a_stop_does_not_wind_up() -> None:
 
 
 @pytest.fixture
-def steered(make_cockpit: type[Cockpit]) -> Cockpit:
-    cockpit = make_cockpit(gimbal=True)
-    cockpit.wait_ready()
-    assert cockpit.command(1001, *COMPANION, -1, -1) == [0]
-    return cockpit
+def steered(make_harness: type[SimHarness]) -> SimHarness:
+    harness = make_harness(gimbal=True)
+    harness.wait_ready()
+    assert harness.command(1001, *COMPANION, -1, -1) == [0]
+    return harness
 
 
-def degrees(cockpit: Cockpit) -> tuple[float, float]:
-    device = cockpit.vehicle.gimbal
+def degrees(harness: SimHarness) -> tuple[float, float]:
+    device = harness.vehicle.gimbal
     assert device is not None
     return math.degrees(device.pitch_rad), math.degrees(device.yaw_rad)
 
 
-def test_a_vehicle_as_delivered_has_no_gimbal(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert cockpit.vehicle.gimbal is None
-    assert cockpit.command(512, 280) == [2]
-    assert cockpit.command(1000, -30, 0, NAN, NAN, 12) == []
-    assert cockpit.received("GIMBAL_MANAGER_STATUS") == []
-    assert "MNT_MODE_OUT" not in cockpit.vehicle.parameters
+def test_a_vehicle_as_delivered_has_no_gimbal(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert harness.vehicle.gimbal is None
+    assert harness.command(512, 280) == [2]
+    assert harness.command(1000, -30, 0, NAN, NAN, 12) == []
+    assert harness.received("GIMBAL_MANAGER_STATUS") == []
+    assert "MNT_MODE_OUT" not in harness.vehicle.parameters
 
 
-def test_the_gimbal_is_told(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(gimbal=True)
-    cockpit.wait_ready()
-    assert cockpit.command(512, 280) == [0]
-    information = cockpit.received("GIMBAL_MANAGER_INFORMATION")[-1]
+def test_the_gimbal_is_told(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(gimbal=True)
+    harness.wait_ready()
+    assert harness.command(512, 280) == [0]
+    information = harness.received("GIMBAL_MANAGER_INFORMATION")[-1]
     assert information.gimbal_device_id == 1
     assert math.degrees(information.pitch_min) == pytest.approx(-135.0)
     assert math.isnan(information.yaw_max)
-    assert cockpit.command(512, 283) == [0]
-    assert cockpit.received("GIMBAL_DEVICE_INFORMATION")[-1].gimbal_device_id == 1
-    cockpit.forget()
-    cockpit.fly(2.0)
-    assert len(cockpit.received("GIMBAL_DEVICE_ATTITUDE_STATUS")) == pytest.approx(10, abs=1)
-    status = cockpit.received("GIMBAL_MANAGER_STATUS")[-1]
+    assert harness.command(512, 283) == [0]
+    assert harness.received("GIMBAL_DEVICE_INFORMATION")[-1].gimbal_device_id == 1
+    harness.forget()
+    harness.fly(2.0)
+    assert len(harness.received("GIMBAL_DEVICE_ATTITUDE_STATUS")) == pytest.approx(10, abs=1)
+    status = harness.received("GIMBAL_MANAGER_STATUS")[-1]
     assert (status.primary_control_sysid, status.primary_control_compid) == (0, 0)
 
 
-def test_only_the_one_in_control_moves_it(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(gimbal=True)
-    cockpit.wait_ready()
-    assert cockpit.command(1000, -45, 0, NAN, NAN, 12) == [2]
-    assert cockpit.command(1001, *COMPANION, -1, -1) == [0]
-    assert cockpit.command(1000, -45, 0, NAN, NAN, 12) == [0]
-    assert cockpit.command(1000, 10, 0, NAN, NAN, 12, source=GROUND_STATION, link="gcs") == [2]
-    cockpit.fly(2.0)
-    assert degrees(cockpit)[0] == pytest.approx(-45.0, abs=0.1)
-    assert cockpit.command(1001, *GROUND_STATION, -1, -1, source=GROUND_STATION, link="gcs") == [0]
-    assert cockpit.vehicle.gimbal_manager is not None
-    assert cockpit.vehicle.gimbal_manager.primary == GROUND_STATION
-    assert cockpit.command(1001, -3, -3, -1, -1) == [0]  # not ours to release
-    assert cockpit.vehicle.gimbal_manager.primary == GROUND_STATION
-    assert cockpit.command(1001, -3, -3, -1, -1, source=GROUND_STATION, link="gcs") == [0]
-    assert cockpit.vehicle.gimbal_manager.primary == (0, 0)
+def test_only_the_one_in_control_moves_it(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(gimbal=True)
+    harness.wait_ready()
+    assert harness.command(1000, -45, 0, NAN, NAN, 12) == [2]
+    assert harness.command(1001, *COMPANION, -1, -1) == [0]
+    assert harness.command(1000, -45, 0, NAN, NAN, 12) == [0]
+    assert harness.command(1000, 10, 0, NAN, NAN, 12, source=GROUND_STATION, link="gcs") == [2]
+    harness.fly(2.0)
+    assert degrees(harness)[0] == pytest.approx(-45.0, abs=0.1)
+    assert harness.command(1001, *GROUND_STATION, -1, -1, source=GROUND_STATION, link="gcs") == [0]
+    assert harness.vehicle.gimbal_manager is not None
+    assert harness.vehicle.gimbal_manager.primary == GROUND_STATION
+    assert harness.command(1001, -3, -3, -1, -1) == [0]  # not ours to release
+    assert harness.vehicle.gimbal_manager.primary == GROUND_STATION
+    assert harness.command(1001, -3, -3, -1, -1, source=GROUND_STATION, link="gcs") == [0]
+    assert harness.vehicle.gimbal_manager.primary == (0, 0)
 
 
-def test_messages_move_it_too(steered: Cockpit) -> None:
+def test_messages_move_it_too(steered: SimHarness) -> None:
     q = list(quaternion_from_euler(0.0, -0.5, 0.8))
     steered.send(dialect.MAVLink_gimbal_manager_set_attitude_message(1, 1, 12, 0, q, NAN, NAN, NAN))
     steered.fly(2.0)
@@ -207,7 +207,7 @@ def test_messages_move_it_too(steered: Cockpit) -> None:
     assert degrees(steered)[1] - before == pytest.approx(30.0, abs=2.0)  # MNT_RATE_YAW
 
 
-def test_a_location_is_looked_at_and_forgotten(steered: Cockpit) -> None:
+def test_a_location_is_looked_at_and_forgotten(steered: SimHarness) -> None:
     x, y, _ = steered.vehicle.airframe.position
     latitude, longitude, altitude = geographic((x + 20.0, y + 20.0, 0.0))
     place = (0, 0, 0, 0)
@@ -220,7 +220,7 @@ def test_a_location_is_looked_at_and_forgotten(steered: Cockpit) -> None:
     assert steered.command(195, 0, 0, 0, 0, NAN, NAN, NAN) == [2]
 
 
-def test_the_attitude_told_is_the_gimbals(steered: Cockpit) -> None:
+def test_the_attitude_told_is_the_gimbals(steered: SimHarness) -> None:
     assert steered.command(1000, -60, 30, NAN, NAN, 12) == [0]
     steered.fly(2.0)
     steered.forget()
@@ -232,7 +232,7 @@ def test_the_attitude_told_is_the_gimbals(steered: Cockpit) -> None:
     assert steered.received("MOUNT_ORIENTATION")[-1].pitch == pytest.approx(-60.0, abs=0.1)
 
 
-def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: Cockpit) -> None:
+def test_landing_turns_it_forward_and_its_commands_are_not_repeated(steered: SimHarness) -> None:
     assert steered.command(1000, -45, 0, NAN, NAN, 12) == [0]
     steered.take_off()
     steered.forget()

@@ -17,9 +17,9 @@ from mavlink_sim.flight.setpoints import (
 from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, geographic
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
-pytestmark = pytest.mark.hears("POSITION_TARGET_LOCAL_NED")
+pytestmark = pytest.mark.streams("POSITION_TARGET_LOCAL_NED")
 
 NAMES = ("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
 POSITION_ALONE = 0xDF8
@@ -68,15 +68,15 @@ def test_a_home_above_the_origin_puts_relative_altitudes_too_low_as_in_px4() -> 
 
 
 @pytest.mark.parametrize("frame", [0, 1, 3, 8, 10])
-def test_a_position_in_another_frame_is_refused_in_words(cockpit: Cockpit, frame: int) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), 6))
-    cockpit.wait_ready()
-    cockpit.fly(0.1)
-    cockpit.forget()
-    cockpit.send(globally(altitude_m=500.0, frame=frame))
-    cockpit.fly(0.05)
-    assert cockpit.texts() == [f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}\t"]
-    assert not cockpit.vehicle.autopilot.has_setpoints
+def test_a_position_in_another_frame_is_refused_in_words(harness: SimHarness, frame: int) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), 6))
+    harness.wait_ready()
+    harness.fly(0.1)
+    harness.forget()
+    harness.send(globally(altitude_m=500.0, frame=frame))
+    harness.fly(0.05)
+    assert harness.texts() == [f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}\t"]
+    assert not harness.vehicle.autopilot.has_setpoints
 
 
 @pytest.mark.parametrize("bit", [1, 2, 4])
@@ -88,25 +88,25 @@ def test_one_ignored_axis_disables_the_whole_position_and_then_any_frame_will_do
     assert setpoint.velocity == (1.0, 2.0, 3.0)
 
 
-def test_force_is_refused_in_words_and_nothing_at_all_without_any(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), 6))
-    cockpit.wait_ready()
-    cockpit.fly(0.1)
-    cockpit.forget()
-    cockpit.send(globally(altitude_m=500.0, mask=512))
-    cockpit.send(globally(altitude_m=500.0, mask=0xDFF))
-    cockpit.fly(0.05)
-    assert cockpit.texts() == ["SET_POSITION_TARGET_GLOBAL_INT force not supported\t"]
-    assert not cockpit.vehicle.autopilot.has_setpoints
+def test_force_is_refused_in_words_and_nothing_at_all_without_any(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), 6))
+    harness.wait_ready()
+    harness.fly(0.1)
+    harness.forget()
+    harness.send(globally(altitude_m=500.0, mask=512))
+    harness.send(globally(altitude_m=500.0, mask=0xDFF))
+    harness.fly(0.05)
+    assert harness.texts() == ["SET_POSITION_TARGET_GLOBAL_INT force not supported\t"]
+    assert not harness.vehicle.autopilot.has_setpoints
 
 
-def test_before_the_vehicle_knows_its_place_a_global_position_is_dropped(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    assert not cockpit.vehicle.autopilot.sensors_ready
-    cockpit.send(globally(altitude_m=500.0))
-    assert not cockpit.vehicle.autopilot.has_setpoints
-    cockpit.send(globally(mask=0xDC7, vx=1.0))  # a velocity needs no place
-    assert cockpit.vehicle.autopilot.has_setpoints
+def test_before_the_vehicle_knows_its_place_a_global_position_is_dropped(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    assert not harness.vehicle.autopilot.sensors_ready
+    harness.send(globally(altitude_m=500.0))
+    assert not harness.vehicle.autopilot.has_setpoints
+    harness.send(globally(mask=0xDC7, vx=1.0))  # a velocity needs no place
+    assert harness.vehicle.autopilot.has_setpoints
 
 
 @pytest.mark.parametrize(("mask", "refused"), [(512 | 0x1C0, False), (512, True), (512 | 0x180, True)])
@@ -151,17 +151,19 @@ def test_any_global_setpoint_is_dropped_or_finite_where_it_controls(
 
 
 @pytest.mark.parametrize(("frame", "altitude_m"), [(5, HOME_ALTITUDE_M + 6.0), (6, 6.0), (11, 6.0)])
-def test_a_global_position_is_flown_to_in_each_frame(cockpit: Cockpit, frame: int, altitude_m: float) -> None:
-    cockpit.take_off(5.0)
+def test_a_global_position_is_flown_to_in_each_frame(
+    harness: SimHarness, frame: int, altitude_m: float
+) -> None:
+    harness.take_off(5.0)
     there = globally((4.0, -3.0, 0.0), altitude_m, frame, mask=0x9F8, yaw=0.5)
-    cockpit.offboard(there)
-    cockpit.fly(15.0, there)
-    assert math.dist(cockpit.vehicle.airframe.position, (4.0, -3.0, -6.0)) < 0.3
-    assert cockpit.vehicle.airframe.yaw_rad == pytest.approx(0.5, abs=0.02)
-    echo = cockpit.received("POSITION_TARGET_LOCAL_NED")[-1]
+    harness.offboard(there)
+    harness.fly(15.0, there)
+    assert math.dist(harness.vehicle.airframe.position, (4.0, -3.0, -6.0)) < 0.3
+    assert harness.vehicle.airframe.yaw_rad == pytest.approx(0.5, abs=0.02)
+    echo = harness.received("POSITION_TARGET_LOCAL_NED")[-1]
     assert (echo.type_mask, echo.coordinate_frame) == (0, 1)
     assert (echo.x, echo.y, echo.z) == pytest.approx((4.0, -3.0, -6.0), abs=0.02)
-    assert cockpit.heartbeat().base_mode == 145
+    assert harness.heartbeat().base_mode == 145
 
 
 @pytest.mark.parametrize(
@@ -170,21 +172,21 @@ def test_a_global_position_is_flown_to_in_each_frame(cockpit: Cockpit, frame: in
     ids=["local", "global"],
 )
 def test_an_acceleration_alone_gains_the_velocity_that_drag_leaves_of_it(
-    cockpit: Cockpit, make: Callable[[], Any]
+    harness: SimHarness, make: Callable[[], Any]
 ) -> None:
-    cockpit.take_off(10.0)
+    harness.take_off(10.0)
     push = make()
-    cockpit.offboard(push)
-    start_s = cockpit.now_s - 0.1
+    harness.offboard(push)
+    start_s = harness.now_s - 0.1
     lag_s = 0.3  # until the vehicle has tilted
     for _ in range(3):
-        cockpit.fly(1.0, push)
-        passed = cockpit.now_s - start_s - lag_s
+        harness.fly(1.0, push)
+        passed = harness.now_s - start_s - lag_s
         gained = (1.0 - math.exp(-LINEAR_DRAG_PER_S * passed)) / LINEAR_DRAG_PER_S
-        assert cockpit.vehicle.airframe.velocity[0] == pytest.approx(gained, abs=0.07)
-    assert abs(cockpit.vehicle.airframe.velocity[1]) < 0.02
-    assert abs(cockpit.height_m - 10.0) < 0.5
-    echo = cockpit.received("POSITION_TARGET_LOCAL_NED")[-1]
+        assert harness.vehicle.airframe.velocity[0] == pytest.approx(gained, abs=0.07)
+    assert abs(harness.vehicle.airframe.velocity[1]) < 0.02
+    assert abs(harness.height_m - 10.0) < 0.5
+    echo = harness.received("POSITION_TARGET_LOCAL_NED")[-1]
     assert echo.type_mask == 63  # no position, no velocity
     assert (echo.afx, echo.afy, echo.afz) == pytest.approx((1.0, 0.0, 0.0))
 
@@ -198,39 +200,39 @@ def test_a_body_acceleration_is_turned_by_the_whole_attitude() -> None:
     assert rolled.acceleration == pytest.approx((0.0, -1.0, 0.0))
 
 
-def test_an_acceleration_beside_a_velocity_is_a_feed_forward(cockpit: Cockpit) -> None:
+def test_an_acceleration_beside_a_velocity_is_a_feed_forward(harness: SimHarness) -> None:
     """With drag at 1/s, 2 m/s need 2 m/s² of thrust: given ahead, little is left to correct."""
-    cockpit.take_off(10.0)
+    harness.take_off(10.0)
     errors = []
     for ahead in (0.0, 2.0):
         setpoint = locally(0xC07, vx=2.0, afx=ahead)
-        cockpit.offboard(setpoint)
-        cockpit.fly(1.5, setpoint)
-        errors.append(abs(cockpit.vehicle.airframe.velocity[0] - 2.0))
-        cockpit.fly(8.0, locally(0xDC7))
+        harness.offboard(setpoint)
+        harness.fly(1.5, setpoint)
+        errors.append(abs(harness.vehicle.airframe.velocity[0] - 2.0))
+        harness.fly(8.0, locally(0xDC7))
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_height_by_position_and_the_rest_by_velocity(cockpit: Cockpit) -> None:
-    cockpit.take_off(5.0)
+def test_height_by_position_and_the_rest_by_velocity(harness: SimHarness) -> None:
+    harness.take_off(5.0)
     mixed = locally(0xDE3, z=-8.0, vx=1.5, vy=-0.5)
-    cockpit.offboard(mixed)
-    cockpit.fly(12.0, mixed)
-    airframe = cockpit.vehicle.airframe
+    harness.offboard(mixed)
+    harness.fly(12.0, mixed)
+    airframe = harness.vehicle.airframe
     assert airframe.position[2] == pytest.approx(-8.0, abs=0.2)
     assert airframe.velocity[:2] == pytest.approx((1.5, -0.5), abs=0.1)
-    assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 3
+    assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask == 3
 
 
-def test_place_by_position_and_height_by_acceleration(cockpit: Cockpit) -> None:
-    cockpit.take_off(10.0)
+def test_place_by_position_and_height_by_acceleration(harness: SimHarness) -> None:
+    harness.take_off(10.0)
     mixed = locally(0xCFC, x=2.0, y=0.0, afz=-0.4)
-    cockpit.offboard(mixed)
-    cockpit.fly(8.0, mixed)
-    airframe = cockpit.vehicle.airframe
+    harness.offboard(mixed)
+    harness.fly(8.0, mixed)
+    airframe = harness.vehicle.airframe
     assert airframe.position[0] == pytest.approx(2.0, abs=0.35)
     assert airframe.velocity[2] == pytest.approx(-0.4 / LINEAR_DRAG_PER_S, abs=0.06)
-    assert cockpit.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask & 63 == 4 | 32
+    assert harness.received("POSITION_TARGET_LOCAL_NED")[-1].type_mask & 63 == 4 | 32
 
 
 @pytest.mark.parametrize(
@@ -239,14 +241,14 @@ def test_place_by_position_and_height_by_acceleration(cockpit: Cockpit) -> None:
     ids=["height alone", "north alone", "north and height"],
 )
 def test_what_leaves_an_axis_open_stops_the_vehicle_but_counts_as_a_signal(
-    cockpit: Cockpit, fields: dict[str, Any]
+    harness: SimHarness, fields: dict[str, Any]
 ) -> None:
-    cockpit.take_off(6.0)
-    before = cockpit.vehicle.airframe.position
+    harness.take_off(6.0)
+    before = harness.vehicle.airframe.position
     incomplete = locally(**fields)
-    cockpit.offboard(incomplete)
-    cockpit.fly(3.0, incomplete)
-    assert cockpit.mode == "OFFBOARD"
-    assert math.dist(cockpit.vehicle.airframe.position, before) < 0.3
-    echo = cockpit.received("POSITION_TARGET_LOCAL_NED")[-1]
+    harness.offboard(incomplete)
+    harness.fly(3.0, incomplete)
+    assert harness.mode == "OFFBOARD"
+    assert math.dist(harness.vehicle.airframe.position, before) < 0.3
+    echo = harness.received("POSITION_TARGET_LOCAL_NED")[-1]
     assert (echo.type_mask, echo.vx, echo.vz) == (7, 0.0, 0.0)

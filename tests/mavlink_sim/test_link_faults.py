@@ -162,7 +162,7 @@ def test_when_a_delay_ends_nothing_overtakes_what_is_on_its_way() -> None:
     channel, delay = Channel(), Delay(1.0)
     channel.impair(delay)
     channel.push(0.0, b"first")
-    channel.mend(delay)
+    channel.clear(delay)
     channel.push(0.1, b"second")
     assert not channel.due(0.5)
     assert [data for data, _ in channel.due(1.0)] == [b"first", b"second"]

@@ -6,82 +6,82 @@ import pytest
 
 from mavlink_sim.wire.announcements import INFO, Text
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
-pytestmark = pytest.mark.hears("everything")
+pytestmark = pytest.mark.streams("everything")
 
 GCS = 6
 ONBOARD_CONTROLLER = 18
 
 
-def test_a_companion_gets_no_status_texts_but_gets_events(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
-    cockpit.take_off()
-    assert cockpit.texts("onboard") == []
-    assert cockpit.texts("gcs") == []
-    assert cockpit.received("EVENT", "onboard")
+def test_a_companion_gets_no_status_texts_but_gets_events(harness: SimHarness) -> None:
+    harness.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
+    harness.take_off()
+    assert harness.texts("onboard") == []
+    assert harness.texts("gcs") == []
+    assert harness.received("EVENT", "onboard")
 
 
-def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), GCS))
-    cockpit.take_off()
-    assert cockpit.texts("gcs") == [
+def test_a_ground_station_gets_them_on_the_link_it_is_heard_on(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), GCS))
+    harness.take_off()
+    assert harness.texts("gcs") == [
         "Armed by external command\t",
         "Using default takeoff altitude: 2.5 m\t",
         "Takeoff detected\t",
     ]
-    assert {message.severity for message in cockpit.received("STATUSTEXT", "gcs")} == {6}
-    assert cockpit.texts("onboard") == []
+    assert {message.severity for message in harness.received("STATUSTEXT", "gcs")} == {6}
+    assert harness.texts("onboard") == []
 
 
-def test_a_ground_station_that_falls_silent_gets_no_more(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), GCS))
-    cockpit.wait_ready()
-    cockpit.heartbeats.clear()
-    cockpit.fly(3.0)
-    cockpit.command(400, 1)
-    assert cockpit.texts("gcs") == []
+def test_a_ground_station_that_falls_silent_gets_no_more(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), GCS))
+    harness.wait_ready()
+    harness.heartbeats.clear()
+    harness.fly(3.0)
+    harness.command(400, 1)
+    assert harness.texts("gcs") == []
 
 
-def test_refusals_are_told_as_critical(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), GCS))
-    cockpit.fly(1.0)
-    cockpit.command(400, 1)
-    assert cockpit.texts() == [
+def test_refusals_are_told_as_critical(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), GCS))
+    harness.fly(1.0)
+    harness.command(400, 1)
+    assert harness.texts() == [
         "Preflight Fail: heading estimate not stable",
         "Arming denied: Resolve system health failures first\t",
     ]
-    assert {message.severity for message in cockpit.received("STATUSTEXT", "gcs")} == {2}
-    cockpit.take_off()
-    cockpit.command(400, 0)
-    assert cockpit.texts()[-1] == "Disarming denied: not landed\t"
-    cockpit.set_mode(77)
-    assert cockpit.texts()[-1] == "Unsupported main mode\t"
+    assert {message.severity for message in harness.received("STATUSTEXT", "gcs")} == {2}
+    harness.take_off()
+    harness.command(400, 0)
+    assert harness.texts()[-1] == "Disarming denied: not landed\t"
+    harness.set_mode(77)
+    assert harness.texts()[-1] == "Unsupported main mode\t"
 
 
-def test_a_long_text_comes_in_chunks(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), GCS))
-    cockpit.fly(0.1)
+def test_a_long_text_comes_in_chunks(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), GCS))
+    harness.fly(0.1)
     long = "x" * 120 + "\t"
-    cockpit.vehicle.autopilot.texts.append(Text(INFO, long))
-    cockpit.fly(0.1)
-    chunks = cockpit.received("STATUSTEXT", "gcs")
+    harness.vehicle.autopilot.texts.append(Text(INFO, long))
+    harness.fly(0.1)
+    chunks = harness.received("STATUSTEXT", "gcs")
     assert [chunk.chunk_seq for chunk in chunks] == [0, 1, 2]
     assert len({chunk.id for chunk in chunks}) == 1
     assert chunks[0].id != 0
-    assert cockpit.texts() == [long]
+    assert harness.texts() == [long]
 
 
-def test_the_loss_of_the_companions_heartbeat_is_told_after_seven_seconds(cockpit: Cockpit) -> None:
-    cockpit.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
-    cockpit.fly(3.0)
-    del cockpit.heartbeats[1]
-    started = cockpit.now_s
-    cockpit.until(lambda: "Connection to mission computer lost\t" in cockpit.texts(), 10.0)
-    assert 6.0 < cockpit.now_s - started < 7.5
-    cockpit.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
-    cockpit.fly(1.5)
-    assert cockpit.texts()[-1] == "Onboard controller regained\t"
+def test_the_loss_of_the_companions_heartbeat_is_told_after_seven_seconds(harness: SimHarness) -> None:
+    harness.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
+    harness.fly(3.0)
+    del harness.heartbeats[1]
+    started = harness.now_s
+    harness.until(lambda: "Connection to mission computer lost\t" in harness.texts(), 10.0)
+    assert 6.0 < harness.now_s - started < 7.5
+    harness.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
+    harness.fly(1.5)
+    assert harness.texts()[-1] == "Onboard controller regained\t"
 
 
 def heartbeat(kind: int = GCS) -> Any:
@@ -91,31 +91,33 @@ def heartbeat(kind: int = GCS) -> Any:
 
 
 def test_a_ground_stations_heartbeat_is_forwarded_byte_for_byte_to_where_somebody_listens(
-    cockpit: Cockpit,
+    harness: SimHarness,
 ) -> None:
-    cockpit.send(heartbeat(), "gcs", (245, 190))
-    assert cockpit.inbox["onboard"] == []  # nobody was heard there yet
-    cockpit.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
-    cockpit.forget()
+    harness.send(heartbeat(), "gcs", (245, 190))
+    assert harness.inbox["onboard"] == []  # nobody was heard there yet
+    harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
+    harness.forget()
     message = heartbeat()
-    cockpit.send(message, "gcs", (245, 190))
-    ((_, item),) = cockpit.inbox["onboard"]
+    harness.send(message, "gcs", (245, 190))
+    ((_, item),) = harness.inbox["onboard"]
     assert (item.system, item.component, item.forwarded) == (245, 190, True)
     assert item.pack(dialect.MAVLink(None, 1, 1)) == bytes(message.get_msgbuf())
-    assert cockpit.inbox["gcs"] == []
+    assert harness.inbox["gcs"] == []
 
 
-def test_a_message_for_the_companion_reaches_it_and_one_for_the_autopilot_does_not(cockpit: Cockpit) -> None:
-    cockpit.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
-    cockpit.forget()
+def test_a_message_for_the_companion_reaches_it_and_one_for_the_autopilot_does_not(
+    harness: SimHarness,
+) -> None:
+    harness.send(dialect.MAVLink_heartbeat_message(ONBOARD_CONTROLLER, 8, 0, 0, 4, 3), "onboard")
+    harness.forget()
     source = (245, 190)
-    cockpit.send(dialect.MAVLink_command_long_message(1, 191, 512, 0, 148, *[0] * 6), "gcs", source)
-    cockpit.send(dialect.MAVLink_command_long_message(1, 55, 512, 0, 148, *[0] * 6), "gcs", source)
-    cockpit.send(dialect.MAVLink_command_long_message(1, 1, 512, 0, 148, *[0] * 6), "gcs", source)
-    forwarded = [item.message.target_component for _, item in cockpit.inbox["onboard"] if item.forwarded]
+    harness.send(dialect.MAVLink_command_long_message(1, 191, 512, 0, 148, *[0] * 6), "gcs", source)
+    harness.send(dialect.MAVLink_command_long_message(1, 55, 512, 0, 148, *[0] * 6), "gcs", source)
+    harness.send(dialect.MAVLink_command_long_message(1, 1, 512, 0, 148, *[0] * 6), "gcs", source)
+    forwarded = [item.message.target_component for _, item in harness.inbox["onboard"] if item.forwarded]
     assert forwarded == [191]
 
 
-def test_its_own_messages_coming_back_are_ignored(cockpit: Cockpit) -> None:
-    cockpit.send(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3), "onboard", (1, 1))
-    assert cockpit.vehicle.links["onboard"].components == set()
+def test_its_own_messages_coming_back_are_ignored(harness: SimHarness) -> None:
+    harness.send(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3), "onboard", (1, 1))
+    assert harness.vehicle.links["onboard"].components == set()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim import Flock, LockstepVehicle
+from mavlink_sim import FleetWorld, LockstepVehicle
 from mavlink_sim.fleet import Fleet, instance_options
 from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
 from mavlink_sim.physics.contact import CRASH_MPS, Collision
@@ -182,18 +182,18 @@ def test_two_that_slide_into_each_other_on_the_ground_stop_there() -> None:
 
 
 def test_in_one_place_two_cannot_begin() -> None:
-    flock = Flock(3)
+    fleet_world = FleetWorld(3)
     first = LockstepVehicle({"onboard": {}}).vehicle
-    flock.join(first)
+    fleet_world.join(first)
     with pytest.raises(ValueError, match="vehicle 1 has joined already"):
-        flock.join(first)
+        fleet_world.join(first)
     near = LockstepVehicle({"onboard": {}}, system_id=2, start_ned_m=(0.0, 0.5)).vehicle
     with pytest.raises(ValueError, match=r"vehicle 2 is 0.5 m beside vehicle 1: they need 0.6 m"):
-        flock.join(near)
-    flock.join(LockstepVehicle({"onboard": {}}, system_id=3, start_ned_m=(0.0, 0.6)).vehicle)
-    flock.join(LockstepVehicle({"onboard": {}}, system_id=4, start_ned_m=(0.0, 1.2)).vehicle)
-    with pytest.raises(ValueError, match="vehicle 5: this flock is of 3"):
-        flock.join(LockstepVehicle({"onboard": {}}, system_id=5, start_ned_m=(9.0, 0.0)).vehicle)
+        fleet_world.join(near)
+    fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=3, start_ned_m=(0.0, 0.6)).vehicle)
+    fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=4, start_ned_m=(0.0, 1.2)).vehicle)
+    with pytest.raises(ValueError, match="vehicle 5: this fleet_world is of 3"):
+        fleet_world.join(LockstepVehicle({"onboard": {}}, system_id=5, start_ned_m=(9.0, 0.0)).vehicle)
 
 
 def place(north: float, east: float, down: float) -> Any:
@@ -209,20 +209,20 @@ def test_two_in_lockstep_do_not_fly_through_each_other() -> None:
         )
         for number, start in ((1, 0.0), (2, 6.0))
     ]
-    flock = Flock(2)
+    fleet_world = FleetWorld(2)
     for vehicle in pair:
-        flock.join(vehicle.vehicle, offset=9)
+        fleet_world.join(vehicle.vehicle, offset=9)
         vehicle.take_off(3.0)
     # each towards where the other is, in its own frame
     for vehicle, north in zip(pair, (6.0, -6.0), strict=True):
         vehicle.repeat(place(north, 0.0, -3.0), 20.0)
         vehicle.step(0.1)
         vehicle.set_mode("OFFBOARD")
-    first, second = flock._midair.bodies
+    first, second = fleet_world._midair.bodies
     for _ in range(1500):
         for vehicle in pair:
             vehicle.step(STEP_S)
-        flock.meet()
+        fleet_world.meet()
         assert apart(first, second) > 0.95
     assert pair[0].truth.collision is not None
     assert (pair[0].truth.collision.name, pair[0].truth.collision.identifier) == ("vehicle 2", 11)
@@ -236,9 +236,9 @@ def test_one_that_lands_on_another_has_landed() -> None:
         )
         for number, start in ((1, 0.0), (2, 3.0))
     ]
-    flock = Flock(2)
+    fleet_world = FleetWorld(2)
     for vehicle in pair:
-        flock.join(vehicle.vehicle)
+        fleet_world.join(vehicle.vehicle)
     upper = pair[1]
     upper.take_off(3.0)
     airframe = upper.vehicle.airframe
@@ -250,7 +250,7 @@ def test_one_that_lands_on_another_has_landed() -> None:
     upper.send(dialect.MAVLink_command_long_message(2, 1, 21, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan))
     for _ in range(10_000):
         upper.step(STEP_S)
-        flock.meet()
+        fleet_world.meet()
         if not upper.truth.armed:
             break
     assert (upper.truth.armed, upper.truth.landed, upper.truth.on_ground) == (False, True, True)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import (
     NAN,
     RETURN,
@@ -27,44 +27,44 @@ SHORT = [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]
 
 
 @pytest.fixture
-def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
+def harness(make_harness: type[SimHarness]) -> SimHarness:
     """A vehicle that is ready at once."""
-    return make_cockpit(ready_after_s=0.0)
+    return make_harness(ready_after_s=0.0)
 
 
-def away(cockpit: Cockpit, north: float, east: float) -> float:
-    return math.dist(cockpit.vehicle.airframe.position[:2], (north, east))
+def away(harness: SimHarness, north: float, east: float) -> float:
+    return math.dist(harness.vehicle.airframe.position[:2], (north, east))
 
 
-def current(cockpit: Cockpit) -> int:
-    return int(cockpit.vehicle.autopilot.navigator.mission.current)
+def current(harness: SimHarness) -> int:
+    return int(harness.vehicle.autopilot.navigator.mission.current)
 
 
-def status(cockpit: Cockpit) -> tuple[int, int, int, int]:
+def status(harness: SimHarness) -> tuple[int, int, int, int]:
     """The newest MISSION_CURRENT: sequence, total, state, mode."""
-    cockpit.fly(1.1)
-    told = cockpit.received("MISSION_CURRENT")[-1]
+    harness.fly(1.1)
+    told = harness.received("MISSION_CURRENT")[-1]
     return told.seq, told.total, told.mission_state, told.mission_mode
 
 
-def test_a_mission_takes_off_flies_lands_and_disarms(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    assert status(cockpit) == (0, 65535, 1, 2)
-    assert upload(cockpit, SHORT) == 0
-    assert status(cockpit) == (0, 3, 2, 2)
-    assert cockpit.set_mode(4, 4) == [0, 0]
-    assert cockpit.vehicle.autopilot.can_arm
-    assert cockpit.command(400, 1) == [0]
-    cockpit.until(lambda: cockpit.height_m > 1.0, 20.0)
-    assert cockpit.vehicle.autopilot.landed_state == 3
-    cockpit.until(lambda: current(cockpit) == 1, 20.0)
-    assert cockpit.height_m == pytest.approx(4.0, abs=0.9)
-    assert status(cockpit)[2:] == (3, 1)
-    cockpit.until(lambda: not cockpit.armed, 60.0)
-    assert away(cockpit, 8, 0) < 1.0
-    assert reached(cockpit) == [0, 1, 2]
-    assert status(cockpit)[:3] == (2, 3, 5)
-    said = cockpit.texts()
+def test_a_mission_takes_off_flies_lands_and_disarms(harness: SimHarness) -> None:
+    listen(harness)
+    assert status(harness) == (0, 65535, 1, 2)
+    assert upload(harness, SHORT) == 0
+    assert status(harness) == (0, 3, 2, 2)
+    assert harness.set_mode(4, 4) == [0, 0]
+    assert harness.vehicle.autopilot.can_arm
+    assert harness.command(400, 1) == [0]
+    harness.until(lambda: harness.height_m > 1.0, 20.0)
+    assert harness.vehicle.autopilot.landed_state == 3
+    harness.until(lambda: current(harness) == 1, 20.0)
+    assert harness.height_m == pytest.approx(4.0, abs=0.9)
+    assert status(harness)[2:] == (3, 1)
+    harness.until(lambda: not harness.armed, 60.0)
+    assert away(harness, 8, 0) < 1.0
+    assert reached(harness) == [0, 1, 2]
+    assert status(harness)[:3] == (2, 3, 5)
+    said = harness.texts()
     assert said[-6:] == [
         "Executing Mission\t",
         "Climb to 4.0 meters above home\t",
@@ -75,41 +75,41 @@ def test_a_mission_takes_off_flies_lands_and_disarms(cockpit: Cockpit) -> None:
     ]
 
 
-def test_mission_start_arms_and_begins_where_it_is_told(cockpit: Cockpit) -> None:
-    assert cockpit.command(300, 0, 0) == [2]
-    upload(cockpit, [takeoff(4.0), waypoint(30, 0, 4), waypoint(0, 6, 4)])
-    assert cockpit.command(300, 3, 0) == [2]
-    assert cockpit.command(300, 2, 0) == [0]
-    assert cockpit.armed
-    assert cockpit.mode == "MISSION"
-    cockpit.until(lambda: cockpit.mode == "HOLD", 40.0)  # after the last item it holds there
-    assert reached(cockpit) == [2]
-    cockpit.fly(4.0)
-    assert away(cockpit, 0, 6) < 1.0
-    assert status(cockpit)[2] == 5
+def test_mission_start_arms_and_begins_where_it_is_told(harness: SimHarness) -> None:
+    assert harness.command(300, 0, 0) == [2]
+    upload(harness, [takeoff(4.0), waypoint(30, 0, 4), waypoint(0, 6, 4)])
+    assert harness.command(300, 3, 0) == [2]
+    assert harness.command(300, 2, 0) == [0]
+    assert harness.armed
+    assert harness.mode == "MISSION"
+    harness.until(lambda: harness.mode == "HOLD", 40.0)  # after the last item it holds there
+    assert reached(harness) == [2]
+    harness.fly(4.0)
+    assert away(harness, 0, 6) < 1.0
+    assert status(harness)[2] == 5
 
 
-def test_reached_items_are_told_again_ten_times(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(4.0), item(17, (0, 0, 4), 0, 0, 0, NAN)])
-    cockpit.command(300)
-    cockpit.until(lambda: current(cockpit) == 1, 30.0)
-    cockpit.fly(13.0)
-    assert [m.seq for m in cockpit.received("MISSION_ITEM_REACHED")] == [0] * 11
-    assert cockpit.mode == "MISSION"  # loiter without end
+def test_reached_items_are_told_again_ten_times(harness: SimHarness) -> None:
+    upload(harness, [takeoff(4.0), item(17, (0, 0, 4), 0, 0, 0, NAN)])
+    harness.command(300)
+    harness.until(lambda: current(harness) == 1, 30.0)
+    harness.fly(13.0)
+    assert [m.seq for m in harness.received("MISSION_ITEM_REACHED")] == [0] * 11
+    assert harness.mode == "MISSION"  # loiter without end
 
 
-def test_a_waypoint_is_held_for_its_time_and_heading(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(3.0), waypoint(5, 0, 3, 3.0, 1.0, 0.0, 90.0), waypoint(5, 5, 3)])
-    cockpit.command(300)
-    cockpit.until(lambda: away(cockpit, 5, 0) < 1.0, 30.0)
-    waited = cockpit.until(lambda: current(cockpit) == 2, 20.0)
+def test_a_waypoint_is_held_for_its_time_and_heading(harness: SimHarness) -> None:
+    upload(harness, [takeoff(3.0), waypoint(5, 0, 3, 3.0, 1.0, 0.0, 90.0), waypoint(5, 5, 3)])
+    harness.command(300)
+    harness.until(lambda: away(harness, 5, 0) < 1.0, 30.0)
+    waited = harness.until(lambda: current(harness) == 2, 20.0)
     assert waited >= 3.0
-    assert math.degrees(cockpit.vehicle.airframe.yaw_rad) == pytest.approx(90.0, abs=12.0)
+    assert math.degrees(harness.vehicle.airframe.yaw_rad) == pytest.approx(90.0, abs=12.0)
 
 
-def test_delay_and_speed_and_jump_items_do_what_they_say(cockpit: Cockpit) -> None:
+def test_delay_and_speed_and_jump_items_do_what_they_say(harness: SimHarness) -> None:
     upload(
-        cockpit,
+        harness,
         [
             takeoff(3.0),
             item(93, None, 2.0),
@@ -121,69 +121,69 @@ def test_delay_and_speed_and_jump_items_do_what_they_say(cockpit: Cockpit) -> No
             RETURN,
         ],
     )
-    cockpit.command(300)
-    cockpit.until(lambda: current(cockpit) == 1, 30.0)
-    assert 1.9 <= cockpit.until(lambda: current(cockpit) == 3, 10.0) <= 2.4
+    harness.command(300)
+    harness.until(lambda: current(harness) == 1, 30.0)
+    assert 1.9 <= harness.until(lambda: current(harness) == 3, 10.0) <= 2.4
     fastest = 0.0
 
     def returning() -> bool:
         nonlocal fastest
-        fastest = max(fastest, math.hypot(*cockpit.vehicle.airframe.velocity[:2]))
-        return bool(cockpit.mode == "RTL")
+        fastest = max(fastest, math.hypot(*harness.vehicle.airframe.velocity[:2]))
+        return bool(harness.mode == "RTL")
 
-    cockpit.until(returning, 60.0)
+    harness.until(returning, 60.0)
     assert 0.7 < fastest < 1.4
-    assert reached(cockpit) == [0, 1, 2, 3, 4, 3, 4, 6, 7]
-    assert status(cockpit)[2:] == (5, 2)  # complete, though the vehicle is still on its way
+    assert reached(harness) == [0, 1, 2, 3, 4, 3, 4, 6, 7]
+    assert status(harness)[2:] == (5, 2)  # complete, though the vehicle is still on its way
 
 
-def test_a_mission_that_ends_in_a_return_holds_for_a_moment(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(3.0), waypoint(4, 0, 3), RETURN])
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.mode == "HOLD", 30.0)
-    assert 0.03 <= cockpit.until(lambda: cockpit.mode == "RTL", 1.0) <= 0.07
-    cockpit.until(lambda: not cockpit.armed, 60.0)
-    assert cockpit.mode == "HOLD"
-    changes = [line for line in cockpit.events if line.startswith("mode ")]
+def test_a_mission_that_ends_in_a_return_holds_for_a_moment(harness: SimHarness) -> None:
+    upload(harness, [takeoff(3.0), waypoint(4, 0, 3), RETURN])
+    harness.command(300)
+    harness.until(lambda: harness.mode == "HOLD", 30.0)
+    assert 0.03 <= harness.until(lambda: harness.mode == "RTL", 1.0) <= 0.07
+    harness.until(lambda: not harness.armed, 60.0)
+    assert harness.mode == "HOLD"
+    changes = [line for line in harness.events if line.startswith("mode ")]
     assert changes == ["mode MISSION", "mode HOLD", "mode RTL", "mode HOLD"]
 
 
-def test_a_pause_keeps_the_place_in_the_mission(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(4.0), waypoint(12, 0, 4), waypoint(12, 8, 4)])
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 4.0, 30.0)
-    assert cockpit.set_mode(4, 3) == [0, 0]
-    cockpit.fly(4.0)
-    assert status(cockpit) == (1, 3, 4, 2)  # paused
-    stayed = cockpit.vehicle.airframe.position[0]
-    cockpit.fly(2.0)
-    assert cockpit.vehicle.airframe.position[0] == pytest.approx(stayed, abs=0.5)
-    cockpit.forget()
-    assert cockpit.set_mode(4, 4) == [0, 0]
-    assert status(cockpit) == (1, 3, 3, 1)
-    cockpit.until(lambda: cockpit.mode == "HOLD", 40.0)
-    assert reached(cockpit) == [1, 2]
+def test_a_pause_keeps_the_place_in_the_mission(harness: SimHarness) -> None:
+    upload(harness, [takeoff(4.0), waypoint(12, 0, 4), waypoint(12, 8, 4)])
+    harness.command(300)
+    harness.until(lambda: harness.vehicle.airframe.position[0] > 4.0, 30.0)
+    assert harness.set_mode(4, 3) == [0, 0]
+    harness.fly(4.0)
+    assert status(harness) == (1, 3, 4, 2)  # paused
+    stayed = harness.vehicle.airframe.position[0]
+    harness.fly(2.0)
+    assert harness.vehicle.airframe.position[0] == pytest.approx(stayed, abs=0.5)
+    harness.forget()
+    assert harness.set_mode(4, 4) == [0, 0]
+    assert status(harness) == (1, 3, 3, 1)
+    harness.until(lambda: harness.mode == "HOLD", 40.0)
+    assert reached(harness) == [1, 2]
 
 
-def test_a_waypoint_on_the_way_is_passed_without_stopping(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(4.0), waypoint(15, 0, 4), waypoint(30, 0, 4)])
-    cockpit.command(300)
-    cockpit.until(lambda: current(cockpit) == 2, 40.0)
-    assert cockpit.vehicle.airframe.velocity[0] > 2.0
+def test_a_waypoint_on_the_way_is_passed_without_stopping(harness: SimHarness) -> None:
+    upload(harness, [takeoff(4.0), waypoint(15, 0, 4), waypoint(30, 0, 4)])
+    harness.command(300)
+    harness.until(lambda: current(harness) == 2, 40.0)
+    assert harness.vehicle.airframe.velocity[0] > 2.0
     slowest = math.inf
 
     def beyond() -> bool:
         nonlocal slowest
-        slowest = min(slowest, cockpit.vehicle.airframe.velocity[0])
-        return bool(cockpit.vehicle.airframe.position[0] > 20.0)
+        slowest = min(slowest, harness.vehicle.airframe.velocity[0])
+        return bool(harness.vehicle.airframe.position[0] > 20.0)
 
-    cockpit.until(beyond, 20.0)
+    harness.until(beyond, 20.0)
     assert slowest > 2.0
 
 
-def test_camera_commands_are_sent_to_the_camera(cockpit: Cockpit) -> None:
+def test_camera_commands_are_sent_to_the_camera(harness: SimHarness) -> None:
     upload(
-        cockpit,
+        harness,
         [
             takeoff(3.0),
             item(2000, None, 0, 1.0, 0),
@@ -193,45 +193,45 @@ def test_camera_commands_are_sent_to_the_camera(cockpit: Cockpit) -> None:
             waypoint(0, 0, 3),
         ],
     )
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.mode == "HOLD", 40.0)
-    sent = [(m.command, m.target_component) for m in cockpit.received("COMMAND_LONG")]
+    harness.command(300)
+    harness.until(lambda: harness.mode == "HOLD", 40.0)
+    sent = [(m.command, m.target_component) for m in harness.received("COMMAND_LONG")]
     # one single shot goes to the vehicle's own trigger, as DO_DIGICAM_CONTROL
     assert sent == [(2000, 100), (203, 100), (2001, 101), (203, 0)]
 
 
-def test_a_mission_uploaded_while_flying_one_is_flown_at_once(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(4.0), waypoint(60, 0, 4)])
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 3.0, 30.0)
-    upload(cockpit, [waypoint(3, 8, 4), waypoint(0, 8, 4)])
-    cockpit.until(lambda: cockpit.mode == "HOLD", 40.0)
-    assert away(cockpit, 0, 8) < 3.0
+def test_a_mission_uploaded_while_flying_one_is_flown_at_once(harness: SimHarness) -> None:
+    upload(harness, [takeoff(4.0), waypoint(60, 0, 4)])
+    harness.command(300)
+    harness.until(lambda: harness.vehicle.airframe.position[0] > 3.0, 30.0)
+    upload(harness, [waypoint(3, 8, 4), waypoint(0, 8, 4)])
+    harness.until(lambda: harness.mode == "HOLD", 40.0)
+    assert away(harness, 0, 8) < 3.0
 
 
-def test_clearing_the_mission_in_flight_ends_in_hold(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(4.0), waypoint(60, 0, 4)])
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 3.0, 30.0)
-    cockpit.send(dialect.MAVLink_mission_clear_all_message(1, 1, 0))
-    cockpit.fly(1.0)
-    assert cockpit.mode == "HOLD"
-    assert cockpit.set_mode(4, 4) == [0, 1]
+def test_clearing_the_mission_in_flight_ends_in_hold(harness: SimHarness) -> None:
+    upload(harness, [takeoff(4.0), waypoint(60, 0, 4)])
+    harness.command(300)
+    harness.until(lambda: harness.vehicle.airframe.position[0] > 3.0, 30.0)
+    harness.send(dialect.MAVLink_mission_clear_all_message(1, 1, 0))
+    harness.fly(1.0)
+    assert harness.mode == "HOLD"
+    assert harness.set_mode(4, 4) == [0, 1]
 
 
-def test_a_finished_mission_begins_again_after_disarming(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(2.5), land()])
-    cockpit.command(300)
-    cockpit.until(lambda: not cockpit.armed, 60.0)
-    assert current(cockpit) == 1
-    cockpit.forget()
-    cockpit.set_mode(4, 4)
-    assert cockpit.command(400, 1) == [0]
-    cockpit.until(lambda: not cockpit.armed, 60.0)
-    assert reached(cockpit)[-2:] == [0, 1]
+def test_a_finished_mission_begins_again_after_disarming(harness: SimHarness) -> None:
+    upload(harness, [takeoff(2.5), land()])
+    harness.command(300)
+    harness.until(lambda: not harness.armed, 60.0)
+    assert current(harness) == 1
+    harness.forget()
+    harness.set_mode(4, 4)
+    assert harness.command(400, 1) == [0]
+    harness.until(lambda: not harness.armed, 60.0)
+    assert reached(harness)[-2:] == [0, 1]
 
 
-def test_numbers_that_are_none_do_not_stop_the_vehicle(cockpit: Cockpit) -> None:
+def test_numbers_that_are_none_do_not_stop_the_vehicle(harness: SimHarness) -> None:
     nothing = [NAN] * 7
     strange = [
         takeoff(3.0),
@@ -244,16 +244,16 @@ def test_numbers_that_are_none_do_not_stop_the_vehicle(cockpit: Cockpit) -> None
         item(19, (0, 0, 3), math.inf, NAN, NAN, NAN),
         waypoint(0, 2, 3),
     ]
-    assert upload(cockpit, strange) == 0
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.mode == "HOLD", 60.0)
-    assert all(map(math.isfinite, cockpit.vehicle.airframe.position))
+    assert upload(harness, strange) == 0
+    harness.command(300)
+    harness.until(lambda: harness.mode == "HOLD", 60.0)
+    assert all(map(math.isfinite, harness.vehicle.airframe.position))
 
 
-def test_an_empty_mission_cannot_be_flown_or_armed_in(cockpit: Cockpit) -> None:
-    assert cockpit.set_mode(4, 4) == [0, 0]  # on the ground any mode may be chosen
-    assert not cockpit.vehicle.autopilot.can_arm
-    assert cockpit.command(400, 1) == [1]
+def test_an_empty_mission_cannot_be_flown_or_armed_in(harness: SimHarness) -> None:
+    assert harness.set_mode(4, 4) == [0, 0]  # on the ground any mode may be chosen
+    assert not harness.vehicle.autopilot.can_arm
+    assert harness.command(400, 1) == [1]
 
 
 @pytest.mark.parametrize(
@@ -302,33 +302,33 @@ def test_an_empty_mission_cannot_be_flown_or_armed_in(cockpit: Cockpit) -> None:
     ],
 )
 def test_a_mission_that_cannot_be_flown_is_stored_but_refused(
-    make_cockpit: type[Cockpit], parameters: dict[str, float], plan: list[Any], words: str
+    make_harness: type[SimHarness], parameters: dict[str, float], plan: list[Any], words: str
 ) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters=parameters)
-    listen(cockpit)
-    assert upload(cockpit, plan) == 0
-    cockpit.fly(0.1)
-    assert words in cockpit.texts()
-    assert cockpit.command(300) == [2]
-    assert cockpit.texts()[-1] == "Mission start denied! No valid mission\t"
-    assert status(cockpit)[2] == 1
+    harness = make_harness(ready_after_s=0.0, parameters=parameters)
+    listen(harness)
+    assert upload(harness, plan) == 0
+    harness.fly(0.1)
+    assert words in harness.texts()
+    assert harness.command(300) == [2]
+    assert harness.texts()[-1] == "Mission start denied! No valid mission\t"
+    assert status(harness)[2] == 1
 
 
-def test_a_far_first_waypoint_is_only_warned_of(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(ready_after_s=0.0, parameters={"MIS_DIST_1WP": 100.0})
-    listen(cockpit)
-    upload(cockpit, [waypoint(150.5, 0, 5)])
-    cockpit.fly(0.1)
-    assert "First waypoint far away from home: 150m. Correct mission loaded?\t" in cockpit.texts()
-    assert cockpit.vehicle.autopilot.navigator.mission.valid
+def test_a_far_first_waypoint_is_only_warned_of(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(ready_after_s=0.0, parameters={"MIS_DIST_1WP": 100.0})
+    listen(harness)
+    upload(harness, [waypoint(150.5, 0, 5)])
+    harness.fly(0.1)
+    assert "First waypoint far away from home: 150m. Correct mission loaded?\t" in harness.texts()
+    assert harness.vehicle.autopilot.navigator.mission.valid
 
 
-def test_a_fence_that_comes_later_makes_the_mission_invalid(cockpit: Cockpit) -> None:
-    upload(cockpit, [takeoff(5.0), waypoint(30, 0, 5)])
-    assert cockpit.vehicle.autopilot.navigator.mission.valid
-    upload(cockpit, [circle(0, 0, 20.0)], 1)
-    cockpit.fly(0.3)
-    assert not cockpit.vehicle.autopilot.navigator.mission.valid
-    upload(cockpit, polygon([(-60, -60), (60, -60), (60, 60), (-60, 60)]), 1)
-    cockpit.fly(0.3)
-    assert cockpit.vehicle.autopilot.navigator.mission.valid
+def test_a_fence_that_comes_later_makes_the_mission_invalid(harness: SimHarness) -> None:
+    upload(harness, [takeoff(5.0), waypoint(30, 0, 5)])
+    assert harness.vehicle.autopilot.navigator.mission.valid
+    upload(harness, [circle(0, 0, 20.0)], 1)
+    harness.fly(0.3)
+    assert not harness.vehicle.autopilot.navigator.mission.valid
+    upload(harness, polygon([(-60, -60), (60, -60), (60, 60), (-60, 60)]), 1)
+    harness.fly(0.3)
+    assert harness.vehicle.autopilot.navigator.mission.valid

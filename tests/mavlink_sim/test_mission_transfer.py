@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
 from mavlink_sim.services.mission_messages import MissionCurrent
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import (
     COMPANION,
     RETURN,
@@ -36,17 +36,17 @@ SQUARE = [(-50.0, -50.0), (-50.0, 50.0), (50.0, 50.0), (50.0, -50.0)]
 
 
 @pytest.fixture
-def cockpit(make_cockpit: type[Cockpit]) -> Cockpit:
+def harness(make_harness: type[SimHarness]) -> SimHarness:
     """A vehicle that is ready at once."""
-    return make_cockpit(ready_after_s=0.0)
+    return make_harness(ready_after_s=0.0)
 
 
 def count(number: int, plan: int = 0, target: tuple[int, int] = (1, 1)) -> Any:
     return dialect.MAVLink_mission_count_message(*target, number, plan)
 
 
-def test_an_uploaded_mission_is_given_back_as_px4_stores_it(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
+def test_an_uploaded_mission_is_given_back_as_px4_stores_it(harness: SimHarness) -> None:
+    harness.wait_ready()
     plan = [
         takeoff(5.0),
         waypoint(10, 0, 5, 2.5, 1.5, 9.0, -90.0),
@@ -55,8 +55,8 @@ def test_an_uploaded_mission_is_given_back_as_px4_stores_it(cockpit: Cockpit) ->
         item(177, None, 1, 2),
         land(10, 10),
     ]
-    assert upload(cockpit, plan) == 0
-    got = download(cockpit)
+    assert upload(harness, plan) == 0
+    got = download(harness)
     assert [(m.seq, m.command, m.frame, m.current) for m in got] == [
         (0, 22, 6, 1),
         (1, 16, 6, 0),
@@ -83,73 +83,73 @@ def test_an_uploaded_mission_is_given_back_as_px4_stores_it(cockpit: Cockpit) ->
     ],
     ids=["fence", "rally"],
 )
-def test_fence_and_rally_points_go_there_and_back(cockpit: Cockpit, plan: int, items: list[Any]) -> None:
-    cockpit.wait_ready()
-    assert upload(cockpit, items, plan) == 0
-    got = download(cockpit, plan)
+def test_fence_and_rally_points_go_there_and_back(harness: SimHarness, plan: int, items: list[Any]) -> None:
+    harness.wait_ready()
+    assert upload(harness, items, plan) == 0
+    got = download(harness, plan)
     assert [(m.command, m.param1, m.x, m.y, m.mission_type) for m in got] == [
         (i["command"], i["param1"], i["x"], i["y"], plan) for i in items
     ]
-    assert download(cockpit, 0) == []
+    assert download(harness, 0) == []
 
 
-def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    cockpit.send(count(2))
-    assert newest(cockpit, "MISSION_REQUEST_INT", 0).seq == 0
+def test_a_client_that_sends_floats_is_asked_with_floats_from_then_on(harness: SimHarness) -> None:
+    harness.wait_ready()
+    harness.send(count(2))
+    assert newest(harness, "MISSION_REQUEST_INT", 0).seq == 0
     wanted = dialect.MAVLink_mission_item_message(1, 1, 0, 3, 22, 1, 1, 0, 0, 0, NAN, 47.3977, 8.5456, 5, 0)
-    cockpit.send(wanted)
-    assert newest(cockpit, "MISSION_REQUEST", 0).seq == 1
-    cockpit.send(
+    harness.send(wanted)
+    assert newest(harness, "MISSION_REQUEST", 0).seq == 1
+    harness.send(
         dialect.MAVLink_mission_item_message(1, 1, 1, 3, 16, 0, 1, 0, 0, 0, NAN, 47.3978, 8.5456, 5, 0)
     )
-    assert newest(cockpit, "MISSION_ACK", 0).type == 0
-    cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
-    cockpit.send(dialect.MAVLink_mission_request_message(1, 1, 0, 0))
-    got = newest(cockpit, "MISSION_ITEM", 0)
+    assert newest(harness, "MISSION_ACK", 0).type == 0
+    harness.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
+    harness.send(dialect.MAVLink_mission_request_message(1, 1, 0, 0))
+    got = newest(harness, "MISSION_ITEM", 0)
     assert (got.frame, got.x) == (3, pytest.approx(47.3977, abs=1e-6))
 
 
-def test_an_unanswered_question_is_repeated_and_in_the_end_given_up(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    cockpit.send(count(2))
-    cockpit.send(message(0, takeoff(5.0)))
-    cockpit.forget()
-    cockpit.fly(4.5)
-    asked = [m.seq for m in cockpit.received("MISSION_REQUEST_INT")]
+def test_an_unanswered_question_is_repeated_and_in_the_end_given_up(harness: SimHarness) -> None:
+    listen(harness)
+    harness.send(count(2))
+    harness.send(message(0, takeoff(5.0)))
+    harness.forget()
+    harness.fly(4.5)
+    asked = [m.seq for m in harness.received("MISSION_REQUEST_INT")]
     assert asked == [1] * 17  # every 250 ms
-    cockpit.fly(2.0)
-    assert "Mission sync timeout\t" in cockpit.texts("gcs")  # on every link, as all of PX4's texts
-    assert len(cockpit.received("MISSION_REQUEST_INT")) <= 20
-    assert upload(cockpit, [takeoff(5.0), RETURN]) == 0
+    harness.fly(2.0)
+    assert "Mission sync timeout\t" in harness.texts("gcs")  # on every link, as all of PX4's texts
+    assert len(harness.received("MISSION_REQUEST_INT")) <= 20
+    assert upload(harness, [takeoff(5.0), RETURN]) == 0
 
 
-def test_a_lost_acknowledgement_is_sent_again(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert upload(cockpit, [takeoff(5.0), waypoint(5, 0, 5)]) == 0
-    cockpit.send(message(1, waypoint(5, 0, 5)))
-    assert [m.type for m in cockpit.received("MISSION_ACK")] == [0, 0]
+def test_a_lost_acknowledgement_is_sent_again(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert upload(harness, [takeoff(5.0), waypoint(5, 0, 5)]) == 0
+    harness.send(message(1, waypoint(5, 0, 5)))
+    assert [m.type for m in harness.received("MISSION_ACK")] == [0, 0]
 
 
-def test_an_item_out_of_sequence_is_passed_over(cockpit: Cockpit) -> None:
-    cockpit.send(count(2))
-    cockpit.send(message(1, waypoint(5, 0, 5)))
-    assert cockpit.received("MISSION_ACK") == []
-    cockpit.send(message(0, takeoff(5.0)))
-    cockpit.send(message(1, waypoint(5, 0, 5)))
-    assert newest(cockpit, "MISSION_ACK", 0).type == 0
+def test_an_item_out_of_sequence_is_passed_over(harness: SimHarness) -> None:
+    harness.send(count(2))
+    harness.send(message(1, waypoint(5, 0, 5)))
+    assert harness.received("MISSION_ACK") == []
+    harness.send(message(0, takeoff(5.0)))
+    harness.send(message(1, waypoint(5, 0, 5)))
+    assert newest(harness, "MISSION_ACK", 0).type == 0
 
 
-def test_an_item_without_a_transfer_is_an_error(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    cockpit.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
-    cockpit.fly(0.01)
-    assert cockpit.texts()[-1:] == ["REJ. MIS ITEM: partner id mismatch\t"]
-    cockpit.send(count(0), "gcs", (245, 190))
-    cockpit.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
-    assert [m.type for m in cockpit.received("MISSION_ACK", "gcs")] == [0, 1]
-    cockpit.fly(0.01)
-    assert cockpit.texts()[-1:] == ["IGN MISSION_ITEM: No transfer\t"]
+def test_an_item_without_a_transfer_is_an_error(harness: SimHarness) -> None:
+    listen(harness)
+    harness.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
+    harness.fly(0.01)
+    assert harness.texts()[-1:] == ["REJ. MIS ITEM: partner id mismatch\t"]
+    harness.send(count(0), "gcs", (245, 190))
+    harness.send(message(3, waypoint(5, 0, 5)), "gcs", (245, 190))
+    assert [m.type for m in harness.received("MISSION_ACK", "gcs")] == [0, 1]
+    harness.fly(0.01)
+    assert harness.texts()[-1:] == ["IGN MISSION_ITEM: No transfer\t"]
 
 
 @pytest.mark.parametrize(
@@ -176,118 +176,118 @@ def test_an_item_without_a_transfer_is_an_error(cockpit: Cockpit) -> None:
     ],
 )
 def test_an_item_px4_does_not_take_ends_the_upload(
-    cockpit: Cockpit, fields: dict[str, Any], plan: int, result: int
+    harness: SimHarness, fields: dict[str, Any], plan: int, result: int
 ) -> None:
-    cockpit.wait_ready()
-    assert upload(cockpit, [fields, fields], plan) == result
-    assert upload(cockpit, [takeoff(5.0)]) == 0  # the next client is welcome
+    harness.wait_ready()
+    assert upload(harness, [fields, fields], plan) == result
+    assert upload(harness, [takeoff(5.0)]) == 0  # the next client is welcome
 
 
 @pytest.mark.parametrize(("plan", "most"), [(0, 10000), (1, 64), (2, 32)])
-def test_more_items_than_there_is_room_for_are_refused(cockpit: Cockpit, plan: int, most: int) -> None:
-    cockpit.send(count(most + 1, plan))
-    assert newest(cockpit, "MISSION_ACK", 0).type == 4
-    cockpit.send(count(most, plan))
-    assert newest(cockpit, "MISSION_REQUEST_INT", 0).seq == 0
+def test_more_items_than_there_is_room_for_are_refused(harness: SimHarness, plan: int, most: int) -> None:
+    harness.send(count(most + 1, plan))
+    assert newest(harness, "MISSION_ACK", 0).type == 4
+    harness.send(count(most, plan))
+    assert newest(harness, "MISSION_REQUEST_INT", 0).seq == 0
 
 
 @pytest.mark.parametrize(("items", "result"), [(1, 4), (0, 0)])
-def test_an_unknown_kind_of_plan_has_room_for_nothing(cockpit: Cockpit, items: int, result: int) -> None:
-    cockpit.send(count(items, 7))
-    ack = newest(cockpit, "MISSION_ACK", 0)
+def test_an_unknown_kind_of_plan_has_room_for_nothing(harness: SimHarness, items: int, result: int) -> None:
+    harness.send(count(items, 7))
+    ack = newest(harness, "MISSION_ACK", 0)
     assert (ack.type, ack.mission_type) == (result, 7)
 
 
-def test_one_client_uploads_at_a_time_over_all_links(cockpit: Cockpit) -> None:
-    cockpit.send(count(2))
-    cockpit.send(count(2), "onboard", (1, 195))
-    assert [(m.type, m.target_component) for m in cockpit.received("MISSION_ACK")] == [(1, 195)]
-    cockpit.send(count(2), "gcs", (245, 190))
-    assert [m.type for m in cockpit.received("MISSION_ACK", "gcs")] == [1]
-    cockpit.send(message(0, takeoff(5.0)))
-    cockpit.send(message(1, RETURN))
-    cockpit.send(count(2), "gcs", (245, 190))
-    assert len(cockpit.received("MISSION_REQUEST_INT", "gcs")) == 1
+def test_one_client_uploads_at_a_time_over_all_links(harness: SimHarness) -> None:
+    harness.send(count(2))
+    harness.send(count(2), "onboard", (1, 195))
+    assert [(m.type, m.target_component) for m in harness.received("MISSION_ACK")] == [(1, 195)]
+    harness.send(count(2), "gcs", (245, 190))
+    assert [m.type for m in harness.received("MISSION_ACK", "gcs")] == [1]
+    harness.send(message(0, takeoff(5.0)))
+    harness.send(message(1, RETURN))
+    harness.send(count(2), "gcs", (245, 190))
+    assert len(harness.received("MISSION_REQUEST_INT", "gcs")) == 1
 
 
-def test_a_cancelled_upload_leaves_the_old_mission(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert upload(cockpit, [takeoff(5.0)]) == 0
-    cockpit.send(count(5))
-    cockpit.send(message(0, takeoff(9.0)))
-    cockpit.send(dialect.MAVLink_mission_ack_message(1, 1, 15, 0))
-    cockpit.forget()
-    cockpit.fly(1.0)
-    assert cockpit.received("MISSION_REQUEST_INT") == []
-    assert [m.z for m in download(cockpit)] == [5.0]
+def test_a_cancelled_upload_leaves_the_old_mission(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert upload(harness, [takeoff(5.0)]) == 0
+    harness.send(count(5))
+    harness.send(message(0, takeoff(9.0)))
+    harness.send(dialect.MAVLink_mission_ack_message(1, 1, 15, 0))
+    harness.forget()
+    harness.fly(1.0)
+    assert harness.received("MISSION_REQUEST_INT") == []
+    assert [m.z for m in download(harness)] == [5.0]
 
 
-def test_a_download_asked_out_of_order_ends_with_an_error(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    upload(cockpit, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
-    cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
-    cockpit.send(dialect.MAVLink_mission_request_int_message(1, 1, 0, 0))
-    cockpit.send(dialect.MAVLink_mission_request_int_message(1, 1, 0, 0))  # once more is no error
-    cockpit.send(dialect.MAVLink_mission_request_int_message(1, 1, 2, 0))
-    assert [m.seq for m in cockpit.received("MISSION_ITEM_INT")] == [0, 0]
-    assert [m.type for m in cockpit.received("MISSION_ACK")] == [0, 1]
+def test_a_download_asked_out_of_order_ends_with_an_error(harness: SimHarness) -> None:
+    harness.wait_ready()
+    upload(harness, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
+    harness.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
+    harness.send(dialect.MAVLink_mission_request_int_message(1, 1, 0, 0))
+    harness.send(dialect.MAVLink_mission_request_int_message(1, 1, 0, 0))  # once more is no error
+    harness.send(dialect.MAVLink_mission_request_int_message(1, 1, 2, 0))
+    assert [m.seq for m in harness.received("MISSION_ITEM_INT")] == [0, 0]
+    assert [m.type for m in harness.received("MISSION_ACK")] == [0, 1]
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 255])
-def test_clearing_takes_away_what_it_names(cockpit: Cockpit, kind: int) -> None:
-    cockpit.wait_ready()
-    upload(cockpit, [takeoff(5.0)])
-    upload(cockpit, polygon(SQUARE), 1)
-    upload(cockpit, [rally(30, 0)], 2)
-    cockpit.send(dialect.MAVLink_mission_clear_all_message(1, 1, kind))
-    ack = cockpit.received("MISSION_ACK")[-1]
+def test_clearing_takes_away_what_it_names(harness: SimHarness, kind: int) -> None:
+    harness.wait_ready()
+    upload(harness, [takeoff(5.0)])
+    upload(harness, polygon(SQUARE), 1)
+    upload(harness, [rally(30, 0)], 2)
+    harness.send(dialect.MAVLink_mission_clear_all_message(1, 1, kind))
+    ack = harness.received("MISSION_ACK")[-1]
     assert (ack.type, ack.mission_type) == (0, kind)
-    left = [len(download(cockpit, plan)) for plan in range(3)]
+    left = [len(download(harness, plan)) for plan in range(3)]
     assert left == [0 if kind in (plan, 255) else full for plan, full in enumerate([1, 4, 1])]
 
 
-def test_messages_for_other_vehicles_or_everybody_are_not_taken(cockpit: Cockpit) -> None:
-    cockpit.send(count(1, target=(2, 1)))
-    cockpit.send(count(1, target=(0, 0)))
-    assert cockpit.received("MISSION_REQUEST_INT") == cockpit.received("MISSION_ACK") == []
-    cockpit.send(count(1, target=(1, 0)))
-    assert len(cockpit.received("MISSION_REQUEST_INT")) == 1
+def test_messages_for_other_vehicles_or_everybody_are_not_taken(harness: SimHarness) -> None:
+    harness.send(count(1, target=(2, 1)))
+    harness.send(count(1, target=(0, 0)))
+    assert harness.received("MISSION_REQUEST_INT") == harness.received("MISSION_ACK") == []
+    harness.send(count(1, target=(1, 0)))
+    assert len(harness.received("MISSION_REQUEST_INT")) == 1
 
 
-def test_set_current_is_told_by_mission_current(cockpit: Cockpit) -> None:
-    listen(cockpit)
-    cockpit.wait_ready()
-    upload(cockpit, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_mission_set_current_message(1, 1, 2))
-    cockpit.fly(0.01)
-    assert {(m.seq, m.total) for m in cockpit.received("MISSION_CURRENT")} == {(2, 3)}
-    cockpit.send(dialect.MAVLink_mission_set_current_message(1, 1, 3), "gcs", (245, 190))
-    cockpit.fly(0.01)
-    assert cockpit.texts()[-1] == "WPM: WP CURR CMD: Not in list\t"
-    assert cockpit.command(224, 1) == [3]  # DO_SET_MISSION_CURRENT is none of PX4's commands
+def test_set_current_is_told_by_mission_current(harness: SimHarness) -> None:
+    listen(harness)
+    harness.wait_ready()
+    upload(harness, [takeoff(5.0), waypoint(5, 0, 5), RETURN])
+    harness.forget()
+    harness.send(dialect.MAVLink_mission_set_current_message(1, 1, 2))
+    harness.fly(0.01)
+    assert {(m.seq, m.total) for m in harness.received("MISSION_CURRENT")} == {(2, 3)}
+    harness.send(dialect.MAVLink_mission_set_current_message(1, 1, 3), "gcs", (245, 190))
+    harness.fly(0.01)
+    assert harness.texts()[-1] == "WPM: WP CURR CMD: Not in list\t"
+    assert harness.command(224, 1) == [3]  # DO_SET_MISSION_CURRENT is none of PX4's commands
 
 
-def test_the_same_mission_again_changes_nothing(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
+def test_the_same_mission_again_changes_nothing(harness: SimHarness) -> None:
+    harness.wait_ready()
     plan = [takeoff(5.0), waypoint(5, 0, 5), RETURN]
-    upload(cockpit, plan)
-    cockpit.send(dialect.MAVLink_mission_set_current_message(1, 1, 2))
-    upload(cockpit, plan)
-    assert cockpit.vehicle.autopilot.navigator.mission.current == 2
-    upload(cockpit, [takeoff(6.0), waypoint(5, 0, 5), RETURN])
-    assert cockpit.vehicle.autopilot.navigator.mission.current == 0
+    upload(harness, plan)
+    harness.send(dialect.MAVLink_mission_set_current_message(1, 1, 2))
+    upload(harness, plan)
+    assert harness.vehicle.autopilot.navigator.mission.current == 2
+    upload(harness, [takeoff(6.0), waypoint(5, 0, 5), RETURN])
+    assert harness.vehicle.autopilot.navigator.mission.current == 0
 
 
-def test_plans_have_identifiers_that_newer_clients_can_read(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    upload(cockpit, [takeoff(5.0), RETURN])
-    identifier = cockpit.received("MISSION_ACK")[-1].opaque_id
+def test_plans_have_identifiers_that_newer_clients_can_read(harness: SimHarness) -> None:
+    harness.wait_ready()
+    upload(harness, [takeoff(5.0), RETURN])
+    identifier = harness.received("MISSION_ACK")[-1].opaque_id
     assert identifier != 0
-    cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
-    assert cockpit.received("MISSION_COUNT")[-1].opaque_id == identifier
-    cockpit.fly(1.1)
-    assert cockpit.received("MISSION_CURRENT")[-1].mission_id == identifier
+    harness.send(dialect.MAVLink_mission_request_list_message(1, 1, 0))
+    assert harness.received("MISSION_COUNT")[-1].opaque_id == identifier
+    harness.fly(1.1)
+    assert harness.received("MISSION_CURRENT")[-1].mission_id == identifier
     packed = MissionCurrent(1, 2, 3, 1, 11, 12, 13).pack(parser())
     payload = packed[10:-2].ljust(18, b"\0")  # MAVLink 2 leaves out the zeros at the end
     assert struct.unpack("<HHBBIII", payload) == (1, 2, 3, 1, 11, 12, 13)

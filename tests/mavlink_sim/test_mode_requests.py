@@ -5,17 +5,17 @@ from typing import Any
 import pytest
 
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 ALL_MODES = [(1, 0), (2, 0), (3, 0), (3, 2), (4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (5, 0), (6, 0), (7, 0)]
 FOLLOW, PRECISION_LAND, ORBIT = (4, 8), (4, 9), (3, 1)
 
 
 @pytest.mark.parametrize(("main", "sub"), ALL_MODES)
-def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Cockpit, main: int, sub: int) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.set_mode(main, sub) == [0, 0]
-    assert cockpit.heartbeat().custom_mode == main << 16 | sub << 24
+def test_a_disarmed_vehicle_takes_every_known_mode(harness: SimHarness, main: int, sub: int) -> None:
+    harness.fly(0.1)
+    assert harness.set_mode(main, sub) == [0, 0]
+    assert harness.heartbeat().custom_mode == main << 16 | sub << 24
 
 
 @pytest.mark.parametrize(
@@ -27,97 +27,99 @@ def test_a_disarmed_vehicle_takes_every_known_mode(cockpit: Cockpit, main: int, 
     ],
 )
 def test_a_disarmed_vehicle_takes_follow_precision_landing_and_orbit_too(
-    cockpit: Cockpit, request_of: tuple[int, int], shown: int, base_mode: int
+    harness: SimHarness, request_of: tuple[int, int], shown: int, base_mode: int
 ) -> None:
-    cockpit.wait_ready()
-    assert cockpit.set_mode(*request_of) == [0, 0]
-    beat = cockpit.heartbeat()
+    harness.wait_ready()
+    assert harness.set_mode(*request_of) == [0, 0]
+    beat = harness.heartbeat()
     assert (beat.custom_mode, beat.base_mode) == (shown, base_mode)
 
 
-def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
-    assert len(cockpit.received("COMMAND_ACK")) == 1
-    cockpit.fly(0.012)
-    assert len(cockpit.received("COMMAND_ACK")) == 2
+def test_the_first_answer_comes_at_once_and_the_real_one_within_ten_milliseconds(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    harness.forget()
+    harness.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
+    assert len(harness.received("COMMAND_ACK")) == 1
+    harness.fly(0.012)
+    assert len(harness.received("COMMAND_ACK")) == 2
 
 
-def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(cockpit: Cockpit) -> None:
-    cockpit.take_off(4.0)
+def test_commands_sent_one_right_after_the_other_are_carried_out_in_order(harness: SimHarness) -> None:
+    harness.take_off(4.0)
     for _ in range(3):
-        cockpit.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
-        cockpit.send(dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, 0, 0, 0, 0))
-    cockpit.fly(0.1)
-    assert cockpit.mode == "LAND"
+        harness.send(dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, 4, 3, 0, 0, 0, 0))
+        harness.send(dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, 0, 0, 0, 0))
+    harness.fly(0.1)
+    assert harness.mode == "LAND"
 
 
 @pytest.mark.parametrize(("main", "sub", "base"), [(8, 0, 1), (4, 1, 1), (4, 99, 1), (77, 0, 1), (4, 3, 0)])
-def test_what_is_no_mode_is_accepted_then_rejected(cockpit: Cockpit, main: int, sub: int, base: int) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.set_mode(main, sub, base) == [0, 1]
-    assert cockpit.mode == "HOLD"
+def test_what_is_no_mode_is_accepted_then_rejected(
+    harness: SimHarness, main: int, sub: int, base: int
+) -> None:
+    harness.fly(0.1)
+    assert harness.set_mode(main, sub, base) == [0, 1]
+    assert harness.mode == "HOLD"
 
 
 @pytest.mark.parametrize(("main", "sub"), [(3, 0), (2, 0), (7, 0), (1, 0), (4, 4), (6, 0)])
 def test_in_the_air_a_mode_that_cannot_be_flown_is_accepted_then_rejected(
-    cockpit: Cockpit, main: int, sub: int
+    harness: SimHarness, main: int, sub: int
 ) -> None:
-    cockpit.take_off()
-    assert cockpit.set_mode(main, sub) == [0, 1]
-    assert cockpit.heartbeat().custom_mode == 0x03040000
+    harness.take_off()
+    assert harness.set_mode(main, sub) == [0, 1]
+    assert harness.heartbeat().custom_mode == 0x03040000
 
 
-def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(cockpit: Cockpit) -> None:
-    cockpit.heartbeats.append(("gcs", (245, 190), 6))
-    cockpit.take_off()
-    cockpit.forget()
-    cockpit.set_mode(6)  # asked by the companion: no words
-    assert cockpit.texts() == []
-    cockpit.set_mode(6, source=(245, 190), link="gcs")
-    assert cockpit.texts() == ["Switching to Offboard is currently not available\t"]
-    cockpit.set_mode(3, source=(245, 190), link="gcs")
-    assert len(cockpit.texts()) == 1  # once a second is enough
-    cockpit.fly(1.0)
-    cockpit.set_mode(3, source=(245, 190), link="gcs")
-    assert cockpit.texts()[1:] == ["Switching to Position is currently not available\t"]
+def test_the_refusal_is_told_in_words_to_a_ground_station_that_asked(harness: SimHarness) -> None:
+    harness.heartbeats.append(("gcs", (245, 190), 6))
+    harness.take_off()
+    harness.forget()
+    harness.set_mode(6)  # asked by the companion: no words
+    assert harness.texts() == []
+    harness.set_mode(6, source=(245, 190), link="gcs")
+    assert harness.texts() == ["Switching to Offboard is currently not available\t"]
+    harness.set_mode(3, source=(245, 190), link="gcs")
+    assert len(harness.texts()) == 1  # once a second is enough
+    harness.fly(1.0)
+    harness.set_mode(3, source=(245, 190), link="gcs")
+    assert harness.texts()[1:] == ["Switching to Position is currently not available\t"]
 
 
-def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(cockpit: Cockpit) -> None:
-    cockpit.take_off()
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_set_mode_message(1, 1, 0x00030000))
-    cockpit.fly(0.05)
-    cockpit.send(dialect.MAVLink_set_mode_message(1, 1, 0x05040000))
-    cockpit.fly(0.05)
-    answers = cockpit.received("COMMAND_ACK")
+def test_the_old_set_mode_message_has_one_answer_which_is_the_real_one(harness: SimHarness) -> None:
+    harness.take_off()
+    harness.forget()
+    harness.send(dialect.MAVLink_set_mode_message(1, 1, 0x00030000))
+    harness.fly(0.05)
+    harness.send(dialect.MAVLink_set_mode_message(1, 1, 0x05040000))
+    harness.fly(0.05)
+    answers = harness.received("COMMAND_ACK")
     assert [(answer.command, answer.result) for answer in answers] == [(176, 1), (176, 0)]
-    assert cockpit.mode == "RTL"
+    assert harness.mode == "RTL"
 
 
-def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    cockpit.heartbeat()
-    cockpit.forget()
-    cockpit.set_mode(4, 2)
-    cockpit.fly(0.9)
-    assert cockpit.received("HEARTBEAT") == []
+def test_a_mode_change_is_not_announced_by_an_extra_heartbeat(harness: SimHarness) -> None:
+    harness.wait_ready()
+    harness.heartbeat()
+    harness.forget()
+    harness.set_mode(4, 2)
+    harness.fly(0.9)
+    assert harness.received("HEARTBEAT") == []
 
 
 def test_current_mode_tells_the_mode_and_the_intention_twice_a_second_and_when_they_change(
-    cockpit: Cockpit,
+    harness: SimHarness,
 ) -> None:
     """However often it is asked for: a real PX4 asked for 20 a second sent 1.75 to 2."""
-    cockpit.fly(0.1)
-    assert cockpit.command(511, 436, 50_000) == [0]
-    cockpit.fly(0.7)
-    cockpit.forget()
-    cockpit.set_mode(4, 5)
-    cockpit.fly(0.03)
-    assert len(cockpit.received("CURRENT_MODE")) == 1
-    cockpit.fly(4.0)
-    seen = cockpit.received("CURRENT_MODE")
+    harness.fly(0.1)
+    assert harness.command(511, 436, 50_000) == [0]
+    harness.fly(0.7)
+    harness.forget()
+    harness.set_mode(4, 5)
+    harness.fly(0.03)
+    assert len(harness.received("CURRENT_MODE")) == 1
+    harness.fly(4.0)
+    seen = harness.received("CURRENT_MODE")
     assert 8 <= len(seen) <= 9
     assert {(m.standard_mode, m.custom_mode, m.intended_custom_mode) for m in seen} == {
         (5, 0x05040000, 0x05040000)
@@ -125,12 +127,12 @@ def test_current_mode_tells_the_mode_and_the_intention_twice_a_second_and_when_t
 
 
 def test_another_system_may_take_the_vehicle_from_the_companion(
-    cockpit: Cockpit, velocity_setpoint: Any
+    harness: SimHarness, velocity_setpoint: Any
 ) -> None:
-    cockpit.take_off()
+    harness.take_off()
     stream = velocity_setpoint(1, 0, 0)
-    cockpit.offboard(stream)
-    assert cockpit.set_mode(4, 3, source=(245, 190), link="gcs") == [0, 0]
-    cockpit.fly(5.0, stream)  # the companion goes on sending, in vain
-    assert cockpit.mode == "HOLD"
-    assert abs(cockpit.vehicle.airframe.velocity[0]) < 0.2
+    harness.offboard(stream)
+    assert harness.set_mode(4, 3, source=(245, 190), link="gcs") == [0, 0]
+    harness.fly(5.0, stream)  # the companion goes on sending, in vain
+    assert harness.mode == "HOLD"
+    assert abs(harness.vehicle.airframe.velocity[0]) < 0.2

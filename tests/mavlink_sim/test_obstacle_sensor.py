@@ -196,7 +196,7 @@ def test_a_leaning_vehicle_looks_past_the_edge() -> None:
     airframe = vehicle.vehicle.airframe
     airframe.position = (0.0, 2.2, -3.0)
     airframe.set_attitude(0.0, 0.0, 0.0)
-    around = vehicle.vehicle.surroundings
+    around = vehicle.vehicle.collision_world
     assert around is not None
     assert around.range_below_m() == pytest.approx(1.5, abs=0.01)
     airframe.set_attitude(0.4, 0.0, 0.0)  # the right side down: its belly looks to the left

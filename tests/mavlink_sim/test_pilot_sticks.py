@@ -21,7 +21,7 @@ from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import event_identifier
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 JOYSTICK = {"COM_RC_IN_MODE": 1}
 REMOTE_CONTROL = {**CALIBRATION, "COM_RC_IN_MODE": 0, "COM_FLTMODE1": 2, "COM_FLTMODE4": 4, "COM_FLTMODE6": 8}
@@ -167,175 +167,179 @@ def stick_message(pitch: int = 0, roll: int = 0, throttle: int = 500, yaw: int =
     return dialect.MAVLink_manual_control_message(target, pitch, roll, throttle, yaw, 0)
 
 
-def push(cockpit: Cockpit, seconds: float, message: Any, until: Any = None) -> None:
+def push(harness: SimHarness, seconds: float, message: Any, until: Any = None) -> None:
     """A joystick's stream at 25 Hz."""
-    end_s = cockpit.now_s + seconds
-    while cockpit.now_s < end_s - 1e-9 and not (until is not None and until()):
-        cockpit.send(message)
-        cockpit.fly(0.04)
+    end_s = harness.now_s + seconds
+    while harness.now_s < end_s - 1e-9 and not (until is not None and until()):
+        harness.send(message)
+        harness.fly(0.04)
 
 
-def events(cockpit: Cockpit, name: str) -> list[Any]:
-    return [message for message in cockpit.received("EVENT") if message.id == event_identifier(name)]
+def events(harness: SimHarness, name: str) -> list[Any]:
+    return [message for message in harness.received("EVENT") if message.id == event_identifier(name)]
 
 
-def test_a_vehicle_as_delivered_ignores_sticks(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    push(cockpit, 0.5, stick_message())
-    assert not cockpit.vehicle.autopilot.pilot_has_sticks
-    assert cockpit.mode == "HOLD"
+def test_a_vehicle_as_delivered_ignores_sticks(harness: SimHarness) -> None:
+    harness.wait_ready()
+    push(harness, 0.5, stick_message())
+    assert not harness.vehicle.autopilot.pilot_has_sticks
+    assert harness.mode == "HOLD"
 
 
 def test_a_joystick_before_any_mode_was_asked_for_makes_position_the_first_mode(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
 ) -> None:
-    cockpit = make_cockpit(parameters=JOYSTICK)
-    cockpit.wait_ready()
-    push(cockpit, 0.2, stick_message(target=7))
-    assert cockpit.mode == "HOLD"  # it was for another vehicle
-    push(cockpit, 0.2, stick_message())
-    assert cockpit.mode == "POSCTL"
-    assert cockpit.vehicle.autopilot.can_arm
+    harness = make_harness(parameters=JOYSTICK)
+    harness.wait_ready()
+    push(harness, 0.2, stick_message(target=7))
+    assert harness.mode == "HOLD"  # it was for another vehicle
+    push(harness, 0.2, stick_message())
+    assert harness.mode == "POSCTL"
+    assert harness.vehicle.autopilot.can_arm
 
 
-def test_sticks_arm_fly_and_disarm(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters=JOYSTICK)
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.wait_ready()
-    push(cockpit, 0.2, stick_message())
-    push(cockpit, 1.5, stick_message(throttle=0, yaw=1000), until=lambda: cockpit.armed)
-    assert cockpit.armed
-    assert "Armed by stick gesture\t" in cockpit.texts()
-    push(cockpit, 8.0, stick_message(throttle=1000), until=lambda: cockpit.height_m > 3.0)
-    assert cockpit.height_m > 3.0
-    push(cockpit, 20.0, stick_message(throttle=0), until=lambda: cockpit.vehicle.autopilot.landed)
-    assert cockpit.vehicle.autopilot.landed
-    push(cockpit, 1.5, stick_message(throttle=0, yaw=-1000), until=lambda: not cockpit.armed)
-    assert not cockpit.armed
-    assert "Disarmed by stick gesture\t" in cockpit.texts()
+def test_sticks_arm_fly_and_disarm(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters=JOYSTICK)
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.wait_ready()
+    push(harness, 0.2, stick_message())
+    push(harness, 1.5, stick_message(throttle=0, yaw=1000), until=lambda: harness.armed)
+    assert harness.armed
+    assert "Armed by stick gesture\t" in harness.texts()
+    push(harness, 8.0, stick_message(throttle=1000), until=lambda: harness.height_m > 3.0)
+    assert harness.height_m > 3.0
+    push(harness, 20.0, stick_message(throttle=0), until=lambda: harness.vehicle.autopilot.landed)
+    assert harness.vehicle.autopilot.landed
+    push(harness, 1.5, stick_message(throttle=0, yaw=-1000), until=lambda: not harness.armed)
+    assert not harness.armed
+    assert "Disarmed by stick gesture\t" in harness.texts()
 
 
-def test_arming_is_denied_where_the_throttle_would_surprise(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters=JOYSTICK)
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.wait_ready()
-    push(cockpit, 1.2, stick_message(throttle=900))
-    assert cockpit.command(400, 1) == [1]
-    assert "Arming denied: throttle above center\t" in cockpit.texts()
-    cockpit.set_mode(7)
-    push(cockpit, 0.2, stick_message(throttle=500))
-    assert cockpit.command(400, 1) == [1]
-    assert "Arming denied: high throttle\t" in cockpit.texts()
-    cockpit.set_mode(4, 3)
-    push(cockpit, 1.2, stick_message(throttle=0, yaw=1000))
-    assert not cockpit.armed
-    assert "Arming denied: switch to manual mode first\t" in cockpit.texts()
+def test_arming_is_denied_where_the_throttle_would_surprise(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters=JOYSTICK)
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.wait_ready()
+    push(harness, 1.2, stick_message(throttle=900))
+    assert harness.command(400, 1) == [1]
+    assert "Arming denied: throttle above center\t" in harness.texts()
+    harness.set_mode(7)
+    push(harness, 0.2, stick_message(throttle=500))
+    assert harness.command(400, 1) == [1]
+    assert "Arming denied: high throttle\t" in harness.texts()
+    harness.set_mode(4, 3)
+    push(harness, 1.2, stick_message(throttle=0, yaw=1000))
+    assert not harness.armed
+    assert "Arming denied: switch to manual mode first\t" in harness.texts()
 
 
-def test_losing_and_regaining_the_joystick_is_an_event(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters=JOYSTICK)
-    cockpit.wait_ready()
-    push(cockpit, 0.2, stick_message())
-    lost_s = cockpit.until(lambda: bool(events(cockpit, "commander_rc_lost")), 2.0)
+def test_losing_and_regaining_the_joystick_is_an_event(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters=JOYSTICK)
+    harness.wait_ready()
+    push(harness, 0.2, stick_message())
+    lost_s = harness.until(lambda: bool(events(harness, "commander_rc_lost")), 2.0)
     assert lost_s == pytest.approx(0.5, abs=0.1)
-    cockpit.fly(1.0)
-    push(cockpit, 0.2, stick_message())
-    assert len(events(cockpit, "commander_rc_regained")) == 1
-    assert any("manual control regained" in line for line in cockpit.events)
+    harness.fly(1.0)
+    push(harness, 0.2, stick_message())
+    assert len(events(harness, "commander_rc_regained")) == 1
+    assert any("manual control regained" in line for line in harness.events)
 
 
-def remote_cockpit(make_cockpit: type[Cockpit], **values: float) -> Cockpit:
-    cockpit = make_cockpit(parameters={**REMOTE_CONTROL, **values})
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    cockpit.vehicle.transmitter.on = True
-    return cockpit
+def remote_cockpit(make_harness: type[SimHarness], **values: float) -> SimHarness:
+    harness = make_harness(parameters={**REMOTE_CONTROL, **values})
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    harness.vehicle.transmitter.on = True
+    return harness
 
 
-def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters=REMOTE_CONTROL)
-    cockpit.fly(1.0)
-    assert cockpit.received("RC_CHANNELS") == []
-    cockpit.vehicle.transmitter.on = True
-    cockpit.vehicle.transmitter.sticks = Sticks(roll=1.0, throttle=-1.0)
-    cockpit.forget()
-    cockpit.fly(2.0)
-    channels = cockpit.received("RC_CHANNELS")
+def test_a_transmitter_is_told_in_rc_channels_and_sys_status(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters=REMOTE_CONTROL)
+    harness.fly(1.0)
+    assert harness.received("RC_CHANNELS") == []
+    harness.vehicle.transmitter.on = True
+    harness.vehicle.transmitter.sticks = Sticks(roll=1.0, throttle=-1.0)
+    harness.forget()
+    harness.fly(2.0)
+    channels = harness.received("RC_CHANNELS")
     assert len(channels) == pytest.approx(40, abs=2)
     last = channels[-1]
     assert (last.chancount, last.chan1_raw, last.chan2_raw, last.chan3_raw) == (8, 2000, 1500, 1000)
     assert last.chan9_raw == 65535
-    status = cockpit.received("SYS_STATUS")[-1]
+    status = harness.received("SYS_STATUS")[-1]
     assert status.onboard_control_sensors_present & status.onboard_control_sensors_health & 0x10000
-    cockpit.vehicle.transmitter.on = False
-    cockpit.fly(0.4)
-    cockpit.forget()
-    cockpit.fly(1.0)
-    assert cockpit.received("RC_CHANNELS") == []
-    assert not cockpit.received("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000
+    harness.vehicle.transmitter.on = False
+    harness.fly(0.4)
+    harness.forget()
+    harness.fly(1.0)
+    assert harness.received("RC_CHANNELS") == []
+    assert not harness.received("SYS_STATUS")[-1].onboard_control_sensors_health & 0x10000
 
 
-def test_rc_channels_override_is_a_remote_control_like_any_other(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(parameters=REMOTE_CONTROL)
-    cockpit.wait_ready()
+def test_rc_channels_override_is_a_remote_control_like_any_other(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(parameters=REMOTE_CONTROL)
+    harness.wait_ready()
     widths = [1500, 1500, 1000, 1500, 1080, 1000, 1000, 65535]
     message = dialect.MAVLink_rc_channels_override_message(1, 1, *widths, *[0] * 10)
     for _ in range(10):
-        cockpit.send(message)
-        cockpit.fly(0.05)
-    assert cockpit.vehicle.autopilot.supervision.sticks.throttle == -1.0
-    assert cockpit.mode == "POSCTL"  # the first position of the mode switch, while disarmed
-    assert cockpit.received("RC_CHANNELS")[-1].chancount == 7
+        harness.send(message)
+        harness.fly(0.05)
+    assert harness.vehicle.autopilot.supervision.sticks.throttle == -1.0
+    assert harness.mode == "POSCTL"  # the first position of the mode switch, while disarmed
+    assert harness.received("RC_CHANNELS")[-1].chancount == 7
 
 
-def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_cockpit: type[Cockpit]) -> None:
-    cockpit = remote_cockpit(make_cockpit, COM_FLTMODE5=3)
-    transmitter = cockpit.vehicle.transmitter
-    cockpit.take_off()
+def test_the_mode_switch_changes_the_mode_and_refusals_are_told(make_harness: type[SimHarness]) -> None:
+    harness = remote_cockpit(make_harness, COM_FLTMODE5=3)
+    transmitter = harness.vehicle.transmitter
+    harness.take_off()
     transmitter.select(Mode.POSCTL)
-    cockpit.fly(0.1)
+    harness.fly(0.1)
     transmitter.mode_slot = 4
-    cockpit.fly(0.1)
-    assert cockpit.mode == "HOLD"
+    harness.fly(0.1)
+    assert harness.mode == "HOLD"
     transmitter.select(Mode.STABILIZED)
-    cockpit.fly(0.1)
-    assert cockpit.mode == "STABILIZED"
+    harness.fly(0.1)
+    assert harness.mode == "STABILIZED"
     transmitter.mode_slot = 1
-    cockpit.fly(0.1)
-    assert cockpit.mode == "POSCTL"
+    harness.fly(0.1)
+    assert harness.mode == "POSCTL"
     transmitter.mode_slot = 5
-    cockpit.fly(0.1)
-    assert cockpit.mode == "POSCTL"
-    assert "Switching to Mission is currently not available\t" in cockpit.texts()
+    harness.fly(0.1)
+    assert harness.mode == "POSCTL"
+    assert "Switching to Mission is currently not available\t" in harness.texts()
 
 
-def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(make_cockpit: type[Cockpit]) -> None:
-    cockpit = remote_cockpit(make_cockpit, COM_DISARM_LAND=-1)
-    cockpit.take_off(6.0)
-    cockpit.vehicle.transmitter.kill = True
-    cockpit.until(lambda: "kill switch engaged" in cockpit.events, 1.0)
-    cockpit.fly(0.02)
-    assert "Kill engaged\t" in cockpit.texts()
-    fell_s = cockpit.until(lambda: cockpit.vehicle.airframe.on_ground, 4.0)
+def test_the_kill_switch_stops_the_motors_and_disarms_after_five_seconds(
+    make_harness: type[SimHarness],
+) -> None:
+    harness = remote_cockpit(make_harness, COM_DISARM_LAND=-1)
+    harness.take_off(6.0)
+    harness.vehicle.transmitter.kill = True
+    harness.until(lambda: "kill switch engaged" in harness.events, 1.0)
+    harness.fly(0.02)
+    assert "Kill engaged\t" in harness.texts()
+    fell_s = harness.until(lambda: harness.vehicle.airframe.on_ground, 4.0)
     assert fell_s < 2.5
-    assert cockpit.armed
-    rest_s = cockpit.until(lambda: not cockpit.armed, 6.0)
+    assert harness.armed
+    rest_s = harness.until(lambda: not harness.armed, 6.0)
     assert fell_s + rest_s == pytest.approx(5.0, abs=0.2)
-    assert "Disarmed by kill-switch\t" in cockpit.texts()
-    assert not cockpit.vehicle.autopilot.can_arm
-    assert cockpit.command(400, 1) == [1]
-    assert "Preflight Fail: Kill switch engaged" in cockpit.texts()
-    cockpit.vehicle.transmitter.kill = False
-    cockpit.fly(0.2)
-    assert "Kill disengaged\t" in cockpit.texts()
-    assert cockpit.vehicle.autopilot.can_arm
+    assert "Disarmed by kill-switch\t" in harness.texts()
+    assert not harness.vehicle.autopilot.can_arm
+    assert harness.command(400, 1) == [1]
+    assert "Preflight Fail: Kill switch engaged" in harness.texts()
+    harness.vehicle.transmitter.kill = False
+    harness.fly(0.2)
+    assert "Kill disengaged\t" in harness.texts()
+    assert harness.vehicle.autopilot.can_arm
 
 
-def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(make_cockpit: type[Cockpit]) -> None:
-    cockpit = remote_cockpit(make_cockpit)
-    cockpit.take_off(15.0)
-    cockpit.vehicle.transmitter.kill = True
-    cockpit.fly(0.4)
-    cockpit.vehicle.transmitter.kill = False
-    cockpit.fly(5.0)
-    assert cockpit.armed
-    assert cockpit.height_m > 8.0
+def test_a_kill_that_is_taken_back_at_once_lets_the_vehicle_catch_itself(
+    make_harness: type[SimHarness],
+) -> None:
+    harness = remote_cockpit(make_harness)
+    harness.take_off(15.0)
+    harness.vehicle.transmitter.kill = True
+    harness.fly(0.4)
+    harness.vehicle.transmitter.kill = False
+    harness.fly(5.0)
+    assert harness.armed
+    assert harness.height_m > 8.0

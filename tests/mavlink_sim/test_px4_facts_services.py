@@ -13,10 +13,10 @@ import pytest
 
 from mavlink_sim.px4.parameters import INT32, REAL32, Parameter, Parameters, is_volatile, parameter_hash
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import upload, waypoint
 
-pytestmark = pytest.mark.hears("everything")
+pytestmark = pytest.mark.streams("everything")
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 PARAMETERS = DATA / "px4" / "parameters.txt"
@@ -25,15 +25,15 @@ DOES_NOT_EXIST, READ_ONLY, TYPE_UNSUPPORTED, TYPE_MISMATCH = 1, 5, 6, 7
 
 
 @pytest.fixture
-def ready(cockpit: Cockpit) -> Cockpit:
-    cockpit.wait_ready()
-    cockpit.forget()
-    return cockpit
+def ready(harness: SimHarness) -> SimHarness:
+    harness.wait_ready()
+    harness.forget()
+    return harness
 
 
-def kinds_in_order(cockpit: Cockpit, *kinds: str) -> list[str]:
+def kinds_in_order(harness: SimHarness, *kinds: str) -> list[str]:
     return [
-        item.message.get_type() for _, item in cockpit.inbox["onboard"] if item.message.get_type() in kinds
+        item.message.get_type() for _, item in harness.inbox["onboard"] if item.message.get_type() in kinds
     ]
 
 
@@ -51,23 +51,23 @@ def kinds_in_order(cockpit: Cockpit, *kinds: str) -> list[str]:
         pytest.param(411, "CURRENT_EVENT_SEQUENCE", id="CURRENT_EVENT_SEQUENCE"),
     ],
 )
-def test_request_message__message_then_accepted(ready: Cockpit, message_id: int, kind: str) -> None:
+def test_request_message__message_then_accepted(ready: SimHarness, message_id: int, kind: str) -> None:
     assert ready.command(512, message_id) == [ACCEPTED]
     assert kinds_in_order(ready, kind, "COMMAND_ACK")[:2] == [kind, "COMMAND_ACK"]
 
 
 @pytest.mark.parametrize("message_id", [259, 60000, -1], ids=["CAMERA_INFORMATION", "60000", "-1"])
-def test_request_message__unknown_id_or_nothing_to_send_denied(ready: Cockpit, message_id: int) -> None:
+def test_request_message__unknown_id_or_nothing_to_send_denied(ready: SimHarness, message_id: int) -> None:
     assert ready.command(512, message_id) == [DENIED]
 
 
-def test_519_accepted(ready: Cockpit) -> None:
+def test_519_accepted(ready: SimHarness) -> None:
     assert ready.command(519, 1) == [ACCEPTED]
 
 
 @pytest.mark.parametrize("command", [(512, 148), (520, 1)], ids=["512_148", "520"])
 def test_autopilot_version_by_512_148_or_520__message_first_then_ack(
-    ready: Cockpit, command: tuple[int, int]
+    ready: SimHarness, command: tuple[int, int]
 ) -> None:
     assert ready.command(*command) == [ACCEPTED]
     assert kinds_in_order(ready, "AUTOPILOT_VERSION", "COMMAND_ACK") == ["AUTOPILOT_VERSION", "COMMAND_ACK"]
@@ -82,7 +82,7 @@ def test_autopilot_version_by_512_148_or_520__message_first_then_ack(
     assert not any(version.uid2)
 
 
-def test_set_message_interval__accepted_and_honoured_100000_us_gives_9_8_hz(ready: Cockpit) -> None:
+def test_set_message_interval__accepted_and_honoured_100000_us_gives_9_8_hz(ready: SimHarness) -> None:
     assert ready.command(511, 30, 100_000) == [ACCEPTED]
     ready.fly(1.0)
     ready.forget()
@@ -101,11 +101,11 @@ def test_set_message_interval__accepted_and_honoured_100000_us_gives_9_8_hz(read
 
 
 @pytest.mark.parametrize("message_id", [27, 0, 60000], ids=["RAW_IMU", "HEARTBEAT", "60000"])
-def test_set_message_interval__unknown_or_unavailable_failed(ready: Cockpit, message_id: int) -> None:
+def test_set_message_interval__unknown_or_unavailable_failed(ready: SimHarness, message_id: int) -> None:
     assert ready.command(511, message_id, 100_000) == [FAILED]
 
 
-def test_get_message_interval__message_interval_and_accepted(ready: Cockpit) -> None:
+def test_get_message_interval__message_interval_and_accepted(ready: SimHarness) -> None:
     assert ready.command(510, 30) == [ACCEPTED]
     assert kinds_in_order(ready, "MESSAGE_INTERVAL", "COMMAND_ACK") == ["MESSAGE_INTERVAL", "COMMAND_ACK"]
     (interval,) = ready.received("MESSAGE_INTERVAL")
@@ -124,7 +124,7 @@ def test_get_message_interval__message_interval_and_accepted(ready: Cockpit) -> 
     ],
 )
 def test_source_to_ask_for_the_interval_that_is_configured_changes_no_rate(
-    ready: Cockpit, kind: str, message_id: int, interval_us: int
+    ready: SimHarness, kind: str, message_id: int, interval_us: int
 ) -> None:
     ready.command(510, message_id)
     assert ready.received("MESSAGE_INTERVAL")[0].interval_us == interval_us
@@ -137,7 +137,7 @@ def test_source_to_ask_for_the_interval_that_is_configured_changes_no_rate(
     assert rates[0] == pytest.approx(rates[1], rel=0.01, abs=0.1)
 
 
-def test_request_data_stream__ignored(ready: Cockpit) -> None:
+def test_request_data_stream__ignored(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 1, 1))
     ready.forget()
     ready.fly(4.0)
@@ -149,7 +149,7 @@ def test_request_data_stream__ignored(ready: Cockpit) -> None:
     ("target", "answered"), [((1, 1), 1), ((1, 0), 1), ((0, 0), 1), ((2, 1), 0), ((1, 100), 0)]
 )
 def test_other_system_or_component_2_1_and_1_100_no_answer__1_0_and_0_0_are_answered(
-    ready: Cockpit, target: tuple[int, int], answered: int
+    ready: SimHarness, target: tuple[int, int], answered: int
 ) -> None:
     assert len(ready.command(512, 148, target=target)) == answered
 
@@ -157,28 +157,28 @@ def test_other_system_or_component_2_1_and_1_100_no_answer__1_0_and_0_0_are_answ
 # ---- TIMESYNC and PING
 
 
-def test_timesync_request__answered_at_once_ts1_echoed_tc1_boot_time_in_ns(ready: Cockpit) -> None:
+def test_timesync_request__answered_at_once_ts1_echoed_tc1_boot_time_in_ns(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_timesync_message(0, 123_456_789_012))
     (answer,) = [message for message in ready.received("TIMESYNC") if message.tc1]
     assert answer.ts1 == 123_456_789_012
     assert answer.tc1 == ready.vehicle.boot_us * 1000
 
 
-def test_timesync__px4_sends_its_own_requests_with_tc1_0_at_10_hz(ready: Cockpit) -> None:
+def test_timesync__px4_sends_its_own_requests_with_tc1_0_at_10_hz(ready: SimHarness) -> None:
     ready.fly(10.0)
     requests = ready.received("TIMESYNC")
     assert all(message.tc1 == 0 for message in requests)
     assert len(requests) / 10.0 == pytest.approx(9.85, abs=0.2)
 
 
-def test_ping_0_0__answered_to_its_sender_with_its_stamp_and_number(ready: Cockpit) -> None:
+def test_ping_0_0__answered_to_its_sender_with_its_stamp_and_number(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_ping_message(55_000, 9, 0, 0))
     (answer,) = [message for message in ready.received("PING") if message.target_system]
     assert (answer.target_system, answer.target_component) == (1, 191)
     assert (answer.time_usec, answer.seq) == (55_000, 9)
 
 
-def test_ping_addressed_1_1__not_answered_own_ping_1_hz(ready: Cockpit) -> None:
+def test_ping_addressed_1_1__not_answered_own_ping_1_hz(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_ping_message(55_000, 9, 1, 1))
     ready.fly(10.0)
     pings = ready.received("PING")
@@ -189,64 +189,64 @@ def test_ping_addressed_1_1__not_answered_own_ping_1_hz(ready: Cockpit) -> None:
 # ---- events
 
 
-def request_event(cockpit: Cockpit, first: int, last: int, target: tuple[int, int] = (1, 1)) -> None:
+def request_event(harness: SimHarness, first: int, last: int, target: tuple[int, int] = (1, 1)) -> None:
     """REQUEST_EVENT as a client whose dialect has it packs it, read as one whose dialect lacks it."""
     payload = struct.pack("<HHBB", first, last, *target)
     body = struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 191, 412, 0) + payload
     crc = dialect.x25crc(body)
     crc.accumulate(bytes([33]))
     (message,) = parser().parse_buffer(b"\xfd" + body + struct.pack("<H", crc.crc))
-    cockpit.forget()
-    cockpit.vehicle.handle("onboard", message)
-    cockpit.fly(0.01)
+    harness.forget()
+    harness.vehicle.handle("onboard", message)
+    harness.fly(0.01)
 
 
-def flown(cockpit: Cockpit) -> list[Any]:
-    cockpit.take_off(2.5)
-    cockpit.command(21)
-    cockpit.until(lambda: not cockpit.armed, 40.0)
-    cockpit.fly(0.1)
-    return list(cockpit.received("EVENT"))
+def flown(harness: SimHarness) -> list[Any]:
+    harness.take_off(2.5)
+    harness.command(21)
+    harness.until(lambda: not harness.armed, 40.0)
+    harness.fly(0.1)
+    return list(harness.received("EVENT"))
 
 
-def test_events__on_occurrence_to_every_link_with_numbers_that_grow(cockpit: Cockpit) -> None:
-    first = flown(cockpit)
+def test_events__on_occurrence_to_every_link_with_numbers_that_grow(harness: SimHarness) -> None:
+    first = flown(harness)
     assert len(first) >= 5
     assert [message.sequence for message in first] == list(range(1, len(first) + 1))
-    assert [message.id for message in cockpit.received("EVENT", "gcs")] == [message.id for message in first]
+    assert [message.id for message in harness.received("EVENT", "gcs")] == [message.id for message in first]
 
 
-def test_source_request_event__the_kept_events_come_again_as_they_were(cockpit: Cockpit) -> None:
-    first = flown(cockpit)
-    request_event(cockpit, 2, 4)
-    again = cockpit.received("EVENT")
+def test_source_request_event__the_kept_events_come_again_as_they_were(harness: SimHarness) -> None:
+    first = flown(harness)
+    request_event(harness, 2, 4)
+    again = harness.received("EVENT")
     assert [(m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in again] == [
         (m.id, m.sequence, m.event_time_boot_ms, m.arguments) for m in first[1:4]
     ]
 
 
 def test_source_response_event_error__for_an_event_that_is_not_kept_with_the_next_that_is(
-    cockpit: Cockpit,
+    harness: SimHarness,
 ) -> None:
-    newest = flown(cockpit)[-1].sequence
-    request_event(cockpit, 65535, 0)
-    errors = cockpit.received("RESPONSE_EVENT_ERROR")
+    newest = flown(harness)[-1].sequence
+    request_event(harness, 65535, 0)
+    errors = harness.received("RESPONSE_EVENT_ERROR")
     assert [(message.sequence, message.sequence_oldest_available) for message in errors] == [
         (65535, 1),
         (0, 1),
     ]
     assert {(message.target_system, message.target_component) for message in errors} == {(1, 191)}
-    request_event(cockpit, newest + 1, 60000)
-    assert 1 <= len(cockpit.received("RESPONSE_EVENT_ERROR")) <= 25  # not one for each of 60000
-    request_event(cockpit, 1, 3, target=(1, 100))
-    assert not cockpit.received("EVENT")
+    request_event(harness, newest + 1, 60000)
+    assert 1 <= len(harness.received("RESPONSE_EVENT_ERROR")) <= 25  # not one for each of 60000
+    request_event(harness, 1, 3, target=(1, 100))
+    assert not harness.received("EVENT")
 
 
-def test_current_event_sequence__0_3_hz_with_the_newest_number(cockpit: Cockpit) -> None:
-    newest = flown(cockpit)[-1].sequence
-    cockpit.forget()
-    cockpit.fly(10.0)
-    told = cockpit.received("CURRENT_EVENT_SEQUENCE")
+def test_current_event_sequence__0_3_hz_with_the_newest_number(harness: SimHarness) -> None:
+    newest = flown(harness)[-1].sequence
+    harness.forget()
+    harness.fly(10.0)
+    told = harness.received("CURRENT_EVENT_SEQUENCE")
     assert len(told) == pytest.approx(3, abs=1)
     assert {message.sequence for message in told} == {newest}
 
@@ -279,13 +279,13 @@ def test_hash_check__is_reproduced_from_the_887_recorded_parameters() -> None:
     assert parameter_hash(parameters) == told == 0x6AF5A894
 
 
-def test_hash_check__the_vehicle_itself_answers_what_px4_answered(ready: Cockpit) -> None:
+def test_hash_check__the_vehicle_itself_answers_what_px4_answered(ready: SimHarness) -> None:
     (answer,) = read(ready, b"_HASH_CHECK")
     assert struct.unpack("<I", struct.pack("<f", answer.param_value))[0] == 0x6AF5A894
     assert (answer.param_type, answer.param_index, answer.param_count) == (5, 65535, 887)
 
 
-def test_request_list__887_parameters_604_real32_283_int32_888_messages_in_0_89_s(ready: Cockpit) -> None:
+def test_request_list__887_parameters_604_real32_283_int32_888_messages_in_0_89_s(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
     ready.fly(2.0)
     stamped = [
@@ -300,12 +300,12 @@ def test_request_list__887_parameters_604_real32_283_int32_888_messages_in_0_89_
     assert (kinds.count(REAL32), kinds.count(INT32)) == (604, 283)
 
 
-def test_names_types_and_values_are_those_recorded(ready: Cockpit) -> None:
+def test_names_types_and_values_are_those_recorded(ready: SimHarness) -> None:
     _, parameters = recorded_parameters()
     assert list(ready.vehicle.parameters) == parameters
 
 
-def test_source_hash_check__volatile_parameters_do_not_count(cockpit: Cockpit) -> None:
+def test_source_hash_check__volatile_parameters_do_not_count(harness: SimHarness) -> None:
     told, parameters = recorded_parameters()
     changed = [
         Parameter(item.name, item.kind, item.value + 1) if is_volatile(item.name) else item
@@ -321,7 +321,7 @@ def test_source_hash_check__volatile_parameters_do_not_count(cockpit: Cockpit) -
 
 
 def test_request_list__first_after_10_ms_the_hash_then_index_order_about_1000_a_second(
-    ready: Cockpit,
+    ready: SimHarness,
 ) -> None:
     total = len(ready.vehicle.parameters)
     started = ready.now_s
@@ -344,7 +344,9 @@ def test_request_list__first_after_10_ms_the_hash_then_index_order_about_1000_a_
     assert total / (stamped[-1][0] - first_s) == pytest.approx(1000, rel=0.05)
 
 
-def test_source_request_list__asked_again_while_it_runs_begins_anew_without_the_hash(ready: Cockpit) -> None:
+def test_source_request_list__asked_again_while_it_runs_begins_anew_without_the_hash(
+    ready: SimHarness,
+) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
     ready.fly(0.1)
     ready.forget()
@@ -357,35 +359,35 @@ def test_source_request_list__asked_again_while_it_runs_begins_anew_without_the_
     assert listed == [parameter.name for parameter in ready.vehicle.parameters]
 
 
-def read(cockpit: Cockpit, name: bytes, index: int = -1) -> list[Any]:
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_param_request_read_message(1, 1, name, index))
-    cockpit.fly(0.1)
-    return [*cockpit.received("PARAM_VALUE"), *cockpit.received("PARAM_ERROR")]
+def read(harness: SimHarness, name: bytes, index: int = -1) -> list[Any]:
+    harness.forget()
+    harness.send(dialect.MAVLink_param_request_read_message(1, 1, name, index))
+    harness.fly(0.1)
+    return [*harness.received("PARAM_VALUE"), *harness.received("PARAM_ERROR")]
 
 
-def write(cockpit: Cockpit, name: bytes, value: float, kind: int) -> list[Any]:
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_param_set_message(1, 1, name, value, kind))
-    cockpit.fly(0.1)
-    return [*cockpit.received("PARAM_VALUE"), *cockpit.received("PARAM_ERROR")]
+def write(harness: SimHarness, name: bytes, value: float, kind: int) -> list[Any]:
+    harness.forget()
+    harness.send(dialect.MAVLink_param_set_message(1, 1, name, value, kind))
+    harness.fly(0.1)
+    return [*harness.received("PARAM_VALUE"), *harness.received("PARAM_ERROR")]
 
 
-def test_read_by_name_or_index__one_param_value(ready: Cockpit) -> None:
+def test_read_by_name_or_index__one_param_value(ready: SimHarness) -> None:
     (by_name,) = read(ready, b"COM_OF_LOSS_T")
     (by_index,) = read(ready, b"", by_name.param_index)
     assert by_name.param_value == by_index.param_value == 1.0
     assert name_of(by_index) == "COM_OF_LOSS_T"
 
 
-def test_unknown__param_error_345_1_does_not_exist(ready: Cockpit) -> None:
+def test_unknown__param_error_345_1_does_not_exist(ready: SimHarness) -> None:
     for answers in (read(ready, b"NO_SUCH"), read(ready, b"", 20_000), write(ready, b"NO_SUCH", 1.0, REAL32)):
         (error,) = answers
         assert (error.get_msgId(), error.error) == (345, DOES_NOT_EXIST)
         assert (error.target_system, error.target_component) == (1, 191)
 
 
-def test_a_parameter_of_missions_is_listed_once_a_mission_was_checked(ready: Cockpit) -> None:
+def test_a_parameter_of_missions_is_listed_once_a_mission_was_checked(ready: SimHarness) -> None:
     (unlisted,) = read(ready, b"MIS_DIST_1WP")
     assert (unlisted.param_value, unlisted.param_index, unlisted.param_count) == (10_000.0, 65535, 887)
     assert upload(ready, [waypoint(10.0, 0.0, 5.0)]) == 0
@@ -395,7 +397,7 @@ def test_a_parameter_of_missions_is_listed_once_a_mission_was_checked(ready: Coc
     assert name_of(by_index) == "MIS_DIST_1WP"
 
 
-def test_set__param_value_twice_at_0_and_10_to_20_ms(ready: Cockpit) -> None:
+def test_set__param_value_twice_at_0_and_10_to_20_ms(ready: SimHarness) -> None:
     started = ready.now_s
     write(ready, b"MIS_TAKEOFF_ALT", 4.0, REAL32)
     stamps = [
@@ -406,25 +408,25 @@ def test_set__param_value_twice_at_0_and_10_to_20_ms(ready: Cockpit) -> None:
     assert 0.01 <= stamps[1] - stamps[0] <= 0.02
 
 
-def test_source_set__a_change_is_told_on_every_link_and_no_change_is_told_once(ready: Cockpit) -> None:
+def test_source_set__a_change_is_told_on_every_link_and_no_change_is_told_once(ready: SimHarness) -> None:
     write(ready, b"MIS_TAKEOFF_ALT", 4.0, REAL32)
     assert [name_of(message) for message in ready.received("PARAM_VALUE", "gcs")] == ["MIS_TAKEOFF_ALT"]
     assert len(write(ready, b"MIS_TAKEOFF_ALT", 4.0, REAL32)) == 1
     assert not ready.received("PARAM_VALUE", "gcs")
 
 
-def test_wrong_type__param_error_7_type_mismatch(ready: Cockpit) -> None:
+def test_wrong_type__param_error_7_type_mismatch(ready: SimHarness) -> None:
     (error,) = write(ready, b"COM_OF_LOSS_T", 1.0, INT32)
     assert error.error == TYPE_MISMATCH
 
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 7, 8, 10, 0, 255])
-def test_source_set__any_type_but_int32_and_real32_is_param_error_6(ready: Cockpit, kind: int) -> None:
+def test_source_set__any_type_but_int32_and_real32_is_param_error_6(ready: SimHarness, kind: int) -> None:
     (error,) = write(ready, b"COM_OF_LOSS_T", 1.0, kind)
     assert error.error == TYPE_UNSUPPORTED
 
 
-def test_source_set_hash_check__stops_the_list_and_is_param_error_5_read_only(ready: Cockpit) -> None:
+def test_source_set_hash_check__stops_the_list_and_is_param_error_5_read_only(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_request_list_message(1, 1))
     ready.fly(0.05)
     (error,) = write(ready, b"_HASH_CHECK", 0.0, 5)[-1:]
@@ -434,11 +436,11 @@ def test_source_set_hash_check__stops_the_list_and_is_param_error_5_read_only(re
     assert not ready.received("PARAM_VALUE")
 
 
-def test_out_of_range_is_accepted_com_of_loss_t_1000(ready: Cockpit) -> None:
+def test_out_of_range_is_accepted_com_of_loss_t_1000(ready: SimHarness) -> None:
     assert [message.param_value for message in write(ready, b"COM_OF_LOSS_T", 1000.0, REAL32)] == [1000.0] * 2
 
 
-def test_a_set_takes_effect_at_once(ready: Cockpit) -> None:
+def test_a_set_takes_effect_at_once(ready: SimHarness) -> None:
     write(ready, b"MIS_TAKEOFF_ALT", 6.0, REAL32)
     ready.command(400, 1)
     ready.command(22, *[float("nan")] * 7)
@@ -448,12 +450,12 @@ def test_a_set_takes_effect_at_once(ready: Cockpit) -> None:
 
 
 def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_defaults(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
 ) -> None:
-    cockpit = make_cockpit(parameters={"COM_OF_LOSS_T": 0.5})
-    cockpit.fly(2.0)
+    harness = make_harness(parameters={"COM_OF_LOSS_T": 0.5})
+    harness.fly(2.0)
     for link in ("onboard", "gcs"):
-        assert [name_of(message) for message in cockpit.received("PARAM_VALUE", link)] == ["COM_OF_LOSS_T"]
+        assert [name_of(message) for message in harness.received("PARAM_VALUE", link)] == ["COM_OF_LOSS_T"]
 
 
 @pytest.mark.parametrize(
@@ -467,7 +469,7 @@ def test_source_a_few_param_values_arrive_unasked__what_differs_from_the_default
     ids=["PARAM_MAP_RC", "PARAM_EXT_REQUEST_LIST", "PARAM_EXT_REQUEST_READ", "PARAM_EXT_SET"],
 )
 def test_source_rc_maps_and_the_extended_protocol_change_nothing_and_get_no_answer(
-    ready: Cockpit, message: Any
+    ready: SimHarness, message: Any
 ) -> None:
     before = ready.vehicle.parameters.hash()
     ready.send(message)
@@ -477,7 +479,7 @@ def test_source_rc_maps_and_the_extended_protocol_change_nothing_and_get_no_answ
     assert ready.vehicle.parameters.hash() == before
 
 
-def test_other_components_parameters_are_not_ours(ready: Cockpit) -> None:
+def test_other_components_parameters_are_not_ours(ready: SimHarness) -> None:
     ready.send(dialect.MAVLink_param_set_message(1, 100, b"COM_OF_LOSS_T", 2.0, REAL32))
     ready.send(dialect.MAVLink_param_request_read_message(2, 1, b"COM_OF_LOSS_T", -1))
     ready.fly(0.1)
@@ -489,7 +491,7 @@ def test_other_components_parameters_are_not_ours(ready: Cockpit) -> None:
 
 
 @pytest.mark.parametrize(("action", "reset"), [(0, False), (1, False), (2, True), (3, False), (4, True)])
-def test_245_accepted_and_2_and_4_reset_the_parameters(ready: Cockpit, action: int, reset: bool) -> None:
+def test_245_accepted_and_2_and_4_reset_the_parameters(ready: SimHarness, action: int, reset: bool) -> None:
     defaults = Parameters().hash()
     write(ready, b"COM_OF_LOSS_T", 3.0, REAL32)
     assert ready.command(245, action) == [ACCEPTED]
@@ -497,7 +499,7 @@ def test_245_accepted_and_2_and_4_reset_the_parameters(ready: Cockpit, action: i
     assert (ready.vehicle.parameters.hash() == defaults) is reset
 
 
-def test_source_245_of_an_armed_vehicle__temporarily_rejected(ready: Cockpit) -> None:
+def test_source_245_of_an_armed_vehicle__temporarily_rejected(ready: SimHarness) -> None:
     write(ready, b"COM_OF_LOSS_T", 3.0, REAL32)
     assert ready.command(400, 1) == [ACCEPTED]
     assert ready.command(245, 2) == [TEMPORARILY_REJECTED]
@@ -505,7 +507,7 @@ def test_source_245_of_an_armed_vehicle__temporarily_rejected(ready: Cockpit) ->
 
 
 @pytest.mark.parametrize("action", [-1.0, 5.0, 1.5, float("nan")])
-def test_245_with_an_unknown_action__nothing_happens(ready: Cockpit, action: float) -> None:
+def test_245_with_an_unknown_action__nothing_happens(ready: SimHarness, action: float) -> None:
     write(ready, b"COM_OF_LOSS_T", 3.0, REAL32)
     assert ready.command(245, action) == [UNSUPPORTED]
     assert ready.vehicle.parameters.number("COM_OF_LOSS_T") == 3.0

@@ -10,9 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import common
 
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
-pytestmark = pytest.mark.hears("everything")
+pytestmark = pytest.mark.streams("everything")
 
 GCS = 6
 ONBOARD_CONTROLLER = 18
@@ -21,40 +21,40 @@ UNKNOWN_TO_COMMON = {8, 300, 380, 395, 397, 410, 411, 435, 436}
 SIGNATURE_BYTES = 13  # the vehicle that was measured signed what it sent
 
 
-def names(cockpit: Cockpit, link: str = "onboard") -> Counter[str]:
-    return Counter(item.message.get_type() for _, item in cockpit.inbox[link])
+def names(harness: SimHarness, link: str = "onboard") -> Counter[str]:
+    return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
-def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_cockpit: type[Cockpit]) -> None:
-    alone, heard = make_cockpit(["everything"]), make_cockpit(["everything"])
+def test_the_streams_are_the_same_whether_or_not_a_companion_is_heard(make_harness: type[SimHarness]) -> None:
+    alone, heard = make_harness(["everything"]), make_harness(["everything"])
     heard.heartbeats.append(("onboard", (1, 191), ONBOARD_CONTROLLER))
-    for cockpit in (alone, heard):
-        cockpit.wait_ready()
-        cockpit.forget()
-        cockpit.fly(10.0)
+    for harness in (alone, heard):
+        harness.wait_ready()
+        harness.forget()
+        harness.fly(10.0)
     assert names(alone) == names(heard)
 
 
 @pytest.mark.parametrize("flying", [False, True], ids=["disarmed", "in flight"])
-def test_the_onboard_link_carries_29_kilobytes_a_second(make_cockpit: type[Cockpit], flying: bool) -> None:
+def test_the_onboard_link_carries_29_kilobytes_a_second(make_harness: type[SimHarness], flying: bool) -> None:
     """Of whole frames with their signatures, as in the recorded flight: 28.7 kB/s before arming."""
-    cockpit = make_cockpit(["everything"], noise=True, gusts_mps=None)
+    harness = make_harness(["everything"], noise=True, gusts_mps=None)
     if flying:
-        cockpit.take_off()
-    cockpit.fly(6.0)  # until the last PARAM_VALUE that comes unasked
-    cockpit.forget()
-    cockpit.fly(20.0)
+        harness.take_off()
+    harness.fly(6.0)  # until the last PARAM_VALUE that comes unasked
+    harness.forget()
+    harness.fly(20.0)
     codec = parser()
-    size = sum(len(item.pack(codec)) + SIGNATURE_BYTES for _, item in cockpit.inbox["onboard"]) / 20.0
+    size = sum(len(item.pack(codec)) + SIGNATURE_BYTES for _, item in harness.inbox["onboard"]) / 20.0
     assert size == pytest.approx(29_000, rel=0.05)
 
 
-def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(cockpit: Cockpit) -> None:
-    cockpit.take_off()
-    cockpit.command(519, 1)
+def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(harness: SimHarness) -> None:
+    harness.take_off()
+    harness.command(519, 1)
     codec, reader = parser(), common.MAVLink(None)
     unknown = set()
-    for _, item in cockpit.inbox["onboard"]:
+    for _, item in harness.inbox["onboard"]:
         (message,) = reader.parse_buffer(item.pack(codec))
         if message.get_type().startswith("UNKNOWN_"):
             unknown.add(int(message.get_type().removeprefix("UNKNOWN_")))
@@ -62,83 +62,85 @@ def test_what_the_common_dialect_does_not_know_is_what_it_does_not_know_of_px4(c
 
 
 def test_a_place_to_fly_to_is_told_in_modes_that_have_one_and_not_in_offboard(
-    cockpit: Cockpit, velocity_setpoint: Any
+    harness: SimHarness, velocity_setpoint: Any
 ) -> None:
-    cockpit.wait_ready()
-    assert "POSITION_TARGET_GLOBAL_INT" not in names(cockpit)  # not on the ground
-    cockpit.take_off(4.0)
+    harness.wait_ready()
+    assert "POSITION_TARGET_GLOBAL_INT" not in names(harness)  # not on the ground
+    harness.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
-    cockpit.offboard(stream)
-    cockpit.forget()
-    cockpit.fly(2.0, stream)
-    assert "POSITION_TARGET_GLOBAL_INT" not in names(cockpit)
+    harness.offboard(stream)
+    harness.forget()
+    harness.fly(2.0, stream)
+    assert "POSITION_TARGET_GLOBAL_INT" not in names(harness)
     for command in (21, 20):
-        cockpit.command(command)
-        cockpit.forget()
-        cockpit.fly(1.0)
-        assert 9 <= names(cockpit)["POSITION_TARGET_GLOBAL_INT"] <= 10
+        harness.command(command)
+        harness.forget()
+        harness.fly(1.0)
+        assert 9 <= names(harness)["POSITION_TARGET_GLOBAL_INT"] <= 10
 
 
-def test_a_heartbeat_comes_once_a_second_whatever_happens(cockpit: Cockpit, velocity_setpoint: Any) -> None:
-    cockpit.wait_ready()
-    cockpit.forget()
-    started = cockpit.now_s
-    cockpit.command(400, 1)
-    cockpit.command(22, *[float("nan")] * 7)
-    cockpit.fly(9.0)
+def test_a_heartbeat_comes_once_a_second_whatever_happens(
+    harness: SimHarness, velocity_setpoint: Any
+) -> None:
+    harness.wait_ready()
+    harness.forget()
+    started = harness.now_s
+    harness.command(400, 1)
+    harness.command(22, *[float("nan")] * 7)
+    harness.fly(9.0)
     stream = velocity_setpoint(0, 0, 0)
-    cockpit.offboard(stream)
-    cockpit.until(lambda: cockpit.mode == "RTL", 10.0)
-    cockpit.command(21)
-    cockpit.until(lambda: not cockpit.armed)
-    stamps = [stamp for stamp, item in cockpit.inbox["onboard"] if item.message.get_type() == "HEARTBEAT"]
-    assert len(stamps) == pytest.approx(cockpit.now_s - started, abs=1.01)
+    harness.offboard(stream)
+    harness.until(lambda: harness.mode == "RTL", 10.0)
+    harness.command(21)
+    harness.until(lambda: not harness.armed)
+    stamps = [stamp for stamp, item in harness.inbox["onboard"] if item.message.get_type() == "HEARTBEAT"]
+    assert len(stamps) == pytest.approx(harness.now_s - started, abs=1.01)
     gaps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
     assert min(gaps) == pytest.approx(1.0, abs=0.01)
     assert max(gaps) == pytest.approx(1.0, abs=0.01)
 
 
-def test_what_a_heartbeat_shows_lags_by_up_to_a_second(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    cockpit.heartbeat()
-    cockpit.fly(0.02)
-    cockpit.command(400, 1)
-    changed = cockpit.now_s
-    assert cockpit.heartbeat().base_mode == 157
-    assert 0.9 < cockpit.now_s - changed <= 1.0
+def test_what_a_heartbeat_shows_lags_by_up_to_a_second(harness: SimHarness) -> None:
+    harness.wait_ready()
+    harness.heartbeat()
+    harness.fly(0.02)
+    harness.command(400, 1)
+    changed = harness.now_s
+    assert harness.heartbeat().base_mode == 157
+    assert 0.9 < harness.now_s - changed <= 1.0
 
 
-def test_the_old_request_for_a_data_stream_is_ignored(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    cockpit.forget()
+def test_the_old_request_for_a_data_stream_is_ignored(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    harness.forget()
     for start in (0, 1):
-        cockpit.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 50, start))
-    cockpit.fly(2.0)
-    assert 196 <= names(cockpit)["ATTITUDE"] <= 198
-    assert 1 <= names(cockpit)["HEARTBEAT"] <= 2
-    assert "COMMAND_ACK" not in names(cockpit)
+        harness.send(dialect.MAVLink_request_data_stream_message(1, 1, 0, 50, start))
+    harness.fly(2.0)
+    assert 196 <= names(harness)["ATTITUDE"] <= 198
+    assert 1 <= names(harness)["HEARTBEAT"] <= 2
+    assert "COMMAND_ACK" not in names(harness)
 
 
-def test_its_own_time_synchronisation_and_pings_are_requests_to_all(cockpit: Cockpit) -> None:
-    cockpit.fly(5.0)
-    requests = cockpit.received("TIMESYNC")
+def test_its_own_time_synchronisation_and_pings_are_requests_to_all(harness: SimHarness) -> None:
+    harness.fly(5.0)
+    requests = harness.received("TIMESYNC")
     assert len(requests) == pytest.approx(49, abs=1)
     assert all(request.tc1 == 0 and request.ts1 > 0 for request in requests)
-    pings = cockpit.received("PING")
+    pings = harness.received("PING")
     assert [(ping.target_system, ping.target_component) for ping in pings] == [(0, 0)] * len(pings)
     assert [ping.seq for ping in pings] == list(range(pings[0].seq, pings[0].seq + len(pings)))
 
 
 def test_a_ground_stations_heartbeat_reaches_the_companion_under_the_ground_stations_name(
-    cockpit: Cockpit,
+    harness: SimHarness,
 ) -> None:
-    cockpit.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
-    cockpit.fly(5.0)
-    sources = Counter((item.system, item.component) for _, item in cockpit.inbox["onboard"] if item.forwarded)
+    harness.heartbeats += [("gcs", (245, 190), GCS), ("onboard", (1, 191), ONBOARD_CONTROLLER)]
+    harness.fly(5.0)
+    sources = Counter((item.system, item.component) for _, item in harness.inbox["onboard"] if item.forwarded)
     assert sources[245, 190] == pytest.approx(5, abs=1)
     own = [
         item.message
-        for _, item in cockpit.inbox["onboard"]
+        for _, item in harness.inbox["onboard"]
         if (item.system, item.component) == (1, 1) and item.message.get_type() == "HEARTBEAT"
     ]
     assert {message.autopilot for message in own} == {12}

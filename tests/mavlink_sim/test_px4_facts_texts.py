@@ -7,29 +7,29 @@ from typing import Any
 import pytest
 
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 INFO, CRITICAL = 6, 2
 GROUND_STATION = (245, 190)
 
 
-def said(cockpit: Cockpit, link: str = "gcs") -> list[tuple[int, str]]:
+def said(harness: SimHarness, link: str = "gcs") -> list[tuple[int, str]]:
     """(severity, whole text) of every STATUSTEXT received."""
     severities = [
-        message.severity for message in cockpit.received("STATUSTEXT", link) if not message.chunk_seq
+        message.severity for message in harness.received("STATUSTEXT", link) if not message.chunk_seq
     ]
-    return list(zip(severities, cockpit.texts(link), strict=True))
+    return list(zip(severities, harness.texts(link), strict=True))
 
 
 @pytest.fixture
-def heard(make_cockpit: type[Cockpit]) -> Cockpit:
+def heard(make_harness: type[SimHarness]) -> SimHarness:
     """A vehicle whose ground-station link has a ground station on it."""
-    cockpit = make_cockpit()
-    cockpit.heartbeats.append(("gcs", GROUND_STATION, 6))
-    return cockpit
+    harness = make_harness()
+    harness.heartbeats.append(("gcs", GROUND_STATION, 6))
+    return harness
 
 
-def test_a_flight_by_command_is_told_in_px4s_words(heard: Cockpit) -> None:
+def test_a_flight_by_command_is_told_in_px4s_words(heard: SimHarness) -> None:
     heard.wait_ready()
     heard.command(400, 1)
     heard.command(22, *[float("nan")] * 7)
@@ -48,7 +48,7 @@ def test_a_flight_by_command_is_told_in_px4s_words(heard: Cockpit) -> None:
     ]
 
 
-def test_a_return_is_told_in_px4s_words_all_as_information(heard: Cockpit) -> None:
+def test_a_return_is_told_in_px4s_words_all_as_information(heard: SimHarness) -> None:
     heard.take_off(4.0)
     heard.fly(4.0)
     heard.forget()
@@ -64,7 +64,7 @@ def test_a_return_is_told_in_px4s_words_all_as_information(heard: Cockpit) -> No
     ]
 
 
-def test_disarming_is_told_with_its_reason(heard: Cockpit) -> None:
+def test_disarming_is_told_with_its_reason(heard: SimHarness) -> None:
     heard.wait_ready()
     heard.command(400, 1)
     heard.command(400, 0)
@@ -77,7 +77,9 @@ def test_disarming_is_told_with_its_reason(heard: Cockpit) -> None:
     ]
 
 
-def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(heard: Cockpit) -> None:
+def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_tab(
+    heard: SimHarness,
+) -> None:
     heard.fly(0.1)
     heard.command(400, 1)
     heard.set_mode(77)
@@ -103,7 +105,9 @@ def test_what_is_refused_is_told_as_critical_and_only_the_preflight_text_has_no_
     assert {severity for severity, _ in texts} == {INFO, CRITICAL}
 
 
-def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Cockpit, velocity_setpoint: Any) -> None:
+def test_the_loss_of_setpoints_and_of_the_companion_are_told(
+    heard: SimHarness, velocity_setpoint: Any
+) -> None:
     heard.heartbeats.append(("onboard", (1, 191), 18))
     heard.take_off(4.0)
     stream = velocity_setpoint(0, 0, 0)
@@ -125,7 +129,7 @@ def test_the_loss_of_setpoints_and_of_the_companion_are_told(heard: Cockpit, vel
 
 
 def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and_says_why(
-    heard: Cockpit,
+    heard: SimHarness,
 ) -> None:
     heard.wait_ready()
     heard.command(400, 1)
@@ -137,7 +141,7 @@ def test_a_take_off_to_a_height_above_ground_instead_of_the_sea_goes_nowhere_and
     assert said(heard)[-1] == (INFO, "Disarmed by auto preflight disarming\t")
 
 
-def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: Cockpit) -> None:
+def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(heard: SimHarness) -> None:
     heard.fly(0.1)
     heard.command(400, 1)
     heard.fly(0.05)
@@ -149,20 +153,20 @@ def test_a_text_of_more_than_fifty_characters_comes_in_chunks_with_one_number(he
 
 
 def test_texts_follow_the_ground_stations_heartbeat_to_whatever_link_it_arrives_on(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
 ) -> None:
-    cockpit = make_cockpit()
-    cockpit.heartbeats.append(("onboard", GROUND_STATION, 6))
-    cockpit.wait_ready()
-    cockpit.command(400, 1)
-    cockpit.fly(0.1)
-    assert cockpit.texts("onboard") == ["Armed by external command\t"]
-    assert cockpit.texts("gcs") == []
+    harness = make_harness()
+    harness.heartbeats.append(("onboard", GROUND_STATION, 6))
+    harness.wait_ready()
+    harness.command(400, 1)
+    harness.fly(0.1)
+    assert harness.texts("onboard") == ["Armed by external command\t"]
+    assert harness.texts("gcs") == []
 
 
-def test_events_go_to_every_link_with_one_numbering(cockpit: Cockpit) -> None:
-    cockpit.take_off()
-    numbers = {link: [m.sequence for m in cockpit.received("EVENT", link)] for link in ("onboard", "gcs")}
+def test_events_go_to_every_link_with_one_numbering(harness: SimHarness) -> None:
+    harness.take_off()
+    numbers = {link: [m.sequence for m in harness.received("EVENT", link)] for link in ("onboard", "gcs")}
     assert numbers["onboard"] == numbers["gcs"] != []
-    newest = cockpit.received("CURRENT_EVENT_SEQUENCE")[-1]
+    newest = harness.received("CURRENT_EVENT_SEQUENCE")[-1]
     assert newest.sequence <= numbers["onboard"][-1]

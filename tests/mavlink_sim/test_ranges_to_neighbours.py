@@ -1,4 +1,4 @@
-"""What the range sensors of one vehicle measure of the others of its flock."""
+"""What the range sensors of one vehicle measure of the others of its fleet_world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from mavlink_sim import Flock, LockstepVehicle
+from mavlink_sim import FleetWorld, LockstepVehicle
 from mavlink_sim.flight.transmitter import CALIBRATION, Sticks
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
@@ -81,8 +81,8 @@ def test_a_level_cuts_those_at_its_height_wherever_their_frames_begin() -> None:
         assert math.dist(start, end) == pytest.approx(2.0 * radius * math.sin(math.pi / 24))
 
 
-def pair(**options: object) -> tuple[Flock, LockstepVehicle, LockstepVehicle]:
-    """Two in one flock, the other 5 m north of the first."""
+def pair(**options: object) -> tuple[FleetWorld, LockstepVehicle, LockstepVehicle]:
+    """Two in one fleet_world, the other 5 m north of the first."""
     calm: dict[str, Any] = {
         "scene": World(()),
         "gusts_mps": 0.0,
@@ -92,10 +92,10 @@ def pair(**options: object) -> tuple[Flock, LockstepVehicle, LockstepVehicle]:
     }
     one = LockstepVehicle(system_id=1, **calm)
     other = LockstepVehicle(system_id=2, start_ned_m=(5.0, 0.0), gusts_mps=0.0, noise=False)
-    flock = Flock(2)
+    fleet_world = FleetWorld(2)
     for vehicle in (one, other):
-        flock.join(vehicle.vehicle)
-    return flock, one, other
+        fleet_world.join(vehicle.vehicle)
+    return fleet_world, one, other
 
 
 def around(vehicle: LockstepVehicle) -> list[int]:
@@ -155,7 +155,7 @@ def test_a_copy_is_in_no_flock_and_measures_nobody() -> None:
 
 
 def test_a_pilot_at_full_stick_stops_before_another_vehicle() -> None:
-    flock, one, other = pair(
+    fleet_world, one, other = pair(
         parameters={**CALIBRATION, "COM_RC_IN_MODE": 0, "CP_GUIDE_ANG": 0, "CP_DIST": 1.5}
     )
     for vehicle in (one, other):
@@ -169,7 +169,7 @@ def test_a_pilot_at_full_stick_stops_before_another_vehicle() -> None:
         one.step(STEP_S)
         north, east, _ = other.vehicle.airframe.position
         other.vehicle.airframe.position = (north, east, one.vehicle.airframe.position[2])  # it stays level
-        flock.meet()
+        fleet_world.meet()
     assert one.truth.mode == "POSCTL"
     assert one.truth.collisions == other.truth.collisions == 0
     assert 1.2 < 5.0 - RADIUS_M - one.truth.position_ned_m[0] < 2.6  # as before a wall

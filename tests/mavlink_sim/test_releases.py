@@ -5,48 +5,48 @@ import pytest
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.releases import RELEASES, release_named
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 
 @pytest.mark.parametrize("release", ["1.14", "1.15"])
 def test_an_older_release_answers_a_mode_request_once_and_truly(
-    make_cockpit: type[Cockpit], release: str
+    make_harness: type[SimHarness], release: str
 ) -> None:
-    cockpit = make_cockpit(px4=release)
-    cockpit.take_off()
-    assert cockpit.set_mode(6) == [1]
-    assert cockpit.set_mode(4, 5) == [0]
+    harness = make_harness(px4=release)
+    harness.take_off()
+    assert harness.set_mode(6) == [1]
+    assert harness.set_mode(4, 5) == [0]
 
 
 @pytest.mark.parametrize("release", ["1.16", "1.17"])
-def test_a_newer_release_answers_it_twice(make_cockpit: type[Cockpit], release: str) -> None:
-    cockpit = make_cockpit(px4=release)
-    cockpit.take_off()
-    assert cockpit.set_mode(6) == [0, 1]
+def test_a_newer_release_answers_it_twice(make_harness: type[SimHarness], release: str) -> None:
+    harness = make_harness(px4=release)
+    harness.take_off()
+    assert harness.set_mode(6) == [0, 1]
 
 
 @pytest.mark.parametrize(("release", "answers"), [("1.16", 0), ("1.17", 1)])
 def test_what_is_wrong_with_a_parameter_is_told_since_v1_17_alone(
-    make_cockpit: type[Cockpit], release: str, answers: int
+    make_harness: type[SimHarness], release: str, answers: int
 ) -> None:
-    cockpit = make_cockpit(px4=release)
+    harness = make_harness(px4=release)
     for request in (
         dialect.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1),
         dialect.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 1.0, 6),
     ):
-        cockpit.forget()
-        cockpit.send(request)
-        cockpit.fly(0.05)
-        assert cockpit.received("PARAM_VALUE") == []
-        assert len(cockpit.received("PARAM_ERROR")) == answers
+        harness.forget()
+        harness.send(request)
+        harness.fly(0.05)
+        assert harness.received("PARAM_VALUE") == []
+        assert len(harness.received("PARAM_ERROR")) == answers
 
 
 @pytest.mark.parametrize("release", RELEASES)
-def test_the_version_that_is_reported_is_the_releases(make_cockpit: type[Cockpit], release: str) -> None:
-    cockpit = make_cockpit(px4=release)
-    cockpit.fly(0.1)
-    cockpit.command(512, 148)
-    version = cockpit.received("AUTOPILOT_VERSION")[0].flight_sw_version
+def test_the_version_that_is_reported_is_the_releases(make_harness: type[SimHarness], release: str) -> None:
+    harness = make_harness(px4=release)
+    harness.fly(0.1)
+    harness.command(512, 148)
+    version = harness.received("AUTOPILOT_VERSION")[0].flight_sw_version
     assert f"{version >> 24}.{version >> 16 & 0xFF}" == release
 
 

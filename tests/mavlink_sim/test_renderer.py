@@ -16,7 +16,7 @@ from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT, Rendered,
 from mavlink_sim.world.shapes import CLASS_NAMES
 from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject, demo_world
 from vision.camera_model import CameraModel, CameraMount
-from vision.geolocation import Sightlines
+from vision.geolocation import PixelRays
 from vision.rotation import matrix_from_euler
 
 GROUND = Ground(("concrete",), 0, 256, 0.05)
@@ -52,10 +52,10 @@ def test_the_depth_of_the_ground_is_the_analytic_depth(pose: tuple[float, ...]) 
     eye_height = -position[2] - float((attitude @ DEFAULT_MOUNT.position_frd_m)[2])
     if eye_height < 0.06:
         return
-    ground = Sightlines.of(CAMERA, DEFAULT_MOUNT, attitude, pixels).on_ground(-position[2], 0.002)
+    ground = PixelRays.of(CAMERA, DEFAULT_MOUNT, attitude, pixels).on_ground(-position[2], 0.002)
     depth = rendered.depth_m[rows.ravel(), columns.ravel()]
     met = np.isfinite(ground[:, 0]) & np.isfinite(depth)
-    again = Sightlines.of(CAMERA, DEFAULT_MOUNT, attitude, pixels[met]).at_depth(depth[met])
+    again = PixelRays.of(CAMERA, DEFAULT_MOUNT, attitude, pixels[met]).at_depth(depth[met])
     # A float32 reciprocal loses relative accuracy in proportion to how far the ground is.
     span = np.linalg.norm(ground[met], axis=1)
     assert np.all(np.linalg.norm(again - ground[met], axis=1) <= 1e-4 * span * (1 + span / eye_height))

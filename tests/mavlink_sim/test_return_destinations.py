@@ -15,7 +15,7 @@ from mavlink_sim.missions.plan import Mission
 from mavlink_sim.missions.return_flight import Goal, destination, mission_route
 from mavlink_sim.physics.geography import geographic
 from mavlink_sim.px4.parameters import Parameters
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import item, land, listen, message, rally, takeoff, upload, waypoint
 
 HOME = (0.0, 0.0, 0.0)
@@ -90,83 +90,85 @@ def test_along_a_mission_it_goes_on_to_the_landing_or_back_home() -> None:
 
 
 @pytest.fixture
-def make(make_cockpit: type[Cockpit]) -> Callable[..., Cockpit]:
+def make(make_harness: type[SimHarness]) -> Callable[..., SimHarness]:
     """Makes vehicles that are ready at once and return low."""
-    return lambda **values: make_cockpit(
+    return lambda **values: make_harness(
         ready_after_s=0.0, parameters={"RTL_RETURN_ALT": 5.0, "RTL_DESCEND_ALT": 5.0, **values}
     )
 
 
-def lands_at(cockpit: Cockpit, north: float, east: float) -> None:
-    cockpit.until(lambda: not cockpit.armed, 90.0)
-    assert math.dist(cockpit.vehicle.airframe.position[:2], (north, east)) < 1.0
+def lands_at(harness: SimHarness, north: float, east: float) -> None:
+    harness.until(lambda: not harness.armed, 90.0)
+    assert math.dist(harness.vehicle.airframe.position[:2], (north, east)) < 1.0
 
 
-def test_rtl_lands_at_the_nearer_rally_point(make: Callable[..., Cockpit]) -> None:
-    cockpit = make()
-    listen(cockpit)
-    upload(cockpit, [rally(14, 0)], 2)
-    cockpit.take_off(4.0)
-    cockpit.vehicle.airframe.position = (12.0, 3.0, -4.0)
-    cockpit.fly(0.01)  # until the estimate knows
-    assert cockpit.command(20) == [0]
-    lands_at(cockpit, 14, 0)
-    assert any("m above destination)" in text for text in cockpit.texts())
+def test_rtl_lands_at_the_nearer_rally_point(make: Callable[..., SimHarness]) -> None:
+    harness = make()
+    listen(harness)
+    upload(harness, [rally(14, 0)], 2)
+    harness.take_off(4.0)
+    harness.vehicle.airframe.position = (12.0, 3.0, -4.0)
+    harness.fly(0.01)  # until the estimate knows
+    assert harness.command(20) == [0]
+    lands_at(harness, 14, 0)
+    assert any("m above destination)" in text for text in harness.texts())
 
 
 def test_a_pilot_who_returns_a_vehicle_that_started_elsewhere_lands_it_at_the_rally_point(
-    make_cockpit: type[Cockpit],
+    make_harness: type[SimHarness],
 ) -> None:
-    cockpit = make_cockpit(
+    harness = make_harness(
         ready_after_s=0.0,
         start_ned_m=(10.0, 20.0),
         parameters={"RTL_RETURN_ALT": 5.0, "RTL_DESCEND_ALT": 5.0},
     )
-    listen(cockpit)
-    upload(cockpit, [rally(24, 20)], 2)  # from SIH's home
-    cockpit.take_off(4.0)
-    cockpit.vehicle.airframe.position = (12.0, 3.0, -4.0)
-    cockpit.fly(0.01)
-    cockpit.vehicle.faults.begin("pilot_takeover RTL")  # by who is no part of the vehicle
-    lands_at(cockpit, 14, 0)
+    listen(harness)
+    upload(harness, [rally(24, 20)], 2)  # from SIH's home
+    harness.take_off(4.0)
+    harness.vehicle.airframe.position = (12.0, 3.0, -4.0)
+    harness.fly(0.01)
+    harness.vehicle.faults.begin("pilot_takeover RTL")  # by who is no part of the vehicle
+    lands_at(harness, 14, 0)
 
 
-def test_rtl_goes_on_along_the_mission_to_its_landing(make: Callable[..., Cockpit]) -> None:
-    cockpit = make(RTL_TYPE=2)
+def test_rtl_goes_on_along_the_mission_to_its_landing(make: Callable[..., SimHarness]) -> None:
+    harness = make(RTL_TYPE=2)
     plan = [takeoff(4.0), waypoint(6, 0, 4, 60.0), waypoint(6, 8, 4), item(189), land(0, 12)]
-    upload(cockpit, plan)
-    cockpit.command(300)
-    cockpit.until(lambda: cockpit.vehicle.airframe.position[0] > 4.5, 30.0)
-    cockpit.command(20)
-    passed = cockpit.until(lambda: math.dist(cockpit.vehicle.airframe.position[:2], (6, 8)) < 2.5, 30.0)
+    upload(harness, plan)
+    harness.command(300)
+    harness.until(lambda: harness.vehicle.airframe.position[0] > 4.5, 30.0)
+    harness.command(20)
+    passed = harness.until(lambda: math.dist(harness.vehicle.airframe.position[:2], (6, 8)) < 2.5, 30.0)
     assert passed < 20.0  # it does not wait the minute at the first
-    lands_at(cockpit, 0, 12)
+    lands_at(harness, 0, 12)
 
 
-def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(make: Callable[..., Cockpit]) -> None:
-    cockpit = make(RTL_TYPE=3)
-    upload(cockpit, [takeoff(4.0), waypoint(30, 0, 4), item(189), waypoint(20, 5, 4), land(20, 12)])
-    cockpit.take_off(4.0)
-    cockpit.vehicle.airframe.position = (16.0, 8.0, -4.0)
-    cockpit.fly(0.01)  # until the estimate knows
-    cockpit.command(20)
-    lands_at(cockpit, 20, 12)
+def test_rtl_flies_to_the_missions_landing_pattern_where_that_is_nearer(
+    make: Callable[..., SimHarness],
+) -> None:
+    harness = make(RTL_TYPE=3)
+    upload(harness, [takeoff(4.0), waypoint(30, 0, 4), item(189), waypoint(20, 5, 4), land(20, 12)])
+    harness.take_off(4.0)
+    harness.vehicle.airframe.position = (16.0, 8.0, -4.0)
+    harness.fly(0.01)  # until the estimate knows
+    harness.command(20)
+    lands_at(harness, 20, 12)
 
 
 @pytest.mark.parametrize("before", [True, False])
 def test_rtl_leads_to_where_home_was_set_before_arming_or_after(
-    make: Callable[..., Cockpit], before: bool
+    make: Callable[..., SimHarness], before: bool
 ) -> None:
-    cockpit = make()
+    harness = make()
     if not before:
-        cockpit.take_off(4.0)
-    cockpit.wait_ready()
+        harness.take_off(4.0)
+    harness.wait_ready()
     latitude, longitude, altitude = geographic((0.0, 8.0, 0.0))
-    assert cockpit.command(179, 0, 0, 0, 0, latitude, longitude, altitude) == [0]
+    assert harness.command(179, 0, 0, 0, 0, latitude, longitude, altitude) == [0]
     if before:
-        cockpit.take_off(4.0)
-    cockpit.fly(2.1)
-    home = cockpit.received("HOME_POSITION")[-1]
+        harness.take_off(4.0)
+    harness.fly(2.1)
+    home = harness.received("HOME_POSITION")[-1]
     assert home.longitude == pytest.approx(longitude * 1e7, abs=200)  # COMMAND_LONG carries floats
-    cockpit.command(20)
-    lands_at(cockpit, 0, 8)
+    harness.command(20)
+    lands_at(harness, 0, 8)

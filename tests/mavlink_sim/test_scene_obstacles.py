@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mavlink_sim.camera.scene import Path
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.mesh import Mesh, mesh_of
 from mavlink_sim.world.obstacles import Obstacles
-from mavlink_sim.world.plates import Print
 from mavlink_sim.world.sectors import SECTORS, nearest_in_sectors
 from mavlink_sim.world.world import Vector, WorldObject
 

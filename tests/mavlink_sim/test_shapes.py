@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavlink_sim.world.painting_order import clip_polygon, painting_tree
-from mavlink_sim.world.palettes import palette_of
+from mavlink_sim.world.depth_sort import clip_polygon, depth_sort_tree
+from mavlink_sim.world.materials import palette_of
 from mavlink_sim.world.shapes import BUILDERS, CLASS_NAMES, VARIANTS, shape_of, variant_of
 from mavlink_sim.world.solids import Body, ground_shadow
 
@@ -71,7 +71,7 @@ def test_boxes_apart_are_painted_far_to_near_from_any_eye(seed: int, eye: tuple[
         for y in (-3.0, 3.0):
             size = rng.uniform(0.5, 2.5, 3)
             body.box((x, y, float(rng.uniform(-2, 2))), (size[0], size[1], size[2]), "wood")
-    order = painting_tree(body.solids).back_to_front(np.array(eye))
+    order = depth_sort_tree(body.solids).back_to_front(np.array(eye))
     assert sorted(order) == list(range(6))
     position = {solid: index for index, solid in enumerate(order)}
     for near in range(6):

@@ -15,7 +15,7 @@ from mavlink_sim.testing import running_simulator
 from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, component_metadata, dialect, parser
 from mavlink_sim.wire.signing import ALWAYS, EXCEPT_USB, OPTIONAL, Signing, key_of, timestamp_now
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
 KEY = bytes(range(32))
 OTHER_KEY = bytes(32 * [7])
@@ -180,19 +180,19 @@ def test_any_bit_changed_makes_the_signature_wrong() -> None:
             assert not vehicle_signing().accepts(bytes(damaged))
 
 
-def test_setup_signing_is_taken_on_the_usb_link_alone(cockpit: Cockpit) -> None:
+def test_setup_signing_is_taken_on_the_usb_link_alone(harness: SimHarness) -> None:
     message = dialect.MAVLink_setup_signing_message(1, 1, KEY, START)
-    cockpit.send(message, "onboard")
-    assert not any(link.signing.has_key for link in cockpit.vehicle.links.values())
-    cockpit.send(message, "gcs", (245, 190))
-    assert cockpit.vehicle.links["gcs"].signing.has_key
-    assert not cockpit.vehicle.links["onboard"].signing.has_key
-    cockpit.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-    cockpit.send(dialect.MAVLink_setup_signing_message(0, 0, KEY, START), "gcs", (245, 190))
-    cockpit.fly(0.1)
-    assert not cockpit.received("SETUP_SIGNING")  # a key is passed on to nobody
-    cockpit.send(dialect.MAVLink_setup_signing_message(1, 1, bytes(32), 0), "gcs", (245, 190))
-    assert not cockpit.vehicle.links["gcs"].signing.has_key
+    harness.send(message, "onboard")
+    assert not any(link.signing.has_key for link in harness.vehicle.links.values())
+    harness.send(message, "gcs", (245, 190))
+    assert harness.vehicle.links["gcs"].signing.has_key
+    assert not harness.vehicle.links["onboard"].signing.has_key
+    harness.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    harness.send(dialect.MAVLink_setup_signing_message(0, 0, KEY, START), "gcs", (245, 190))
+    harness.fly(0.1)
+    assert not harness.received("SETUP_SIGNING")  # a key is passed on to nobody
+    harness.send(dialect.MAVLink_setup_signing_message(1, 1, bytes(32), 0), "gcs", (245, 190))
+    assert not harness.vehicle.links["gcs"].signing.has_key
 
 
 def test_an_endpoint_refuses_and_counts_over_a_real_socket() -> None:

@@ -14,7 +14,7 @@ from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.lens import Shutter
 from mavlink_sim.camera.scene import CameraSettings, Path, Scene
 from mavlink_sim.camera.simulated_camera import SimulatedCamera, _motion_between, frame_truth, truth_line
-from mavlink_sim.world.plates import Print
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_euler

@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.wire.messages import dialect
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
-pytestmark = pytest.mark.hears("everything")
+pytestmark = pytest.mark.streams("everything")
 
 
 @pytest.mark.parametrize(
@@ -35,111 +35,111 @@ pytestmark = pytest.mark.hears("everything")
     ],
 )
 def test_the_result_of_a_command_is_as_measured(
-    cockpit: Cockpit, command: int, values: tuple[float, ...], result: int
+    harness: SimHarness, command: int, values: tuple[float, ...], result: int
 ) -> None:
-    cockpit.wait_ready()
-    assert cockpit.command(command, *values) == [result]
+    harness.wait_ready()
+    assert harness.command(command, *values) == [result]
 
 
 @pytest.mark.parametrize(
     ("target", "answers"), [((1, 1), 1), ((1, 0), 1), ((0, 0), 1), ((2, 1), 0), ((1, 100), 0)]
 )
 def test_only_what_is_addressed_to_the_autopilot_is_answered(
-    cockpit: Cockpit, target: tuple[int, int], answers: int
+    harness: SimHarness, target: tuple[int, int], answers: int
 ) -> None:
-    cockpit.fly(0.1)
-    assert len(cockpit.command(401, target=target)) == answers
+    harness.fly(0.1)
+    assert len(harness.command(401, target=target)) == answers
 
 
-def test_home_is_not_set_while_its_parameter_forbids_it(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(["everything"], parameters={"COM_HOME_EN": 0})
-    cockpit.wait_ready()
-    assert cockpit.command(179, 1) == [2]
+def test_home_is_not_set_while_its_parameter_forbids_it(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(["everything"], parameters={"COM_HOME_EN": 0})
+    harness.wait_ready()
+    assert harness.command(179, 1) == [2]
 
 
 @pytest.mark.parametrize("command", [0, 205, 310, 531, 2510])
-def test_what_px4_leaves_to_others_is_not_answered(cockpit: Cockpit, command: int) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.command(command) == []
+def test_what_px4_leaves_to_others_is_not_answered(harness: SimHarness, command: int) -> None:
+    harness.fly(0.1)
+    assert harness.command(command) == []
 
 
 @pytest.mark.parametrize(("command", "result"), [(241, 1), (310, 2)])
 def test_an_armed_vehicle_is_not_calibrated_and_no_actuator_tested(
-    cockpit: Cockpit, command: int, result: int
+    harness: SimHarness, command: int, result: int
 ) -> None:
-    cockpit.wait_ready()
-    assert cockpit.command(400, 1) == [0]
-    assert cockpit.command(command, 0, 0, 0, 0, 1) == [result]
+    harness.wait_ready()
+    assert harness.command(400, 1) == [0]
+    assert harness.command(command, 0, 0, 0, 0, 1) == [result]
 
 
-def test_get_home_position_sends_it_before_the_acknowledgement(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    cockpit.forget()
-    assert cockpit.command(410) == [0]
-    kinds = [item.message.get_type() for _, item in cockpit.inbox["onboard"]]
+def test_get_home_position_sends_it_before_the_acknowledgement(harness: SimHarness) -> None:
+    harness.wait_ready()
+    harness.forget()
+    assert harness.command(410) == [0]
+    kinds = [item.message.get_type() for _, item in harness.inbox["onboard"]]
     assert kinds.index("HOME_POSITION") < kinds.index("COMMAND_ACK")
 
 
-def test_available_modes_lists_one_or_all(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.command(512, 435, 0) == [0]
-    listed = cockpit.received("AVAILABLE_MODES")
+def test_available_modes_lists_one_or_all(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    assert harness.command(512, 435, 0) == [0]
+    listed = harness.received("AVAILABLE_MODES")
     assert [told.mode_index for told in listed] == list(range(1, listed[0].number_modes + 1))
     assert {told.custom_mode for told in listed} >= {0x00010000, 0x03040000, 0x04040000, 0x00060000}
-    cockpit.forget()
-    assert cockpit.command(512, 435, 1) == [0]
-    (manual,) = cockpit.received("AVAILABLE_MODES")
+    harness.forget()
+    assert harness.command(512, 435, 1) == [0]
+    (manual,) = harness.received("AVAILABLE_MODES")
     assert (manual.custom_mode, manual.standard_mode, manual.properties) == (0x00010000, 0, 1)
     assert manual.mode_name.rstrip("\0") == "Manual"
-    assert cockpit.command(512, 435, 200) == [2]
+    assert harness.command(512, 435, 200) == [2]
 
 
-def test_flight_information_tells_when_it_armed_and_took_off(cockpit: Cockpit) -> None:
-    cockpit.wait_ready()
-    assert cockpit.command(512, 264) == [0]
-    before = cockpit.received("FLIGHT_INFORMATION")[-1]
+def test_flight_information_tells_when_it_armed_and_took_off(harness: SimHarness) -> None:
+    harness.wait_ready()
+    assert harness.command(512, 264) == [0]
+    before = harness.received("FLIGHT_INFORMATION")[-1]
     assert (before.arming_time_utc, before.takeoff_time_utc, before.flight_uuid) == (0, 0, 0)
-    armed_us = cockpit.now_s * 1e6
-    cockpit.command(400, 1)
-    cockpit.command(22, *[float("nan")] * 7)
-    cockpit.until(lambda: not cockpit.vehicle.autopilot.landed, 5.0)
-    left_us = cockpit.now_s * 1e6
-    assert cockpit.command(512, 264) == [0]
-    flying = cockpit.received("FLIGHT_INFORMATION")[-1]
+    armed_us = harness.now_s * 1e6
+    harness.command(400, 1)
+    harness.command(22, *[float("nan")] * 7)
+    harness.until(lambda: not harness.vehicle.autopilot.landed, 5.0)
+    left_us = harness.now_s * 1e6
+    assert harness.command(512, 264) == [0]
+    flying = harness.received("FLIGHT_INFORMATION")[-1]
     assert flying.arming_time_utc == pytest.approx(armed_us, abs=20_000)
     assert flying.takeoff_time_utc == pytest.approx(left_us, abs=20_000)
 
 
-def test_the_protocol_version_is_sent_on_request(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.command(519, 1) == [0]
-    version = cockpit.received("PROTOCOL_VERSION")[0]
+def test_the_protocol_version_is_sent_on_request(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    assert harness.command(519, 1) == [0]
+    version = harness.received("PROTOCOL_VERSION")[0]
     assert (version.version, version.min_version, version.max_version) == (200, 100, 200)
 
 
-def test_another_system_id_is_answered_under_it(make_cockpit: type[Cockpit]) -> None:
-    cockpit = make_cockpit(["everything"], system_id=7)
-    cockpit.fly(0.1)
-    assert cockpit.command(401, target=(1, 1)) == []
-    assert cockpit.command(401, target=(7, 1)) == [0]
-    assert {item.system for _, item in cockpit.inbox["onboard"]} == {7}
-    assert cockpit.vehicle.parameters.number("MAV_SYS_ID") == 7
+def test_another_system_id_is_answered_under_it(make_harness: type[SimHarness]) -> None:
+    harness = make_harness(["everything"], system_id=7)
+    harness.fly(0.1)
+    assert harness.command(401, target=(1, 1)) == []
+    assert harness.command(401, target=(7, 1)) == [0]
+    assert {item.system for _, item in harness.inbox["onboard"]} == {7}
+    assert harness.vehicle.parameters.number("MAV_SYS_ID") == 7
 
 
 @pytest.mark.parametrize(("command", "values"), [(512, (148,)), (520, (1,))])
 def test_the_version_comes_before_the_acknowledgement(
-    cockpit: Cockpit, command: int, values: tuple[float, ...]
+    harness: SimHarness, command: int, values: tuple[float, ...]
 ) -> None:
-    cockpit.fly(0.1)
-    cockpit.forget()
-    assert cockpit.command(command, *values) == [0]
+    harness.fly(0.1)
+    harness.forget()
+    assert harness.command(command, *values) == [0]
     order = [
         item.message.get_type()
-        for _, item in cockpit.inbox["onboard"]
+        for _, item in harness.inbox["onboard"]
         if item.message.get_type() in ("AUTOPILOT_VERSION", "COMMAND_ACK")
     ]
     assert order == ["AUTOPILOT_VERSION", "COMMAND_ACK"]
-    version = cockpit.received("AUTOPILOT_VERSION")[0]
+    version = harness.received("AUTOPILOT_VERSION")[0]
     assert version.capabilities == 59647
     assert version.flight_sw_version == 0x01110040
     assert list(version.flight_custom_version) == [0, 0, 0, 253, 175, 214, 222, 89]
@@ -148,93 +148,93 @@ def test_the_version_comes_before_the_acknowledgement(
 
 
 @pytest.mark.parametrize("identifier", [259, 280, 60000, 27])
-def test_a_message_that_it_does_not_have_is_denied(cockpit: Cockpit, identifier: int) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.command(512, identifier) == [2]
+def test_a_message_that_it_does_not_have_is_denied(harness: SimHarness, identifier: int) -> None:
+    harness.fly(0.1)
+    assert harness.command(512, identifier) == [2]
 
 
-def test_home_cannot_be_asked_for_before_it_is_known(cockpit: Cockpit) -> None:
-    cockpit.fly(0.5)
-    assert cockpit.command(512, 242) == [2]
-    cockpit.wait_ready()
-    assert cockpit.command(512, 242) == [0]
-    assert cockpit.received("HOME_POSITION")[-1].altitude == 489400
+def test_home_cannot_be_asked_for_before_it_is_known(harness: SimHarness) -> None:
+    harness.fly(0.5)
+    assert harness.command(512, 242) == [2]
+    harness.wait_ready()
+    assert harness.command(512, 242) == [0]
+    assert harness.received("HOME_POSITION")[-1].altitude == 489400
 
 
-def test_an_interval_is_honoured_switched_off_and_restored(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
+def test_an_interval_is_honoured_switched_off_and_restored(harness: SimHarness) -> None:
+    harness.fly(0.1)
 
     def count(seconds: float) -> int:
-        cockpit.forget()
-        cockpit.fly(seconds)
-        return len(cockpit.received("ATTITUDE"))
+        harness.forget()
+        harness.fly(seconds)
+        return len(harness.received("ATTITUDE"))
 
     assert 97 <= count(1.0) <= 99
-    assert cockpit.command(511, 30, 100_000) == [0]
+    assert harness.command(511, 30, 100_000) == [0]
     assert 19 <= count(2.0) <= 20
-    assert cockpit.command(511, 30, -1) == [0]
+    assert harness.command(511, 30, -1) == [0]
     assert count(1.0) == 0
-    assert cockpit.command(511, 30, 0) == [0]
+    assert harness.command(511, 30, 0) == [0]
     assert 97 <= count(1.0) <= 99
 
 
 @pytest.mark.parametrize("identifier", [27, 0, 60000])
-def test_the_interval_of_what_it_does_not_stream_cannot_be_set(cockpit: Cockpit, identifier: int) -> None:
-    cockpit.fly(0.1)
-    assert cockpit.command(511, identifier, 100_000) == [4]
+def test_the_interval_of_what_it_does_not_stream_cannot_be_set(harness: SimHarness, identifier: int) -> None:
+    harness.fly(0.1)
+    assert harness.command(511, identifier, 100_000) == [4]
 
 
-def test_an_interval_set_on_one_link_leaves_the_other_alone(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    cockpit.command(511, 30, -1)
-    cockpit.forget()
-    cockpit.fly(1.0)
-    assert cockpit.received("ATTITUDE", "onboard") == []
-    assert len(cockpit.received("ATTITUDE", "gcs")) == 49
+def test_an_interval_set_on_one_link_leaves_the_other_alone(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    harness.command(511, 30, -1)
+    harness.forget()
+    harness.fly(1.0)
+    assert harness.received("ATTITUDE", "onboard") == []
+    assert len(harness.received("ATTITUDE", "gcs")) == 49
 
 
-def test_the_interval_can_be_read_back(cockpit: Cockpit) -> None:
-    cockpit.fly(0.1)
-    cockpit.command(511, 32, 250_000)
+def test_the_interval_can_be_read_back(harness: SimHarness) -> None:
+    harness.fly(0.1)
+    harness.command(511, 32, 250_000)
     for identifier, interval in ((32, 250_000), (30, 10_000), (27, -1)):
-        assert cockpit.command(510, identifier) == [0]
-        answer = cockpit.received("MESSAGE_INTERVAL")[-1]
+        assert harness.command(510, identifier) == [0]
+        answer = harness.received("MESSAGE_INTERVAL")[-1]
         assert (answer.message_id, answer.interval_us) == (identifier, interval)
-    assert cockpit.command(512, 244, 32) == [0]
-    answer = cockpit.received("MESSAGE_INTERVAL")[-1]
+    assert harness.command(512, 244, 32) == [0]
+    answer = harness.received("MESSAGE_INTERVAL")[-1]
     assert (answer.message_id, answer.interval_us) == (32, 250_000)
 
 
-def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(cockpit: Cockpit) -> None:
-    cockpit.fly(0.5)
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_timesync_message(0, 123456789))
-    answer = cockpit.received("TIMESYNC")[0]
+def test_a_timesync_request_is_answered_with_its_own_stamp_and_boot_time(harness: SimHarness) -> None:
+    harness.fly(0.5)
+    harness.forget()
+    harness.send(dialect.MAVLink_timesync_message(0, 123456789))
+    answer = harness.received("TIMESYNC")[0]
     assert (answer.ts1, answer.tc1) == (123456789, 500_000_000)
-    cockpit.forget()
-    cockpit.fly(1.0)
-    assert {message.tc1 for message in cockpit.received("TIMESYNC")} == {0}  # its own requests
+    harness.forget()
+    harness.fly(1.0)
+    assert {message.tc1 for message in harness.received("TIMESYNC")} == {0}  # its own requests
 
 
-def test_a_timesync_answer_is_not_answered(cockpit: Cockpit) -> None:
-    cockpit.send(dialect.MAVLink_timesync_message(5, 123))
-    assert cockpit.received("TIMESYNC") == []
+def test_a_timesync_answer_is_not_answered(harness: SimHarness) -> None:
+    harness.send(dialect.MAVLink_timesync_message(5, 123))
+    assert harness.received("TIMESYNC") == []
 
 
-def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(cockpit: Cockpit) -> None:
-    cockpit.send(dialect.MAVLink_ping_message(77, 5, 0, 0))
-    answer = cockpit.received("PING")[0]
+def test_a_ping_to_all_is_answered_to_its_sender_and_a_ping_to_it_is_not(harness: SimHarness) -> None:
+    harness.send(dialect.MAVLink_ping_message(77, 5, 0, 0))
+    answer = harness.received("PING")[0]
     assert (answer.time_usec, answer.seq, answer.target_system, answer.target_component) == (77, 5, 1, 191)
-    cockpit.forget()
-    cockpit.send(dialect.MAVLink_ping_message(78, 6, 1, 1))
-    assert cockpit.received("PING") == []
+    harness.forget()
+    harness.send(dialect.MAVLink_ping_message(78, 6, 1, 1))
+    assert harness.received("PING") == []
 
 
-def test_there_is_no_mission_on_board(cockpit: Cockpit) -> None:
-    cockpit.send(dialect.MAVLink_mission_request_list_message(1, 1, 1))
-    count = cockpit.received("MISSION_COUNT")[0]
+def test_there_is_no_mission_on_board(harness: SimHarness) -> None:
+    harness.send(dialect.MAVLink_mission_request_list_message(1, 1, 1))
+    count = harness.received("MISSION_COUNT")[0]
     assert (count.count, count.mission_type, count.target_component) == (0, 1, 191)
-    assert cockpit.command(300) == [2]
+    assert harness.command(300) == [2]
 
 
 numbers = st.one_of(
@@ -253,14 +253,14 @@ COMMANDS = [16, 20, 21, 22, 176, 178, 179, 185, 192, 193, 245, 300, 400, 401, 51
     )
 )
 def test_no_command_with_any_values_can_stop_the_vehicle(
-    make_cockpit: type[Cockpit], requests: list[tuple[int, list[float]]]
+    make_harness: type[SimHarness], requests: list[tuple[int, list[float]]]
 ) -> None:
-    cockpit = make_cockpit(["everything"], ready_after_s=0.0)
-    cockpit.command(400, 1)
+    harness = make_harness(["everything"], ready_after_s=0.0)
+    harness.command(400, 1)
     for command, values in requests:
-        for result in cockpit.command(command, *values):
+        for result in harness.command(command, *values):
             assert 0 <= result <= 4
-    cockpit.fly(1.0)
+    harness.fly(1.0)
     codec = dialect.MAVLink(None, 1, 1)
-    for _, item in cockpit.inbox["onboard"]:
+    for _, item in harness.inbox["onboard"]:
         assert item.pack(codec)

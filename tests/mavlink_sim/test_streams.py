@@ -11,19 +11,19 @@ from pymavlink import mavutil
 
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.streams import Streams
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 
-pytestmark = pytest.mark.hears("everything")
+pytestmark = pytest.mark.streams("everything")
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"
 PARAMETERS = DATA / "px4" / "parameters.txt"
 
 
-def counts(cockpit: Cockpit, link: str, seconds: float) -> Counter[str]:
-    cockpit.forget()
-    cockpit.fly(seconds)
-    return Counter(item.message.get_type() for _, item in cockpit.inbox[link])
+def counts(harness: SimHarness, link: str, seconds: float) -> Counter[str]:
+    harness.forget()
+    harness.fly(seconds)
+    return Counter(item.message.get_type() for _, item in harness.inbox[link])
 
 
 # As counted of a real PX4, disarmed, over 20 s; none of the vehicle's own tables is asked.
@@ -50,12 +50,12 @@ MEASURED_GCS_HZ = {
 
 
 @pytest.fixture
-def settled(cockpit: Cockpit) -> Cockpit:
-    cockpit.fly(6.0)  # what a start alone sends is over
-    return cockpit
+def settled(harness: SimHarness) -> SimHarness:
+    harness.fly(6.0)  # what a start alone sends is over
+    return harness
 
 
-def test_the_onboard_streams_have_the_measured_rates(settled: Cockpit) -> None:
+def test_the_onboard_streams_have_the_measured_rates(settled: SimHarness) -> None:
     seen = counts(settled, "onboard", 20.0)
     assert set(seen) == set(MEASURED_ONBOARD_HZ)  # nothing else, and no RC_CHANNELS above all
     for name, rate in MEASURED_ONBOARD_HZ.items():
@@ -63,7 +63,7 @@ def test_the_onboard_streams_have_the_measured_rates(settled: Cockpit) -> None:
 
 
 def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_or_less(
-    settled: Cockpit,
+    settled: SimHarness,
 ) -> None:
     seen = counts(settled, "gcs", 20.0)
     assert set(seen) <= set(MEASURED_ONBOARD_HZ)
@@ -73,35 +73,35 @@ def test_the_ground_stations_streams_have_the_measured_rates_and_the_rest_1_hz_o
     assert max(seen.values()) <= 21
 
 
-def test_a_mode_that_flies_to_a_place_tells_it(cockpit: Cockpit) -> None:
-    cockpit.take_off(5.0)
-    cockpit.forget()
-    cockpit.fly(1.0)
-    goals = cockpit.received("POSITION_TARGET_GLOBAL_INT")
+def test_a_mode_that_flies_to_a_place_tells_it(harness: SimHarness) -> None:
+    harness.take_off(5.0)
+    harness.forget()
+    harness.fly(1.0)
+    goals = harness.received("POSITION_TARGET_GLOBAL_INT")
     assert 9 <= len(goals) <= 10
     assert goals[-1].alt == pytest.approx(494.4, abs=0.1)
 
 
-def test_the_origin_is_told_once_and_on_request(cockpit: Cockpit) -> None:
-    cockpit.fly(10.0)
-    assert len(cockpit.received("GPS_GLOBAL_ORIGIN")) == 1
-    assert cockpit.command(512, 49) == [0]
-    assert len(cockpit.received("GPS_GLOBAL_ORIGIN")) == 2
+def test_the_origin_is_told_once_and_on_request(harness: SimHarness) -> None:
+    harness.fly(10.0)
+    assert len(harness.received("GPS_GLOBAL_ORIGIN")) == 1
+    assert harness.command(512, 49) == [0]
+    assert len(harness.received("GPS_GLOBAL_ORIGIN")) == 2
 
 
 def test_the_messages_agree_with_each_other_and_with_the_truth(
-    cockpit: Cockpit, position_setpoint: Any
+    harness: SimHarness, position_setpoint: Any
 ) -> None:
-    cockpit.take_off(5.0)
+    harness.take_off(5.0)
     there = position_setpoint(4, -3, -6, 0.7)
-    cockpit.offboard(there)
-    cockpit.fly(30.0, there)
-    north, east, down = cockpit.vehicle.airframe.position
-    local = cockpit.received("LOCAL_POSITION_NED")[-1]
-    odometry = cockpit.received("ODOMETRY")[-1]
-    world = cockpit.received("GLOBAL_POSITION_INT")[-1]
-    attitude = cockpit.received("ATTITUDE")[-1]
-    hud = cockpit.received("VFR_HUD")[-1]
+    harness.offboard(there)
+    harness.fly(30.0, there)
+    north, east, down = harness.vehicle.airframe.position
+    local = harness.received("LOCAL_POSITION_NED")[-1]
+    odometry = harness.received("ODOMETRY")[-1]
+    world = harness.received("GLOBAL_POSITION_INT")[-1]
+    attitude = harness.received("ATTITUDE")[-1]
+    hud = harness.received("VFR_HUD")[-1]
     assert (local.x, local.y, local.z) == pytest.approx((north, east, down), abs=0.05)
     assert (odometry.x, odometry.y, odometry.z) == pytest.approx((north, east, down), abs=0.05)
     assert (odometry.frame_id, odometry.child_frame_id) == (1, 1)
@@ -113,7 +113,7 @@ def test_the_messages_agree_with_each_other_and_with_the_truth(
     assert attitude.yaw == pytest.approx(0.7, abs=0.02)
     assert world.hdg == pytest.approx(math.degrees(0.7) * 100, abs=120)
     assert hud.heading in (39, 40, 41)
-    assert cockpit.received("DISTANCE_SENSOR")[-1].current_distance == pytest.approx(-down * 100, abs=5)
+    assert harness.received("DISTANCE_SENSOR")[-1].current_distance == pytest.approx(-down * 100, abs=5)
 
 
 def test_a_stream_that_was_held_up_skips_instead_of_bursting() -> None:
@@ -123,11 +123,11 @@ def test_a_stream_that_was_held_up_skips_instead_of_bursting() -> None:
     assert streams.due(1_010_000) == ["ATTITUDE"]
 
 
-def test_every_message_survives_the_wire(cockpit: Cockpit) -> None:
-    cockpit.take_off()
+def test_every_message_survives_the_wire(harness: SimHarness) -> None:
+    harness.take_off()
     codec = dialect.MAVLink(None, 1, 1)
     reader = dialect.MAVLink(None)
-    for _, item in cockpit.inbox["onboard"]:
+    for _, item in harness.inbox["onboard"]:
         (message,) = reader.parse_buffer(item.pack(codec))
         if message.get_msgId() in dialect.mavlink_map:
             assert message.get_type() == item.message.get_type()
@@ -156,15 +156,15 @@ NAMES_OF_UNKNOWN = {
 
 
 def test_a_flight_yields_the_same_kinds_of_messages_as_the_real_one(
-    cockpit: Cockpit, recorded: dict[str, list[Any]], velocity_setpoint: Any
+    harness: SimHarness, recorded: dict[str, list[Any]], velocity_setpoint: Any
 ) -> None:
-    cockpit.take_off()
+    harness.take_off()
     stream = velocity_setpoint(1, 0, -0.5)
-    cockpit.offboard(stream)
-    cockpit.fly(2.0, stream)
-    cockpit.command(21)
-    cockpit.until(lambda: not cockpit.armed, 40.0)
-    ours = {item.message.get_type() for _, item in cockpit.inbox["onboard"]}
+    harness.offboard(stream)
+    harness.fly(2.0, stream)
+    harness.command(21)
+    harness.until(lambda: not harness.armed, 40.0)
+    ours = {item.message.get_type() for _, item in harness.inbox["onboard"]}
     theirs = {NAMES_OF_UNKNOWN.get(name, name) for name in recorded}
     assert theirs - ours == {"PARAM_VALUE"}  # a few that PX4 sends unasked when a parameter changes
     assert ours - theirs == set()
@@ -186,30 +186,30 @@ def test_a_flight_yields_the_same_kinds_of_messages_as_the_real_one(
     ],
 )
 def test_constant_fields_are_those_of_the_real_vehicle(
-    cockpit: Cockpit, recorded: dict[str, list[Any]], kind: str, fields: tuple[str, ...]
+    harness: SimHarness, recorded: dict[str, list[Any]], kind: str, fields: tuple[str, ...]
 ) -> None:
-    cockpit.take_off()
-    ours, theirs = cockpit.received(kind)[-1], recorded[kind][-1]
+    harness.take_off()
+    ours, theirs = harness.received(kind)[-1], recorded[kind][-1]
     assert [getattr(ours, field) for field in fields] == [getattr(theirs, field) for field in fields]
 
 
-def test_events_are_those_of_the_real_flight(cockpit: Cockpit, recorded: dict[str, list[Any]]) -> None:
-    cockpit.take_off()
-    cockpit.command(21)
-    cockpit.until(lambda: not cockpit.armed, 40.0)
+def test_events_are_those_of_the_real_flight(harness: SimHarness, recorded: dict[str, list[Any]]) -> None:
+    harness.take_off()
+    harness.command(21)
+    harness.until(lambda: not harness.armed, 40.0)
     theirs = {bytes(message.data)[10:14] for message in recorded["UNKNOWN_410"]}
-    events = cockpit.received("EVENT")
+    events = harness.received("EVENT")
     assert {message.id.to_bytes(4, "little") for message in events} <= theirs
     assert [message.sequence for message in events] == list(range(1, len(events) + 1))
 
 
-def test_the_parameters_are_those_a_real_vehicle_reports(cockpit: Cockpit) -> None:
+def test_the_parameters_are_those_a_real_vehicle_reports(harness: SimHarness) -> None:
     if not PARAMETERS.exists():
         pytest.skip(f"needs the recorded parameters {PARAMETERS}")
     recorded = {}
     for line in PARAMETERS.read_text().splitlines():
         name, kind, value = line.split()
         recorded[name] = (int(kind), float(value))
-    cockpit.fly(0.1)
-    for parameter in cockpit.vehicle.parameters:
+    harness.fly(0.1)
+    for parameter in harness.vehicle.parameters:
         assert (parameter.kind, float(parameter.value)) == recorded[parameter.name], parameter.name

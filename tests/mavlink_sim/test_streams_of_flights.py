@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.wire.messages import dialect, parser
-from tests.mavlink_sim.conftest import Cockpit
+from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import circle, land, rally, takeoff, upload, waypoint
 
 NAN = math.nan
@@ -22,65 +22,65 @@ NUMBERS = {
 }
 
 
-def mission(cockpit: Cockpit) -> None:
-    assert upload(cockpit, [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]) == 0
-    assert cockpit.set_mode(4, 4) == [0, 0]
-    cockpit.fly(6.0)
+def mission(harness: SimHarness) -> None:
+    assert upload(harness, [takeoff(4.0), waypoint(8, 0, 4), land(8, 0)]) == 0
+    assert harness.set_mode(4, 4) == [0, 0]
+    harness.fly(6.0)
 
 
-def return_to_a_rally_point(cockpit: Cockpit) -> None:
-    assert upload(cockpit, [rally(6, 6)], 2) == 0
-    assert cockpit.set_mode(4, 5) == [0, 0]
-    cockpit.fly(6.0)
+def return_to_a_rally_point(harness: SimHarness) -> None:
+    assert upload(harness, [rally(6, 6)], 2) == 0
+    assert harness.set_mode(4, 5) == [0, 0]
+    harness.fly(6.0)
 
 
-def precision_landing(cockpit: Cockpit) -> None:
+def precision_landing(harness: SimHarness) -> None:
     seen = dialect.MAVLink_landing_target_message(
         0, 0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 0.0, [1, 0, 0, 0], 2, 1
     )
-    cockpit.fly(0.2, seen)
-    assert cockpit.set_mode(4, 9) == [0, 0]
-    cockpit.fly(6.0, seen)
+    harness.fly(0.2, seen)
+    assert harness.set_mode(4, 9) == [0, 0]
+    harness.fly(6.0, seen)
 
 
-def geofence(cockpit: Cockpit) -> None:
-    assert upload(cockpit, [circle(0, 0, 5.0)], 1) == 0
+def geofence(harness: SimHarness) -> None:
+    assert upload(harness, [circle(0, 0, 5.0)], 1) == 0
     forward = dialect.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, 1, 1479, 0, 0, 0, 3.0, 0, 0, 0, 0, 0, 0, 0.0
     )
-    cockpit.offboard(forward)
-    cockpit.fly(6.0, forward)
+    harness.offboard(forward)
+    harness.fly(6.0, forward)
 
 
-def orbit(cockpit: Cockpit) -> None:
-    assert cockpit.command(34, 5, 2, 0, NAN, NAN, NAN, NAN) == [0]
-    cockpit.fly(6.0)
+def orbit(harness: SimHarness) -> None:
+    assert harness.command(34, 5, 2, 0, NAN, NAN, NAN, NAN) == [0]
+    harness.fly(6.0)
 
 
-def sticks(cockpit: Cockpit) -> None:
+def sticks(harness: SimHarness) -> None:
     pushed = dialect.MAVLink_manual_control_message(1, 500, 0, 500, 0, 0)
-    cockpit.fly(0.3, pushed)
-    assert cockpit.set_mode(3) == [0, 0]
-    cockpit.fly(4.0, pushed)
+    harness.fly(0.3, pushed)
+    assert harness.set_mode(3) == [0, 0]
+    harness.fly(4.0, pushed)
 
 
 @pytest.mark.parametrize(
     "flight", [mission, return_to_a_rally_point, precision_landing, geofence, orbit, sticks]
 )
 def test_all_that_is_said_in_a_flight_can_be_put_on_the_wire(
-    make_cockpit: type[Cockpit], flight: Callable[[Any], None]
+    make_harness: type[SimHarness], flight: Callable[[Any], None]
 ) -> None:
     joystick = {"COM_RC_IN_MODE": 1} if flight is sticks else {}
-    cockpit = make_cockpit(["everything"], parameters=joystick)
-    cockpit.take_off(6.0)
-    cockpit.forget()
-    flight(cockpit)
-    assert {told.custom_mode for told in cockpit.received("HEARTBEAT")} - {HOLD}
+    harness = make_harness(["everything"], parameters=joystick)
+    harness.take_off(6.0)
+    harness.forget()
+    flight(harness)
+    assert {told.custom_mode for told in harness.received("HEARTBEAT")} - {HOLD}
     codec = parser(1)
     for link in ("onboard", "gcs"):
-        for _, item in cockpit.inbox[link]:
+        for _, item in harness.inbox[link]:
             assert item.pack(codec)
         for kind, names in NUMBERS.items():
-            for told in cockpit.received(kind, link):
+            for told in harness.received(kind, link):
                 assert all(math.isfinite(getattr(told, name)) for name in names), told
-    assert len(cockpit.received("ATTITUDE")) > 300
+    assert len(harness.received("ATTITUDE")) > 300

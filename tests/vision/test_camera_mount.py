@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vision.camera_model import CameraModel, CameraMount
-from vision.geolocation import Sightlines
+from vision.geolocation import PixelRays
 from vision.rotation import matrix_from_euler
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -25,7 +25,7 @@ def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(
 ) -> None:
     mount = CameraMount(pitch_rad=-down, yaw_rad=aside, levelled=True)
     body = matrix_from_euler(roll, pitch, yaw)
-    north, east, below = Sightlines.of(CAMERA, mount, body, MIDDLE).directions[0]
+    north, east, below = PixelRays.of(CAMERA, mount, body, MIDDLE).directions[0]
     assert math.asin(below) == pytest.approx(down, abs=1e-6)
     heading = math.atan2(body[1, 0], body[0, 0])
     assert math.remainder(math.atan2(east, north) - heading - aside, math.tau) == pytest.approx(0.0, abs=1e-6)
@@ -47,10 +47,10 @@ def test_the_ground_point_and_the_point_at_its_depth_are_one(
     mount = CameraMount(0.2, -0.1, 0.05, pitch_rad=-0.9, levelled=levelled)
     body = matrix_from_euler(roll, pitch, yaw)
     pixels = np.array([[100.0, 80.0], [320.0, 240.0], [600.0, 470.0]])
-    ground = Sightlines.of(CAMERA, mount, body, pixels).on_ground(10.0, 0.05)
+    ground = PixelRays.of(CAMERA, mount, body, pixels).on_ground(10.0, 0.05)
     met = np.isfinite(ground[:, 0])
     eye = body @ mount.position_frd_m
     depth = (ground[met] - eye) @ mount.ned_from_optical(body)[:, 2]
-    again = Sightlines.of(CAMERA, mount, body, pixels[met]).at_depth(depth)
+    again = PixelRays.of(CAMERA, mount, body, pixels[met]).at_depth(depth)
     assert np.allclose(again, ground[met], atol=1e-6 * (1 + np.abs(ground[met])))
     assert np.allclose(ground[met][:, 2], 10.0)

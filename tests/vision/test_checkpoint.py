@@ -33,7 +33,7 @@ from vision.yolo.checkpoint import (
 )
 from vision.yolo.layers import Conv
 from vision.yolo.published import SCALES, published_description
-from vision.yolo.safe_pickle import Admitted, unpickle
+from vision.yolo.safe_pickle import AllowedGlobal, unpickle
 
 
 def test_a_saved_model_comes_back_the_same(tmp_path: Path) -> None:
@@ -259,8 +259,8 @@ def test_modules_that_contain_each_other_are_refused(
 # Every generation, as releases old and new wrote it
 
 
-def shrunk(generation: str, scale: str) -> ModelDescription:
-    description = published_description(generation, scale, NAMES)
+def shrunk(model_family: str, scale: str) -> ModelDescription:
+    description = published_description(model_family, scale, NAMES)
     return dataclasses.replace(description, depth_multiple=0.34, width_multiple=0.25, max_channels=None)
 
 
@@ -276,9 +276,9 @@ def terse(whole: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("generation", "scale"),
+    ("model_family", "scale"),
     [
-        *((generation, "n") for generation in SCALES),
+        *((model_family, "n") for model_family in SCALES),
         ("YOLOv10", "x"),
         ("YOLO11", "m"),
         ("YOLO12", "l"),
@@ -286,9 +286,9 @@ def terse(whole: Any) -> None:
     ],
 )
 def test_every_generation_is_built_from_what_the_pickled_layers_show(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], generation: str, scale: str
+    tmp_path: Path, foreign: dict[str, type[nn.Module]], model_family: str, scale: str
 ) -> None:
-    model = trained_model(shrunk(generation, scale))
+    model = trained_model(shrunk(model_family, scale))
     whole = as_foreign(model, foreign)
     terse(whole)
     loaded = load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
@@ -301,11 +301,11 @@ def test_every_generation_is_built_from_what_the_pickled_layers_show(
         assert torch.equal(weights[name].half(), tensor.half()), name
 
 
-@pytest.mark.parametrize("generation", ["YOLOv5u", "YOLOv8"])
+@pytest.mark.parametrize("model_family", ["YOLOv5u", "YOLOv8"])
 def test_a_checkpoint_of_the_first_releases_is_read(
-    tmp_path: Path, early_foreign: dict[str, type[nn.Module]], generation: str
+    tmp_path: Path, early_foreign: dict[str, type[nn.Module]], model_family: str
 ) -> None:
-    model = trained_model(shrunk(generation, "n"))
+    model = trained_model(shrunk(model_family, "n"))
     whole = as_foreign(model, early_foreign)
     del whole.model[-1].reg_max
     settings: Any = early_foreign["DictConfig"]()
@@ -324,11 +324,11 @@ def test_a_head_of_two_is_end_to_end_whichever_answered_last(
     assert load_checkpoint(save_foreign(tmp_path / "f.pt", whole)).model.end_to_end
 
 
-@pytest.mark.parametrize("generation", ["YOLOv8", "YOLOv10", "YOLO26"])
+@pytest.mark.parametrize("model_family", ["YOLOv8", "YOLOv10", "YOLO26"])
 def test_a_checkpoint_saved_folded_is_read(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]], generation: str
+    tmp_path: Path, foreign: dict[str, type[nn.Module]], model_family: str
 ) -> None:
-    model = trained_model(shrunk(generation, "s"))
+    model = trained_model(shrunk(model_family, "s"))
     model.fuse()
     whole = as_foreign(model, foreign)
     layer = whole.model[0]
@@ -379,7 +379,7 @@ def test_another_stride_than_the_layers_give_is_refused(
 
 def test_a_set_named_by_its_type_is_read() -> None:
     program = b"\x80\x02cdill._dill\n_load_type\nX\x03\x00\x00\x00set\x85R]K\x01a\x85R."
-    admitted = {"dill._dill._load_type": Admitted("dill._dill._load_type", torch_archive._type_by_name)}
+    admitted = {"dill._dill._load_type": AllowedGlobal("dill._dill._load_type", torch_archive._type_by_name)}
     assert unpickle(program, admitted, lambda identity: None) == {1}
 
 

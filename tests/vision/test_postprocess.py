@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vision.yolo import postprocess
 from vision.yolo.architecture import YoloModel, build, yolov8_description
-from vision.yolo.maps import ClassRows, Head, LevelMaps
+from vision.yolo.level_outputs import ClassRows, Head, LevelOutput
 from vision.yolo.postprocess import boxes_of, candidates_of, select_boxes, suppress
 
 NAMES = ("car", "dog", "boat")
@@ -114,12 +114,12 @@ def test_a_one_to_one_head_speaks_for_every_class_and_suppresses_nothing() -> No
     classes = np.full((3, 4, 4), -9.0, np.float32)
     classes[0, 1, 1], classes[2, 1, 1], classes[0, 1, 2] = 3.0, 1.0, 2.0
     sides = np.full((4, 4, 4), 1.5, np.float32)
-    boxes = boxes_of(head, [LevelMaps(classes=classes, sides=sides)], iou=0.1)
+    boxes = boxes_of(head, [LevelOutput(classes=classes, sides=sides)], iou=0.1)
     assert boxes.class_id.tolist() == [0, 0, 2]
     np.testing.assert_allclose(boxes.xyxy[0], [0, 0, 24, 24])
     np.testing.assert_allclose(boxes.xyxy[2], boxes.xyxy[0])
-    assert boxes_of(head, [LevelMaps(classes=classes, sides=sides)], most=2).class_id.tolist() == [0, 0]
-    only = boxes_of(head, [LevelMaps(classes=classes, sides=sides)], class_ids=[2])
+    assert boxes_of(head, [LevelOutput(classes=classes, sides=sides)], most=2).class_id.tolist() == [0, 0]
+    only = boxes_of(head, [LevelOutput(classes=classes, sides=sides)], class_ids=[2])
     assert only.class_id.tolist() == [2]
 
 
@@ -144,8 +144,8 @@ def test_computing_only_the_wanted_classes_is_the_same_as_filtering_afterwards(
     whole = Head((8,), 1, False, classes, tuple(range(classes)))
     rows = (ClassRows.distinct(weight, bias),) if len(ids) < classes else None
     sliced = Head((8,), 1, False, classes, tuple(ids), rows)
-    (expected,) = candidates_of(whole, [LevelMaps(classes=logits, sides=sides)], confidence, ids)
-    maps = LevelMaps(classes=logits[ids], sides=sides, features=features if rows else None)
+    (expected,) = candidates_of(whole, [LevelOutput(classes=logits, sides=sides)], confidence, ids)
+    maps = LevelOutput(classes=logits[ids], sides=sides, features=features if rows else None)
     (found,) = candidates_of(sliced, [maps], confidence, ids)
     assert found.cell.tolist() == expected.cell.tolist()
     assert found.class_id.tolist() == expected.class_id.tolist()
@@ -157,12 +157,12 @@ def test_the_memory_order_of_the_maps_does_not_matter(order: Literal["C", "F"]) 
     random = np.random.default_rng(0)
     classes, sides = random.normal(size=(5, 6, 7)), random.normal(size=(64, 6, 7))
     head = Head((8,), 16, False, 5, tuple(range(5)))
-    plain = boxes_of(head, [LevelMaps(classes=classes.astype(np.float32), sides=sides.astype(np.float32))])
+    plain = boxes_of(head, [LevelOutput(classes=classes.astype(np.float32), sides=sides.astype(np.float32))])
     # Channels last in memory, as torch gives them.
     moved = [
         np.array(a.transpose(1, 2, 0), np.float32, order=order).transpose(2, 0, 1) for a in (classes, sides)
     ]
-    again = boxes_of(head, [LevelMaps(classes=moved[0], sides=moved[1])])
+    again = boxes_of(head, [LevelOutput(classes=moved[0], sides=moved[1])])
     np.testing.assert_allclose(again.xyxy, plain.xyxy, atol=1e-4)
     assert again.class_id.tolist() == plain.class_id.tolist()
 
@@ -170,7 +170,7 @@ def test_the_memory_order_of_the_maps_does_not_matter(order: Literal["C", "F"]) 
 def test_maps_without_sides_and_without_what_gives_them_are_refused() -> None:
     head = Head((8,), 16, False, 1, (0,))
     with pytest.raises(ValueError, match="need the neck's maps"):
-        boxes_of(head, [LevelMaps(classes=np.ones((1, 2, 2), np.float32))])
+        boxes_of(head, [LevelOutput(classes=np.ones((1, 2, 2), np.float32))])
 
 
 BOXES = st.lists(

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
-from vision.sources.feed import LoopingFeed
-from vision.sources.images import ImagesFeed, natural_key
+from vision.sources.capture import LoopingCapture
+from vision.sources.images import ImagesCapture, natural_key
 from vision.sources.source import SourceStatistics
 
 DATA = Path(
@@ -68,8 +68,8 @@ def test_a_single_picture_in_a_loop_stands_as_long_as_any_other(count: int, tmp_
     paths = [tmp_path / f"{number}.png" for number in range(count)]
     for path in paths:
         cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
-    feed = LoopingFeed(lambda: ImagesFeed(paths, rate_hz=10.0))
-    pictures = [feed.read(1.0) for _ in range(5)]
+    capture = LoopingCapture(lambda: ImagesCapture(paths, rate_hz=10.0))
+    pictures = [capture.read(1.0) for _ in range(5)]
     assert [picture.media_s for picture in pictures if picture] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 

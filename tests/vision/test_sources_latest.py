@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from vision.frame import Frame
-from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.latest import LatestSource
 from vision.sources.source import EndOfStream, SourceError, SourceSettings
 
 QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.2, retry_min_s=0.01, retry_max_s=0.04)
 
 
-class ScriptedFeed(Feed):
+class ScriptedFeed(Capture):
     """Gives what its script says: a number (that grey), an exception, None (silence)."""
 
     def __init__(self, script: list[int | Exception | None], gate: threading.Event | None = None) -> None:
@@ -25,7 +25,7 @@ class ScriptedFeed(Feed):
         self.gate = gate
         self.closed = 0
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         if not self.script:
             time.sleep(min(timeout_s, 0.02))
             return None
@@ -37,22 +37,22 @@ class ScriptedFeed(Feed):
         if step is None:
             time.sleep(min(timeout_s, 0.02))
             return None
-        return Picture(np.full((2, 2, 3), step, np.uint8))
+        return RawFrame(np.full((2, 2, 3), step, np.uint8))
 
     def close(self) -> None:
         self.closed += 1
 
 
-def opener(*feeds: Feed | Exception) -> Callable[[], Feed]:
+def opener(*feeds: Capture | Exception) -> Callable[[], Capture]:
     remaining = list(feeds)
 
-    def open_feed() -> Feed:
-        feed = remaining.pop(0) if remaining else FeedLost("nobody there")
-        if isinstance(feed, Exception):
-            raise feed
-        return feed
+    def open_capture() -> Capture:
+        capture = remaining.pop(0) if remaining else CaptureError("nobody there")
+        if isinstance(capture, Exception):
+            raise capture
+        return capture
 
-    return open_feed
+    return open_capture
 
 
 def frame_of(source: LatestSource, value: int) -> Frame:
@@ -67,9 +67,11 @@ def frame_of(source: LatestSource, value: int) -> Frame:
 def test_a_lost_feed_is_opened_again_and_both_are_said_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("WARNING")
     gate = threading.Event()
-    first = ScriptedFeed([1, FeedLost("unplugged")], gate)
+    first = ScriptedFeed([1, CaptureError("unplugged")], gate)
     second = ScriptedFeed([2])
-    with LatestSource("camera", opener(first, FeedLost("no"), FeedLost("no"), second), QUICK) as source:
+    with LatestSource(
+        "camera", opener(first, CaptureError("no"), CaptureError("no"), second), QUICK
+    ) as source:
         frame_of(source, 1)
         gate.set()
         frame = frame_of(source, 2)
@@ -103,7 +105,7 @@ def test_the_pause_between_attempts_doubles_up_to_its_cap(monkeypatch: pytest.Mo
 
     gate = threading.Event()
     settings = SourceSettings(retry_min_s=1.0, retry_max_s=5.0)
-    source = LatestSource("camera", opener(ScriptedFeed([1, FeedLost("gone")], gate)), settings)
+    source = LatestSource("camera", opener(ScriptedFeed([1, CaptureError("gone")], gate)), settings)
     source._stop = Watched()
     gate.set()
     assert enough.wait(20)
@@ -134,8 +136,8 @@ def test_an_unexpected_error_reaches_the_reader_and_not_only_a_thread() -> None:
 
 
 def test_without_reopening_the_end_comes_after_the_last_frame() -> None:
-    feed = ScriptedFeed([1, 2, EndOfStream()])
-    with LatestSource("pipe", opener(feed), QUICK, reopen=False) as source:
+    capture = ScriptedFeed([1, 2, EndOfStream()])
+    with LatestSource("pipe", opener(capture), QUICK, reopen=False) as source:
         assert frame_of(source, 2).sequence == 1
         with pytest.raises(EndOfStream):
             source.read(20.0)
@@ -145,8 +147,8 @@ def test_without_reopening_the_end_comes_after_the_last_frame() -> None:
 
 def test_without_reopening_a_loss_is_an_error() -> None:
     gate = threading.Event()
-    feed = ScriptedFeed([1, FeedLost("a broken frame")], gate)
-    with LatestSource("pipe", opener(feed), QUICK, reopen=False) as source:
+    capture = ScriptedFeed([1, CaptureError("a broken frame")], gate)
+    with LatestSource("pipe", opener(capture), QUICK, reopen=False) as source:
         frame_of(source, 1)
         gate.set()
         with pytest.raises(SourceError, match="pipe: a broken frame"):
@@ -178,9 +180,9 @@ def test_close_wakes_a_reader_that_waits() -> None:
 
 def test_what_the_writer_overwrote_counts_as_dropped() -> None:
     class Skipping(ScriptedFeed):
-        def read(self, timeout_s: float) -> Picture | None:
+        def read(self, timeout_s: float) -> RawFrame | None:
             picture = super().read(timeout_s)
-            return None if picture is None else Picture(picture.image, skipped=4)
+            return None if picture is None else RawFrame(picture.image, skipped=4)
 
     with LatestSource("shared", opener(Skipping([1])), QUICK) as source:
         assert frame_of(source, 1).sequence == 4

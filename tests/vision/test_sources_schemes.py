@@ -7,15 +7,23 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from vision.sources import Feed, Picture, SequentialSource, Source, SourceError, SourceSettings, open_source
+from vision.sources import (
+    Capture,
+    RawFrame,
+    SequentialSource,
+    Source,
+    SourceError,
+    SourceSettings,
+    open_source,
+)
 from vision.sources.registry import SOURCES, source
 
 
-class OneGrey(Feed):
+class OneGrey(Capture):
     """One grey picture."""
 
-    def read(self, timeout_s: float) -> Picture | None:
-        return Picture(np.full((48, 64, 3), 128, np.uint8))
+    def read(self, timeout_s: float) -> RawFrame | None:
+        return RawFrame(np.full((48, 64, 3), 128, np.uint8))
 
     def close(self) -> None:
         """Nothing is kept open."""

@@ -10,7 +10,7 @@ import torch
 
 from vision.yolo.architecture import (
     ArchitectureError,
-    LayerRow,
+    LayerSpec,
     ModelDescription,
     anchor_points,
     build,
@@ -217,5 +217,5 @@ def test_a_head_must_come_last() -> None:
 
 
 def test_a_single_source_is_written_as_a_number() -> None:
-    assert LayerRow((-1,), 1, "Conv", (8,)).to_plain() == [-1, 1, "Conv", [8]]
-    assert LayerRow((-1, 6), 1, "Concat", (1,)).to_plain() == [[-1, 6], 1, "Concat", [1]]
+    assert LayerSpec((-1,), 1, "Conv", (8,)).to_plain() == [-1, 1, "Conv", [8]]
+    assert LayerSpec((-1, 6), 1, "Concat", (1,)).to_plain() == [[-1, 6], 1, "Concat", [1]]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vision.runtimes.contract import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
+from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
 from vision.runtimes.torch_runtime import traced
@@ -43,17 +43,17 @@ def export(
     output: Path | None = None,
     image_size: int = 640,
     *,
-    generation: str = "",
+    model_family: str = "",
 ) -> Path:
     """Write a checkpoint's network for another runtime.
 
     The file takes (1, H, W, 3) uint8 BGR, H and W any multiples of the largest stride, and gives for each
-    level (stride S) `sides_S` and `classes_S`, see `LevelMaps`. It carries its `ExportedFacts`.
+    level (stride S) `sides_S` and `classes_S`, see `LevelOutput`. It carries its `ExportedFacts`.
 
     Args:
         output: where to; None: beside the checkpoint, with the kind's own ending (`SUFFIXES`).
         image_size: what it is tuned for and checked at; of a TensorRT plan the largest side.
-        generation: of the network, to be told on.
+        model_family: of the network, to be told on.
 
     Raises:
         CheckpointError: the checkpoint cannot be read.
@@ -72,7 +72,7 @@ def export(
         end_to_end=model.end_to_end,
         image_size=image_size,
         source_sha256=weights_sha256(model_path),
-        generation=generation,
+        model_family=model_family,
         metadata=loaded.metadata,
     )
     if image_size < 2 * max(facts.strides) or image_size % max(facts.strides):

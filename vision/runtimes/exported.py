@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from vision.runtimes.contract import RuntimeUnusableError
-from vision.yolo.maps import Head
+from vision.runtimes.base import RuntimeUnusableError
+from vision.yolo.level_outputs import Head
 
 FORMAT = "mavlink-companion.network.v1"
 KEY = "mavlink_companion"
@@ -39,7 +39,7 @@ class ExportedFacts:
         strides, reg_max, end_to_end: how its maps are read, see `Head`.
         image_size: pixels that it was made for; it takes others too, unless `fixed_size` names the one.
         fixed_size: (height, width) of the only input it takes; None: any multiples of the largest stride.
-        generation: of the network, as the exporter was told; may be empty.
+        model_family: of the network, as the exporter was told; may be empty.
         source_sha256: of the file that it was made from.
         metadata: the source's own: licence, origin, score.
     """
@@ -51,7 +51,7 @@ class ExportedFacts:
     image_size: int
     source_sha256: str
     fixed_size: tuple[int, int] | None = None
-    generation: str = ""
+    model_family: str = ""
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def head(self) -> Head:
@@ -91,7 +91,7 @@ class ExportedFacts:
             facts.image_size,
             str(facts.source_sha256),
             None if fixed is None else (fixed[0], fixed[1]),
-            str(facts.generation),
+            str(facts.model_family),
             facts.metadata,
         )
 

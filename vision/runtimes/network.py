@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vision.runtimes.contract import RuntimeUnusableError
+from vision.runtimes.base import RuntimeUnusableError
 from vision.yolo.architecture import YoloModel
 from vision.yolo.layers import Detect
-from vision.yolo.maps import BoxBranch, ClassRows, Head
+from vision.yolo.level_outputs import BoxBranch, ClassRows, Head
 from vision.yolo.postprocess import head_of
 
 

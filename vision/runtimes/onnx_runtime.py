@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, required
+from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, ExportedFacts, not_ours
-from vision.yolo.maps import Head, LevelMaps, Product
+from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 # As ONNX Runtime names them. A provider that is there is wanted: its package was chosen for it.
 _PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
@@ -67,7 +67,7 @@ class OnnxRuntime:
     def prepare(self, height: int, width: int) -> None:
         self.infer(np.zeros((height, width, 3), np.uint8))
 
-    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         maps = [level[0] for level in self._session.run(None, {INPUT: image_bgr[None]})]
         return self.head.levels(maps)
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.runtimes import contract
-from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError, required
+from vision.runtimes import base
+from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours
-from vision.yolo.maps import Head, LevelMaps, Product
+from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
 _MOST_SIZES = 2
@@ -45,7 +45,7 @@ class OpenVinoRuntime:
         self._core = self._openvino.Core()
         self._model = _read(self._core, path)
         self.head = head if head is not None else openvino_facts(path, self._model).head()
-        native = contract.bfloat16_instructions()
+        native = base.bfloat16_instructions()
         self._automatic = precision == "auto"
         if precision == "auto":
             self.precision = "bfloat16" if native else "float32"
@@ -73,7 +73,7 @@ class OpenVinoRuntime:
     def prepare(self, height: int, width: int) -> None:
         self.infer(np.zeros((height, width, 3), np.uint8))
 
-    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         size = (image_bgr.shape[0], image_bgr.shape[1])
         request = self._requests.get(size) or self._compiled(size)
         # Both ways without a copy: the tensor is the picture, the maps are the request's own memory.

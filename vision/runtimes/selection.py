@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from vision.runtimes.contract import (
+from vision.runtimes.base import (
     RUNTIMES,
     Precision,
     Runtime,
@@ -24,7 +24,7 @@ from vision.runtimes.contract import (
 from vision.runtimes.exported import FORMAT, SUFFIXES, ExportedFacts, ExportKind
 from vision.runtimes.source import ModelSource, cannot_run
 from vision.yolo.checkpoint_pair import weights_sha256
-from vision.yolo.maps import Head
+from vision.yolo.level_outputs import Head
 
 if TYPE_CHECKING:
     from vision.runtimes.network import Network
@@ -41,7 +41,7 @@ _EXPORTS: dict[RuntimeName, ExportKind] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
+class SelectedRuntime:
     """A runtime that runs.
 
     Attributes:
@@ -61,7 +61,7 @@ def start_runtime(
     threads: int | None = None,
     image_size: int = 640,
     sparse_boxes: bool = False,
-) -> Started:
+) -> SelectedRuntime:
     """Make a model ready on the runtime that was asked for.
 
     Args:
@@ -79,8 +79,8 @@ def start_runtime(
     check_runtime(source, choice)
     if choice != "auto":
         runtime = _start(source, choice, class_ids, precision, threads, image_size, sparse_boxes)
-        return Started(runtime, "as asked")
-    from vision.runtimes.trial import fastest_runtime
+        return SelectedRuntime(runtime, "as asked")
+    from vision.runtimes.autotune import fastest_runtime
 
     candidates = [name for name in source.runners() if installed(name)]
     if len(candidates) == 1:
@@ -94,7 +94,9 @@ def start_runtime(
             threads=threads,
             image_size=image_size,
         )
-    return Started(_start(source, name, class_ids, precision, threads, image_size, sparse_boxes), reason)
+    return SelectedRuntime(
+        _start(source, name, class_ids, precision, threads, image_size, sparse_boxes), reason
+    )
 
 
 def check_runtime(source: ModelSource, choice: RuntimeChoice) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vision.runtimes.contract import RuntimeName, RuntimeUnusableError, installed
+from vision.runtimes.base import RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
 from vision.yolo.safe_pickle import CheckpointError
 

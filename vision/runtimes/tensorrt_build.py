@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from vision.runtimes.contract import RuntimeUnusableError, required
+from vision.runtimes.base import RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT
 
 logger = logging.getLogger(__name__)

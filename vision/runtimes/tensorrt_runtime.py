@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.runtimes.contract import (
+from vision.runtimes.base import (
     Precision,
     RuntimeMissingError,
     RuntimeName,
@@ -16,7 +16,7 @@ from vision.runtimes.contract import (
     required,
 )
 from vision.runtimes.exported import INPUT, ExportedFacts, split_facts
-from vision.yolo.maps import Head, LevelMaps, Product
+from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 _CUDA = "cuda.bindings.runtime"
 
@@ -72,7 +72,7 @@ class TensorRtRuntime:
         for _ in range(2):
             self.infer(np.zeros((height, width, 3), np.uint8))
 
-    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         size = (image_bgr.shape[0], image_bgr.shape[1])
         if size != self._size:
             self._allocate(size)

@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vision.runtimes import contract
-from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError
+from vision.runtimes import base
+from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.yolo.architecture import YoloModel
-from vision.yolo.maps import Head, LevelMaps, Product
+from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class TorchRuntime:
         for _ in range(2):
             self.infer(blank)
 
-    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         pixels = torch.from_numpy(image_bgr).unsqueeze(0)
         with torch.inference_mode():
             graph = self._graph or self._graph_of_size(pixels)
@@ -132,7 +132,7 @@ class TorchRuntime:
         return graph
 
     def _choose_precision(self, asked: Precision) -> tuple[str, str]:
-        native = contract.bfloat16_instructions()
+        native = base.bfloat16_instructions()
         if asked == "bfloat16" and not native:
             logger.warning("this processor does not compute in bfloat16; it is emulated, and slow")
         if asked != "auto":

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vision.runtimes.contract import Precision, RuntimeName, RuntimeUnusableError
+from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError
 from vision.runtimes.exported import KEY, ExportedFacts, not_ours
 from vision.runtimes.torch_runtime import torch_product
-from vision.yolo.maps import Head, LevelMaps, Product
+from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 
 class TorchScriptRuntime:
@@ -60,7 +60,7 @@ class TorchScriptRuntime:
         for _ in range(2):
             self.infer(np.zeros((height, width, 3), np.uint8))
 
-    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelMaps]:
+    def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         with torch.inference_mode():
             maps = [level[0].numpy() for level in self._module(torch.from_numpy(image_bgr).unsqueeze(0))]
         return self.head.levels(maps)

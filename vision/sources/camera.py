@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 
-from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import quiet_opencv, read_capture
 from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings
 
@@ -65,12 +65,12 @@ def check_camera(device: Path, settings: SourceSettings) -> None:
         )
 
 
-class CameraFeed(Feed):
+class CameraCapture(Capture):
     """Frames of a V4L2 camera, stamped by its driver where it stamps with the monotonic clock.
 
     Raises:
         SourceError: it cannot be opened, for a reason found.
-        FeedLost: it did not open; another program may have it.
+        CaptureError: it did not open; another program may have it.
     """
 
     def __init__(self, device: Path, settings: SourceSettings) -> None:
@@ -82,7 +82,7 @@ class CameraFeed(Feed):
         self._capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
         if not self._capture.isOpened():
             self._capture.release()
-            raise FeedLost(
+            raise CaptureError(
                 "it does not open as a camera; another program may be using it, or it is a camera's second "
                 "device (metadata)"
             )
@@ -120,14 +120,14 @@ class CameraFeed(Feed):
         else:
             logger.info("%s: gives %s", self._device, given_text)
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         image, now_ns, decode_ms = read_capture(self._capture)
         if image is None:
             gone = "" if self._device.exists() else "; it was unplugged"
-            raise FeedLost(f"the camera gave no frame{gone}")
+            raise CaptureError(f"the camera gave no frame{gone}")
         driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         captured_ns = driver_ns if 0 <= now_ns - driver_ns < _OLDEST_STAMP_NS else now_ns
-        return Picture(image, captured_ns, decode_ms=decode_ms)
+        return RawFrame(image, captured_ns, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()

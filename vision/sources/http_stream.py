@@ -19,9 +19,9 @@ from urllib.parse import unquote, urlsplit, urlunsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.mjpeg import MjpegParser
-from vision.sources.network import StreamFeed, network_error
+from vision.sources.network import StreamCapture, network_error
 from vision.sources.source import SourceError, SourceSettings
 
 _JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
@@ -33,12 +33,12 @@ _REFUSALS = {
 }
 
 
-def open_http(uri: str, settings: SourceSettings) -> Feed:
+def open_http(uri: str, settings: SourceSettings) -> Capture:
     """Ask the server for the stream.
 
     Raises:
         SourceError: it says no (401, 403, 404, 410).
-        FeedLost: it does not answer, or with an error that may pass.
+        CaptureError: it does not answer, or with an error that may pass.
     """
     parts = urlsplit(uri)
     bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
@@ -52,17 +52,17 @@ def open_http(uri: str, settings: SourceSettings) -> Feed:
             text += f"; put the right ones into the address: {parts.scheme}://USER:PASSWORD@{parts.hostname}…"
         if error.code in _REFUSALS:
             raise SourceError(text) from error
-        raise FeedLost(text) from error
+        raise CaptureError(text) from error
     except urllib.error.URLError as error:
         cause = error.reason if isinstance(error.reason, OSError) else OSError(str(error.reason))
-        raise FeedLost(f"{parts.hostname}:{parts.port or parts.scheme} {network_error(cause)}") from error
+        raise CaptureError(f"{parts.hostname}:{parts.port or parts.scheme} {network_error(cause)}") from error
     except (OSError, http.client.HTTPException) as error:
-        raise FeedLost(f"no answer in HTTP: {error!r}") from error
+        raise CaptureError(f"no answer in HTTP: {error!r}") from error
     if response.headers.get_content_type() in _JPEG_TYPES:
-        return HttpMjpegFeed(response)
+        return HttpMjpegCapture(response)
     kind = response.headers.get_content_type()
     response.close()
-    return StreamFeed(uri, settings, {}, f"the server sends {kind}, and no video that FFmpeg can read")
+    return StreamCapture(uri, settings, {}, f"the server sends {kind}, and no video that FFmpeg can read")
 
 
 def _opener(uri: str) -> urllib.request.OpenerDirector:
@@ -77,7 +77,7 @@ def _opener(uri: str) -> urllib.request.OpenerDirector:
     )
 
 
-class HttpMjpegFeed(Feed):
+class HttpMjpegCapture(Capture):
     """The images of an HTTP response that does not end."""
 
     def __init__(self, response: http.client.HTTPResponse) -> None:
@@ -87,23 +87,23 @@ class HttpMjpegFeed(Feed):
         # A second handle on the same connection, to end a read from another thread.
         self._socket = socket.socket(fileno=os.dup(response.fileno()))
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         while not self._ready:
             try:
                 data = self._response.read1(1 << 16)
             except TimeoutError as error:
-                raise FeedLost("nothing came any more") from error
+                raise CaptureError("nothing came any more") from error
             except (OSError, http.client.HTTPException) as error:
-                raise FeedLost(f"the connection broke: {error}") from error
+                raise CaptureError(f"the connection broke: {error}") from error
             if not data:
-                raise FeedLost("the server closed the connection")
+                raise CaptureError("the server closed the connection")
             captured_ns = time.monotonic_ns()
             images = self._parser.push(data)
             decode_ms = (time.monotonic_ns() - captured_ns) / 1e6 / max(len(images), 1)
             self._ready.extend((image, captured_ns, decode_ms) for image in images)
             self.unreadable = self._parser.unreadable
         image, captured_ns, decode_ms = self._ready.popleft()
-        return Picture(image, captured_ns, decode_ms=decode_ms)
+        return RawFrame(image, captured_ns, decode_ms=decode_ms)
 
     def interrupt(self) -> None:
         with contextlib.suppress(OSError):  # it is closed already

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.sources.feed import Feed, Picture
+from vision.sources.capture import Capture, RawFrame
 from vision.sources.opencv import quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
 
@@ -59,7 +59,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8] | None:
     return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
 
 
-class ImagesFeed(Feed):
+class ImagesCapture(Capture):
     """Images one after another. One that cannot be read is named in a warning, counted and passed over."""
 
     def __init__(self, paths: list[Path], rate_hz: float) -> None:
@@ -69,7 +69,7 @@ class ImagesFeed(Feed):
         self._next = 0
         self.total_frames = len(paths)
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         while self._next < len(self._paths):
             index = self._next
             self._next += 1
@@ -82,7 +82,7 @@ class ImagesFeed(Feed):
                 image, reason = None, error.strerror or str(error)
             if image is not None:
                 decode_ms = (time.monotonic_ns() - started_ns) / 1e6
-                return Picture(image, media_s=index * self.interval_s, decode_ms=decode_ms)
+                return RawFrame(image, media_s=index * self.interval_s, decode_ms=decode_ms)
             self.unreadable += 1
             logger.warning("%s: passed over: %s", path, reason)
         if self.unreadable == len(self._paths):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from vision.frame import Frame
-from vision.sources.feed import Feed, FeedLost, OpenFeed, Picture
+from vision.sources.capture import Capture, CaptureError, OpenFeed, RawFrame
 from vision.sources.source import (
     CameraChangedError,
     EndOfStream,
@@ -33,7 +33,7 @@ class LatestSource(Source):
 
     Args:
         uri: the name in messages, without passwords.
-        open_feed: opens the feed, again and again.
+        open_capture: opens the feed, again and again.
         settings: the time-outs and pauses.
         reopen: whether a feed that ended or broke is opened again; if not, that ends the source.
         paced: hold every picture back until its `media_s` has passed: a recording that stands for a camera.
@@ -46,7 +46,7 @@ class LatestSource(Source):
     def __init__(
         self,
         uri: str,
-        open_feed: OpenFeed,
+        open_capture: OpenFeed,
         settings: SourceSettings,
         *,
         reopen: bool = True,
@@ -55,7 +55,7 @@ class LatestSource(Source):
         on_close: Callable[[], None] | None = None,
     ) -> None:
         self.uri = uri
-        self._open_feed = open_feed
+        self._open_feed = open_capture
         self._settings = settings
         self._reopen = reopen
         self._paced = paced
@@ -63,7 +63,7 @@ class LatestSource(Source):
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._slot: Frame | None = None
-        self._feed: Feed | None = None
+        self._capture: Capture | None = None
         self._opened = False
         self._end: Exception | None = None
         self._last_reason = "nothing arrived"
@@ -127,10 +127,10 @@ class LatestSource(Source):
             if self._stop.is_set():
                 return
             self._stop.set()
-            feed = self._feed
+            capture = self._capture
             self._changed.notify_all()
-        if feed is not None:
-            feed.interrupt()
+        if capture is not None:
+            capture.interrupt()
         # A decoder inside a network call returns at its own time-out, and must not outlive the interpreter.
         self._thread.join(max(self._settings.open_timeout_s, self._settings.read_timeout_s) + 1.0)
         if self._thread.is_alive():
@@ -151,7 +151,7 @@ class LatestSource(Source):
 
     def _run(self) -> None:
         try:
-            self._read_for_ever()
+            self._read_forever()
         except EndOfStream as end:
             if str(end) and self._opened:
                 logger.warning("%s: ended after %d frames: %s", self.uri, self._sequence, end)
@@ -166,24 +166,24 @@ class LatestSource(Source):
             self._end = end
             self._changed.notify_all()
 
-    def _read_for_ever(self) -> None:
+    def _read_forever(self) -> None:
         pause_s = self._settings.retry_min_s
         while not self._stop.is_set():
             came_back = False
             try:
                 self._read_one_feed()
-            except FeedLost as lost:
+            except CaptureError as lost:
                 came_back = self._lost_since_s is None and self._opened
-                self._say_lost(str(lost))
+                self._log_lost(str(lost))
             except EndOfStream as end:
                 if not self._reopen:
                     raise
                 came_back = self._lost_since_s is None and self._opened
-                self._say_lost(str(end) or "it ended")
+                self._log_lost(str(end) or "it ended")
             except SourceError as error:
                 if not self._opened or isinstance(error, CameraChangedError):
                     raise
-                self._say_lost(str(error))
+                self._log_lost(str(error))
             if came_back:
                 pause_s = self._settings.retry_min_s
             left_s = self._open_deadline_s - time.monotonic()
@@ -192,7 +192,7 @@ class LatestSource(Source):
             self._stop.wait(pause_s if self._opened else min(pause_s, left_s))
             pause_s = min(pause_s * 2, self._settings.retry_max_s)
 
-    def _say_lost(self, reason: str) -> None:
+    def _log_lost(self, reason: str) -> None:
         if self._stop.is_set():
             return
         if not self._reopen:
@@ -206,57 +206,57 @@ class LatestSource(Source):
             logger.debug("%s: not yet: %s", self.uri, reason)
 
     def _read_one_feed(self) -> None:
-        feed = self._open_feed()
+        capture = self._open_feed()
         self._pace_origin_s = None
         with self._changed:
-            self._feed = feed
+            self._capture = capture
         try:
-            if self._opened and feed.calibration != self.calibration:
+            if self._opened and capture.calibration != self.calibration:
                 raise CameraChangedError(
                     f"{self.uri}: the camera came back with another lens or mount; open the source again"
                 )
-            self.calibration = feed.calibration
-            self._pump(feed)
+            self.calibration = capture.calibration
+            self._pump(capture)
         finally:
             with self._changed:
-                self._feed = None
-                self._unreadable_before += feed.unreadable
-            feed.close()
+                self._capture = None
+                self._unreadable_before += capture.unreadable
+            capture.close()
 
-    def _pump(self, feed: Feed) -> None:
+    def _pump(self, capture: Capture) -> None:
         settings = self._settings
         heard_s = time.monotonic()
         said_silent = False
         while not self._stop.is_set():
-            picture = feed.read(_POLL_S)
+            picture = capture.read(_POLL_S)
             silent_s = time.monotonic() - heard_s
             if picture is not None:
                 if said_silent:
                     logger.info("%s: back after %.1f s", self.uri, silent_s)
                 said_silent = False
                 self._hold_back(picture)
-                self._publish(picture, feed)
+                self._publish(picture, capture)
                 heard_s = time.monotonic()
             elif not self._opened and time.monotonic() > self._open_deadline_s:
                 raise self._never_opened()
             elif silent_s > settings.read_timeout_s:
-                if feed.silence_is_loss:
-                    raise FeedLost(f"nothing came for {silent_s:.1f} s")
+                if capture.silence_is_loss:
+                    raise CaptureError(f"nothing came for {silent_s:.1f} s")
                 if self._opened and self._lost_since_s is None and not said_silent:
                     logger.warning("%s: nothing came for %.1f s; waiting", self.uri, silent_s)
                     said_silent = True
 
-    def _hold_back(self, picture: Picture) -> None:
+    def _hold_back(self, picture: RawFrame) -> None:
         if not self._paced or picture.media_s is None:
             return
         if self._pace_origin_s is None:
             self._pace_origin_s = time.monotonic() - picture.media_s
         self._stop.wait(max(self._pace_origin_s + picture.media_s - time.monotonic(), 0.0))
 
-    def _publish(self, picture: Picture, feed: Feed) -> None:
+    def _publish(self, picture: RawFrame, capture: Capture) -> None:
         ready_ns = time.monotonic_ns()
         captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
-        unreadable = self._unreadable_before + feed.unreadable
+        unreadable = self._unreadable_before + capture.unreadable
         self._sequence += picture.skipped + unreadable - self._statistics.unreadable
         frame = Frame(
             picture.image,
@@ -274,7 +274,7 @@ class LatestSource(Source):
         with self._changed:
             if not self._opened:
                 self._opened = True
-                self.total_frames = feed.total_frames
+                self.total_frames = capture.total_frames
             elif self._lost_since_s is not None:
                 came_back_after_s = time.monotonic() - self._lost_since_s
                 self._lost_since_s = None

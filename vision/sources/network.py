@@ -12,7 +12,7 @@ from urllib.parse import SplitResult, parse_qsl, urlencode, urlsplit, urlunsplit
 
 import cv2
 
-from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import open_ffmpeg, read_capture
 from vision.sources.source import SourceError, SourceSettings
 
@@ -34,7 +34,7 @@ def without_password(uri: str) -> str:
     return urlunsplit(parts._replace(netloc=f"{parts.username}:***@{host}"))
 
 
-class StreamFeed(Feed):
+class StreamCapture(Capture):
     """A stream opened by FFmpeg.
 
     Args:
@@ -44,7 +44,7 @@ class StreamFeed(Feed):
         reason: says why nothing came, once opening has failed.
 
     Raises:
-        FeedLost: it did not open in `open_timeout_s`.
+        CaptureError: it did not open in `open_timeout_s`.
     """
 
     def __init__(
@@ -61,35 +61,35 @@ class StreamFeed(Feed):
         # RTP's description alone lets FFmpeg open it; without a size nothing has come.
         if not (self._capture.isOpened() and self._capture.get(cv2.CAP_PROP_FRAME_WIDTH) > 0):
             self._capture.release()
-            raise FeedLost(reason or "no video stream came")
+            raise CaptureError(reason or "no video stream came")
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         image, captured_ns, decode_ms = read_capture(self._capture)
         if image is None:
             # OpenCV does not tell an end from a silence of `read_timeout_s`.
-            raise FeedLost("the stream stopped")
+            raise CaptureError("the stream stopped")
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
         step_s = 0.0 if self._stamp_s is None else stamp_s - self._stamp_s
         self._stamp_s = stamp_s
         if 0.0 <= step_s <= _LONGEST_STEP_S:
             self._media_s += step_s
-        return Picture(image, captured_ns, media_s=self._media_s, decode_ms=decode_ms)
+        return RawFrame(image, captured_ns, media_s=self._media_s, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()
 
 
-def open_rtsp(uri: str, settings: SourceSettings) -> StreamFeed:
+def open_rtsp(uri: str, settings: SourceSettings) -> StreamCapture:
     """RTSP (RFC 2326), its media inside the TCP connection; OPENCV_FFMPEG_CAPTURE_OPTIONS can say otherwise.
 
     Raises:
-        FeedLost: nobody answers, or not with video.
+        CaptureError: nobody answers, or not with video.
     """
     options = {"rtsp_transport": "tcp", **_LOW_LATENCY}
     try:
-        return StreamFeed(uri, settings, options)
-    except FeedLost as lost:
-        raise FeedLost(_why_no_rtsp(uri, min(settings.open_timeout_s, 2.0))) from lost
+        return StreamCapture(uri, settings, options)
+    except CaptureError as lost:
+        raise CaptureError(_why_no_rtsp(uri, min(settings.open_timeout_s, 2.0))) from lost
 
 
 def _why_no_rtsp(uri: str, timeout_s: float) -> str:
@@ -155,7 +155,7 @@ class UdpStream:
         self._payload = int(payload) if payload else usual
         self._query = query
 
-    def open_feed(self) -> StreamFeed:
+    def open_capture(self) -> StreamCapture:
         """Open the port and wait for video on it."""
         if self._format == "mpegts":
             host = f"[{self._host}]" if ":" in self._host else self._host
@@ -168,11 +168,11 @@ class UdpStream:
             options = {"protocol_whitelist": "file,udp,rtp", **_LOW_LATENCY}
             return self._open(description.name, options)
 
-    def _open(self, location: str, options: Mapping[str, str]) -> StreamFeed:
+    def _open(self, location: str, options: Mapping[str, str]) -> StreamCapture:
         try:
-            return StreamFeed(location, self._settings, options)
-        except FeedLost as lost:
-            raise FeedLost(self._why_nothing()) from lost
+            return StreamCapture(location, self._settings, options)
+        except CaptureError as lost:
+            raise CaptureError(self._why_nothing()) from lost
 
     def session_description(self) -> str:
         """What the sender sends, in SDP (RFC 4566): FFmpeg cannot tell from RTP packets alone."""

@@ -8,19 +8,19 @@ import stat
 from collections.abc import Callable
 from pathlib import Path
 
-from vision.sources.camera import CameraFeed, camera_device, check_camera
-from vision.sources.feed import Feed, LoopingFeed
+from vision.sources.camera import CameraCapture, camera_device, check_camera
+from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.http_stream import open_http
-from vision.sources.images import ImagesFeed, images_in, is_image
+from vision.sources.images import ImagesCapture, images_in, is_image
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, open_rtsp, without_password
 from vision.sources.opencv import quiet_opencv
-from vision.sources.pipe import Fifo, PipeFeed, check_pipe_settings
+from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
-from vision.sources.shared import SharedFrameFeed, check_name
+from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
-from vision.sources.video_file import VideoFileFeed
+from vision.sources.video_file import VideoFileCapture
 
 _IMAGE_RATE_HZ = 10.0  # of images standing for a camera when no rate is asked
 
@@ -56,7 +56,7 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         return _open_standard_input(settings)
     if (device := camera_device(uri)) is not None:
         check_camera(device, settings)
-        return LatestSource(str(device), lambda: CameraFeed(device, settings), settings)
+        return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
     scheme, separator, _ = uri.partition("://")
     if not separator:
         return _open_path(Path(uri).expanduser(), settings)
@@ -98,7 +98,7 @@ def _open_http(uri: str, settings: SourceSettings) -> Source:
 def _open_udp(uri: str, settings: SourceSettings) -> Source:
     stream = UdpStream(uri, settings)
     return LatestSource(
-        without_password(uri), stream.open_feed, settings, advice="is the sender sending here?"
+        without_password(uri), stream.open_capture, settings, advice="is the sender sending here?"
     )
 
 
@@ -106,7 +106,7 @@ def _open_udp(uri: str, settings: SourceSettings) -> Source:
 def _open_shared(uri: str, settings: SourceSettings) -> Source:
     check_name(_rest(uri))
     return LatestSource(
-        uri, lambda: SharedFrameFeed(_rest(uri), settings), settings, advice="is its writer running?"
+        uri, lambda: SharedFrameCapture(_rest(uri), settings), settings, advice="is its writer running?"
     )
 
 
@@ -127,22 +127,24 @@ def _open_path(path: Path, settings: SourceSettings) -> Source:
     if not os.access(path, os.R_OK):
         raise SourceError(f"{path}: no permission to read it")
     if stat.S_ISDIR(mode):
-        return _open_file(str(path), lambda: ImagesFeed(images_in(path), _image_rate_hz(settings)), settings)
+        return _open_file(
+            str(path), lambda: ImagesCapture(images_in(path), _image_rate_hz(settings)), settings
+        )
     if not stat.S_ISREG(mode):
         raise SourceError(f"{path}: neither a file, a folder, a FIFO nor a video device")
     if settings.pixel_format in RAW_PIXEL_FORMATS:
         check_pipe_settings(str(path), settings)
-        return _open_file(str(path), lambda: PipeFeed(os.open(path, os.O_RDONLY), settings), settings)
+        return _open_file(str(path), lambda: PipeCapture(os.open(path, os.O_RDONLY), settings), settings)
     if is_image(path):
-        return _open_file(str(path), lambda: ImagesFeed([path], _image_rate_hz(settings)), settings)
-    return _open_file(str(path), lambda: VideoFileFeed(path), settings)
+        return _open_file(str(path), lambda: ImagesCapture([path], _image_rate_hz(settings)), settings)
+    return _open_file(str(path), lambda: VideoFileCapture(path), settings)
 
 
-def _open_file(name: str, open_feed: Callable[[], Feed], settings: SourceSettings) -> Source:
-    def open_looping() -> Feed:
-        return LoopingFeed(open_feed)
+def _open_file(name: str, open_capture: Callable[[], Capture], settings: SourceSettings) -> Source:
+    def open_looping() -> Capture:
+        return LoopingCapture(open_capture)
 
-    opener = open_looping if settings.loop else open_feed
+    opener = open_looping if settings.loop else open_capture
     if settings.realtime:
         return LatestSource(name, opener, settings, reopen=False, paced=True)
     return SequentialSource(name, opener, settings)
@@ -154,26 +156,26 @@ def _open_standard_input(settings: SourceSettings) -> Source:
     if os.isatty(0):
         raise SourceError("standard input is a terminal; pipe frames into it, or name a source")
 
-    def open_feed() -> Feed:
-        return PipeFeed(os.dup(0), settings)
+    def open_capture() -> Capture:
+        return PipeCapture(os.dup(0), settings)
 
     is_file = stat.S_ISREG(os.fstat(0).st_mode)
     every_frame = settings.every_frame
     if every_frame is None:
         every_frame = is_file and not settings.realtime
     if every_frame:
-        return SequentialSource(name, open_feed, settings)
-    return LatestSource(name, open_feed, settings, reopen=False, paced=settings.realtime and is_file)
+        return SequentialSource(name, open_capture, settings)
+    return LatestSource(name, open_capture, settings, reopen=False, paced=settings.realtime and is_file)
 
 
 def _open_fifo(path: Path, settings: SourceSettings) -> Source:
     fifo = Fifo(path, settings)
     try:
         if settings.every_frame:
-            return SequentialSource(str(path), fifo.open_feed, settings, on_close=fifo.close)
+            return SequentialSource(str(path), fifo.open_capture, settings, on_close=fifo.close)
         return LatestSource(
             str(path),
-            fifo.open_feed,
+            fifo.open_capture,
             settings,
             advice="start its writer",
             on_close=fifo.close,

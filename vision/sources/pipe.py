@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.mjpeg import MjpegParser
 from vision.sources.raw import RawParser, StreamError, StreamParser
 from vision.sources.source import RAW_PIXEL_FORMATS, EndOfStream, SourceError, SourceSettings
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 _PIPE_BYTES = 1 << 20  # a frame of 640x480 in one go; the kernel's own default is 64 KiB
 
 
-class PipeFeed(Feed):
+class PipeCapture(Capture):
     """Pictures out of a file descriptor, which it owns.
 
     Args:
@@ -52,11 +52,11 @@ class PipeFeed(Feed):
         with contextlib.suppress(OSError):  # not a pipe, or above the user's limit: the default size does
             fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         deadline_s = time.monotonic() + timeout_s
         while not self._ready:
             if not self._poll.poll(max(deadline_s - time.monotonic(), 0.0) * 1000.0):
-                self._look_for_a_quiet_end()
+                self._check_clean_end()
                 return None
             data = os.read(self._descriptor, _PIPE_BYTES)
             if not data:
@@ -68,9 +68,9 @@ class PipeFeed(Feed):
         media_s = self._delivered * self.interval_s
         self._delivered += 1
         stamp_ns = None if self._is_file else captured_ns
-        return Picture(image, stamp_ns, media_s=media_s, decode_ms=decode_ms)
+        return RawFrame(image, stamp_ns, media_s=media_s, decode_ms=decode_ms)
 
-    def _look_for_a_quiet_end(self) -> None:
+    def _check_clean_end(self) -> None:
         # A writer of a FIFO that had gone before we opened raises no POLLHUP; a read tells that it has gone.
         if self._heard and not os.get_blocking(self._descriptor):
             with contextlib.suppress(BlockingIOError):
@@ -92,7 +92,7 @@ class PipeFeed(Feed):
                 self._parser = _parser_for(data)
             images = self._parser.push(data)
         except StreamError as error:
-            raise FeedLost(str(error)) from error
+            raise CaptureError(str(error)) from error
         self.unreadable = self._parser.unreadable
         decode_ms = (time.monotonic_ns() - captured_ns) / 1e6 / max(len(images), 1)
         self._ready.extend((image, captured_ns, decode_ms) for image in images)
@@ -106,7 +106,7 @@ class PipeFeed(Feed):
         if self._parser is None and not self._head:
             leftover = "no bytes at all"
         if self._end_is_loss:
-            raise FeedLost(f"its writer has gone{f', {leftover}' if leftover else ''}")
+            raise CaptureError(f"its writer has gone{f', {leftover}' if leftover else ''}")
         raise EndOfStream(leftover)
 
     def close(self) -> None:
@@ -120,18 +120,18 @@ class Fifo:
         self._path = path
         self._settings = settings
         check_pipe_settings(str(path), settings)
-        self._keeper = _open_fifo(path)
+        self._supervisor = _open_fifo(path)
         self._closed = False
 
-    def open_feed(self) -> PipeFeed:
-        return PipeFeed(
+    def open_capture(self) -> PipeCapture:
+        return PipeCapture(
             _open_fifo(self._path), self._settings, end_is_loss=self._settings.every_frame is not True
         )
 
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            os.close(self._keeper)
+            os.close(self._supervisor)
 
 
 def _open_fifo(path: Path) -> int:

@@ -23,13 +23,13 @@ def source(scheme: str, help_text: str) -> Callable[[_Opener], _Opener]:
     """Let `open_source` open `scheme://…` by the decorated function or class.
 
     It is called with the whole address and the `SourceSettings`, and returns an open `Source` whose first
-    frame is there. Most hand a `Feed` of theirs to `LatestSource` (a camera: the newest frame wins, a lost
+    frame is there. Most hand a `Capture` of theirs to `LatestSource` (a camera: the newest frame wins, a lost
     feed is opened again) or to `SequentialSource` (a recording: every frame), which do what `SourceSettings`
     says of time-outs and `on_frame`. A `Source` of another class must do that itself.
 
         @source("squares", "a square that moves")
         def open_squares(uri: str, settings: SourceSettings) -> Source:
-            return LatestSource(uri, SquareFeed, settings, paced=True)
+            return LatestSource(uri, SquareCapture, settings, paced=True)
 
     Args:
         scheme: what stands before `://`, lower case.

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from vision.frame import Frame
-from vision.sources.feed import FeedLost, OpenFeed, Picture
+from vision.sources.capture import CaptureError, OpenFeed, RawFrame
 from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
 
 logger = logging.getLogger(__name__)
@@ -21,7 +21,7 @@ class SequentialSource(Source):
     def __init__(
         self,
         uri: str,
-        open_feed: OpenFeed,
+        open_capture: OpenFeed,
         settings: SourceSettings,
         *,
         on_close: Callable[[], None] | None = None,
@@ -30,8 +30,8 @@ class SequentialSource(Source):
         self._on_close = on_close
         self._on_frame = settings.on_frame
         try:
-            self._feed = open_feed()
-        except FeedLost as lost:
+            self._capture = open_capture()
+        except CaptureError as lost:
             raise SourceError(f"{uri}: {lost}") from lost
         self._sequence = 0
         self._delivered = 0
@@ -39,22 +39,22 @@ class SequentialSource(Source):
         self._unreadable_seen = 0
         self._closed = False
         self._ended = False
-        self.total_frames = self._feed.total_frames
+        self.total_frames = self._capture.total_frames
         try:
-            self._first: Picture | None = self._first_picture(settings.open_timeout_s)
+            self._first: RawFrame | None = self._first_picture(settings.open_timeout_s)
         except BaseException:
             self.close()
             raise
 
-    def _first_picture(self, timeout_s: float) -> Picture:
+    def _first_picture(self, timeout_s: float) -> RawFrame:
         deadline_s = time.monotonic() + timeout_s
         try:
-            picture = self._feed.read(timeout_s)
+            picture = self._capture.read(timeout_s)
             while picture is None and time.monotonic() < deadline_s:
-                picture = self._feed.read(max(deadline_s - time.monotonic(), 0.0))
+                picture = self._capture.read(max(deadline_s - time.monotonic(), 0.0))
         except EndOfStream as end:
             raise SourceError(f"{self.uri}: ended before its first frame{_detail(end)}") from end
-        except FeedLost as lost:
+        except CaptureError as lost:
             raise SourceError(f"{self.uri}: {lost}") from lost
         if picture is None:
             raise SourceError(f"{self.uri}: no frame within {timeout_s:g} s; is its writer running?")
@@ -67,18 +67,18 @@ class SequentialSource(Source):
         self._first = None
         if picture is None:
             try:
-                picture = self._feed.read(timeout_s)
+                picture = self._capture.read(timeout_s)
             except EndOfStream as end:
                 self._ended = True
-                self._say_what_is_missing(end)
+                self._log_missing_files(end)
                 raise
-            except FeedLost as lost:
+            except CaptureError as lost:
                 self._ended = True
                 raise SourceError(f"{self.uri}: {lost}") from lost
         if picture is None:
             return None
-        self._sequence += picture.skipped + self._feed.unreadable - self._unreadable_seen
-        self._unreadable_seen = self._feed.unreadable
+        self._sequence += picture.skipped + self._capture.unreadable - self._unreadable_seen
+        self._unreadable_seen = self._capture.unreadable
         self._dropped += picture.skipped
         ready_ns = time.monotonic_ns()
         captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
@@ -97,20 +97,20 @@ class SequentialSource(Source):
             self._on_frame(frame)
         return frame
 
-    def _say_what_is_missing(self, end: EndOfStream) -> None:
+    def _log_missing_files(self, end: EndOfStream) -> None:
         if detail := _detail(end):
             logger.warning("%s: ended after %d frames%s", self.uri, self._delivered, detail)
 
     @property
     def statistics(self) -> SourceStatistics:
         return SourceStatistics(
-            delivered=self._delivered, dropped=self._dropped, unreadable=self._feed.unreadable
+            delivered=self._delivered, dropped=self._dropped, unreadable=self._capture.unreadable
         )
 
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            self._feed.close()
+            self._capture.close()
             if self._on_close is not None:
                 self._on_close()
 

@@ -6,7 +6,7 @@ import time
 
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameReader, segment_path
-from vision.sources.feed import Feed, FeedLost, Picture
+from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.source import SourceError, SourceSettings
 
 _LOOK_EVERY_S = 0.001  # shared memory wakes nobody; a look costs some microseconds
@@ -20,32 +20,32 @@ def check_name(name: str) -> None:
         raise SourceError(f"shm://{name}: {error}") from error
 
 
-class SharedFrameFeed(Feed):
+class SharedFrameCapture(Capture):
     """The newest frame of a shared memory, each once.
 
     Raises:
-        FeedLost: nobody has made it (yet), or something else is there.
+        CaptureError: nobody has made it (yet), or something else is there.
     """
 
     def __init__(self, name: str, settings: SourceSettings) -> None:
         try:
             self._reader = SharedFrameReader(name)
         except (OSError, ValueError) as error:
-            raise FeedLost(f"no frames in the shared memory {name!r} ({error})") from error
+            raise CaptureError(f"no frames in the shared memory {name!r} ({error})") from error
         self._stale_ns = round(settings.read_timeout_s * 1e9)
         self._after: int | None = None
         self.calibration = self._reader.calibration
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         deadline_s = time.monotonic() + timeout_s
         while True:
             looked_ns = time.monotonic_ns()
             try:
                 frame = self._reader.latest(self._after)
             except ValueError as error:  # a new writer of another release
-                raise FeedLost(str(error)) from error
+                raise CaptureError(str(error)) from error
             if self._reader.calibration != self.calibration:
-                raise FeedLost("another camera writes there now")
+                raise CaptureError("another camera writes there now")
             if frame is not None and self._after is None and self._is_stale(frame):
                 # What a dead writer left behind is no sign of life.
                 self._after = frame.sequence
@@ -58,7 +58,7 @@ class SharedFrameFeed(Feed):
         before, self._after = self._after, frame.sequence
         skipped = 0 if before is None else max(frame.sequence - before - 1, 0)
         copy_ms = (time.monotonic_ns() - looked_ns) / 1e6
-        return Picture(frame.image, frame.captured_ns, frame.depth_m, skipped=skipped, decode_ms=copy_ms)
+        return RawFrame(frame.image, frame.captured_ns, frame.depth_m, skipped=skipped, decode_ms=copy_ms)
 
     def _is_stale(self, frame: Frame) -> bool:
         return time.monotonic_ns() - frame.captured_ns > self._stale_ns

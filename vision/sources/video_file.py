@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vision.sources.feed import Feed, Picture
+from vision.sources.capture import Capture, RawFrame
 from vision.sources.opencv import open_ffmpeg
 from vision.sources.source import EndOfStream, SourceError
 
 
-class VideoFileFeed(Feed):
+class VideoFileCapture(Capture):
     """Every frame of a video file in order, with its time in the film.
 
     Raises:
@@ -37,7 +37,7 @@ class VideoFileFeed(Feed):
         self._delivered = 0
         self._last_s = -self.interval_s
 
-    def read(self, timeout_s: float) -> Picture | None:
+    def read(self, timeout_s: float) -> RawFrame | None:
         started_ns = time.monotonic_ns()
         ok, image = self._capture.read()
         decode_ms = (time.monotonic_ns() - started_ns) / 1e6  # a file has no waiting in it
@@ -52,7 +52,7 @@ class VideoFileFeed(Feed):
         if not stamp_s > self._last_s:  # some containers carry no stamps, or repeat them
             stamp_s = self._last_s + self.interval_s
         self._last_s = stamp_s
-        return Picture(np.ascontiguousarray(image, dtype=np.uint8), media_s=stamp_s, decode_ms=decode_ms)
+        return RawFrame(np.ascontiguousarray(image, dtype=np.uint8), media_s=stamp_s, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()

@@ -156,7 +156,7 @@ class Tracker:
         for index, track in zip(chosen.tolist(), tracks.tolist(), strict=True):
             lives[index] = life = self._lives[track]
             life.see(float(confidence[index]), captured_ns)
-            self._tell_seen(life, boxes[index], captured_ns, events)
+            self._update_seen(life, boxes[index], captured_ns, events)
         begun = np.flatnonzero((track_of < 0) & (confidence >= self.settings.high_confidence))
         on_object = overlaps(detections.xyxy[begun], believed)
         known = [life.evidence for life in self._lives]
@@ -170,7 +170,7 @@ class Tracker:
                 life.evidence = dict(known[int(on_object[row].argmax())])
             else:
                 self._weigh_classes([life], detections.xyxy[[index]], detections)
-            self._tell_seen(life, boxes[index], captured_ns, events)
+            self._update_seen(life, boxes[index], captured_ns, events)
             self._lives.append(life)
             lives[index] = life
         if len(begun):
@@ -188,14 +188,14 @@ class Tracker:
         self._states.mean[unseen, 6:] = 0.0
         states = kalman.predicted(self._states, (captured_ns - before_ns) / 1e9)
         ended = np.array([captured_ns - life.last_ns >= self.settings.end_s * 1e9 for life in self._lives])
-        self._warn_of_pace(bool((ended & ~unseen).any()), (captured_ns - before_ns) / 1e9)
+        self._warn_of_rate(bool((ended & ~unseen).any()), (captured_ns - before_ns) / 1e9)
         if view is not None and before is not None and view.camera == before.camera:
             states, visible = turned(states, view.camera, view.turn_from(before))
             ended |= ~visible
         self._states = states
         self._drop(ended, captured_ns, events)
 
-    def _warn_of_pace(self, ended_though_seen: bool, interval_s: float) -> None:
+    def _warn_of_rate(self, ended_though_seen: bool, interval_s: float) -> None:
         """Say once that frames are too far apart for anything to be followed from one to the next."""
         if ended_though_seen and not self._warned_of_pace:
             self._warned_of_pace = True
@@ -258,7 +258,9 @@ class Tracker:
             for key, value in called.items():
                 evidence[key] = evidence.get(key, 0.0) + value
 
-    def _tell_seen(self, life: _Life, xyxy: list[float], captured_ns: int, events: list[TrackEvent]) -> None:
+    def _update_seen(
+        self, life: _Life, xyxy: list[float], captured_ns: int, events: list[TrackEvent]
+    ) -> None:
         kind = TrackEventKind.UPDATE
         if not life.confirmed:
             settings = self.settings

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from vision.yolo.description import ArchitectureError, LayerRow, ModelDescription, yolov8_description
+from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription, yolov8_description
+from vision.yolo.layer_config import HEADS, LAYERS, make
 from vision.yolo.layers import Concat, Conv, Detect, LargeKernelDWConv
-from vision.yolo.rows import HEADS, LAYERS, make
 
 __all__ = [
     "ArchitectureError",
-    "LayerRow",
+    "LayerSpec",
     "ModelDescription",
     "YoloModel",
     "anchor_points",

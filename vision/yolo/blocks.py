@@ -1,4 +1,4 @@
-"""The blocks between input and head: cross-stage partial blocks of every generation, pooling, joining.
+"""The blocks between input and head: cross-stage partial blocks of every model family, pooling, joining.
 
 Attribute names (`cv1`, `m`, `gamma` …) are those that checkpoints in circulation use.
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build_shapes
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
 from vision.yolo.pickled_layers import as_trained
-from vision.yolo.safe_pickle import CheckpointError, Inert, UnsafeCheckpointError, one_line, shown
+from vision.yolo.safe_pickle import CheckpointError, Stub, UnsafeCheckpointError, one_line, shown
 from vision.yolo.torch_archive import read_archive
 
 __all__ = [
@@ -119,7 +119,7 @@ def _interpret(content: Any) -> LoadedModel:
         return _interpret_own(content)
     # The averaged weights, where training kept them, are the better ones.
     record = content["model"] if content.get("ema") is None and "model" in content else content.get("ema")
-    if not isinstance(record, Inert):
+    if not isinstance(record, Stub):
         raise CheckpointError(
             "holds no model: expected our own format, or Ultralytics' with the model under 'ema' or 'model'"
         )
@@ -142,7 +142,7 @@ def _described(content: dict[Any, Any]) -> LoadedModel:
     return LoadedModel(model, description.class_names, description, _plain_dictionary(content, "metadata"))
 
 
-def _interpret_ultralytics(record: Inert, content: dict[Any, Any]) -> LoadedModel:
+def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel:
     if record.name not in _DETECTION_MODELS:
         raise CheckpointError(f"holds a {record.name.rpartition('.')[2]}; only detection models can be used")
     table = _plain_dictionary(record.state, "yaml")
@@ -173,7 +173,7 @@ def _note(content: dict[Any, Any], key: str) -> str:
     return value[:200] if isinstance(value, str) else ""
 
 
-def _class_names(record: Inert, table: dict[Any, Any]) -> list[str]:
+def _class_names(record: Stub, table: dict[Any, Any]) -> list[str]:
     names = _plain(record.state.get("names"))
     if isinstance(names, dict):
         if sorted(map(str, names)) != sorted(map(str, range(len(names)))):
@@ -186,7 +186,7 @@ def _class_names(record: Inert, table: dict[Any, Any]) -> list[str]:
     return names
 
 
-def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
+def _modules(record: Stub) -> Iterator[tuple[str, Stub]]:
     """Every module below `record` with its dotted name."""
     waiting = [("", record, 0)]
     seen = 0
@@ -202,13 +202,13 @@ def _modules(record: Inert) -> Iterator[tuple[str, Inert]]:
         if not isinstance(children, dict):
             raise CheckpointError(f"the modules of {name or 'the model'} are not a dictionary")
         for key, child in children.items():
-            if isinstance(child, Inert):
+            if isinstance(child, Stub):
                 waiting.append((f"{name}.{key}" if name else str(key), child, depth + 1))
             elif child is not None:
                 raise CheckpointError(f"{name}.{key} is not a module")
 
 
-def _weights(modules: dict[str, Inert]) -> Iterator[tuple[str, Tensor]]:
+def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, Tensor]]:
     """Each tensor with its dotted name, taken out of its module: who gets it holds it alone."""
     for name, module in modules.items():
         passing = module.state.get("_non_persistent_buffers_set", frozenset())

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from vision.yolo.convolution import ACTIVATIONS
-from vision.yolo.layer_row import ArchitectureError, LayerRow, settle_pooling, settle_scale
+from vision.yolo.layer_spec import ArchitectureError, LayerSpec, settle_pooling, settle_scale
 
-__all__ = ["YOLOV8_SCALES", "ArchitectureError", "LayerRow", "ModelDescription", "yolov8_description"]
+__all__ = ["YOLOV8_SCALES", "ArchitectureError", "LayerSpec", "ModelDescription", "yolov8_description"]
 
 # scale → depth multiple, width multiple, largest channel count before the width multiple (published table).
 YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
@@ -50,8 +50,8 @@ class ModelDescription:
     """
 
     class_names: tuple[str, ...]
-    backbone: tuple[LayerRow, ...]
-    head: tuple[LayerRow, ...]
+    backbone: tuple[LayerSpec, ...]
+    head: tuple[LayerSpec, ...]
     depth_multiple: float = 1.0
     width_multiple: float = 1.0
     max_channels: int | None = None
@@ -95,7 +95,7 @@ class ModelDescription:
             raise ArchitectureError(f"a network needs 1..{_LARGEST_ROWS} rows, got {len(self.rows)}")
 
     @property
-    def rows(self) -> tuple[LayerRow, ...]:
+    def rows(self) -> tuple[LayerSpec, ...]:
         """The rows of backbone and head, in the order in which the network runs them."""
         return self.backbone + self.head
 
@@ -133,7 +133,7 @@ class ModelDescription:
         depth, width, max_channels = _multiples(plain)
         plain_rows = [*_list(plain, "backbone"), *_list(plain, "head")]
         rows = tuple(
-            settle_scale(settle_pooling(LayerRow.from_plain(row, index)), _scale(plain))
+            settle_scale(settle_pooling(LayerSpec.from_plain(row, index)), _scale(plain))
             for index, row in enumerate(plain_rows)
         )
         layers = {row.layer for row in rows}
@@ -169,36 +169,36 @@ def yolov8_description(scale: str | tuple[float, float, int], class_names: Seque
     depth, width, max_channels = scale
     before = (-1,)
 
-    def down(channels: int) -> LayerRow:
-        return LayerRow(before, 1, "Conv", (channels, 3, 2))
+    def down(channels: int) -> LayerSpec:
+        return LayerSpec(before, 1, "Conv", (channels, 3, 2))
 
-    upsample = LayerRow(before, 1, "nn.Upsample", (None, 2, "nearest"))
+    upsample = LayerSpec(before, 1, "nn.Upsample", (None, 2, "nearest"))
     backbone = (
         down(64),
         down(128),
-        LayerRow(before, 3, "C2f", (128, True)),
+        LayerSpec(before, 3, "C2f", (128, True)),
         down(256),
-        LayerRow(before, 6, "C2f", (256, True)),
+        LayerSpec(before, 6, "C2f", (256, True)),
         down(512),
-        LayerRow(before, 6, "C2f", (512, True)),
+        LayerSpec(before, 6, "C2f", (512, True)),
         down(1024),
-        LayerRow(before, 3, "C2f", (1024, True)),
-        LayerRow(before, 1, "SPPF", (1024, 5)),
+        LayerSpec(before, 3, "C2f", (1024, True)),
+        LayerSpec(before, 1, "SPPF", (1024, 5)),
     )
     head = (
         upsample,
-        LayerRow((-1, 6), 1, "Concat", (1,)),
-        LayerRow(before, 3, "C2f", (512,)),
+        LayerSpec((-1, 6), 1, "Concat", (1,)),
+        LayerSpec(before, 3, "C2f", (512,)),
         upsample,
-        LayerRow((-1, 4), 1, "Concat", (1,)),
-        LayerRow(before, 3, "C2f", (256,)),
+        LayerSpec((-1, 4), 1, "Concat", (1,)),
+        LayerSpec(before, 3, "C2f", (256,)),
         down(256),
-        LayerRow((-1, 12), 1, "Concat", (1,)),
-        LayerRow(before, 3, "C2f", (512,)),
+        LayerSpec((-1, 12), 1, "Concat", (1,)),
+        LayerSpec(before, 3, "C2f", (512,)),
         down(512),
-        LayerRow((-1, 9), 1, "Concat", (1,)),
-        LayerRow(before, 3, "C2f", (1024,)),
-        LayerRow((15, 18, 21), 1, "Detect", ("nc",)),
+        LayerSpec((-1, 9), 1, "Concat", (1,)),
+        LayerSpec(before, 3, "C2f", (1024,)),
+        LayerSpec((15, 18, 21), 1, "Detect", ("nc",)),
     )
     return ModelDescription(tuple(class_names), backbone, head, depth, width, max_channels)
 

@@ -14,16 +14,16 @@ from typing import Any
 from torch import Tensor
 
 from vision.yolo.description import ModelDescription
-from vision.yolo.layer_row import (
+from vision.yolo.layer_spec import (
     A2C2F_DEFAULTS,
     C3K2_DEFAULTS,
     PUBLISHED_MLP_RATIOS,
     SPPF_DEFAULTS,
-    LayerRow,
+    LayerSpec,
 )
-from vision.yolo.safe_pickle import CheckpointError, Inert, shown
+from vision.yolo.safe_pickle import CheckpointError, Stub, shown
 
-Modules = Mapping[str, Inert]
+Modules = Mapping[str, Stub]
 """Dotted name → module, `model.<row>` for the rows."""
 
 # The last convolution of each layer, by the names it has there: the channels that the layer gives.
@@ -55,7 +55,7 @@ def _tensor(modules: Modules, name: str, parameter: str = "weight") -> Tensor | 
     return tensor if isinstance(tensor, Tensor) and tensor.dim() > 0 else None
 
 
-def _settle(row: LayerRow, name: str, modules: Modules) -> LayerRow:
+def _settle(row: LayerSpec, name: str, modules: Modules) -> LayerSpec:
     first = kind(modules, f"{name}.m.0")
     if row.layer == "C3k2" and first:
         if first == "Sequential":
@@ -73,7 +73,7 @@ def _settle(row: LayerRow, name: str, modules: Modules) -> LayerRow:
     return row
 
 
-def _mlp_ratio(row: LayerRow, wide: Tensor) -> Any:
+def _mlp_ratio(row: LayerSpec, wide: Tensor) -> Any:
     """The ratio the row gives, or a published one, where it fits what was trained; else the trained one."""
     outputs, inputs = wide.shape[:2]
     given = row.arguments[4] if len(row.arguments) > 4 else A2C2F_DEFAULTS[4]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.yolo.maps import Head, LevelMaps, Product
+from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -54,7 +54,7 @@ def select_boxes(
     """One image's maps as the model gives them, (1, 4 · reg_max + classes, H, W) a level → its boxes."""
     sides = 4 * model.reg_max
     arrays = [level[0].detach().float().cpu().numpy() for level in maps]
-    levels = [LevelMaps(classes=array[sides:], sides=array[:sides]) for array in arrays]
+    levels = [LevelOutput(classes=array[sides:], sides=array[:sides]) for array in arrays]
     return boxes_of(head_of(model), levels, confidence=confidence, iou=iou, class_ids=class_ids, most=most)
 
 
@@ -66,16 +66,16 @@ def head_of(model: YoloModel) -> Head:
 
 def boxes_of(
     head: Head,
-    levels: Sequence[LevelMaps],
+    levels: Sequence[LevelOutput],
     *,
     confidence: float = 0.25,
     iou: float = 0.7,
     class_ids: Sequence[int] | None = None,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """One image's maps → its boxes: `candidates_of`, `sides_of` and `boxes_from` in a row."""
+    """One image's maps → its boxes: `candidates_of`, `decode_ltrb` and `boxes_from` in a row."""
     candidates = candidates_of(head, levels, confidence, class_ids)
-    return boxes_from(head, levels, candidates, sides_of(head, levels, candidates), iou, most)
+    return boxes_from(head, levels, candidates, decode_ltrb(head, levels, candidates), iou, most)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ class Candidates:
 
 
 def candidates_of(
-    head: Head, levels: Sequence[LevelMaps], confidence: float, class_ids: Sequence[int] | None = None
+    head: Head, levels: Sequence[LevelOutput], confidence: float, class_ids: Sequence[int] | None = None
 ) -> list[Candidates]:
     """The cells of each level that speak for a wanted class, above `confidence`.
 
@@ -127,9 +127,9 @@ def candidates_of(
     return found
 
 
-def sides_of(
+def decode_ltrb(
     head: Head,
-    levels: Sequence[LevelMaps],
+    levels: Sequence[LevelOutput],
     candidates: Sequence[Candidates],
     product: Product = np.matmul,
 ) -> list[NDArray[np.float32]]:
@@ -153,7 +153,7 @@ def sides_of(
 
 def boxes_from(
     head: Head,
-    levels: Sequence[LevelMaps],
+    levels: Sequence[LevelOutput],
     candidates: Sequence[Candidates],
     sides: Sequence[NDArray[np.float32]],
     iou: float = 0.7,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vision.yolo.description import YOLOV8_SCALES, ModelDescription, yolov8_description
-from vision.yolo.layer_row import ArchitectureError
+from vision.yolo.layer_spec import ArchitectureError
 
 Scale = tuple[float, float, int]
 """Depth multiple, width multiple, largest channel count before the width multiple."""
@@ -51,27 +51,27 @@ SCALES: Mapping[str, Mapping[str, Scale]] = {
 """Generation → scale letter → its multipliers, as published."""
 
 
-def published_description(generation: str, scale: str, class_names: Sequence[str]) -> ModelDescription:
-    """The published network of a generation and a scale, as a key of `SCALES` and of its table.
+def published_description(model_family: str, scale: str, class_names: Sequence[str]) -> ModelDescription:
+    """The published network of a model family and a scale, as a key of `SCALES` and of its table.
 
     Raises `ArchitectureError` for an unknown one.
     """
-    if generation not in SCALES:
-        raise ArchitectureError(f"unknown generation {generation!r:.100}; known are {', '.join(SCALES)}")
-    scales = SCALES[generation]
+    if model_family not in SCALES:
+        raise ArchitectureError(f"unknown model family {model_family!r:.100}; known are {', '.join(SCALES)}")
+    scales = SCALES[model_family]
     if scale not in scales:
-        raise ArchitectureError(f"{generation} has no scale {scale!r:.100}; known are {', '.join(scales)}")
-    if generation == "YOLOv8":
+        raise ArchitectureError(f"{model_family} has no scale {scale!r:.100}; known are {', '.join(scales)}")
+    if model_family == "YOLOv8":
         return yolov8_description(scale, class_names)
-    backbone, head = _rows(_blocks(generation, scale))
+    backbone, head = _rows(_blocks(model_family, scale))
     depth, width, most = scales[scale]
     table = {
         "backbone": backbone,
         "head": head,
         "scales": {scale: [depth, width, most]},
         "scale": scale,
-        "reg_max": 1 if generation == "YOLO26" else 16,
-        "end2end": generation in ("YOLOv10", "YOLO26"),
+        "reg_max": 1 if model_family == "YOLO26" else 16,
+        "end2end": model_family in ("YOLOv10", "YOLO26"),
     }
     return ModelDescription.from_plain(table, class_names)
 
@@ -102,9 +102,9 @@ class _Blocks:
     head: str = "Detect"
 
 
-def _blocks(generation: str, scale: str) -> _Blocks:
+def _blocks(model_family: str, scale: str) -> _Blocks:
     sppf: Block = (1, "SPPF", (5,))
-    if generation == "YOLOv5u":
+    if model_family == "YOLOv5u":
         c3: Block = (3, "C3", (False,))
         return _Blocks(
             stem=(6, 2, 2),
@@ -115,20 +115,20 @@ def _blocks(generation: str, scale: str) -> _Blocks:
             down=(c3, c3),
             narrow_first=True,
         )
-    if generation == "YOLOv10":
+    if model_family == "YOLOv10":
         return _yolov10(scale, sppf)
     narrow: Block = (2, "C3k2", (False, 0.25))
     usual: Block = (2, "C3k2", (False,))
     deep: Block = (2, "C3k2", (True,))
     attention: Block = (2, "C2PSA", ())
-    if generation == "YOLO11":
+    if model_family == "YOLO11":
         return _Blocks(
             stages=(narrow, narrow, deep, deep),
             deepest=(sppf, attention),
             up=(usual, usual),
             down=(usual, deep),
         )
-    if generation == "YOLO12":
+    if model_family == "YOLO12":
         plain: Block = (2, "A2C2f", (False, -1))
         return _Blocks(
             stages=(narrow, narrow, (4, "A2C2f", (True, 4)), (4, "A2C2f", (True, 1))),
@@ -163,7 +163,7 @@ def _yolov10(scale: str, sppf: Block) -> _Blocks:
 
 
 def _rows(blocks: _Blocks) -> tuple[list[Any], list[Any]]:
-    """Backbone and head, rows as `LayerRow.to_plain` writes them."""
+    """Backbone and head, rows as `LayerSpec.to_plain` writes them."""
     rows: list[Any] = []
 
     def add(layer: str, arguments: Sequence[Any], repeats: int = 1, source: int | list[int] = -1) -> int:

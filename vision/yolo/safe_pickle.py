@@ -1,7 +1,7 @@
 """A reader of pickles that cannot run anything: the part of the pickle machine that `torch.save` writes.
 
 Python's own unpickler imports what a file names and calls it. This one knows tokens only: a global is looked
-up in the caller's table of admitted names, "calling" it makes an `Inert` record or asks the table's own
+up in the caller's table of admitted names, "calling" it makes an `Stub` record or asks the table's own
 function, and setting state fills a record's dictionary. No import, no attribute of a real object, no class of
 the file's choosing. The opcodes are those of pickle protocol 2 (PEP 307); any other is refused.
 
@@ -27,7 +27,7 @@ class UnsafeCheckpointError(CheckpointError):
 
 
 @dataclass(slots=True, eq=False)
-class Inert:
+class Stub:
     """What stands in for an object of class `name`: its constructor's arguments and its attributes."""
 
     name: str
@@ -36,17 +36,17 @@ class Inert:
 
 
 @dataclass(frozen=True, slots=True)
-class Admitted:
+class AllowedGlobal:
     """A global that the file may name. `make` answers a call with these arguments.
 
-    Without `make` a call, or an instance, is an `Inert` of this name.
+    Without `make` a call, or an instance, is an `Stub` of this name.
     """
 
     name: str
     make: Callable[[tuple[Any, ...]], Any] | None = None
 
     def call(self, arguments: tuple[Any, ...]) -> Any:
-        return Inert(self.name, arguments) if self.make is None else self.make(arguments)
+        return Stub(self.name, arguments) if self.make is None else self.make(arguments)
 
 
 def one_line(message: str) -> str:
@@ -77,7 +77,7 @@ def shown(value: object) -> str:
 
 def unpickle(
     data: bytes,
-    admitted: Mapping[str, Admitted],
+    admitted: Mapping[str, AllowedGlobal],
     persistent: Callable[[tuple[Any, ...]], Any],
     allowance_bytes: int = _DEFAULT_ALLOWANCE_BYTES,
 ) -> Any:
@@ -100,13 +100,13 @@ class _Machine:
     def __init__(
         self,
         data: bytes,
-        admitted: Mapping[str, Admitted],
+        admitted: Mapping[str, AllowedGlobal],
         persistent: Callable[[tuple[Any, ...]], Any],
         allowance_bytes: int,
     ) -> None:
         self._data = data
         self._position = 0
-        self._admitted = admitted
+        self._allowed = admitted
         self._persistent = persistent
         self._left_bytes = allowance_bytes
         self._stack: list[Any] = []
@@ -253,16 +253,16 @@ class _Machine:
 
     def global_name(self) -> None:
         name = f"{self._line()}.{self._line()}"
-        if name not in self._admitted:
+        if name not in self._allowed:
             raise UnsafeCheckpointError(
                 f"its pickle asks for {name!r:.200}, which is not part of a detection checkpoint; "
                 "nothing was run. Do not use this file, or save the model again from a source you trust"
             )
-        self._push(self._admitted[name])
+        self._push(self._allowed[name])
 
     def reduce(self) -> None:
         arguments, function = self._pop(), self._pop()
-        if not isinstance(function, Admitted) or not isinstance(arguments, tuple):
+        if not isinstance(function, AllowedGlobal) or not isinstance(arguments, tuple):
             raise UnsafeCheckpointError(f"its pickle calls a {type(function).__name__}; nothing was run")
         # A set and a size are copies of what they are given.
         copied = arguments[0] if arguments else None
@@ -271,18 +271,18 @@ class _Machine:
 
     def new_object(self) -> None:
         arguments, kind = self._pop(), self._pop()
-        if not isinstance(kind, Admitted) or kind.make is not None or not isinstance(arguments, tuple):
-            name = kind.name if isinstance(kind, Admitted) else type(kind).__name__
+        if not isinstance(kind, AllowedGlobal) or kind.make is not None or not isinstance(arguments, tuple):
+            name = kind.name if isinstance(kind, AllowedGlobal) else type(kind).__name__
             raise UnsafeCheckpointError(f"its pickle makes an instance of {name}; nothing was run")
         self._left_bytes -= _CALL_BYTES
-        self._push(Inert(kind.name, arguments))
+        self._push(Stub(kind.name, arguments))
 
     def build(self) -> None:
         state = self._pop()
         target = self._stack[-1] if self._stack else None
         if isinstance(target, dict):
             return  # An ordered dictionary's own attributes (torch: layer versions) carry no weights.
-        if not isinstance(target, Inert):
+        if not isinstance(target, Stub):
             raise UnsafeCheckpointError(
                 f"its pickle sets attributes of a {type(target).__name__}; nothing was run"
             )

@@ -15,11 +15,11 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from vision.yolo.admitted_names import INERT
+from vision.yolo.allowlist import INERT
 from vision.yolo.safe_pickle import (
-    Admitted,
+    AllowedGlobal,
     CheckpointError,
-    Inert,
+    Stub,
     UnsafeCheckpointError,
     one_line,
     unpickle,
@@ -54,7 +54,7 @@ _LARGEST_SET = 10_000
 
 
 def read_archive(path: str | Path) -> Any:
-    """The value that was saved at `path`: containers, scalars, CPU tensors, `Inert` records for the rest.
+    """The value that was saved at `path`: containers, scalars, CPU tensors, `Stub` records for the rest.
 
     Raises:
         UnsafeCheckpointError: the file asks for something that is not admitted, by name.
@@ -155,7 +155,7 @@ class _Archive:
 
     def value(self) -> Any:
         data = self._bytes(self._members[f"{self._root}data.pkl"], _LARGEST_PICKLE_BYTES)
-        return unpickle(data, self._admitted(), self._storage, _VALUES_BYTES + self._size)
+        return unpickle(data, self._allowed(), self._storage, _VALUES_BYTES + self._size)
 
     def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
         if largest is not None and member.file_size > largest:
@@ -164,7 +164,7 @@ class _Archive:
             )
         return self._archive.read(member)
 
-    def _admitted(self) -> dict[str, Admitted]:
+    def _allowed(self) -> dict[str, AllowedGlobal]:
         calls = {
             "torch._utils._rebuild_tensor_v2": self._tensor,
             "torch._utils._rebuild_parameter": _parameter,
@@ -180,8 +180,8 @@ class _Archive:
             "dill._dill._load_type": _type_by_name,
         }
         return (
-            {name: Admitted(name) for name in (*INERT, *_STORAGES)}
-            | {name: Admitted(name, make) for name, make in calls.items()}
+            {name: AllowedGlobal(name) for name in (*INERT, *_STORAGES)}
+            | {name: AllowedGlobal(name, make) for name, make in calls.items()}
         )  # fmt: skip
 
     def _storage(self, identity: tuple[Any, ...]) -> Tensor:
@@ -189,7 +189,7 @@ class _Archive:
         if len(identity) != 5 or identity[0] != "storage":
             raise CheckpointError("its pickle refers to something else than a storage")
         _, kind, key, _, count = identity
-        dtype = _STORAGES.get(kind.name) if isinstance(kind, Admitted) else None
+        dtype = _STORAGES.get(kind.name) if isinstance(kind, AllowedGlobal) else None
         if dtype is None or not isinstance(key, str) or type(count) is not int or count < 0:
             raise CheckpointError("its pickle refers to a storage in an unknown way")
         stored = self._storages.get(key)
@@ -263,7 +263,10 @@ def _dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
 
 def _default_dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
     """What it would make for a missing key is of no use here; its own entries follow one by one."""
-    if any(not isinstance(argument, Admitted | None) for argument in arguments[:1]) or len(arguments) > 1:
+    if (
+        any(not isinstance(argument, AllowedGlobal | None) for argument in arguments[:1])
+        or len(arguments) > 1
+    ):
         raise UnsafeCheckpointError("its pickle fills a default dictionary by a call; nothing was run")
     return {}
 
@@ -279,16 +282,16 @@ def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
     return frozenset(values)
 
 
-def _folded_forward(arguments: tuple[Any, ...]) -> Inert:
+def _folded_forward(arguments: tuple[Any, ...]) -> Stub:
     """A layer saved with its normalisation folded names its own method; it becomes one more inert record."""
-    if len(arguments) != 2 or not isinstance(arguments[0], Inert) or arguments[1] != "forward_fuse":
+    if len(arguments) != 2 or not isinstance(arguments[0], Stub) or arguments[1] != "forward_fuse":
         raise UnsafeCheckpointError("its pickle calls getattr; nothing was run. Do not use this file")
-    return Inert("forward_fuse")
+    return Stub("forward_fuse")
 
 
-def _type_by_name(arguments: tuple[Any, ...]) -> Admitted:
+def _type_by_name(arguments: tuple[Any, ...]) -> AllowedGlobal:
     if arguments not in (("set",), ("frozenset",)):
         raise UnsafeCheckpointError(
             f"its pickle asks for the type {', '.join(map(repr, arguments))!s:.100}; nothing was run"
         )
-    return Admitted(f"builtins.{arguments[0]}", _set)
+    return AllowedGlobal(f"builtins.{arguments[0]}", _set)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.gimbal.tracking import GimbalTracking
 from companion.guidance.motion import (
     ARRIVED_M,
@@ -106,11 +106,11 @@ class ApproachBehaviour(Behaviour):
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
 
-    def on_activate(self, situation: Situation) -> None:
-        position, _ = position_and_yaw(situation.state)
+    def on_activate(self, context: BehaviourContext) -> None:
+        position, _ = position_and_yaw(context.state)
         self._down_m = position[2]
-        self._started_ns = self._seen_ns = situation.now_ns
-        self._until_ns = situation.now_ns + BASE_TIMEOUT_S * 1e9
+        self._started_ns = self._seen_ns = context.now_ns
+        self._until_ns = context.now_ns + BASE_TIMEOUT_S * 1e9
         self._track = self._bearing_rad = self._wait_place = self._anchor_rad = None
         self._choice = TargetSelector()
         self._doubted = False
@@ -118,12 +118,12 @@ class ApproachBehaviour(Behaviour):
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
         if self._tracking is not None:
-            self._tracking.begin(situation)
+            self._tracking.begin(context)
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        now_ns, state = situation.now_ns, situation.state
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        now_ns, state = context.now_ns, context.state
         position, yaw_rad = position_and_yaw(state)
-        self._observe(situation, position, yaw_rad)
+        self._observe(context, position, yaw_rad)
         track = self._track
         unseen_s = (now_ns - self._seen_ns) / 1e9
         if track is not None:
@@ -131,15 +131,15 @@ class ApproachBehaviour(Behaviour):
             self._range_m = math.hypot(north - position[0], east - position[1])
         if self._tracking is not None:
             newest = None if track is None else track.newest
-            why = self._tracking.keep_on(newest, self._range_m, position, situation)
+            why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"approach lost the gimbal: {why}")
         if now_ns > self._until_ns:
             away = f"still {self._range_m:.1f} m away" if track else "its range never became known"
             took_s = (now_ns - self._started_ns) / 1e9
             return Outcome(False, f"did not reach the {self._class_name} in {took_s:.0f} s: {away}")
-        if track is None or unseen_s > LOST_AFTER_S or not situation.perception_fresh:
-            return self._wait(dt_s, situation, position, unseen_s)
+        if track is None or unseen_s > LOST_AFTER_S or not context.perception_fresh:
+            return self._wait(dt_s, context, position, unseen_s)
         if self._wait_place is not None:
             self._wait_place, self._controller = None, PositionController()
 
@@ -179,30 +179,30 @@ class ApproachBehaviour(Behaviour):
             return f"lost the {self._class_name}, waiting"
         return f"{self._class_name} {self._range_m:.1f} m away"
 
-    def _observe(self, situation: Situation, position: Vector3, yaw_rad: float) -> None:
+    def _observe(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> None:
         fitting = [
             target
-            for target in situation.targets
+            for target in context.targets
             if target.class_name == self._class_name and target.score >= self._confidence
         ]
         if self._track is not None:
             if self._track.update(fitting, position):
                 self._seen_ns = self._track.captured_ns
-            elif situation.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
+            elif context.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
                 self._find_again(self._track, fitting, position)
             return
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
-        chosen = self._choice.take(fitting, yaw_rad, situation.now_ns)
+        chosen = self._choice.take(fitting, yaw_rad, context.now_ns)
         if chosen is None:
             return
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._bearing_rad = chosen.bearing_rad
             if self._tracking is not None:
-                self._tracking.turn_to(chosen, situation)
+                self._tracking.turn_to(chosen, context)
             return
-        self._begin(chosen, position, situation.now_ns)
+        self._begin(chosen, position, context.now_ns)
 
     def _find_again(self, lost: ObjectTrack, fitting: list[Target], position: Vector3) -> None:
         """A wrong range can lead the track away from its object: begin anew with what is where it was."""
@@ -215,7 +215,7 @@ class ApproachBehaviour(Behaviour):
                 continue
             off = abs(wrap_angle(target.bearing_rad - bearing))
             if off < SAME_BEARING_RAD and 0.5 * range_m < target.ground_range_m < 2.0 * range_m:
-                self._track, self._seen_ns = lost.anew(target, position), target.captured_ns
+                self._track, self._seen_ns = lost.restart(target, position), target.captured_ns
                 return
 
     def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
@@ -260,13 +260,15 @@ class ApproachBehaviour(Behaviour):
         self._anchor_rad = None
         self._arrival, self._controller = Arrival(), PositionController()
 
-    def _wait(self, dt_s: float, situation: Situation, position: Vector3, unseen_s: float) -> Step:
+    def _wait(
+        self, dt_s: float, context: BehaviourContext, position: Vector3, unseen_s: float
+    ) -> BehaviourOutput:
         """Not seen: brake, stay where the vehicle comes to rest, and keep looking there."""
         if self._wait_place is None:
             self._leave_goal()
         if unseen_s > self._lost_timeout_s:
-            if not situation.perception_fresh:
-                why = situation.why_blind("nothing comes from the detector")
+            if not context.perception_fresh:
+                why = context.why_blind("nothing comes from the detector")
             elif self._doubted:
                 why = DOUBTED
             elif self._track is None:
@@ -275,13 +277,13 @@ class ApproachBehaviour(Behaviour):
                 why = f"last seen {self._range_m:.1f} m away"
                 self.lost_at = self._track.position_ned_m
             return Outcome(False, f"lost the {self._class_name} for {unseen_s:.1f} s: {why}")
-        if self._wait_place is None and ground_speed(situation.state) < STANDING_MPS:
-            north, east, _ = stopping_point(situation.state)
+        if self._wait_place is None and ground_speed(context.state) < STANDING_MPS:
+            north, east, _ = stopping_point(context.state)
             self._wait_place = (north, east, self._down_m)
         if self._wait_place is None:
             velocity = (0.0, 0.0, correction(self._down_m - position[2]))
         else:
-            velocity = self._controller.velocity(self._wait_place, situation.state, dt_s)
+            velocity = self._controller.velocity(self._wait_place, context.state, dt_s)
         if self._bearing_rad is None:
-            return Setpoint.velocity(velocity, situation.now_ns, yaw_rate_radps=0.0)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=self._bearing_rad)
+            return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=self._bearing_rad)

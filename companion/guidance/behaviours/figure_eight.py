@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import EnumArgument, Number
-from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import laps_text, position_and_yaw
@@ -44,16 +44,16 @@ class FigureEightBehaviour(PathFlight):
         super().__init__(speed_mps, laps=laps, nose_along=nose_along)
         self._radius_m = radius_m
 
-    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
-        centre, yaw_rad = position_and_yaw(situation.state)
+        centre, yaw_rad = position_and_yaw(context.state)
         return tuple(lemniscate(centre, yaw_rad, self._radius_m))
 
-    def _path(self, situation: Situation) -> Path:
-        centre, yaw_rad = position_and_yaw(situation.state)
+    def _path(self, context: BehaviourContext) -> Path:
+        centre, yaw_rad = position_and_yaw(context.state)
         return Path(lemniscate(centre, yaw_rad, self._radius_m), self._speed_mps, closed=True)
 
-    def _flown(self) -> str:
+    def _active(self) -> str:
         return f"{laps_text(self._laps)} of the eight flown"
 
 

@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import ClassName, EnumArgument, Number
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal.tracking import GimbalTracking, GimbalUse
 from companion.guidance.motion import correction, in_degrees, position_and_yaw, pressed
@@ -140,16 +140,16 @@ class FollowBehaviour(Behaviour):
         self._range_m = math.nan
         self._unseen_s = 0.0
 
-    def on_activate(self, situation: Situation) -> None:
-        position, _ = position_and_yaw(situation.state)
-        self._forget(situation.now_ns, position[2])
+    def on_activate(self, context: BehaviourContext) -> None:
+        position, _ = position_and_yaw(context.state)
+        self._forget(context.now_ns, position[2])
         if self._tracking is not None:
-            self._tracking.begin(situation)
+            self._tracking.begin(context)
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        now_ns, state = situation.now_ns, situation.state
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        now_ns, state = context.now_ns, context.state
         position, yaw_rad = position_and_yaw(state)
-        self._observe(situation, yaw_rad)
+        self._observe(context, yaw_rad)
         track = self._track
         self._unseen_s = (now_ns - self._seen_ns) / 1e9
         if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
@@ -157,14 +157,14 @@ class FollowBehaviour(Behaviour):
                 return Outcome(False, f"saw no {self._class_name} to follow in {self._duration_s:g} s")
             return Outcome(True, f"followed the {self._class_name} for {self._duration_s:g} s")
         if self._unseen_s > self._occlusion_s:
-            return Outcome(False, self._lost(situation))
+            return Outcome(False, self._lost(context))
         if track is not None:
             place = track.place(now_ns)
             north, east = place[0] - position[0], place[1] - position[1]
             self._range_m = math.hypot(north, east)
         if self._tracking is not None:
             newest = None if track is None else track.newest
-            why = self._tracking.keep_on(newest, self._range_m, position, situation)
+            why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"follow lost the gimbal: {why}")
         height_mps = correction(self._down_m - position[2])
@@ -216,13 +216,13 @@ class FollowBehaviour(Behaviour):
             self._course_rad = wrap_angle(self._course_rad + max(-most, min(most, turn)))
         return None if self._course_rad is None else wrap_angle(self._course_rad + self._angle_rad)
 
-    def _observe(self, situation: Situation, yaw_rad: float) -> None:
-        if not situation.perception_fresh:
+    def _observe(self, context: BehaviourContext, yaw_rad: float) -> None:
+        if not context.perception_fresh:
             return
-        position, _ = position_and_yaw(situation.state)
+        position, _ = position_and_yaw(context.state)
         fitting = [
             target
-            for target in situation.targets
+            for target in context.targets
             if target.class_name == self._class_name and target.score >= self._confidence
         ]
         if self._track is not None:
@@ -231,20 +231,20 @@ class FollowBehaviour(Behaviour):
             return
         if fitting:
             self._doubted = not any(target.trusted for target in fitting)
-        chosen = self._choice.take(fitting, yaw_rad, situation.now_ns)
+        chosen = self._choice.take(fitting, yaw_rad, context.now_ns)
         if chosen is None:
             return
         if chosen.position_ned_m is None:
             # Turned to, it may come fully into the picture, and its range with it.
             self._yaw_rad = chosen.bearing_rad
             if self._tracking is not None:
-                self._tracking.turn_to(chosen, situation)
+                self._tracking.turn_to(chosen, context)
             return
         self._track, self._seen_ns = MovingTrack(chosen, position), chosen.captured_ns
 
-    def _lost(self, situation: Situation) -> str:
-        if not situation.perception_fresh:
-            why = situation.why_blind("nothing comes from the detector")
+    def _lost(self, context: BehaviourContext) -> str:
+        if not context.perception_fresh:
+            why = context.why_blind("nothing comes from the detector")
         elif self._track is not None:
             north, east = self._track.velocity
             moving = (

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.geometry.points import points_from
 from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points
-from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import home_of, laps_text, position_and_yaw
@@ -70,27 +70,27 @@ class FollowPathBehaviour(PathFlight):
         self._points = tuple(points)
         self._round_trip = round_trip or laps != 1.0
 
-    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
-        return tuple(self._places(situation))
+        return tuple(self._places(context))
 
-    def _places(self, situation: Situation) -> list[Vector3]:
-        position, _ = position_and_yaw(situation.state)
-        home = home_of(situation.state)
+    def _places(self, context: BehaviourContext) -> list[Vector3]:
+        position, _ = position_and_yaw(context.state)
+        home = home_of(context.state)
         down, places = position[2], list[Vector3]()
         for north, east, *height in self._points:
             down = home[2] - height[0] if height else down
             places.append((home[0] + north, home[1] + east, down))
         return places
 
-    def _path(self, situation: Situation) -> Path:
-        position, _ = position_and_yaw(situation.state)
-        places = self._places(situation)
+    def _path(self, context: BehaviourContext) -> Path:
+        position, _ = position_and_yaw(context.state)
+        places = self._places(context)
         if self._round_trip:
             return Path(places, self._speed_mps, closed=True)
         return Path([position, *places], self._speed_mps)
 
-    def _flown(self) -> str:
+    def _active(self) -> str:
         if not self._round_trip:
             return f"all {len(self._points)} points flown"
         return f"{laps_text(self._laps)} of {len(self._points)} points flown"

@@ -16,12 +16,12 @@ from typing import Annotated
 from companion.geometry.formation import SHAPES, Vector3, slot_motion
 from companion.geometry.points import points_from
 from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points, Word
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.formation.group import Agreement, Group
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.formation.pose import FormationNote, Plan, Structure
-from companion.guidance.formation.separation import MARGIN_M, around, pushed_apart
+from companion.guidance.formation.separation import MARGIN_M, avoid, pushed_apart
 from companion.guidance.formation.virtual_structure import VirtualStructure
 from companion.guidance.motion import home_of, position_and_yaw, pressed, stopping_speed
 from companion.guidance.registry import behaviour
@@ -167,46 +167,44 @@ class FormationBehaviour(Behaviour):
         self.note: FormationNote | None = None
         self.slot_offset_ned_m: Vector3 | None = None
 
-    def on_activate(self, situation: Situation) -> None:
+    def on_activate(self, context: BehaviourContext) -> None:
         self._reset()
 
     def on_deactivate(self) -> None:
         self.note = None
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        hood = situation.neighbourhood
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        hood = context.neighbourhood
         if hood is None or hood.problem is not None or hood.anchor is None:
-            return self._without_leader(
-                situation, "the others are not heard" if hood is None else hood.problem
-            )
-        leader = self._leader(dt_s, situation, hood)
+            return self._without_leader(context, "the others are not heard" if hood is None else hood.problem)
+        leader = self._leader(dt_s, context, hood)
         if isinstance(leader, Outcome):
             return leader
         if isinstance(leader, str):
-            self._tell_waiting(hood)
-            return self._without_leader(situation, leader)
+            self._report_waiting(hood)
+            return self._without_leader(context, leader)
         self._lost_since_ns = None
-        position, _ = position_and_yaw(situation.state)
+        position, _ = position_and_yaw(context.state)
         if self._heading_rad is None:
             self._heading_rad = leader.heading_rad
         agreement = self._agree(hood, leader, position)
-        if ended := self._ended(situation, agreement, leader):
+        if ended := self._ended(context, agreement, leader):
             return ended
         self._turn(dt_s, hood, leader, agreement)
         offset = agreement.offset(hood.own, centre_taken=self._centre_taken(hood))
         self._tell(hood, agreement)
         if offset is None:
             self._words = f"waiting for a slot from {agreement.by}"
-            return self._stand(situation)
+            return self._stand(context)
         self._place = None
-        return self._fly(situation, hood, leader, agreement, offset, position)
+        return self._fly(context, hood, leader, agreement, offset, position)
 
     # ---- the leader -------------------------------------------------------------------------------------
 
-    def _leader(self, dt_s: float, situation: Situation, hood: Neighbourhood) -> _Leader | Outcome | str:
+    def _leader(self, dt_s: float, context: BehaviourContext, hood: Neighbourhood) -> _Leader | Outcome | str:
         """What is followed; or why it cannot be now; or why it cannot be at all."""
         if self._structure is not None:
-            return self._virtual_leader(dt_s, situation, hood, self._structure)
+            return self._virtual_leader(dt_s, context, hood, self._structure)
         if self.leader_name == hood.own:
             return Outcome(False, f"{hood.own} cannot follow itself: name another leader")
         leader = hood.named(self.leader_name)
@@ -221,7 +219,7 @@ class FormationBehaviour(Behaviour):
         )
 
     def _virtual_leader(
-        self, dt_s: float, situation: Situation, hood: Neighbourhood, structure: VirtualStructure
+        self, dt_s: float, context: BehaviourContext, hood: Neighbourhood, structure: VirtualStructure
     ) -> _Leader | Outcome | str:
         assert hood.anchor is not None
         told = self._told_structures(hood)
@@ -242,8 +240,8 @@ class FormationBehaviour(Behaviour):
                 if known is not None:
                     structure.take_over(hood.anchor, known)
                 else:
-                    home = home_of(situation.state)
-                    structure.begin(hood.anchor, home, situation.state.altitude_m or 0.0)
+                    home = home_of(context.state)
+                    structure.begin(hood.anchor, home, context.state.altitude_m or 0.0)
         except ValueError as error:
             return Outcome(False, f"{self.name}: {error}")
         position, velocity, heading = structure.motion()
@@ -285,23 +283,23 @@ class FormationBehaviour(Behaviour):
         self._agreement = self._group.agree(hood.vehicles, places, self._error_m)
         return self._agreement
 
-    def _ended(self, situation: Situation, agreement: Agreement, leader: _Leader) -> Outcome | None:
-        own = situation.neighbourhood.own if situation.neighbourhood is not None else ""
+    def _ended(self, context: BehaviourContext, agreement: Agreement, leader: _Leader) -> Outcome | None:
+        own = context.neighbourhood.own if context.neighbourhood is not None else ""
         given = agreement.slots.get(own)
         if self._slot is not None and agreement.slots and given != self._slot:
             holder = next((name for name, number in agreement.slots.items() if number == self._slot), None)
             if holder is not None:
                 return Outcome(False, f"slot {self._slot} is {holder}'s: choose another, or slot=auto")
-        if agreement.plan.spacing_m < situation.min_separation_m + MARGIN_M:
-            least_m = situation.min_separation_m + MARGIN_M
+        if agreement.plan.spacing_m < context.min_separation_m + MARGIN_M:
+            least_m = context.min_separation_m + MARGIN_M
             return Outcome(
                 False,
                 f"spacing must be {least_m:g} m at least with guidance.min_separation_m at "
-                f"{situation.min_separation_m:g} m, got {agreement.plan.spacing_m:g} m",
+                f"{context.min_separation_m:g} m, got {agreement.plan.spacing_m:g} m",
             )
         if self._structure is None:
             return None
-        now_ns = situation.now_ns
+        now_ns = context.now_ns
         if agreement.by != own:
             return Outcome(True, "the structure has flown its path") if leader.over else None
         if not (self._structure.arrived and agreement.worst_error_m < THERE_M):
@@ -351,7 +349,7 @@ class FormationBehaviour(Behaviour):
             note = replace(note, structure=told)
         self.note = note
 
-    def _tell_waiting(self, hood: Neighbourhood) -> None:
+    def _report_waiting(self, hood: Neighbourhood) -> None:
         """Until the leader is heard nothing is assigned, but the others know who waits."""
         plan = Plan(0, hood.own, self._shape, self._spacing_m)
         held = self.note
@@ -361,7 +359,7 @@ class FormationBehaviour(Behaviour):
 
     def _fly(
         self,
-        situation: Situation,
+        context: BehaviourContext,
         hood: Neighbourhood,
         leader: _Leader,
         agreement: Agreement,
@@ -378,11 +376,11 @@ class FormationBehaviour(Behaviour):
         self._error_m = math.hypot(*missing)
         way_m = math.hypot(missing[0], missing[1])
         gain = min(SLOT_GAIN_PER_S, CATCH_UP_MPS / way_m) if way_m > 1e-6 else 0.0
-        nearest_m = situation.min_separation_m
+        nearest_m = context.min_separation_m
         closing = (missing[0] * gain, missing[1] * gain)
         if way_m > FAR_M:
             standing = [other for other in hood.vehicles if _stands(other, moving)]
-            closing, self._side = around(
+            closing, self._side = avoid(
                 closing, way_m, position, standing, nearest_m + CLEARANCE_M, self._side
             )
         # Neighbours in their slots do not push each other.
@@ -390,25 +388,25 @@ class FormationBehaviour(Behaviour):
         push = pushed_apart(position, hood.vehicles, soft_m)
         down = max(-CLIMB_MPS, min(CLIMB_MPS, SLOT_GAIN_PER_S * missing[2]))
         wanted = (moving[0] + closing[0] + push[0], moving[1] + closing[1] + push[1])
-        north, east = pressed(wanted, situation.state, math.hypot(*wanted) + 1.0)
+        north, east = pressed(wanted, context.state, math.hypot(*wanted) + 1.0)
         self._words = (
             f"slot {agreement.slots[hood.own]} of {agreement.plan.shape}, {self._error_m:.1f} m from it"
         )
-        return Setpoint.velocity((north, east, moving[2] + down), situation.now_ns, yaw_rad=self._heading_rad)
+        return Setpoint.velocity((north, east, moving[2] + down), context.now_ns, yaw_rad=self._heading_rad)
 
-    def _without_leader(self, situation: Situation, why: str | None) -> Step:
+    def _without_leader(self, context: BehaviourContext, why: str | None) -> BehaviourOutput:
         """Brake and hold; not for ever."""
-        now_ns = situation.now_ns
+        now_ns = context.now_ns
         if self._lost_since_ns is None:
             self._lost_since_ns = now_ns
         lost_s = (now_ns - self._lost_since_ns) / 1e9
         if lost_s > self._lost_timeout_s:
             return Outcome(False, f"{why or 'the leader is lost'}; waited for {self._lost_timeout_s:g} s")
         self._words = f"holding: {why}"
-        return self._stand(situation)
+        return self._stand(context)
 
-    def _stand(self, situation: Situation) -> Setpoint:
-        state, now_ns = situation.state, situation.now_ns
+    def _stand(self, context: BehaviourContext) -> Setpoint:
+        state, now_ns = context.state, context.now_ns
         yaw_rad = self._heading_rad if self._heading_rad is not None else state.yaw_rad
         if self._place is None and math.hypot(*(state.velocity_ned_mps or (0.0, 0.0, 0.0))) < STANDING_MPS:
             self._place = state.position_ned_m

@@ -9,7 +9,7 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import Number
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal.controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
@@ -46,18 +46,18 @@ class PointGimbalBehaviour(HoldBehaviour):
         self._aim = aim
         self.gimbal_pitches_rad = (aim.pitch_rad,)
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         # At the first turn it is still told of what came before.
-        if situation.gimbal.problem and situation.now_ns > self._since_ns:
-            return Outcome(False, f"gimbal: {situation.gimbal.problem}")
-        state, gimbal = situation.state, situation.state.gimbal
+        if context.gimbal.problem and context.now_ns > self._since_ns:
+            return Outcome(False, f"gimbal: {context.gimbal.problem}")
+        state, gimbal = context.state, context.state.gimbal
         off_rad = None if gimbal is None else gimbal.off_rad(self._aim, state.yaw_rad or 0.0)
-        known = gimbal is not None and gimbal.attitude_fresh(situation.now_ns)
+        known = gimbal is not None and gimbal.attitude_fresh(context.now_ns)
         if known and off_rad is not None and off_rad <= POINTED_RAD:
             return Outcome(True, f"the gimbal looks {direction_text(self._aim)}")
-        if situation.now_ns - self._since_ns > POINT_TIMEOUT_S * 1e9:
+        if context.now_ns - self._since_ns > POINT_TIMEOUT_S * 1e9:
             return Outcome(False, f"gimbal: it does not look {direction_text(self._aim)} after all")
-        return super().update(dt_s, situation)
+        return super().update(dt_s, context)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:

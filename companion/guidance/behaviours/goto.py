@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.geometry.geodesy import north_east
 from companion.guidance.arguments import GrammarError, Number
-from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import home_of, position_and_yaw
@@ -92,23 +92,23 @@ class GotoBehaviour(PathFlight):
         self._from_home_m, self._from_here_m, self._global_deg = from_home_m, from_here_m, global_deg
         self._altitude_m = altitude_m
 
-    def _path(self, situation: Situation) -> Path:
-        position, _ = position_and_yaw(situation.state)
-        goal = self._goal(situation)
+    def _path(self, context: BehaviourContext) -> Path:
+        position, _ = position_and_yaw(context.state)
+        goal = self._goal(context)
         if math.dist(goal, position) < NEAREST_M:
             # A path has a length: who is there already arrives from a hand's breadth above.
             position = (goal[0], goal[1], goal[2] - NEAREST_M)
         return Path([position, goal], self._speed_mps)
 
-    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
         try:
-            return (self._goal(situation),)
+            return (self._goal(context),)
         except ValueError:
             return ()  # it says so when it begins
 
-    def _goal(self, situation: Situation) -> Vector3:
-        state = situation.state
+    def _goal(self, context: BehaviourContext) -> Vector3:
+        state = context.state
         position, yaw_rad = position_and_yaw(state)
         down = position[2] if self._altitude_m is None else home_of(state)[2] - self._altitude_m
         if self._from_home_m is not None:
@@ -122,13 +122,13 @@ class GotoBehaviour(PathFlight):
         assert self._global_deg is not None
         if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
             raise ValueError("the vehicle does not know its latitude and longitude")
-        age_s = (situation.now_ns - state.global_ns) / 1e9
+        age_s = (context.now_ns - state.global_ns) / 1e9
         if age_s > GLOBAL_MAX_AGE_S:
             raise ValueError(f"the vehicle's latitude and longitude are {age_s:.1f} s old")
         north, east = north_east((state.latitude_deg, state.longitude_deg), self._global_deg)
         return (position[0] + north, position[1] + east, down)
 
-    def _flown(self) -> str:
+    def _active(self) -> str:
         return "there"
 
 

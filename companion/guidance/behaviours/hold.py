@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import Number
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import (
     HOLD_VELOCITY_GAIN,
@@ -58,16 +58,16 @@ class HoldBehaviour(Behaviour):
         self._since_ns = 0
         self._controller = PositionController()
 
-    def on_activate(self, situation: Situation) -> None:
-        self._since_ns = situation.now_ns
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._since_ns = context.now_ns
         self._controller = PositionController()
-        self._yaw_rad = situation.state.yaw_rad
-        goal, position = situation.goal_ned_m, situation.state.position_ned_m
+        self._yaw_rad = context.state.yaw_rad
+        goal, position = context.goal_ned_m, context.state.position_ned_m
         near = goal is not None and position is not None and math.dist(goal, position) <= GOAL_NEAR_M
         self._place = goal if near else None
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        now_ns, state = situation.now_ns, situation.state
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        now_ns, state = context.now_ns, context.state
         if self._duration_s and now_ns - self._since_ns >= self._duration_s * 1e9:
             return Outcome(True, f"held for {self._duration_s:g} s", self._place)
         if self._place is None and speed_of(state) < STANDING_MPS:

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import math
 
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    ModeRequest,
+    Outcome,
+    Requirement,
+)
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -43,19 +50,19 @@ class LandBehaviour(Behaviour):
         self._landed = LandedState.UNKNOWN
         self._flew = False
 
-    def on_activate(self, situation: Situation) -> None:
-        self._until_ns = situation.now_ns + self.timeout_s(situation.state) * 1e9
-        self._flew = situation.state.armed
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._until_ns = context.now_ns + self.timeout_s(context.state) * 1e9
+        self._flew = context.state.armed
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        state = situation.state
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        state = context.state
         self._landed = state.landed
         self._flew |= state.armed
         if not state.armed and state.landed is LandedState.ON_GROUND:
             return Outcome(
                 True, f"{self.did} and disarmed" if self._flew else "already on the ground, disarmed"
             )
-        if situation.now_ns > self._until_ns:
+        if context.now_ns > self._until_ns:
             armed = "armed" if state.armed else "disarmed"
             return Outcome(
                 False, f"{self.name} timed out: {state.landed.value.replace('_', ' ')} and {armed}"

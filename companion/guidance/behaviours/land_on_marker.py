@@ -13,7 +13,14 @@ from enum import StrEnum
 from typing import Annotated
 
 from companion.guidance.arguments import EnumArgument, GrammarError, Number
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    ModeRequest,
+    Outcome,
+    Requirement,
+)
 from companion.guidance.behaviours.marker_search import MarkerSearch
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import correction, position_and_yaw, towards
@@ -139,29 +146,29 @@ class LandOnMarkerBehaviour(Behaviour):
         self._touching = False
         self._height_m = math.nan
 
-    def on_activate(self, situation: Situation) -> None:
-        position, _ = position_and_yaw(situation.state)
+    def on_activate(self, context: BehaviourContext) -> None:
+        position, _ = position_and_yaw(context.state)
         self._started_down_m = position[2]
         self._pad = self._target = self._blind_since_ns = None
         self._failures = []
         # Frames captured before the command do not count: they may be of another place.
-        self._newest_ns = situation.now_ns
-        self._begin_search(situation, position)
+        self._newest_ns = context.now_ns
+        self._begin_search(context, position)
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        position, _ = position_and_yaw(situation.state)
-        self._observe(situation)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        position, _ = position_and_yaw(context.state)
+        self._observe(context)
         if self._pad is not None:
-            self._height_m = self._pad.at(situation.now_ns)[2] - position[2]
-        state = situation.state
+            self._height_m = self._pad.at(context.now_ns)[2] - position[2]
+        state = context.state
         if self._phase in (_Phase.FINAL, _Phase.DELEGATED):
             if not state.armed and state.landed is LandedState.ON_GROUND:
-                return self._landed(situation, position)
+                return self._landed(context, position)
         elif not state.armed:
             return Outcome(False, f"disarmed while {self.status}")
-        if situation.now_ns > self._until_ns:
+        if context.now_ns > self._until_ns:
             return Outcome(False, f"timed out while {self.status}{self._so_far()}")
-        return _STEPS[self._phase](self, dt_s, situation, position)
+        return _STEPS[self._phase](self, dt_s, context, position)
 
     @property
     def landing_target(self) -> LandingTarget | None:
@@ -180,10 +187,10 @@ class LandOnMarkerBehaviour(Behaviour):
 
     # --- what is seen
 
-    def _observe(self, situation: Situation) -> None:
-        sight = situation.markers
+    def _observe(self, context: BehaviourContext) -> None:
+        sight = context.markers
         self._blind_since_ns = (
-            None if sight.fresh else self._blind_since_ns or max(situation.now_ns, self._newest_ns)
+            None if sight.fresh else self._blind_since_ns or max(context.now_ns, self._newest_ns)
         )
         sightings = [
             target
@@ -225,14 +232,14 @@ class LandOnMarkerBehaviour(Behaviour):
         self._waiting_s = self._blocked_s = 0.0
         self._touching = False
 
-    def _begin_search(self, situation: Situation, position: Vector3) -> None:
-        height_m = max(situation.state.altitude_m or 0.0, 1.0)
+    def _begin_search(self, context: BehaviourContext, position: Vector3) -> None:
+        height_m = max(context.state.altitude_m or 0.0, 1.0)
         self._search = MarkerSearch(position, self._search_m, height_m)
         turns = self._search_m / height_m + 1.0
-        self._enter(_Phase.SEARCH, situation.now_ns, BASE_TIMEOUT_S + 12.0 * turns * self._search_m)
+        self._enter(_Phase.SEARCH, context.now_ns, BASE_TIMEOUT_S + 12.0 * turns * self._search_m)
 
-    def _searching(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
-        now_ns = situation.now_ns
+    def _searching(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
+        now_ns = context.now_ns
         if self._found(now_ns) is not None:
             if self._by_autopilot:
                 self._enter(_Phase.DELEGATED, now_ns, DELEGATED_TIMEOUT_S)
@@ -240,7 +247,7 @@ class LandOnMarkerBehaviour(Behaviour):
             height_m = max(self._height_m, 0.0)
             self._enter(_Phase.DESCEND, now_ns, BASE_TIMEOUT_S + 6.0 * height_m)
             self._wanted_down_m = position[2]
-            return self._descending(dt_s, situation, position)
+            return self._descending(dt_s, context, position)
         if self._blind_since_ns is not None:
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
                 return Outcome(False, f"nothing came from the camera for {BLIND_TIMEOUT_S:g} s")
@@ -251,21 +258,21 @@ class LandOnMarkerBehaviour(Behaviour):
         if search.ended:
             what = f"looked {self._search_m:g} m around"
             return Outcome(False, f"marker {self._identifier} was not seen, {what}{self._so_far()}")
-        return self._to(place, situation, position, (0.0, 0.0), correction(place[2] - position[2], CLIMB_MPS))
+        return self._to(place, context, position, (0.0, 0.0), correction(place[2] - position[2], CLIMB_MPS))
 
-    def _descending(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
-        now_ns, pad = situation.now_ns, self._pad
+    def _descending(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
+        now_ns, pad = context.now_ns, self._pad
         assert pad is not None
         unseen_s = pad.unseen_s(now_ns)
         if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
-            return self._climb(f"lost {self._height_m:.1f} m above it", situation, position)
+            return self._climb(f"lost {self._height_m:.1f} m above it", context, position)
         place, drift = pad.at(now_ns), pad.velocity_mps
         error_m = math.dist(place[:2], position[:2])
         if self._height_m <= FINAL_M:
             self._waiting_s += dt_s
-            if unseen_s < LOST_AFTER_S and self._well_above(error_m, situation, drift):
+            if unseen_s < LOST_AFTER_S and self._well_above(error_m, context, drift):
                 self._enter(_Phase.FINAL, now_ns, LANDING_TIMEOUT_S)
-                return self._finishing(dt_s, situation, position)
+                return self._finishing(dt_s, context, position)
         allowed_m = CONE_M + CONE_PER_M * max(self._height_m, 0.0)
         inside = max(0.0, min(1.0, 2.0 * (allowed_m - error_m) / allowed_m))
         rate = min(DESCENT_MPS, SLOWEST_DESCENT_MPS + DESCENT_PER_M * max(self._height_m, 0.0)) * inside
@@ -273,7 +280,7 @@ class LandOnMarkerBehaviour(Behaviour):
             rate = -RISE_MPS if self._height_m < LOW_M else 0.0
         elif self._height_m <= FINAL_M:
             rate = 0.0
-        return self._to(place, situation, position, drift, self._held(rate, dt_s, position))
+        return self._to(place, context, position, drift, self._held(rate, dt_s, position))
 
     def _held(self, rate_mps: float, dt_s: float, position: Vector3) -> float:
         """The velocity down that keeps to a height which changes at a rate."""
@@ -282,37 +289,37 @@ class LandOnMarkerBehaviour(Behaviour):
         self._wanted_down_m = wanted_m
         return max(-CLIMB_MPS, min(DESCENT_MPS, rate_mps + HEIGHT_GAIN_PER_S * (wanted_m - position[2])))
 
-    def _well_above(self, error_m: float, situation: Situation, drift: tuple[float, float]) -> bool:
-        north, east, _ = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+    def _well_above(self, error_m: float, context: BehaviourContext, drift: tuple[float, float]) -> bool:
+        north, east, _ = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
         speed = math.hypot(north - drift[0], east - drift[1])
         allowed_m = FINAL_ERROR_M * (1.0 + min(1.0, self._waiting_s / PATIENCE_S))
         return error_m + FINAL_LOOKAHEAD_S * speed < allowed_m
 
-    def _finishing(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
-        now_ns, pad = situation.now_ns, self._pad
+    def _finishing(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
+        now_ns, pad = context.now_ns, self._pad
         assert pad is not None
         place, drift = pad.at(now_ns), pad.velocity_mps
         error_m = math.dist(place[:2], position[:2])
         seen = pad.unseen_s(now_ns) < WAIT_AFTER_S
         if seen and error_m > MISSED_M and self._height_m > MISSED_HEIGHT_M and not self._touching:
-            return self._climb(f"{error_m:.1f} m beside it before touching down", situation, position)
-        on_ground = situation.state.landed is LandedState.ON_GROUND
+            return self._climb(f"{error_m:.1f} m beside it before touching down", context, position)
+        on_ground = context.state.landed is LandedState.ON_GROUND
         if self._touching or on_ground:
             self._touching |= on_ground
             return ModeRequest(FlightMode.LAND)
-        return self._to(place, situation, position, drift, TOUCHDOWN_MPS)
+        return self._to(place, context, position, drift, TOUCHDOWN_MPS)
 
-    def _climb(self, why: str, situation: Situation, position: Vector3) -> Step:
+    def _climb(self, why: str, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         self._failures.append(why)
         # Higher than where it began, the marker may be too small to be seen.
         self._goal_down_m = min(position[2], max(self._started_down_m, position[2] - 2 * CLIMB_M))
-        self._enter(_Phase.CLIMB, situation.now_ns, BASE_TIMEOUT_S)
-        return self._climbing(0.0, situation, position)
+        self._enter(_Phase.CLIMB, context.now_ns, BASE_TIMEOUT_S)
+        return self._climbing(0.0, context, position)
 
-    def _climbing(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
-        now_ns, pad = situation.now_ns, self._pad
+    def _climbing(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
+        now_ns, pad = context.now_ns, self._pad
         left_m = position[2] - self._goal_down_m
-        held = situation.sent is not None and (situation.sent.velocity_ned_mps or (0, 0, 0))[2] > -0.05
+        held = context.sent is not None and (context.sent.velocity_ned_mps or (0, 0, 0))[2] > -0.05
         # An envelope's ceiling ends a climb as well as its goal does.
         self._blocked_s = self._blocked_s + dt_s if held else 0.0
         if left_m < 0.3 or self._blocked_s > 3.0:
@@ -321,22 +328,22 @@ class LandOnMarkerBehaviour(Behaviour):
             if pad is not None and pad.unseen_s(now_ns) > LOST_AFTER_S:
                 # Where it is now is to be seen anew; what is remembered may have been the mistake.
                 self._pad = self._target = None
-            self._begin_search(situation, position)
-            return self._searching(dt_s, situation, position)
+            self._begin_search(context, position)
+            return self._searching(dt_s, context, position)
         place = position if pad is None else pad.at(now_ns)
         drift = (0.0, 0.0) if pad is None else pad.velocity_mps
         if self._unseen_s(now_ns) > 2 * LOST_AFTER_S:
             place, drift = position, (0.0, 0.0)
-        return self._to(place, situation, position, drift, -CLIMB_MPS)
+        return self._to(place, context, position, drift, -CLIMB_MPS)
 
-    def _delegated(self, dt_s: float, situation: Situation, position: Vector3) -> Step:
+    def _delegated(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         return ModeRequest(FlightMode.PRECISION_LAND)
 
     # --- ends and ways
 
-    def _landed(self, situation: Situation, position: Vector3) -> Outcome:
+    def _landed(self, context: BehaviourContext, position: Vector3) -> Outcome:
         assert self._pad is not None
-        beside_m = math.dist(self._pad.at(situation.now_ns)[:2], position[:2])
+        beside_m = math.dist(self._pad.at(context.now_ns)[:2], position[:2])
         where = f"{beside_m:.2f} m beside where marker {self._identifier} was last seen"
         if self._by_autopilot and beside_m > ON_PAD_M:
             return Outcome(False, f"the autopilot landed elsewhere: {where}")
@@ -351,7 +358,7 @@ class LandOnMarkerBehaviour(Behaviour):
     def _to(
         self,
         place: Vector3,
-        situation: Situation,
+        context: BehaviourContext,
         position: Vector3,
         drift: tuple[float, float],
         down_mps: float,
@@ -359,16 +366,16 @@ class LandOnMarkerBehaviour(Behaviour):
         """Towards a place over ground that moves with `drift`, and down (negative: up) at a rate."""
         north, east = towards(place, position, GAIN_PER_S, self._speed_mps)
         wanted = (north + drift[0], east + drift[1])
-        now_north, now_east, _ = situation.state.velocity_ned_mps or (*wanted, 0.0)
+        now_north, now_east, _ = context.state.velocity_ned_mps or (*wanted, 0.0)
         north = wanted[0] + PRESS * (wanted[0] - now_north)
         east = wanted[1] + PRESS * (wanted[1] - now_east)
         top_mps = self._speed_mps + math.hypot(*drift)
         scale = min(1.0, top_mps / max(math.hypot(north, east), 1e-6))
         velocity = (north * scale, east * scale, down_mps)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rate_radps=0.0)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
 
 
-_STEPS: dict[_Phase, Callable[[LandOnMarkerBehaviour, float, Situation, Vector3], Step]] = {
+_STEPS: dict[_Phase, Callable[[LandOnMarkerBehaviour, float, BehaviourContext, Vector3], BehaviourOutput]] = {
     _Phase.SEARCH: LandOnMarkerBehaviour._searching,
     _Phase.DESCEND: LandOnMarkerBehaviour._descending,
     _Phase.FINAL: LandOnMarkerBehaviour._finishing,

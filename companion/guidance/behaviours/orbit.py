@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import (
     STOPPING_MPS2,
@@ -124,8 +124,8 @@ class OrbitBehaviour(Behaviour):
         self._asked_mps = (0.0, 0.0)
         self._until_ns: float = 0
 
-    def on_activate(self, situation: Situation) -> None:
-        position, yaw_rad = position_and_yaw(situation.state)
+    def on_activate(self, context: BehaviourContext) -> None:
+        position, yaw_rad = position_and_yaw(context.state)
         self._down_m = position[2]
         self._angle_rad, self._flown_rad = None, 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
@@ -137,18 +137,18 @@ class OrbitBehaviour(Behaviour):
                 position[1] + self._radius_m * math.sin(yaw_rad),
                 position[2],
             )
-        elif (target := self._nearest_to_nose(situation.targets, yaw_rad)) is not None:
+        elif (target := self._nearest_to_nose(context.targets, yaw_rad)) is not None:
             self._centre = target.position_ned_m
         away_m = 0.0 if self._centre is None else math.dist(position[:2], self._centre[:2])
         path_m = self._laps * math.tau * self._radius_m + abs(away_m - self._radius_m)
-        turning_mps2 = TURNING_SHARE * situation.max_acceleration_mps2
+        turning_mps2 = TURNING_SHARE * context.max_acceleration_mps2
         slow_mps = min(self._speed_mps, math.sqrt(turning_mps2 * self._radius_m))
-        self._until_ns = situation.now_ns + (2.0 * path_m / slow_mps + 30.0) * 1e9
+        self._until_ns = context.now_ns + (2.0 * path_m / slow_mps + 30.0) * 1e9
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         if self._centre is None:
             return Outcome(False, f"no {self._class_name} with a known place in sight to orbit")
-        position, yaw_rad = position_and_yaw(situation.state)
+        position, yaw_rad = position_and_yaw(context.state)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]
         distance = math.hypot(north, east)
         angle = math.atan2(east, north)
@@ -157,20 +157,20 @@ class OrbitBehaviour(Behaviour):
         self._angle_rad = angle
         if self._laps and self._flown_rad >= self._laps * math.tau:
             return Outcome(True, f"{laps_text(self._laps)} flown at {distance:.1f} m")
-        if self._laps and situation.now_ns > self._until_ns:
+        if self._laps and context.now_ns > self._until_ns:
             return Outcome(
                 False, f"orbit timed out after {self._flown_rad / math.tau:.1f} of {self._laps:g} laps"
             )
 
         if distance < MIN_RADIUS_M:
             return Setpoint.velocity(
-                (self._speed_mps, 0.0, correction(self._down_m - position[2])), situation.now_ns
+                (self._speed_mps, 0.0, correction(self._down_m - position[2])), context.now_ns
             )
         outward = (north / distance, east / distance)
-        velocity = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        velocity = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
         out_mps = outward[0] * velocity[0] + outward[1] * velocity[1]
         along_mps = self._turn * (outward[0] * velocity[1] - outward[1] * velocity[0])
-        self._adapt_pace(along_mps, distance, situation.max_acceleration_mps2, dt_s)
+        self._adapt_pace(along_mps, distance, context.max_acceleration_mps2, dt_s)
         asked_out_mps, asked_along_mps = self._asked(self._radius_m - distance, out_mps, along_mps, dt_s)
         self._asked_mps = (asked_out_mps, asked_along_mps)
         around_mps = self._turn * asked_along_mps
@@ -191,7 +191,7 @@ class OrbitBehaviour(Behaviour):
         if on_circle:
             ahead = angle + turn_radps * ACCELERATION_DELAY_S
             turning = self._acceleration(ahead, turn_radps * self._turn * along_mps)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=heading, acceleration_ned_mps2=turning)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=heading, acceleration_ned_mps2=turning)
 
     def _acceleration(self, angle_rad: float, inward_mps2: float) -> Vector3:
         """What the vehicle needs at this angle of the circle: to turn, and against drag."""

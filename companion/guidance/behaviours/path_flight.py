@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.motion import (
     Arrival,
     PositionController,
@@ -60,40 +60,40 @@ class PathFlight(Behaviour):
         self._arrival, self._controller = Arrival(), PositionController()
 
     @abstractmethod
-    def _path(self, situation: Situation) -> Path:
+    def _path(self, context: BehaviourContext) -> Path:
         """The path, from where the vehicle is. Raises ValueError with a line that says why there is none."""
 
     @abstractmethod
-    def _flown(self) -> str:
+    def _active(self) -> str:
         """What to say when it was flown."""
 
-    def on_activate(self, situation: Situation) -> None:
-        _, self._yaw_rad = position_and_yaw(situation.state)
+    def on_activate(self, context: BehaviourContext) -> None:
+        _, self._yaw_rad = position_and_yaw(context.state)
         self._follower, self._problem = None, ""
         self._arrival, self._controller = Arrival(), PositionController()
-        self._best_m, self._best_ns = -math.inf, situation.now_ns
+        self._best_m, self._best_ns = -math.inf, context.now_ns
         try:
-            self._follower = PathFollower(self._path(situation), self._laps)
+            self._follower = PathFollower(self._path(context), self._laps)
         except ValueError as error:
             self._problem = str(error)
 
-    def resume(self, situation: Situation) -> None:
+    def resume(self, context: BehaviourContext) -> None:
         """Something else was flown in between: the way goes on where it was left."""
-        self._best_m, self._best_ns = -math.inf, situation.now_ns
+        self._best_m, self._best_ns = -math.inf, context.now_ns
         self._arrival, self._controller = Arrival(), PositionController()
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         follower = self._follower
         if follower is None:
             return Outcome(False, f"{self.name}: {self._problem}")
-        state, now_ns = situation.state, situation.now_ns
+        state, now_ns = context.state, context.now_ns
         position, yaw_rad = position_and_yaw(state)
         velocity = follower.velocity(position, ground_speed(state))
         end = follower.end_ned_m
         away_m = math.inf if end is None or follower.left_m > END_M else math.dist(end, position)
         turned = self._heading_rad is None or abs(wrap_angle(self._heading_rad - yaw_rad)) <= HEADING_RAD
         if self._arrival.update(away_m, speed_of(state), now_ns) and turned:
-            return Outcome(True, self._flown(), end)
+            return Outcome(True, self._active(), end)
         if stuck := self._stuck(follower, now_ns):
             return Outcome(False, stuck)
         bearing = follower.bearing()

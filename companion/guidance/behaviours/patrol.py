@@ -9,10 +9,10 @@ from typing import Annotated
 
 from companion.geometry.points import points_from
 from companion.guidance.arguments import ClassNames, EnumArgument, GrammarError, Number, Points, names_in
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.confirmation import DetectionConfirmer, YawAligner
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.behaviours.sighting import Gaze, Sightings
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
 from companion.guidance.registry import behaviour
@@ -120,13 +120,13 @@ class PatrolBehaviour(Behaviour):
         if approach_m is not None:
             self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
         self._way = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
-        self._sightings = Sightings(class_names, confidence)
+        self._sightings = DetectionConfirmer(class_names, confidence)
         self._speed_mps, self._confidence = speed_mps, confidence
         self._approach_m, self._wait_s = approach_m, wait_s
         self._again_s, self._apart_m = again_s, apart_m
         self._known: list[_Known] = []
         self._notes: list[str] = []
-        self._gaze: Gaze | None = None
+        self._gaze: YawAligner | None = None
         self._reported = False
         self._approach: ApproachBehaviour | None = None
         self._wait_until_ns: float | None = None
@@ -135,35 +135,35 @@ class PatrolBehaviour(Behaviour):
         self._blind_since_ns: int | None = None
         self._found = 0
 
-    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
-        return self._way.goals(situation)
+        return self._way.goals(context)
 
-    def on_activate(self, situation: Situation) -> None:
-        self._way.on_activate(situation)
-        self._sightings.reset(situation.now_ns)
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._way.on_activate(context)
+        self._sightings.reset(context.now_ns)
         self._known.clear()
         self._gaze = self._approach = self._stop = self._blind_since_ns = self._wait_until_ns = None
         self._found = 0
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        position, yaw_rad = position_and_yaw(situation.state)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        position, yaw_rad = position_and_yaw(context.state)
         if self._approach is not None:
-            return self._fly_there(self._approach, dt_s, situation, position)
-        if not situation.perception_fresh:
-            return self._wait_blind(situation, position)
+            return self._fly_there(self._approach, dt_s, context, position)
+        if not context.perception_fresh:
+            return self._wait_blind(context, position)
         self._blind_since_ns = None
         if self._gaze is not None:
-            return self._look_at(self._gaze, situation, position, yaw_rad)
-        found = self._sightings.look(situation, lambda target: not self._known_already(target, situation))
+            return self._look_at(self._gaze, context, position, yaw_rad)
+        found = self._sightings.look(context, lambda target: not self._known_already(target, context))
         if found is not None:
-            self._gaze, self._reported, self._stop = Gaze(found, situation.now_ns), False, None
+            self._gaze, self._reported, self._stop = YawAligner(found, context.now_ns), False, None
             self._down_m = position[2]
-            return self._stand(situation, position, found.bearing_rad)
+            return self._stand(context, position, found.bearing_rad)
         if self._stop is not None:
             # Blind for a moment, it stood there.
-            self._resume(situation)
-        step = self._way.update(dt_s, situation)
+            self._resume(context)
+        step = self._way.update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
             return Outcome(True, f"{step.reason}, {stops}")
@@ -181,22 +181,24 @@ class PatrolBehaviour(Behaviour):
             return f"patrol, looking at a {self._gaze.target.class_name}"
         return self._way.status.replace(self._way.name, "patrol", 1)
 
-    def _look_at(self, gaze: Gaze, situation: Situation, position: Vector3, yaw_rad: float) -> Step:
+    def _look_at(
+        self, gaze: YawAligner, context: BehaviourContext, position: Vector3, yaw_rad: float
+    ) -> BehaviourOutput:
         """Stand, turn to it, tell of it; then go there, or stay for a while."""
-        now_ns = situation.now_ns
-        gaze.follow(self._sightings.fresh(situation))
+        now_ns = context.now_ns
+        gaze.follow(self._sightings.fresh(context))
         if self._wait_until_ns is not None:
             self._remember(gaze.target, now_ns)
             if now_ns >= self._wait_until_ns:
-                return self._go_on(situation, position)
+                return self._go_on(context, position)
         elif gaze.lost(now_ns):
             self._note(f"lost sight of a {_named(gaze.target)} before it was faced")
             self._remember(gaze.target, now_ns)
-            return self._go_on(situation, position)
+            return self._go_on(context, position)
         elif gaze.faced(yaw_rad, now_ns):
             self._found += 1
             self._remember(gaze.target, now_ns)
-            self._note(f"found a {_named(gaze.target)}, {self._place_text(gaze.target, situation)}")
+            self._note(f"found a {_named(gaze.target)}, {self._place_text(gaze.target, context)}")
             if self._approach_m is not None:
                 self._approach = ApproachBehaviour(
                     gaze.target.class_name,
@@ -204,56 +206,56 @@ class PatrolBehaviour(Behaviour):
                     speed_mps=min(self._speed_mps, 3.0),
                     confidence=min(0.3, self._confidence),
                 )
-                self._approach.on_activate(situation)
-                return self._fly_there(self._approach, 0.0, situation, position)
+                self._approach.on_activate(context)
+                return self._fly_there(self._approach, 0.0, context, position)
             self._wait_until_ns = now_ns + self._wait_s * 1e9
-        return self._stand(situation, position, gaze.target.bearing_rad)
+        return self._stand(context, position, gaze.target.bearing_rad)
 
     def _fly_there(
-        self, approach: ApproachBehaviour, dt_s: float, situation: Situation, position: Vector3
-    ) -> Step:
-        step = approach.update(dt_s, situation)
+        self, approach: ApproachBehaviour, dt_s: float, context: BehaviourContext, position: Vector3
+    ) -> BehaviourOutput:
+        step = approach.update(dt_s, context)
         if not isinstance(step, Outcome):
             return step
         approach.on_deactivate()
         self._approach = None
         self._note(step.reason)
         # What is seen from here is what was flown to: it is still looked at while waiting.
-        self._stop, self._wait_until_ns = None, situation.now_ns + self._wait_s * 1e9
-        _, yaw_rad = position_and_yaw(situation.state)
-        return self._stand(situation, position, yaw_rad)
+        self._stop, self._wait_until_ns = None, context.now_ns + self._wait_s * 1e9
+        _, yaw_rad = position_and_yaw(context.state)
+        return self._stand(context, position, yaw_rad)
 
-    def _stand(self, situation: Situation, position: Vector3, bearing_rad: float) -> Setpoint:
+    def _stand(self, context: BehaviourContext, position: Vector3, bearing_rad: float) -> Setpoint:
         """Brake, stay where the vehicle comes to rest, nose to a direction."""
-        if self._stop is None and ground_speed(situation.state) < STANDING_MPS:
+        if self._stop is None and ground_speed(context.state) < STANDING_MPS:
             self._stop = (position[0], position[1], self._down_m)
         velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=bearing_rad)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
 
-    def _go_on(self, situation: Situation, position: Vector3) -> Step:
+    def _go_on(self, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         self._gaze = self._wait_until_ns = None
         self._sightings.forget()
-        self._resume(situation)
-        return self._way.update(0.0, situation)
+        self._resume(context)
+        return self._way.update(0.0, context)
 
-    def _resume(self, situation: Situation) -> None:
+    def _resume(self, context: BehaviourContext) -> None:
         self._stop = None
-        self._way.resume(situation)
+        self._way.resume(context)
 
-    def _wait_blind(self, situation: Situation, position: Vector3) -> Step:
+    def _wait_blind(self, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         """Nothing is seen at all: flying on would leave a part of the way unseen."""
-        now_ns = situation.now_ns
+        now_ns = context.now_ns
         if self._blind_since_ns is None:
             self._blind_since_ns, self._down_m, self._stop = now_ns, position[2], None
         if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-            why = situation.why_blind("nothing came from the detector")
+            why = context.why_blind("nothing came from the detector")
             return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
-        _, yaw_rad = position_and_yaw(situation.state)
-        return self._stand(situation, position, yaw_rad)
+        _, yaw_rad = position_and_yaw(context.state)
+        return self._stand(context, position, yaw_rad)
 
-    def _known_already(self, target: Target, situation: Situation) -> bool:
+    def _known_already(self, target: Target, context: BehaviourContext) -> bool:
         """Whether the patrol stopped for it lately. One that moves is followed in memory."""
-        self._known = [known for known in self._known if known.until_ns > situation.now_ns]
+        self._known = [known for known in self._known if known.until_ns > context.now_ns]
         for known in self._known:
             if self._same(known, target):
                 _update(known, target)
@@ -278,11 +280,11 @@ class PatrolBehaviour(Behaviour):
             return False
         return math.dist(known.place[:2], target.position_ned_m[:2]) <= self._apart_m
 
-    def _place_text(self, target: Target, situation: Situation) -> str:
+    def _place_text(self, target: Target, context: BehaviourContext) -> str:
         place = target.position_ned_m
         if place is None:
             return f"bearing {math.degrees(target.bearing_rad) % 360:.0f}°, range unknown"
-        home = home_of(situation.state)
+        home = home_of(context.state)
         north, east = place[0] - home[0], place[1] - home[1]
         return f"{target.ground_range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
 

@@ -6,10 +6,10 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import ClassName, EnumArgument, GrammarError, Number
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
+from companion.guidance.behaviours.confirmation import DetectionConfirmer, YawAligner
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.behaviours.seek import BLIND_TIMEOUT_S, SeekBehaviour, found_text
-from companion.guidance.behaviours.sighting import Gaze, Sightings
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.gimbal.sweep import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
@@ -138,41 +138,41 @@ class SearchBehaviour(PathFlight):
         self._class_name = class_name
         self._radius_m, self._size_m = radius_m, size_m
         self._spacing_m, self._footprint = spacing_m, footprint
-        self._sightings = Sightings((class_name,), confidence)
-        self._gaze: Gaze | None = None
+        self._sightings = DetectionConfirmer((class_name,), confidence)
+        self._gaze: YawAligner | None = None
         self._stop: Vector3 | None = None
         self._blind_since_ns: int | None = None
 
-    def on_activate(self, situation: Situation) -> None:
-        super().on_activate(situation)
-        self._sightings.reset(situation.now_ns)
+    def on_activate(self, context: BehaviourContext) -> None:
+        super().on_activate(context)
+        self._sightings.reset(context.now_ns)
         self._gaze = self._stop = self._blind_since_ns = None
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        now_ns = situation.now_ns
-        position, yaw_rad = position_and_yaw(situation.state)
-        if not situation.perception_fresh:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        now_ns = context.now_ns
+        position, yaw_rad = position_and_yaw(context.state)
+        if not context.perception_fresh:
             self._blind_since_ns = now_ns if self._blind_since_ns is None else self._blind_since_ns
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-                why = situation.why_blind("nothing came from the detector")
+                why = context.why_blind("nothing came from the detector")
                 return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
-            return self._stand(situation, position, yaw_rad)
+            return self._stand(context, position, yaw_rad)
         self._blind_since_ns = None
         if self._gaze is not None:
-            self._gaze.follow(self._sightings.fresh(situation))
+            self._gaze.follow(self._sightings.fresh(context))
             if self._gaze.faced(yaw_rad, now_ns):
                 return Outcome(True, found_text(self._gaze.target))
             if not self._gaze.lost(now_ns):
-                return self._stand(situation, position, self._gaze.target.bearing_rad)
+                return self._stand(context, position, self._gaze.target.bearing_rad)
             self._gaze = None
             self._sightings.forget()
-        elif (found := self._sightings.look(situation)) is not None:
-            self._gaze, self._stop = Gaze(found, now_ns), None
-            return self._stand(situation, position, found.bearing_rad)
+        elif (found := self._sightings.look(context)) is not None:
+            self._gaze, self._stop = YawAligner(found, now_ns), None
+            return self._stand(context, position, found.bearing_rad)
         if self._stop is not None:
             self._stop = None
-            self.resume(situation)
-        step = super().update(dt_s, situation)
+            self.resume(context)
+        step = super().update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             why = f": {DOUBTED}" if self._sightings.doubted else ""
             return Outcome(False, f"no {self._class_name} seen in the whole area{why}")
@@ -184,19 +184,19 @@ class SearchBehaviour(PathFlight):
             return f"facing the {self._class_name}"
         return f"looking for a {self._class_name} over an area{super().status.removeprefix(self.name)}"
 
-    def _stand(self, situation: Situation, position: Vector3, bearing_rad: float) -> Setpoint:
-        if self._stop is None and ground_speed(situation.state) < STANDING_MPS:
+    def _stand(self, context: BehaviourContext, position: Vector3, bearing_rad: float) -> Setpoint:
+        if self._stop is None and ground_speed(context.state) < STANDING_MPS:
             self._stop = position
         velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
-        return Setpoint.velocity(velocity, situation.now_ns, yaw_rad=bearing_rad)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
 
-    def _path(self, situation: Situation) -> Path:
-        position, _ = position_and_yaw(situation.state)
+    def _path(self, context: BehaviourContext) -> Path:
+        position, _ = position_and_yaw(context.state)
         spacing_m = self._spacing_m
         if spacing_m is None:
             if self._footprint is None:
                 raise ValueError("the camera's footprint is not known: give spacing")
-            spacing_m = self._footprint.spacing_m(situation.state.altitude_m or 0.0)
+            spacing_m = self._footprint.spacing_m(context.state.altitude_m or 0.0)
         if self._radius_m is not None:
             points = expanding_square(self._radius_m, spacing_m)
         else:
@@ -207,5 +207,5 @@ class SearchBehaviour(PathFlight):
             raise ValueError(f"from here strips {spacing_m:.0f} m apart show it all: use pattern=turn")
         return Path([position, *places], self._speed_mps)
 
-    def _flown(self) -> str:
+    def _active(self) -> str:
         return "the whole area flown"

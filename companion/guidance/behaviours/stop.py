@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, ModeRequest, Outcome
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.registry import behaviour
 from companion.vehicle.state import FlightMode
@@ -25,15 +25,15 @@ class StopBehaviour(Behaviour):
         self._until_ns: float = 0
         self._asked = False
 
-    def on_activate(self, situation: Situation) -> None:
-        self._until_ns = situation.now_ns + TIMEOUT_S * 1e9
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._until_ns = context.now_ns + TIMEOUT_S * 1e9
         self._asked = False
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        mode = situation.state.mode
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        mode = context.state.mode
         if self._asked and mode is FlightMode.HOLD:
             return Outcome(True, "stopped: the autopilot holds")
-        if situation.now_ns > self._until_ns:
+        if context.now_ns > self._until_ns:
             return Outcome(False, f"hold mode was not reached in {TIMEOUT_S:g} s: {mode.value} mode")
         self._asked = True
         return ModeRequest(FlightMode.HOLD)

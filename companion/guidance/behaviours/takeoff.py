@@ -5,7 +5,14 @@ from __future__ import annotations
 from typing import Annotated
 
 from companion.guidance.arguments import Number
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    ModeRequest,
+    Outcome,
+    Requirement,
+)
 from companion.guidance.command import BuildContext, Command
 from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
 from companion.guidance.registry import behaviour
@@ -54,21 +61,21 @@ class TakeoffBehaviour(Behaviour):
         climbing = set() if self._top is None else {Requirement.POSITION}
         return frozenset({Requirement.ON_GROUND} | climbing)
 
-    def goals(self, situation: Situation) -> tuple[Vector3, ...]:
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour: the autopilot climbs there by itself, where no limit of setpoints holds."""
-        state = situation.state
+        state = context.state
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
         north, east, _ = state.position_ned_m or home
         return ((north, east, home[2] - self._altitude_m),)
 
-    def on_activate(self, situation: Situation) -> None:
+    def on_activate(self, context: BehaviourContext) -> None:
         limit_s = BASE_TIMEOUT_S + self._altitude_m / SLOWEST_CLIMB_MPS
-        self._until_ns = situation.now_ns + limit_s * 1e9
+        self._until_ns = context.now_ns + limit_s * 1e9
         self._still_since_ns = self._there_since_ns = self._top = None
         self._controller = PositionController()
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        now_ns, state = situation.now_ns, situation.state
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        now_ns, state = context.now_ns, context.state
         altitude_m = state.altitude_m
         self._altitude_now_m = altitude_m or 0.0
         missing_m = self._altitude_m - self._altitude_now_m

@@ -40,7 +40,7 @@ PUSH_MPS = 1.0
 _ROUNDS = 20
 
 
-class Row(NamedTuple):
+class SpeedConstraint(NamedTuple):
     """One limit: a unit direction (NED) towards a neighbour, and the speed allowed in it."""
 
     north: float
@@ -67,9 +67,9 @@ def allowed_speed(left_m: float, ahead_mps: float, age_s: float, braking_mps2: f
     return max(0.0, min(stopping, ahead_mps + GAIN_PER_S * max(0.0, left_m)))
 
 
-def rows_at(
+def constraints_at(
     position: Vector3, neighbours: Sequence[Neighbour], separation_m: float, braking_mps2: float
-) -> list[Row]:
+) -> list[SpeedConstraint]:
     """The limits at a place (local NED): one for every neighbour that is really there."""
     rows = []
     for neighbour in neighbours:
@@ -83,11 +83,15 @@ def rows_at(
         left_m = distance_m - separation_m - MARGIN_M
         # A silent one is at rest; how late we answer does not grow with its silence.
         age_s = 0.0 if neighbour.silent else neighbour.age_s
-        rows.append(Row(north, east, down, allowed_speed(left_m, ahead, age_s, braking_mps2), neighbour.name))
+        rows.append(
+            SpeedConstraint(
+                north, east, down, allowed_speed(left_m, ahead, age_s, braking_mps2), neighbour.name
+            )
+        )
     return rows
 
 
-def apart(velocity: Vector3, rows: Sequence[Row]) -> tuple[Vector3, tuple[str, ...]]:
+def apply_separation(velocity: Vector3, rows: Sequence[SpeedConstraint]) -> tuple[Vector3, tuple[str, ...]]:
     """What is left of a velocity (NED), no faster than it came, and because of whom."""
     top = math.hypot(*velocity)
     acting = [row for row in rows if row.allowed_mps < top]
@@ -114,7 +118,7 @@ def apart(velocity: Vector3, rows: Sequence[Row]) -> tuple[Vector3, tuple[str, .
     return (velocity[0] * share, velocity[1] * share, velocity[2] * share), tuple(names)
 
 
-def level_rows(rows: Sequence[Row], down_mps: float) -> list[tuple[float, float, float]]:
+def level_constraints(rows: Sequence[SpeedConstraint], down_mps: float) -> list[tuple[float, float, float]]:
     """The same limits for a velocity over ground (north, east, speed), beside this one downwards."""
     level = []
     for row in rows:
@@ -125,7 +129,7 @@ def level_rows(rows: Sequence[Row], down_mps: float) -> list[tuple[float, float,
     return level
 
 
-def around(
+def avoid(
     wanted: tuple[float, float],
     way_m: float,
     position: Vector3,
@@ -208,5 +212,5 @@ def pushed_apart(
     return (north * scale, east * scale)
 
 
-def _towards(velocity: Vector3, row: Row) -> float:
+def _towards(velocity: Vector3, row: SpeedConstraint) -> float:
     return velocity[0] * row.north + velocity[1] * row.east + velocity[2] * row.down

@@ -23,7 +23,7 @@ SHOWN_WITHIN_S = 2.5
 _UNTOLD = "its manager does not tell who has control of it"
 
 
-class GimbalAsk(StrEnum):
+class GimbalCommand(StrEnum):
     """What is asked of a gimbal's manager."""
 
     TAKE = "take"
@@ -35,7 +35,7 @@ class GimbalAsk(StrEnum):
 class GimbalRequest:
     """One thing to ask; `aim` is for POINT."""
 
-    ask: GimbalAsk
+    ask: GimbalCommand
     aim: GimbalAim | None = None
 
 
@@ -95,7 +95,7 @@ class GimbalControl:
         if self._asked is not None:
             return None
         if aim is None or self.problem:
-            return self._ask(GimbalRequest(GimbalAsk.GIVE_BACK)) if self._ours(now_ns, gimbal) else None
+            return self._ask(GimbalRequest(GimbalCommand.GIVE_BACK)) if self._ours(now_ns, gimbal) else None
         if not self.held or self._doubted_ns is not None:
             if self._unsure(now_ns, gimbal):
                 return None
@@ -103,11 +103,11 @@ class GimbalControl:
                 self.problem = why
                 return None
             self._taken_from = None if gimbal is None else gimbal.primary_control
-            return self._ask(GimbalRequest(GimbalAsk.TAKE))
+            return self._ask(GimbalRequest(GimbalCommand.TAKE))
         if now_ns - self._pointed_ns < AIM_PERIOD_S * 1e9 or _same(aim, self.pointed):
             return None
         self._pointed_ns = now_ns
-        return self._ask(GimbalRequest(GimbalAsk.POINT, aim))
+        return self._ask(GimbalRequest(GimbalCommand.POINT, aim))
 
     def answered(self, now_ns: int, refused: str | None) -> None:
         """What was asked was done, or why it was not."""
@@ -115,14 +115,14 @@ class GimbalControl:
         if asked is None:
             return
         match asked.ask:
-            case GimbalAsk.TAKE if refused is None:
+            case GimbalCommand.TAKE if refused is None:
                 self.held, self._taken_ns, self._shown, self._doubted_ns = True, now_ns, False, None
                 self._pointed_ns = -math.inf
-            case GimbalAsk.POINT if refused is None:
+            case GimbalCommand.POINT if refused is None:
                 self.pointed = asked.aim
-            case GimbalAsk.GIVE_BACK if refused is None:
+            case GimbalCommand.GIVE_BACK if refused is None:
                 self.held, self._doubted_ns = False, None
-            case GimbalAsk.GIVE_BACK:
+            case GimbalCommand.GIVE_BACK:
                 # Still ours, perhaps: asked again when the manager shows that, but not at every word of it.
                 self._doubted_ns, self._give_back_due_ns = now_ns, now_ns + SHOWN_WITHIN_S * 1e9
             case _:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.guidance.behaviour import Behaviour, Outcome
-from companion.guidance.gimbal.control import GimbalAsk, GimbalControl, GimbalRequest
-from companion.guidance.gimbal_sight import GimbalSight, missing_gimbal
+from companion.guidance.gimbal.control import GimbalCommand, GimbalControl, GimbalRequest
+from companion.guidance.gimbal_status import GimbalStatus, missing_gimbal
 from companion.guidance.interface import (
     Answer,
     EventKind,
@@ -73,7 +73,7 @@ class GimbalController:
     def __init__(self, own: Address, mounting: GimbalMounting) -> None:
         self.mounting = mounting
         self._control = GimbalControl(own)
-        self._asked: tuple[int, GimbalAsk, int] | None = None
+        self._asked: tuple[int, GimbalCommand, int] | None = None
         self._find: int | None = None
         self._not_found = False
         self._search_due_ns = 0
@@ -87,14 +87,14 @@ class GimbalController:
 
     # --- what others see ---------------------------------------------------------------------------------
 
-    def sight(self, now_ns: int, state: VehicleState) -> GimbalSight:
+    def sight(self, now_ns: int, state: VehicleState) -> GimbalStatus:
         """What behaviours see of the gimbal, besides its state."""
         elsewhere = self._control.elsewhere(state.gimbal)
         undirected = ""
         if self.mounting.carries_steering:
             why = "no gimbal answers" if state.gimbal is None else state.gimbal.why_not_looking(now_ns)
             undirected = "" if why is None else f"the gimbal that carries it: {why}"
-        return GimbalSight(
+        return GimbalStatus(
             self.mounting.carries_steering,
             undirected,
             "" if elsewhere is None or self._control.holds(now_ns, state.gimbal) else address_text(elsewhere),
@@ -148,25 +148,27 @@ class GimbalController:
         elif self._asked is not None and answer.identifier == self._asked[0]:
             ask, self._asked = self._asked[1], None
             self._control.answered(now_ns, answer.refused)
-            self._tell_problem(out)
-            if ask is GimbalAsk.GIVE_BACK:
+            self._report_problem(out)
+            if ask is GimbalCommand.GIVE_BACK:
                 if answer.refused is not None and not self._release_failed:
                     text = f"the gimbal could not be given back: {answer.refused}"
                     out.event(EventKind.GIMBAL, "", text, warning=True)
                 self._release_failed = answer.refused is not None
 
-    def update(self, now_ns: int, state: VehicleState, flown: Behaviour | None, out: OutputCollector) -> None:
+    def update(
+        self, now_ns: int, state: VehicleState, active: Behaviour | None, out: OutputCollector
+    ) -> None:
         """One step, after that of the behaviour that is flown."""
-        aim = None if flown is None else flown.gimbal_aim
-        owner: object | None = flown
-        if self._point is not None and aim is not None and flown is not None:
-            self._end_point(Outcome(False, f"{flown.name} moves the gimbal"), out)
+        aim = None if active is None else active.gimbal_aim
+        owner: object | None = active
+        if self._point is not None and aim is not None and active is not None:
+            self._end_point(Outcome(False, f"{active.name} moves the gimbal"), out)
         if self._point is not None:
             aim, owner = self._point.aim, self._point
         request = self._control.update(now_ns, state.gimbal, aim, owner)
         if request is not None:
             self._asked = (out.request(_action(request)), request.ask, now_ns)
-        self._tell_problem(out)
+        self._report_problem(out)
         if self._point is not None:
             self._judge(self._point, now_ns, state, out)
         self._watch(now_ns, state, out)
@@ -207,7 +209,7 @@ class GimbalController:
             return "no gimbal answers"
         return state.gimbal.why_not_looking(now_ns) or ""
 
-    def _tell_problem(self, out: OutputCollector) -> None:
+    def _report_problem(self, out: OutputCollector) -> None:
         if self._control.problem != self._told_problem:
             self._told_problem = self._control.problem
             if self._told_problem:
@@ -264,4 +266,4 @@ def direction_text(aim: GimbalAim) -> str:
 def _action(request: GimbalRequest) -> TakeGimbal | PointGimbal | ReleaseGimbal:
     if request.aim is not None:
         return PointGimbal(request.aim)
-    return TakeGimbal() if request.ask is GimbalAsk.TAKE else ReleaseGimbal()
+    return TakeGimbal() if request.ask is GimbalCommand.TAKE else ReleaseGimbal()

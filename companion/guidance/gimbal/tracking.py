@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 from companion.guidance.arguments import EnumArgument
-from companion.guidance.behaviour import Situation
+from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.gimbal.sweep import BEHIND_RAD, PATIENCE_S, gap_text
 from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim
@@ -41,26 +41,26 @@ class GimbalTracking:
         self._down_m: float | None = None
         self._behind_since_ns: int | None = None
 
-    def begin(self, situation: Situation) -> None:
+    def begin(self, context: BehaviourContext) -> None:
         """Stay where the gimbal looks, so that control of it is had when the object is seen."""
-        gimbal = situation.state.gimbal
+        gimbal = context.state.gimbal
         self.aim = self._seen = self._down_m = self._behind_since_ns = None
-        self._begun_ns = situation.now_ns
+        self._begun_ns = context.now_ns
         if gimbal is not None and gimbal.pitch_rad is not None:
             self.aim = GimbalAim(gimbal.nearest_pitch_rad(gimbal.pitch_rad))
 
-    def taken(self, situation: Situation) -> str | None:
+    def taken(self, context: BehaviourContext) -> str | None:
         """Why the gimbal is not moved any more, in words; None: it is."""
-        if situation.now_ns <= self._begun_ns:  # at the first turn it is still told of what came before
+        if context.now_ns <= self._begun_ns:  # at the first turn it is still told of what came before
             return None
-        return situation.gimbal.problem or None
+        return context.gimbal.problem or None
 
-    def turn_to(self, target: Target, situation: Situation) -> None:
+    def turn_to(self, target: Target, context: BehaviourContext) -> None:
         """Look at what has no range yet: it may come fully into the picture, and its range with it."""
-        self._look(target.elevation_rad, situation)
+        self._look(target.elevation_rad, context)
 
     def keep_on(
-        self, newest: Target | None, range_m: float, position: Vector3, situation: Situation
+        self, newest: Target | None, range_m: float, position: Vector3, context: BehaviourContext
     ) -> str | None:
         """Look at the object where it is thought to be now, as far as the gimbal reaches.
 
@@ -68,7 +68,7 @@ class GimbalTracking:
             newest: its newest detection; None: there was none with a range.
             range_m: how far away it is thought to be now, horizontal metres.
             position: the vehicle's, local NED metres.
-            situation: tells of the gimbal.
+            context: tells of the gimbal.
 
         Returns:
             Why there is no use in going on, in words; None: the gimbal follows.
@@ -83,18 +83,18 @@ class GimbalTracking:
                 before_m = down_m if self._down_m is None else self._down_m
                 self._down_m = before_m + NEWEST_SHARE * (down_m - before_m)
             assert self._down_m is not None
-            self._look(math.atan2(position[2] - self._down_m, range_m), situation)
-        return self.taken(situation) or self._stuck(situation)
+            self._look(math.atan2(position[2] - self._down_m, range_m), context)
+        return self.taken(context) or self._stuck(context)
 
-    def _look(self, elevation_rad: float, situation: Situation) -> None:
-        pitch_rad = elevation_rad - situation.gimbal.camera_pitch_rad
-        gimbal = situation.state.gimbal
+    def _look(self, elevation_rad: float, context: BehaviourContext) -> None:
+        pitch_rad = elevation_rad - context.gimbal.camera_pitch_rad
+        gimbal = context.state.gimbal
         if gimbal is not None:  # else it is lost, and told so
             self.aim = GimbalAim(gimbal.nearest_pitch_rad(pitch_rad))
 
-    def _stuck(self, situation: Situation) -> str | None:
+    def _stuck(self, context: BehaviourContext) -> str | None:
         """It does not go where it is asked to, for longer than a gimbal may take."""
-        gimbal, now_ns = situation.state.gimbal, situation.now_ns
+        gimbal, now_ns = context.state.gimbal, context.now_ns
         measured_rad = None if gimbal is None else gimbal.pitch_rad
         if self.aim is None or measured_rad is None or abs(self.aim.pitch_rad - measured_rad) <= BEHIND_RAD:
             self._behind_since_ns = None

@@ -85,7 +85,7 @@ def _known(state: VehicleState, now_ns: int) -> str:
     return f"it has {state.battery_fraction:.0%}"
 
 
-class BatteryWatch:
+class BatteryMonitor:
     """Looks at the charge in flight: says once when it has run low, and once when it is not told any more."""
 
     def __init__(self, minimum: BatteryMinimum) -> None:

@@ -16,7 +16,13 @@ from typing import NamedTuple
 
 from companion.geometry.fence import Fence
 from companion.guidance.formation.neighbours import Neighbour
-from companion.guidance.formation.separation import BRAKING, Row, apart, level_rows, rows_at
+from companion.guidance.formation.separation import (
+    BRAKING,
+    SpeedConstraint,
+    apply_separation,
+    constraints_at,
+    level_constraints,
+)
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import wrap_angle
@@ -262,7 +268,7 @@ class Envelope:
             circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
             if north * circle[-1][0] + east * circle[-1][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
-        circle += level_rows(rows, down)
+        circle += level_constraints(rows, down)
         over_ground = limits.fence.slowed((north, east), away, self._towards_fence, also=circle)
         if math.dist(over_ground, (north, east)) > 1e-9:
             if not reasons or not reasons[-1].startswith("distance from home"):
@@ -270,15 +276,15 @@ class Envelope:
             north, east = over_ground
         return (north, east, down)
 
-    def _rows(self, place: Vector3) -> list[Row]:
+    def _rows(self, place: Vector3) -> list[SpeedConstraint]:
         limits = self.limits
-        return rows_at(
+        return constraints_at(
             place, self._neighbours, limits.min_separation_m, BRAKING * limits.max_acceleration_mps2
         )
 
-    def _keep_apart(self, velocity: Vector3, rows: Sequence[Row], reasons: list[str]) -> Vector3:
+    def _keep_apart(self, velocity: Vector3, rows: Sequence[SpeedConstraint], reasons: list[str]) -> Vector3:
         """Take away what would carry the vehicle nearer to another than they may be."""
-        left, because_of = apart(velocity, rows)
+        left, because_of = apply_separation(velocity, rows)
         if because_of:
             reasons.append(f"kept {self.limits.min_separation_m:g} m from {', '.join(because_of)}")
         return left
@@ -332,9 +338,9 @@ class Envelope:
             place = (home[0] + inside[0], home[1] + inside[1], down)
             reasons.append("kept inside the fence")
         way = (place[0] - here[0], place[1] - here[1])
-        flown = (way[0] * POSITION_GAIN_PER_S, way[1] * POSITION_GAIN_PER_S)
-        freed = NO_FENCE.slowed(flown, here[:2], abs, self.near)
-        if math.dist(freed, flown) > 1e-9:
+        active = (way[0] * POSITION_GAIN_PER_S, way[1] * POSITION_GAIN_PER_S)
+        freed = NO_FENCE.slowed(active, here[:2], abs, self.near)
+        if math.dist(freed, active) > 1e-9:
             reach_s = 1.0 / POSITION_GAIN_PER_S
             place = (here[0] + freed[0] * reach_s, here[1] + freed[1] * reach_s, place[2])
             reasons.append("slowed down before an obstacle")

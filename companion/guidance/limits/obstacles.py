@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.limits.battery import needs_charge
 from vision.obstacle_sectors import SECTOR_RAD, SECTORS, ObstacleSectors
 
@@ -66,25 +66,25 @@ class ObstacleRules:
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} must be a finite number above 0, got {value}")
 
-    def missing(self, behaviour: Behaviour, situation: Situation) -> str | None:
+    def missing(self, behaviour: Behaviour, context: BehaviourContext) -> str | None:
         """What a behaviour that flies lacks, in words; None: nothing."""
-        if self.use != "required" or not needs_charge(behaviour) or fresh(situation):
+        if self.use != "required" or not needs_charge(behaviour) or fresh(context):
             return None
-        return f"depth ({_age(situation.obstacles, situation.now_ns)}; guidance.obstacles is required)"
+        return f"depth ({_age(context.obstacles, context.now_ns)}; guidance.obstacles is required)"
 
-    def blind(self, situation: Situation) -> str | None:
+    def blind(self, context: BehaviourContext) -> str | None:
         """Why the vehicle must brake for want of depth; None: it need not."""
-        relied_on = self.use == "required" or (self.use == "auto" and situation.obstacles is not None)
-        if not relied_on or fresh(situation):
+        relied_on = self.use == "required" or (self.use == "auto" and context.obstacles is not None)
+        if not relied_on or fresh(context):
             return None
-        return f"no depth to fly by: {_age(situation.obstacles, situation.now_ns)}"
+        return f"no depth to fly by: {_age(context.obstacles, context.now_ns)}"
 
-    def rows(self, situation: Situation) -> tuple[Row, ...]:
+    def rows(self, context: BehaviourContext) -> tuple[Row, ...]:
         """(north, east) unit direction and the speed allowed in it, of every sector that bounds one."""
-        seen = situation.obstacles
-        if self.use == "off" or seen is None or not fresh(situation):
+        seen = context.obstacles
+        if self.use == "off" or seen is None or not fresh(context):
             return ()
-        late_s = LATENCY_S + (situation.now_ns - seen.captured_ns) / 1e9
+        late_s = LATENCY_S + (context.now_ns - seen.captured_ns) / 1e9
         rows = []
         for (north, east), distance_m in zip(DIRECTIONS, seen.distance_m, strict=True):
             if math.isfinite(distance_m):
@@ -94,16 +94,16 @@ class ObstacleRules:
         nearest_m = min((value for value in seen.distance_m if math.isfinite(value)), default=math.inf)
         if math.isfinite(nearest_m):
             north, east = DIRECTIONS[seen.distance_m.index(nearest_m)]
-            rows.insert(0, (north, east, self._braking(nearest_m, (north, east), late_s, situation)))
+            rows.insert(0, (north, east, self._braking(nearest_m, (north, east), late_s, context)))
         return tuple(rows)
 
     def _braking(
-        self, distance_m: float, direction: tuple[float, float], late_s: float, situation: Situation
+        self, distance_m: float, direction: tuple[float, float], late_s: float, context: BehaviourContext
     ) -> float:
         """The speed allowed towards the nearest: below zero where the vehicle is too fast or too near."""
         left_m = distance_m - self.margin_m
         allowed = speed_towards(left_m, late_s) if left_m >= 0.0 else max(-MOST_RETREAT_MPS, left_m)
-        north_mps, east_mps, _ = situation.state.velocity_ned_mps or (0.0, 0.0, 0.0)
+        north_mps, east_mps, _ = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
         excess = north_mps * direction[0] + east_mps * direction[1] - allowed
         if excess > 0.0:
             allowed -= min(MOST_BRAKING_MPS, BRAKING_GAIN * excess)
@@ -124,12 +124,12 @@ class ObstacleMemory:
         self._places: list[tuple[int, float, float]] = []
         self._newest_ns = 0
 
-    def filled(self, situation: Situation) -> Situation:
-        """The situation, with remembered obstacles in its unknown sectors."""
-        seen, position = situation.obstacles, situation.state.position_ned_m
+    def filled(self, context: BehaviourContext) -> BehaviourContext:
+        """The context, with remembered obstacles in its unknown sectors."""
+        seen, position = context.obstacles, context.state.position_ned_m
         if seen is None or position is None:
-            return situation
-        oldest_ns = situation.now_ns - REMEMBERED_S * 1e9
+            return context
+        oldest_ns = context.now_ns - REMEMBERED_S * 1e9
         kept, distances = [], list(seen.distance_m)
         for stamp_ns, north, east in self._places:
             away = (north - position[0], east - position[1])
@@ -146,7 +146,7 @@ class ObstacleMemory:
                 if distance_m <= REMEMBERED_WITHIN_M:
                     place = (position[0] + distance_m * north, position[1] + distance_m * east)
                     self._places.append((seen.captured_ns, *place))
-        return replace(situation, obstacles=replace(seen, distance_m=tuple(distances)))
+        return replace(context, obstacles=replace(seen, distance_m=tuple(distances)))
 
 
 def speed_towards(left_m: float, late_s: float, deceleration_mps2: float = DECELERATION_MPS2) -> float:
@@ -156,10 +156,10 @@ def speed_towards(left_m: float, late_s: float, deceleration_mps2: float = DECEL
     return min(math.sqrt(late**2 + 2.0 * deceleration_mps2 * left_m) - late, GAIN_PER_S * left_m)
 
 
-def fresh(situation: Situation) -> bool:
+def fresh(context: BehaviourContext) -> bool:
     """There are sectors, no older than `MAX_AGE_S`."""
-    seen = situation.obstacles
-    return seen is not None and situation.now_ns - seen.captured_ns <= MAX_AGE_S * 1e9
+    seen = context.obstacles
+    return seen is not None and context.now_ns - seen.captured_ns <= MAX_AGE_S * 1e9
 
 
 def obstacles_message(seen: ObstacleSectors, vehicle: str) -> dict[str, object]:

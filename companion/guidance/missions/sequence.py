@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.state import Vector3
 
@@ -93,7 +93,7 @@ class SequenceBehaviour(Behaviour):
         self._plan, self._refused = plan, refused
         self.records: list[StepRecord] = []
         self._at = 0
-        self._flown: Behaviour | None = None
+        self._active: Behaviour | None = None
         # The first one, made at once, tells what the mission needs to begin.
         first = plan.steps[0].make()
         self._first: Behaviour | None = first
@@ -113,8 +113,8 @@ class SequenceBehaviour(Behaviour):
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
         """Of the step that is flown; before, of the first one, if the mission ends with its failure."""
-        if self._flown is not None:
-            return self._flown.requirements
+        if self._active is not None:
+            return self._active.requirements
         if self._first is None or self._plan.steps[0].on_failure != ABORT:
             return frozenset()
         return self._first.requirements
@@ -129,92 +129,92 @@ class SequenceBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
-        doing = "" if self._flown is None else f": {self._flown.status}"
+        doing = "" if self._active is None else f": {self._active.status}"
         return f"mission {self._plan.name}, {self.where}{doing}"
 
     def told(self, outcome: Outcome) -> Outcome:
         """The same with the step it was at: what ended it from outside (a pilot, a command) knows of none."""
-        if outcome.success or self._ended or self._flown is None:
+        if outcome.success or self._ended or self._active is None:
             return outcome
         return Outcome(False, f"{self.where}: {outcome.reason}")
 
     def take_notes(self) -> Sequence[str]:
-        inner = () if self._flown is None else tuple(self._flown.take_notes())
+        inner = () if self._active is None else tuple(self._active.take_notes())
         notes, self._notes = (*self._notes, *inner), []
         return notes
 
     def request_failed(self, why: str) -> bool:
         """The autopilot refused a step's mode: that fails the step, not more."""
-        if self._flown is None:
+        if self._active is None:
             return False
         self._request_failure = why
         return True
 
     @property
-    def flown(self) -> Behaviour:
-        return self if self._flown is None else self._flown.flown
+    def active(self) -> Behaviour:
+        return self if self._active is None else self._active.active
 
     @property
     def landing_target(self) -> LandingTarget | None:
-        return None if self._flown is None else self._flown.landing_target
+        return None if self._active is None else self._active.landing_target
 
-    def on_activate(self, situation: Situation) -> None:
-        self._started_ns = situation.now_ns
-        self._goal_ned_m = situation.goal_ned_m
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._started_ns = context.now_ns
+        self._goal_ned_m = context.goal_ned_m
         self.records.clear()
         self._visits.clear()
         self._request_failure = self._failure = ""
         self._ended = False
-        self._at, self._repeats, self._flown = 0, 0, None
+        self._at, self._repeats, self._active = 0, 0, None
 
     def on_deactivate(self) -> None:
         self._leave()
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        step = self._update(dt_s, situation)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        step = self._update(dt_s, context)
         self._ended = isinstance(step, Outcome)
         return step
 
-    def _update(self, dt_s: float, situation: Situation) -> Step:
-        if self._flown is None:
-            if (ended := self._begin(0, situation)) is not None:
+    def _update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if self._active is None:
+            if (ended := self._begin(0, context)) is not None:
                 return ended
             dt_s = 0.0
         # Steps may end as soon as they begin; so many in one turn go round in circles.
         for _ in range(2 * len(self._plan.steps) + 2):
-            if not self._failure and self._out_of_time(situation):
-                ended = self._give_up(situation)
+            if not self._failure and self._out_of_time(context):
+                ended = self._give_up(context)
             else:
-                step = self._fly(dt_s, situation)
+                step = self._fly(dt_s, context)
                 if not isinstance(step, Outcome):
                     return step
-                ended = self._after(step, situation)
+                ended = self._after(step, context)
             if ended is not None:
                 return ended
             dt_s = 0.0
         return Outcome(False, f"{self.where}: its steps end as soon as they begin: {self.records[-1].reason}")
 
-    def _fly(self, dt_s: float, situation: Situation) -> Step:
+    def _fly(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """One turn of the step that is flown."""
-        flown, planned = self._flown, self._plan.steps[self._at]
-        assert flown is not None
-        situation = replace(situation, goal_ned_m=self._goal_ned_m)
+        active, planned = self._active, self._plan.steps[self._at]
+        assert active is not None
+        context = replace(context, goal_ned_m=self._goal_ned_m)
         if self._request_failure:
             why, self._request_failure = self._request_failure, ""
             return Outcome(False, why)
-        if not self._failure and (late := self._late(planned, situation.now_ns)) is not None:
+        if not self._failure and (late := self._late(planned, context.now_ns)) is not None:
             return late
         try:
             if not self._activated:
-                if (refused := self._refused(flown)) is not None:
+                if (refused := self._refused(active)) is not None:
                     return Outcome(False, f"refused: {refused}")
                 self._activated = True
-                flown.on_activate(situation)
-            return flown.update(dt_s, situation)
+                active.on_activate(context)
+            return active.update(dt_s, context)
         except Exception as error:
             # What goes wrong in one step is that step's failure: the plan says what then.
-            logger.exception("%s failed", flown.name)
-            return Outcome(False, f"{flown.name} failed: {type(error).__name__}: {error}")
+            logger.exception("%s failed", active.name)
+            return Outcome(False, f"{active.name} failed: {type(error).__name__}: {error}")
 
     def _late(self, planned: PlannedStep, now_ns: int) -> Outcome | None:
         flown_s, limit_s = (now_ns - self._begun_ns) / 1e9, planned.timeout_s
@@ -225,9 +225,9 @@ class SequenceBehaviour(Behaviour):
         return Outcome(False, f"timed out after {limit_s:g} s: {self._status_of_flown()}")
 
     def _status_of_flown(self) -> str:
-        return self._flown.status if self._flown is not None else "not begun"
+        return self._active.status if self._active is not None else "not begun"
 
-    def _after(self, outcome: Outcome, situation: Situation) -> Outcome | None:
+    def _after(self, outcome: Outcome, context: BehaviourContext) -> Outcome | None:
         """What follows a step that has ended; the outcome of all, if nothing does."""
         planned, where = self._plan.steps[self._at], self.where
         self._goal_ned_m = outcome.goal_ned_m
@@ -236,61 +236,61 @@ class SequenceBehaviour(Behaviour):
         if self._failure:
             return Outcome(False, f"{self._failure}; {outcome.reason}")
         told = (planned.title, planned.command, outcome.success, outcome.reason)
-        self.records.append(StepRecord(*told, self._begun_ns, situation.now_ns))
+        self.records.append(StepRecord(*told, self._begun_ns, context.now_ns))
         self._repeats += 1
         if outcome.success and self._repeats < planned.repeat:
-            return self._begin(self._at, situation, again=True)
+            return self._begin(self._at, context, again=True)
         follows = planned.on_success if outcome.success else planned.on_failure
         self._notes.append(f"mission {self._plan.name}: {where} {_done(outcome)}{_then(self._plan, follows)}")
-        return self._go_on(follows, f"{where}: {outcome.reason}", situation)
+        return self._go_on(follows, f"{where}: {outcome.reason}", context)
 
-    def _go_on(self, follows: int | str, told: str, situation: Situation) -> Outcome | None:
+    def _go_on(self, follows: int | str, told: str, context: BehaviourContext) -> Outcome | None:
         if isinstance(follows, int):
-            return self._begin(follows, situation)
+            return self._begin(follows, context)
         if follows == END:
             return Outcome(True, f"flown, {len(self.records)} steps", self._goal_ned_m)
         if follows == ABORT:
             return Outcome(False, told)
         self._failure = told
-        self._flown, self._activated, self._begun_ns = self._plan.way_down(follows), False, situation.now_ns
+        self._active, self._activated, self._begun_ns = self._plan.way_down(follows), False, context.now_ns
         return None
 
-    def _begin(self, index: int, situation: Situation, *, again: bool = False) -> Outcome | None:
+    def _begin(self, index: int, context: BehaviourContext, *, again: bool = False) -> Outcome | None:
         planned = self._plan.steps[index]
-        self._at, self._begun_ns, self._activated = index, situation.now_ns, False
+        self._at, self._begun_ns, self._activated = index, context.now_ns, False
         if not again:
             self._repeats = 0
             self._visits[index] += 1
             if planned.visits is not None and self._visits[index] > planned.visits:
                 told = f"{self.where}: begun {planned.visits} times already"
-                return self._go_on(_final(planned.on_failure), told, situation)
-        self._flown, self._first = self._first or planned.make(), None
+                return self._go_on(_final(planned.on_failure), told, context)
+        self._active, self._first = self._first or planned.make(), None
         times = f", {self._repeats + 1} of {planned.repeat} times" if planned.repeat > 1 else ""
         number = f"step {index + 1} of {len(self._plan.steps)}"
         self._notes.append(f"mission {self._plan.name}: {number}{times}: {planned.command}")
         return None
 
-    def _out_of_time(self, situation: Situation) -> bool:
+    def _out_of_time(self, context: BehaviourContext) -> bool:
         limit_s = self._plan.timeout_s
-        return limit_s is not None and situation.now_ns - self._started_ns > limit_s * 1e9
+        return limit_s is not None and context.now_ns - self._started_ns > limit_s * 1e9
 
-    def _give_up(self, situation: Situation) -> Outcome | None:
+    def _give_up(self, context: BehaviourContext) -> Outcome | None:
         """The time of the whole mission is over: the step that is flown fails for good."""
         told = f"{self.where}: the mission's {self._plan.timeout_s:g} s are over"
         self._goal_ned_m = None
         self._take_last_notes()
         self._leave()
         self._notes.append(f"mission {self._plan.name}: {told}")
-        return self._go_on(_final(self._plan.steps[self._at].on_failure), told, situation)
+        return self._go_on(_final(self._plan.steps[self._at].on_failure), told, context)
 
     def _take_last_notes(self) -> None:
-        if self._flown is not None:
-            self._notes.extend(self._flown.take_notes())
+        if self._active is not None:
+            self._notes.extend(self._active.take_notes())
 
     def _leave(self) -> None:
-        if self._flown is not None and self._activated:
+        if self._active is not None and self._activated:
             self._activated = False
-            self._flown.on_deactivate()
+            self._active.on_deactivate()
 
 
 def _done(outcome: Outcome) -> str:

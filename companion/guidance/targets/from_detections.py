@@ -22,7 +22,7 @@ from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import slerp, turned_about_down
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
-from vision.geolocation import Sightlines, foot_of_upright
+from vision.geolocation import PixelRays, range_from_known_height
 from vision.rotation import matrix_from_quaternion
 from vision.tracking.association import overlaps
 
@@ -227,7 +227,7 @@ def _sights(
     pixels[:count, 0] = middle
     pixels[count:, 0] = middle + _contact_px(right - left, bottom - top, _roll_rad(mount, pose))
     pixels[:count, 1], pixels[count:, 1] = (top + bottom) / 2, bottom
-    lines = Sightlines.of(camera, mount, pose.ned_from_body, pixels)
+    lines = PixelRays.of(camera, mount, pose.ned_from_body, pixels)
     centres, feet = lines[:count], lines[count:]
     on_ground = feet.on_ground(pose.height_m, MIN_DEPRESSION_RAD)
     offsets = lines.camera_ned_m + nearest @ mount.ned_from_optical(pose.ned_from_body).T
@@ -307,7 +307,9 @@ def _target(
             math.hypot(offset[0], offset[1]) ** 2 / offset[2] + offset[2]
         )
     elif height_m is not None and _measurable(camera, top, bottom):
-        offset = foot_of_upright(camera, mount, pose.ned_from_body, detection["xyxy"], height_m).tolist()
+        offset = range_from_known_height(
+            camera, mount, pose.ned_from_body, detection["xyxy"], height_m
+        ).tolist()
         if all(map(math.isfinite, offset)):
             source = RangeSource.KNOWN_HEIGHT
             fixed_m, growing_m = HEIGHT_SIGMA[0], HEIGHT_SIGMA[1] * math.hypot(offset[0], offset[1])

@@ -67,7 +67,7 @@ class MovingEstimate:
     source: RangeSource
 
     @classmethod
-    def begun(cls, target: Target, vehicle: Vector3) -> Self:
+    def initialize(cls, target: Target, vehicle: Vector3) -> Self:
         """The first. Raises ValueError: the target has no range."""
         if target.position_ned_m is None:
             raise ValueError(f"a track begins with a known place; this {target.class_name} has no range")
@@ -120,7 +120,7 @@ class MovingEstimate:
         spread = self.covariance[:2, :2] + noise
         return Fit(float(innovation @ np.linalg.solve(spread, innovation)), target, innovation, spread)
 
-    def taking(self, fit: Fit) -> MovingEstimate:
+    def update(self, fit: Fit) -> MovingEstimate:
         """With a detection that fits taken in."""
         gain = np.linalg.solve(fit.spread, self.covariance[:2, :]).T
         state = self.state + gain @ fit.innovation

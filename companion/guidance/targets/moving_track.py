@@ -38,7 +38,7 @@ PARTED_S, PARTED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
 SAME_BEARING_RAD = 0.03
 
 
-class _Parting(NamedTuple):
+class _OcclusionHypothesis(NamedTuple):
     """What was known when the object was seen last, kept while it is in doubt who came out again."""
 
     estimate: MovingEstimate
@@ -55,11 +55,11 @@ class MovingTrack:
 
     def __init__(self, target: Target, vehicle: Vector3) -> None:
         self._class_name = target.class_name
-        self._estimate = MovingEstimate.begun(target, vehicle)
+        self._estimate = MovingEstimate.initialize(target, vehicle)
         self._track_id = target.track_id
         self._newest = target
         self._others: set[int] = set()
-        self._parting: _Parting | None = None
+        self._occlusion: _OcclusionHypothesis | None = None
         self._intervals_s: deque[float] = deque(maxlen=5)
 
     @property
@@ -113,12 +113,14 @@ class MovingTrack:
             return False
         surely = own.target.track_id == self._track_id and own.squared <= EXPECTED_GATE
         if (
-            self._parting is None
+            self._occlusion is None
             and not surely
             and unseen_s > max(PARTED_S, PARTED_FRAMES * self._interval_s)
         ):
-            self._parting = _Parting(self._estimate, frozenset(self._others), now_ns + DOUBT_S * 1e9)
-        self._estimate, self._newest = expected.taking(own), own.target
+            self._occlusion = _OcclusionHypothesis(
+                self._estimate, frozenset(self._others), now_ns + DOUBT_S * 1e9
+            )
+        self._estimate, self._newest = expected.update(own), own.target
         self._intervals_s.append(unseen_s)
         if own.target.track_id is not None:
             self._track_id = own.target.track_id
@@ -156,11 +158,11 @@ class MovingTrack:
 
     def _gone_back(self, fresh: Sequence[Target], now_ns: int, vehicle: Vector3) -> bool:
         """Leave what was taken for the object if another is far nearer to where that was expected."""
-        parting = self._parting
+        parting = self._occlusion
         if parting is None:
             return False
         if now_ns > parting.until_ns:
-            self._parting = None
+            self._occlusion = None
             return False
         expected, present = parting.estimate.at(now_ns), self._estimate.at(now_ns)
         seen = [t for t in fresh if t.position_ned_m is not None and t.track_id not in parting.others]
@@ -180,7 +182,7 @@ class MovingTrack:
             return False
         if taken <= bar or any(rival.squared <= bar for rival in rivals[1:]):
             return False
-        self._estimate, self._track_id, self._parting = expected.taking(best), best.target.track_id, None
+        self._estimate, self._track_id, self._occlusion = expected.update(best), best.target.track_id, None
         self._newest = best.target
         self._others = set(parting.others)
         if followed is not None and followed.track_id is not None:

@@ -72,7 +72,7 @@ class ObjectTrack:
         """Whether this was seen beside the object, so that it cannot be the object."""
         return target.track_id in self._others
 
-    def anew(self, target: Target, vehicle: Vector3) -> ObjectTrack:
+    def restart(self, target: Target, vehicle: Vector3) -> ObjectTrack:
         """The same object begun again at a target that is taken for it."""
         track = ObjectTrack(target, vehicle)
         track._others = self._others

@@ -262,7 +262,7 @@ def test_the_bundled_model_is_not_for_photographs_and_says_so_once(
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
     assert "'default'" in line
-    warn = companion_commands._warn_drawn_scenes_only
+    warn = companion_commands._warn_synthetic_model
     warn([("shm://simulator", "default"), ("/dev/video0", "yolo11n")])
     assert capsys.readouterr().err == ""
     warn([("shm://simulator", "default"), ("/dev/video0", "default"), ("/dev/video1", "default")])

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions, Phase
 from companion.guidance.interface import (
@@ -314,7 +314,7 @@ class Flight:
     limits: Limits = field(default_factory=Limits)
     camera_hz: float = 10.0
     latency_s: float = 0.1
-    steps: list[Step] = field(default_factory=list)
+    steps: list[BehaviourOutput] = field(default_factory=list)
     track: list[tuple[float, float, float]] = field(default_factory=list)
 
     def run(
@@ -353,15 +353,15 @@ class Flight:
 class _Recording(Behaviour):
     """Another behaviour, with a list of what it gives. Needs nothing before it begins."""
 
-    def __init__(self, inner: Behaviour, steps: list[Step]) -> None:
+    def __init__(self, inner: Behaviour, steps: list[BehaviourOutput]) -> None:
         self._inner, self._steps = inner, steps
         self.name = inner.name
 
-    def on_activate(self, situation: Situation) -> None:
-        self._inner.on_activate(situation)
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._inner.on_activate(context)
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        step = self._inner.update(dt_s, situation)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        step = self._inner.update(dt_s, context)
         self._steps.append(step)
         return step
 
@@ -369,8 +369,8 @@ class _Recording(Behaviour):
         self._inner.on_deactivate()
 
     @property
-    def flown(self) -> Behaviour:
-        return self._inner.flown
+    def active(self) -> Behaviour:
+        return self._inner.active
 
     @property
     def status(self) -> str:

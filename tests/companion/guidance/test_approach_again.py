@@ -12,7 +12,7 @@ from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObj
 Each = Callable[[float, Flight], None]
 
 
-def flown(
+def active(
     text: str, car: SeenObject, each: Each, seconds: float = 300.0
 ) -> tuple[Outcome, list[str], Flight]:
     behaviour = parse(text).build(NO_CONTEXT)
@@ -35,7 +35,7 @@ def test_what_comes_back_where_it_was_is_approached_on() -> None:
     def each(seconds: float, flight: Flight) -> None:
         car.visible = not 5.0 < seconds < 11.0
 
-    outcome, notes, flight = flown("approach car", car, each)
+    outcome, notes, flight = active("approach car", car, each)
     assert outcome.success, outcome.reason
     assert [note.split(";")[-1].strip() for note in notes] == [
         "looking for it, 1 of 2",
@@ -52,7 +52,7 @@ def test_what_went_elsewhere_is_found_by_turning_and_approached() -> None:
         if seconds > 6.0:
             car.north, car.east, car.track_id = -8.0, 14.0, 2
 
-    outcome, notes, flight = flown("approach car", car, each)
+    outcome, notes, flight = active("approach car", car, each)
     assert outcome.success, outcome.reason
     assert notes[-1].startswith("approach: found a car: bearing")
     assert math.dist(flight.vehicle.position[:2], (-8.0, 14.0)) == pytest.approx(5.0, abs=0.5)
@@ -70,7 +70,7 @@ def test_what_is_gone_for_good_is_looked_for_so_often_and_the_vehicle_stands(ret
         if seconds > 9.0:
             places.append(tuple(flight.vehicle.position))
 
-    outcome, notes, _ = flown(f"approach car retries={retries}", car, each)
+    outcome, notes, _ = active(f"approach car retries={retries}", car, each)
     assert not outcome.success
     assert outcome.reason.startswith("lost the car for 5.0 s: last seen ")
     assert outcome.reason.endswith(said)
@@ -79,7 +79,7 @@ def test_what_is_gone_for_good_is_looked_for_so_often_and_the_vehicle_stands(ret
 
 
 def test_what_was_never_seen_is_not_sought() -> None:
-    outcome, notes, _ = flown("approach car", SeenObject("car", -20.0, 0.0), lambda seconds, flight: None)
+    outcome, notes, _ = active("approach car", SeenObject("car", -20.0, 0.0), lambda seconds, flight: None)
     assert "never seen" in outcome.reason
     assert notes == []
 
@@ -88,7 +88,7 @@ def test_a_silent_detector_is_no_lost_object() -> None:
     def each(seconds: float, flight: Flight) -> None:
         flight.perception_alive = seconds < 4.0
 
-    outcome, notes, _ = flown("approach car", SeenObject("car", 40.0, 0.0), each)
+    outcome, notes, _ = active("approach car", SeenObject("car", 40.0, 0.0), each)
     assert "nothing comes from the detector" in outcome.reason
     assert notes == []
 

@@ -16,7 +16,7 @@ from companion.bench.lockstep_flight import LockstepFlight, Moment, camera_setti
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.goto import GotoBehaviour
@@ -61,9 +61,9 @@ def then_hold(
     outcomes: list[Outcome] = []
 
     class Watched(SequenceBehaviour):
-        def _after(self, outcome: Outcome, situation: Situation) -> Outcome | None:
+        def _after(self, outcome: Outcome, context: BehaviourContext) -> Outcome | None:
             outcomes.append(outcome)
-            return super()._after(outcome, situation)
+            return super()._after(outcome, context)
 
     steps = (
         PlannedStep("fly", "fly", lambda: behaviour, on_success=1),
@@ -75,15 +75,15 @@ def then_hold(
     assert outcomes, behaviour.status
     assert outcomes[0].success, outcomes[0].reason
     ended_ns = mission.records[0].ended_ns
-    return outcomes[0], [moment for moment in log.moments if moment.situation.now_ns >= ended_ns]
+    return outcomes[0], [moment for moment in log.moments if moment.context.now_ns >= ended_ns]
 
 
 def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3, name: str) -> None:
     """There within 0.3 m and slower than 0.3 m/s, and kept: as near by what answers as PX4 does."""
     assert outcome.goal_ned_m == pytest.approx(goal, abs=1e-3)
-    first = hold[0].situation.state
+    first = hold[0].context.state
     assert first.velocity_ned_mps is not None
-    off_m = [math.dist(moment.situation.state.position_ned_m or (), goal) for moment in hold]
+    off_m = [math.dist(moment.context.state.position_ned_m or (), goal) for moment in hold]
     assert off_m[0] <= 0.3
     assert math.hypot(*first.velocity_ned_mps) <= 0.3
     usually_m, at_most_m = (0.5, 0.7) if name == "loose" else (0.3, 0.5)
@@ -111,9 +111,9 @@ def test_figure_eight_ends_standing_where_it_began(name: str, seed: int) -> None
     begin: list[Vector3] = []
 
     class Watched(FigureEightBehaviour):
-        def on_activate(self, situation: Situation) -> None:
-            begin.append(situation.state.position_ned_m or (0.0, 0.0, 0.0))
-            super().on_activate(situation)
+        def on_activate(self, context: BehaviourContext) -> None:
+            begin.append(context.state.position_ned_m or (0.0, 0.0, 0.0))
+            super().on_activate(context)
 
     outcome, hold = then_hold(flight, Watched(8.0, 2.5, 1.0))
     assert_arrived(outcome, hold, begin[0], name)
@@ -145,7 +145,7 @@ def on_circle(radius_m: float, speed_mps: float, name: str, seed: int) -> tuple[
     assert centre is not None
     wide, nose = [], []
     for moment in log.moments:
-        position, yaw_rad = moment.situation.state.position_ned_m, moment.situation.state.yaw_rad
+        position, yaw_rad = moment.context.state.position_ned_m, moment.context.state.yaw_rad
         assert position is not None
         assert yaw_rad is not None
         if moment.seconds > 8.0:

@@ -12,7 +12,7 @@ from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.battery import BATTERY_MAX_AGE_S, BatteryAction, BatteryMinimum
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from companion.vehicle.telemetry_fold import fold
+from companion.vehicle.telemetry import apply_message
 from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
@@ -156,12 +156,12 @@ def test_a_low_battery_while_offboard_is_still_asked_for_ends_in_the_return_as_w
 
 
 def test_both_battery_messages_carry_their_stamp() -> None:
-    state = fold(VehicleState(), "BATTERY_STATUS", {"id": 0, "battery_remaining": 40}, 5)
+    state = apply_message(VehicleState(), "BATTERY_STATUS", {"id": 0, "battery_remaining": 40}, 5)
     assert (state.battery_fraction, state.battery_ns) == (0.4, 5)
     fields = {"onboard_control_sensors_health": 0, "battery_remaining": 39}
-    state = fold(state, "SYS_STATUS", fields, 9)
+    state = apply_message(state, "SYS_STATUS", fields, 9)
     assert (state.battery_fraction, state.battery_ns) == (0.39, 9)
-    unknown = fold(state, "BATTERY_STATUS", {"id": 0, "battery_remaining": -1}, 20)
+    unknown = apply_message(state, "BATTERY_STATUS", {"id": 0, "battery_remaining": -1}, 20)
     assert unknown.battery_ns == 9
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, Requirement, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.guidance.gimbal.controller import FIND_TIMEOUT_S
@@ -22,8 +22,8 @@ class NeedsGimbal(Behaviour):
     name = "needs-gimbal"
     requirements = frozenset({Requirement.GIMBAL})
 
-    def update(self, dt_s: float, situation: Situation) -> Setpoint:
-        return Setpoint.brake(situation.now_ns)
+    def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
+        return Setpoint.brake(context.now_ns)
 
 
 class Waiting:

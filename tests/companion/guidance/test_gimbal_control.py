@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.gimbal.control import SHOWN_WITHIN_S, GimbalAsk, GimbalControl, GimbalRequest
+from companion.guidance.gimbal.control import SHOWN_WITHIN_S, GimbalCommand, GimbalControl, GimbalRequest
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 
 OURS, STATION, AUTOPILOT = (1, 191), (245, 190), (1, 1)
 DOWN, LEVEL = GimbalAim(-0.5), GimbalAim(0.0)
-TAKE, GIVE_BACK = GimbalRequest(GimbalAsk.TAKE), GimbalRequest(GimbalAsk.GIVE_BACK)
+TAKE, GIVE_BACK = GimbalRequest(GimbalCommand.TAKE), GimbalRequest(GimbalCommand.GIVE_BACK)
 SEEK = object()
 UNTOLD = "its manager does not tell who has control of it"
 
 
 def point(aim: GimbalAim) -> GimbalRequest:
-    return GimbalRequest(GimbalAsk.POINT, aim)
+    return GimbalRequest(GimbalCommand.POINT, aim)
 
 
 class Bench:
@@ -72,7 +72,7 @@ def test_an_aim_that_moves_goes_out_ten_times_a_second() -> None:
     bench.held()
     asked = [bench.turn(GimbalAim(-0.5 - 0.01 * n), seconds=0.02) for n in range(1, 51)]
     for request in asked:
-        assert request is None or request.ask is GimbalAsk.POINT
+        assert request is None or request.ask is GimbalCommand.POINT
         if request is not None:
             bench.answer()
     assert 1 <= sum(request is not None for request in asked) <= 11

@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject, ScenePose
-from companion.guidance.behaviour import Behaviour, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.command import BuildContext
 from companion.guidance.gimbal.tracking import GimbalTracking
-from companion.guidance.gimbal_sight import GimbalSight
+from companion.guidance.gimbal_status import GimbalStatus
 from companion.guidance.grammar import parse
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.refusal import refusal
+from companion.guidance.requirements import check_requirements
 from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim, GimbalState
 from companion.vehicle.mav_result import result_name
@@ -76,7 +76,7 @@ def off_rad(moment: Moment, thing: SceneObject, camera_rad: float = 0.0) -> floa
     """Between where the camera looks and the object's true elevation."""
     pose, (north, east, down) = thing.pose(moment.seconds), moment.truth.position_ned_m
     range_m = math.hypot(pose.north_m - north, pose.east_m - east)
-    gimbal = moment.situation.state.gimbal
+    gimbal = moment.context.state.gimbal
     assert gimbal is not None
     assert gimbal.pitch_rad is not None
     return abs(gimbal.pitch_rad + camera_rad - math.atan2(down + MIDDLE_M, range_m))
@@ -150,7 +150,7 @@ def test_who_is_cut_off_by_the_pictures_edge_is_looked_at_and_gets_a_range(word:
     thing = SceneObject("car", (4.0, 1.8, 1.5), person(0.0, 9.0).pose)
     # an approach ends by itself, long before; who follows has been there for half a minute
     flight, log = fly(command(f"{word} car distance=4 gimbal=track"), thing, begin_deg=-14.0, limit_s=50.0)
-    first = next(seen for moment in log.moments for seen in moment.situation.targets)
+    first = next(seen for moment in log.moments for seen in moment.context.targets)
     assert first.position_ned_m is None
     assert pitch_deg(flight.state) < -40.0
     assert thing.range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(4.0, abs=1.0)
@@ -189,7 +189,7 @@ def test_what_is_lost_is_looked_for_with_the_gimbal_too_and_only_then_it_is_give
     behaviour = command("approach person retries=1 gimbal=track")
 
     def note(flight: LockstepFlight, moment: Moment) -> None:
-        seen.append((behaviour.status, pitch_deg(moment.situation.state), primary(flight)))
+        seen.append((behaviour.status, pitch_deg(moment.context.state), primary(flight)))
 
     flight, log = fly(behaviour, who_leaves(), note)
     assert "looked for it again once" in reason(log, False)
@@ -241,23 +241,23 @@ def test_the_steps_of_a_mission_hand_it_on() -> None:
     assert primary(flight) == NOBODY
 
 
-def flying(gimbal: GimbalState | None, sight: GimbalSight) -> Situation:
+def flying(gimbal: GimbalState | None, sight: GimbalStatus) -> BehaviourContext:
     """With everything that an approach wants but, perhaps, a gimbal."""
-    situations: list[Situation] = []
+    contexts: list[BehaviourContext] = []
     flight = gimbal_flight(person(0.0, 12.0))
-    flight.fly(command("hold"), 2.0, each=lambda moment: situations.append(moment.situation))
-    now = situations[-1]
+    flight.fly(command("hold"), 2.0, each=lambda moment: contexts.append(moment.context))
+    now = contexts[-1]
     return replace(now, state=replace(now.state, gimbal=gimbal or now.state.gimbal), gimbal=sight)
 
 
 @pytest.mark.parametrize("word", ["approach", "follow"])
 def test_without_a_camera_on_a_gimbal_tracking_is_refused_and_the_rest_is_not(word: str) -> None:
-    now = flying(None, GimbalSight(carries_camera=False))
-    assert refusal(command(f"{word} person"), now, ("person",)) is None
-    refused = refusal(command(f"{word} person gimbal=track"), now, ("person",))
+    now = flying(None, GimbalStatus(carries_camera=False))
+    assert check_requirements(command(f"{word} person"), now, ("person",)) is None
+    refused = check_requirements(command(f"{word} person gimbal=track"), now, ("person",))
     assert refused == f"{word} needs the camera on the gimbal (camera.gimbal is not set)"
-    nobody = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalSight(carries_camera=True))
-    refused = refusal(command(f"{word} person gimbal=track"), nobody, ("person",))
+    nobody = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalStatus(carries_camera=True))
+    refused = check_requirements(command(f"{word} person gimbal=track"), nobody, ("person",))
     assert refused == f"{word} needs a gimbal (none answers)"
 
 
@@ -265,11 +265,11 @@ def target(elevation_rad: float, range_m: float) -> Target:
     return Target("person", 0.9, 1, 0.0, elevation_rad, range_m)
 
 
-def situation(
+def context(
     gimbal: GimbalState, now_ns: int = 1, *, problem: str = "", camera_pitch_rad: float = 0.0
-) -> Situation:
-    sight = GimbalSight(True, problem=problem, camera_pitch_rad=camera_pitch_rad)
-    return Situation(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=sight)
+) -> BehaviourContext:
+    sight = GimbalStatus(True, problem=problem, camera_pitch_rad=camera_pitch_rad)
+    return BehaviourContext(now_ns, replace(VehicleState(), gimbal=gimbal), gimbal=sight)
 
 
 FREE = GimbalState()
@@ -285,7 +285,7 @@ def test_it_looks_at_the_height_that_the_detection_told(
     elevation_deg: float, then_m: float, later_m: float, climbed_m: float
 ) -> None:
     tracking = GimbalTracking()
-    now = situation(FREE)
+    now = context(FREE)
     seen = target(math.radians(elevation_deg), then_m)
     assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), now) is None
     assert tracking.aim is None
@@ -309,7 +309,7 @@ def test_it_asks_for_nothing_beyond_the_stops(
     elevation_deg: float, range_m: float, low_deg: float, high_deg: float
 ) -> None:
     low, high = math.radians(low_deg), math.radians(high_deg)
-    now = situation(GimbalState(lowest_pitch_rad=low, highest_pitch_rad=high), camera_pitch_rad=-0.3)
+    now = context(GimbalState(lowest_pitch_rad=low, highest_pitch_rad=high), camera_pitch_rad=-0.3)
     tracking = GimbalTracking()
     seen = target(math.radians(elevation_deg), range_m)
     tracking.keep_on(seen, 5.0, (0.0, 0.0, -10.0), now)
@@ -324,7 +324,7 @@ def test_it_asks_for_nothing_beyond_the_stops(
 
 def test_what_hindered_the_one_before_is_no_hindrance_in_the_first_turn() -> None:
     tracking = GimbalTracking()
-    first = situation(FREE, 5 * SECOND_NS, problem="245/190 has taken control of it")
+    first = context(FREE, 5 * SECOND_NS, problem="245/190 has taken control of it")
     tracking.begin(first)
     assert tracking.keep_on(None, math.nan, (0.0, 0.0, -10.0), first) is None
     later = replace(first, now_ns=6 * SECOND_NS)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, Outcome, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
@@ -140,11 +140,11 @@ class Broken(Behaviour):
         self.updates_left = after
         self.deactivated = 0
 
-    def update(self, dt_s: float, situation: Situation) -> Setpoint:
+    def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
         self.updates_left -= 1
         if self.updates_left < 0:
             raise ZeroDivisionError("a bug")
-        return Setpoint.velocity((1.0, 0.0, 0.0), situation.now_ns)
+        return Setpoint.velocity((1.0, 0.0, 0.0), context.now_ns)
 
     def on_deactivate(self) -> None:
         self.deactivated += 1
@@ -166,7 +166,7 @@ def test_an_exception_in_a_behaviour_is_logged_ends_it_and_holds(
     assert math.hypot(*harness.vehicle.velocity) < 0.1
 
 
-HOOKS = ("on_activate", "update", "take_notes", "flown", "landing", "gimbal_aim", "landing_target")
+HOOKS = ("on_activate", "update", "take_notes", "active", "landing", "gimbal_aim", "landing_target")
 
 
 @pytest.mark.parametrize("hook", HOOKS)
@@ -208,7 +208,7 @@ def test_pilot_wins_while_a_hook_raises() -> None:
         broken = False
 
         @property
-        def flown(self) -> Behaviour:
+        def active(self) -> Behaviour:
             if self.broken:
                 raise ZeroDivisionError("a bug")
             return self
@@ -232,7 +232,7 @@ def test_exception_with_the_answer_does_not_lose_it() -> None:
 
     class Faulty(Curious):
         @property
-        def flown(self) -> Behaviour:
+        def active(self) -> Behaviour:
             if harness.guidance.phase == "offboard":
                 raise ZeroDivisionError("a bug")
             return self
@@ -262,9 +262,9 @@ class Curious(Behaviour):
     def __init__(self) -> None:
         self.seen: list[tuple[float, Setpoint | None]] = []
 
-    def update(self, dt_s: float, situation: Situation) -> Setpoint:
-        self.seen.append((dt_s, situation.sent))
-        return Setpoint.velocity((9.0, 0.0, 0.0), situation.now_ns)
+    def update(self, dt_s: float, context: BehaviourContext) -> Setpoint:
+        self.seen.append((dt_s, context.sent))
+        return Setpoint.velocity((9.0, 0.0, 0.0), context.now_ns)
 
 
 def test_what_was_sent_is_told_to_the_behaviour_and_published_beside_what_was_asked() -> None:
@@ -306,8 +306,8 @@ class Stops(HoldBehaviour):
 
     name = "stops"
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        return Outcome(True, "there", (1.0, 0.5, -5.0)) if dt_s else super().update(dt_s, situation)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        return Outcome(True, "there", (1.0, 0.5, -5.0)) if dt_s else super().update(dt_s, context)
 
 
 def test_the_hold_that_follows_keeps_the_goal_of_what_has_ended() -> None:

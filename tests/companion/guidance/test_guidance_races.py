@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import (
+    Behaviour,
+    BehaviourContext,
+    BehaviourOutput,
+    ModeRequest,
+    Outcome,
+    Requirement,
+)
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
@@ -38,8 +45,8 @@ class TakesOffOnce(Behaviour):
 
     name = "takes-off-once"
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        if situation.state.ready_to_arm:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if context.state.ready_to_arm:
             return Outcome(False, "enough")
         return ModeRequest(FlightMode.TAKEOFF, 3.0, arm=True)
 
@@ -149,9 +156,9 @@ def test_an_approach_backs_off_from_what_comes_nearer(speed_mps: float, nearest_
     car, vehicle = SeenObject("car", 20.0, 0.0), KinematicVehicle()
     ranges: list[float] = []
 
-    def each(seconds: float, flown: KinematicVehicle) -> None:
+    def each(seconds: float, active: KinematicVehicle) -> None:
         car.north = 20.0 - speed_mps * seconds
-        ranges.append(math.hypot(car.north - flown.position[0], car.east - flown.position[1]))
+        ranges.append(math.hypot(car.north - active.position[0], car.east - active.position[1]))
 
     Flight(ApproachBehaviour("car", distance_m=5.0), vehicle, [car]).run(25.0, each)
     assert min(ranges) > nearest_m

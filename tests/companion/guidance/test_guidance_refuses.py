@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from companion.geometry.fence import Fence
-from companion.guidance.behaviour import Behaviour, ModeRequest, Outcome, Requirement, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext, ModeRequest, Outcome, Requirement
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.goto import GotoBehaviour
@@ -161,7 +161,7 @@ class Daring(Behaviour):
     name = "daring"
     requirements = frozenset({Requirement.ON_GROUND})
 
-    def update(self, dt_s: float, situation: Situation) -> ModeRequest:
+    def update(self, dt_s: float, context: BehaviourContext) -> ModeRequest:
         return ModeRequest(FlightMode.LAND, arm=True)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.vehicle.setpoint import Setpoint
@@ -22,11 +22,11 @@ class AfterGoal(Behaviour):
     def __init__(self, behaviour: Behaviour, goal_ned_m: Vector3) -> None:
         self._behaviour, self._goal_ned_m = behaviour, goal_ned_m
 
-    def on_activate(self, situation: Situation) -> None:
-        self._behaviour.on_activate(replace(situation, goal_ned_m=self._goal_ned_m))
+    def on_activate(self, context: BehaviourContext) -> None:
+        self._behaviour.on_activate(replace(context, goal_ned_m=self._goal_ned_m))
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
-        return self._behaviour.update(dt_s, situation)
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        return self._behaviour.update(dt_s, context)
 
 
 def test_hold_keeps_the_place_and_heading_it_began_with() -> None:
@@ -123,5 +123,5 @@ def test_an_orbit_pushed_into_its_centre_still_gives_finite_setpoints() -> None:
     flight = Flight(behaviour, vehicle)
     flight.run(0.1)
     vehicle.position[:2] = [5.0, 0.0]
-    step = behaviour.update(0.02, Situation(vehicle.now_ns, vehicle.state))
+    step = behaviour.update(0.02, BehaviourContext(vehicle.now_ns, vehicle.state))
     assert isinstance(step, Setpoint)

@@ -6,12 +6,12 @@ import pytest
 
 from companion.bench.flights_land import land
 from companion.guidance.arguments import GrammarError
-from companion.guidance.behaviour import Requirement, Situation
+from companion.guidance.behaviour import BehaviourContext, Requirement
 from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.behaviours.marker_search import CLIMB_M, MarkerSearch
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.refusal import refusal
+from companion.guidance.requirements import check_requirements
 from companion.vehicle.state import LandedState, VehicleState
 
 
@@ -67,5 +67,5 @@ def test_without_markers_it_is_refused_and_what_is_missing_is_named() -> None:
         armed=True,
         landed=LandedState.IN_AIR,
     )
-    why = refusal(behaviour, Situation(now_ns, state), None)
+    why = check_requirements(behaviour, BehaviourContext(now_ns, state), None)
     assert why == ("land-on-marker needs perception that looks for markers (markers.dictionary is not set)")

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.behaviour import Behaviour, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Requirement
 from companion.guidance.formation.neighbours import Anchor, Neighbour, Neighbours, missing_neighbours
 from companion.guidance.formation.pose import Pose
-from companion.guidance.refusal import refusal
+from companion.guidance.requirements import check_requirements
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.test_pose import NOW_NS, STATE
 
@@ -129,7 +129,7 @@ class Needy(Behaviour):
     requirements = frozenset({Requirement.NEIGHBOURS})
     neighbour_names = ("alpha",)
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         raise NotImplementedError
 
 
@@ -138,8 +138,8 @@ def test_a_behaviour_that_needs_a_neighbour_is_refused_with_its_name() -> None:
 
     def words(now_ns: int) -> str | None:
         state = state_at(now_ns)
-        return refusal(
-            Needy(), Situation(now_ns, state, neighbourhood=neighbours.around(state, now_ns)), None
+        return check_requirements(
+            Needy(), BehaviourContext(now_ns, state, neighbourhood=neighbours.around(state, now_ns)), None
         )
 
     assert words(NOW_NS) == "needy needs the pose of alpha (none came; nobody is heard)"

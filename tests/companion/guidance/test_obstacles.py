@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.bench.flights_obstacles import ALLOWED_M, MARGIN_M, run
-from companion.guidance.behaviour import Situation
+from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.core import GuidanceOptions
@@ -19,7 +19,7 @@ from companion.guidance.limits.obstacles import (
     obstacles_message,
     speed_towards,
 )
-from companion.guidance.refusal import refusal
+from companion.guidance.requirements import check_requirements
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness
@@ -36,11 +36,11 @@ def sectors(captured_ns: int, near: dict[int, float] | None = None, *, rest: flo
     return ObstacleSectors(captured_ns, tuple(distances))
 
 
-def situation(
+def context(
     obstacles: ObstacleSectors | None, *, age_s: float = 0.0, vehicle: KinematicVehicle | None = None
-) -> Situation:
+) -> BehaviourContext:
     vehicle = vehicle or KinematicVehicle()
-    return Situation(vehicle.now_ns + round(age_s * 1e9), vehicle.state, obstacles=obstacles)
+    return BehaviourContext(vehicle.now_ns + round(age_s * 1e9), vehicle.state, obstacles=obstacles)
 
 
 def sent_velocity(harness: GuidanceHarness) -> Vector3:
@@ -52,7 +52,7 @@ def sent_velocity(harness: GuidanceHarness) -> Vector3:
 
 def ahead_m(memory: ObstacleMemory, vehicle: KinematicVehicle) -> float:
     """What is known ahead when nothing is seen now."""
-    filled = memory.filled(situation(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles
+    filled = memory.filled(context(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle)).obstacles
     assert filled is not None
     return filled.distance_m[0]
 
@@ -70,7 +70,7 @@ def test_a_wall_ahead_takes_what_leads_into_it_and_leaves_what_leads_along_it() 
     # A wall 2 m north, at right angles.
     near = {i: 2.0 / math.cos(math.radians(5 * i)) for i in range(-14, 15)}
     envelope = Envelope()
-    envelope.near = ObstacleRules("auto", 2.0).rows(situation(sectors(now_ns, near), vehicle=vehicle))
+    envelope.near = ObstacleRules("auto", 2.0).rows(context(sectors(now_ns, near), vehicle=vehicle))
     asked = Setpoint.velocity((2.0, 2.0, 0.0), now_ns)
     sent = envelope.apply(asked, vehicle.state, now_ns, 0.05)
     assert sent.sent.velocity_ned_mps is not None
@@ -86,7 +86,7 @@ def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
     vehicle = KinematicVehicle()
     envelope = Envelope()
     near = sectors(vehicle.now_ns, {0: 3.0, 1: 3.0, -1: 3.0})
-    envelope.near = ObstacleRules("auto", 2.0).rows(situation(near, vehicle=vehicle))
+    envelope.near = ObstacleRules("auto", 2.0).rows(context(near, vehicle=vehicle))
     sent = envelope.apply(
         Setpoint.position((10.0, 0.0, -5.0), vehicle.now_ns), vehicle.state, vehicle.now_ns, 0.05
     )
@@ -96,8 +96,8 @@ def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
 
 def test_unknown_is_not_limited_unless_the_operator_says_so() -> None:
     seen = sectors(KinematicVehicle().now_ns, rest=NAN)
-    assert ObstacleRules("auto").rows(situation(seen)) == ()
-    rows = ObstacleRules("auto", unknown_speed_mps=1.0).rows(situation(seen))
+    assert ObstacleRules("auto").rows(context(seen)) == ()
+    rows = ObstacleRules("auto", unknown_speed_mps=1.0).rows(context(seen))
     assert len(rows) == SECTORS
     assert {row[2] for row in rows} == {1.0}
 
@@ -106,21 +106,23 @@ def test_depth_that_stops_coming_is_named_and_brakes() -> None:
     vehicle = KinematicVehicle()
     seen = sectors(vehicle.now_ns)
     rules = ObstacleRules("auto")
-    assert rules.blind(situation(seen, age_s=MAX_AGE_S - 0.1)) is None
-    assert rules.blind(situation(seen, age_s=0.7)) == "no depth to fly by: the newest is 0.7 s old"
-    assert rules.blind(situation(None)) is None
-    assert ObstacleRules("required").blind(situation(None)) == "no depth to fly by: none came yet"
-    assert ObstacleRules("off").blind(situation(seen, age_s=9.0)) is None
+    assert rules.blind(context(seen, age_s=MAX_AGE_S - 0.1)) is None
+    assert rules.blind(context(seen, age_s=0.7)) == "no depth to fly by: the newest is 0.7 s old"
+    assert rules.blind(context(None)) is None
+    assert ObstacleRules("required").blind(context(None)) == "no depth to fly by: none came yet"
+    assert ObstacleRules("off").blind(context(seen, age_s=9.0)) is None
 
 
 def test_required_depth_that_is_missing_is_a_refusal_that_names_it() -> None:
     goto = GotoBehaviour(from_here_m=(5.0, 0.0))
     rules = ObstacleRules("required")
-    why = refusal(goto, situation(None), None, obstacles=rules)
+    why = check_requirements(goto, context(None), None, obstacles=rules)
     assert why is not None
     assert "needs depth (none came yet" in why
-    assert refusal(LandBehaviour(), situation(None), None, obstacles=rules) is None
-    assert refusal(goto, situation(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
+    assert check_requirements(LandBehaviour(), context(None), None, obstacles=rules) is None
+    assert (
+        check_requirements(goto, context(sectors(KinematicVehicle().now_ns)), None, obstacles=rules) is None
+    )
 
 
 def test_the_pilot_sends_a_brake_while_depth_is_missing() -> None:
@@ -146,7 +148,7 @@ def test_the_pilot_sends_a_brake_while_depth_is_missing() -> None:
 
 def test_what_has_left_the_picture_is_remembered_where_it_stands() -> None:
     memory, vehicle = ObstacleMemory(), KinematicVehicle()
-    memory.filled(situation(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
+    memory.filled(context(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle))
     vehicle.position[0] += 1.0
     vehicle.now_ns += 10**9
     assert ahead_m(memory, vehicle) == pytest.approx(3.0)

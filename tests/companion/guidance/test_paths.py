@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from companion.geometry.geodesy import north_east
 from companion.guidance import grammar
 from companion.guidance.arguments import GrammarError
-from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour, lemniscate
 from companion.guidance.behaviours.follow_path import FollowPath, FollowPathBehaviour
 from companion.guidance.behaviours.goto import GotoBehaviour
@@ -31,7 +31,7 @@ WIDE = Limits(max_distance_m=1000.0, max_altitude_m=100.0)
 places = st.tuples(*[st.floats(-50, 50)] * 3)
 
 
-def flown(
+def active(
     behaviour: Behaviour, seconds: float = 120.0, vehicle: KinematicVehicle | None = None
 ) -> tuple[Flight, Outcome]:
     flight = Flight(behaviour, vehicle or KinematicVehicle(), limits=WIDE)
@@ -49,7 +49,7 @@ def off_the_line(place: Sequence[float], start: Sequence[float], end: Sequence[f
 
 
 def test_goto_flies_straight_there_and_stops_with_the_nose_along_the_way() -> None:
-    flight, outcome = flown(GotoBehaviour(from_home_m=(20.0, -10.0), altitude_m=8.0))
+    flight, outcome = active(GotoBehaviour(from_home_m=(20.0, -10.0), altitude_m=8.0))
     assert outcome.success
     assert math.dist(flight.vehicle.position, (20.0, -10.0, -8.0)) < 0.5
     assert max(off_the_line(place, (0, 0, -5), (20, -10, -8)) for place in flight.track) < 0.3
@@ -65,20 +65,20 @@ def test_goto_flies_straight_there_and_stops_with_the_nose_along_the_way() -> No
 
 def test_goto_by_the_nose_and_with_a_heading() -> None:
     vehicle = KinematicVehicle(position=[5.0, 5.0, -5.0], yaw_rad=math.pi / 2)
-    flight, outcome = flown(GotoBehaviour(from_here_m=(10.0, 2.0), heading_rad=math.pi), vehicle=vehicle)
+    flight, outcome = active(GotoBehaviour(from_here_m=(10.0, 2.0), heading_rad=math.pi), vehicle=vehicle)
     assert outcome.success
     assert math.dist(flight.vehicle.position, (3.0, 15.0, -5.0)) < 0.5
     assert abs(wrap_angle(flight.vehicle.yaw_rad - math.pi)) < 0.05
 
 
 def test_goto_where_it_is_already_ends_at_once_and_in_success() -> None:
-    _, outcome = flown(GotoBehaviour(from_here_m=(0.0, 0.0)), 10.0)
+    _, outcome = active(GotoBehaviour(from_here_m=(0.0, 0.0)), 10.0)
     assert outcome.success
 
 
 def test_goto_by_latitude_and_longitude_needs_to_know_its_own() -> None:
     behaviour = GotoBehaviour(global_deg=(47.0, 8.0))
-    _, outcome = flown(behaviour)
+    _, outcome = active(behaviour)
     assert not outcome.success
     assert "does not know its latitude" in outcome.reason
 
@@ -87,8 +87,8 @@ def test_goto_by_latitude_and_longitude() -> None:
     vehicle = KinematicVehicle()
     state = replace(vehicle.state, global_ns=vehicle.now_ns, latitude_deg=47.397742, longitude_deg=8.545594)
     behaviour = GotoBehaviour(global_deg=(47.397742 + 1e-4, 8.545594))
-    behaviour.on_activate(Situation(vehicle.now_ns, state))
-    step = behaviour.update(0.0, Situation(vehicle.now_ns, state))
+    behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
+    step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))
     assert isinstance(step, Setpoint)
     assert behaviour._follower is not None
     assert behaviour._follower.path.length_m == pytest.approx(11.12, abs=0.01)
@@ -108,7 +108,7 @@ def test_a_goal_beyond_a_limit_is_given_up_with_the_reason() -> None:
 
 def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners() -> None:
     points = [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0, 8.0), (0.0, 20.0)]
-    flight, outcome = flown(FollowPathBehaviour(points, 4.0))
+    flight, outcome = active(FollowPathBehaviour(points, 4.0))
     assert outcome.success, outcome.reason
     corners = [(0, 0, -5), (20, 0, -5), (20, 20, -8), (0, 20, -8)]
     for corner in corners:
@@ -120,7 +120,7 @@ def test_a_path_is_flown_along_all_its_points_slowly_round_its_corners() -> None
 def test_a_path_is_flown_round_and_round_from_a_vehicle_far_from_it() -> None:
     points = [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)]
     vehicle = KinematicVehicle(position=[-60.0, 0.0, -5.0])
-    flight, outcome = flown(FollowPathBehaviour(points, 3.0, laps=2.0), 200.0, vehicle)
+    flight, outcome = active(FollowPathBehaviour(points, 3.0, laps=2.0), 200.0, vehicle)
     assert outcome.success, outcome.reason
     assert "2 laps" in outcome.reason
     times_by = sum(
@@ -131,10 +131,10 @@ def test_a_path_is_flown_round_and_round_from_a_vehicle_far_from_it() -> None:
 
 
 def test_where_a_path_turns_back_on_itself_it_is_flown_to_the_end_first() -> None:
-    flight, outcome = flown(FollowPathBehaviour([(10.0, 0.0), (0.0, 0.0)], 3.0))
+    flight, outcome = active(FollowPathBehaviour([(10.0, 0.0), (0.0, 0.0)], 3.0))
     assert outcome.success
     assert max(place[0] for place in flight.track) > 9.5
-    flight, outcome = flown(FollowPathBehaviour([(0.0, 0.0), (4.0, 0.0)], 3.0, laps=3.0))
+    flight, outcome = active(FollowPathBehaviour([(0.0, 0.0), (4.0, 0.0)], 3.0, laps=3.0))
     assert outcome.success
     assert sum(a[0] < 3.4 <= b[0] for a, b in itertools.pairwise(flight.track)) == 3
 
@@ -142,7 +142,7 @@ def test_where_a_path_turns_back_on_itself_it_is_flown_to_the_end_first() -> Non
 def test_a_round_is_begun_at_its_first_point_from_wherever() -> None:
     points = [(0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)]
     vehicle = KinematicVehicle(position=[30.0, -30.0, -5.0])
-    flight, outcome = flown(FollowPathBehaviour(points, 4.0, laps=2.0), 200.0, vehicle)
+    flight, outcome = active(FollowPathBehaviour(points, 4.0, laps=2.0), 200.0, vehicle)
     assert outcome.success
     first = next(i for i, place in enumerate(flight.track) if math.dist(place, (0, 0, -5)) < 1.5)
     second = next(i for i, place in enumerate(flight.track) if math.dist(place, (30, 30, -5)) < 1.5)
@@ -150,14 +150,14 @@ def test_a_round_is_begun_at_its_first_point_from_wherever() -> None:
 
 
 def test_a_steep_way_stays_on_its_line_within_the_limits_of_climb() -> None:
-    flight, outcome = flown(GotoBehaviour(from_home_m=(30.0, 0.0), altitude_m=35.0, speed_mps=8.0))
+    flight, outcome = active(GotoBehaviour(from_home_m=(30.0, 0.0), altitude_m=35.0, speed_mps=8.0))
     assert outcome.success
     assert max(off_the_line(place, (0, 0, -5), (30, 0, -35)) for place in flight.track) < 1.5
 
 
 def test_a_slow_climb_is_as_slow_as_it_was_asked_for() -> None:
     behaviour = GotoBehaviour(from_here_m=(0.0, 0.0), altitude_m=8.0, speed_mps=0.2)
-    flight, outcome = flown(behaviour)
+    flight, outcome = active(behaviour)
     assert outcome.success
     steps = itertools.pairwise(flight.track)
     assert max(abs(b[2] - a[2]) for a, b in steps) < 0.25 / 50
@@ -168,14 +168,14 @@ def test_a_place_about_home_needs_to_know_home() -> None:
     state = replace(vehicle.state, home_position_ned_m=None)
     for text in ("goto 1 2", "follow-path 1,2 3,4", "goto forward=1 right=1 altitude=5"):
         behaviour = grammar.parse(text).build(NO_CONTEXT)
-        behaviour.on_activate(Situation(vehicle.now_ns, state))
-        step = behaviour.update(0.0, Situation(vehicle.now_ns, state))
+        behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
+        step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))
         assert isinstance(step, Outcome)
         assert "where home is" in step.reason
 
 
 def test_an_eight_is_flown_on_its_line() -> None:
-    flight, outcome = flown(FigureEightBehaviour(10.0, 2.5, 1.0), vehicle=KinematicVehicle(yaw_rad=0.7))
+    flight, outcome = active(FigureEightBehaviour(10.0, 2.5, 1.0), vehicle=KinematicVehicle(yaw_rad=0.7))
     assert outcome.success, outcome.reason
     line = lemniscate((0.0, 0.0, -5.0), 0.7, 10.0)
     legs = list(zip(line, line[1:] + line[:1], strict=True))

@@ -14,7 +14,7 @@ from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObj
 ROUND = ((0.0, 0.0), (24.0, 0.0), (24.0, 24.0), (0.0, 24.0))
 
 
-def flown(
+def active(
     behaviour: PatrolBehaviour,
     objects: list[SeenObject],
     seconds: float = 240.0,
@@ -38,7 +38,7 @@ def nearest(flight: Flight, place: Sequence[float]) -> float:
 
 
 def test_a_round_without_anything_to_see_is_flown_whole() -> None:
-    outcome, notes, flight = flown(PatrolBehaviour(ROUND, ["car"], laps=1.0), [SeenObject("person", 10, 3)])
+    outcome, notes, flight = active(PatrolBehaviour(ROUND, ["car"], laps=1.0), [SeenObject("person", 10, 3)])
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert outcome.reason == "1 lap of 4 points flown, 0 stops"
@@ -55,7 +55,7 @@ def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_l
         if "looking at" in behaviour.status and math.hypot(*vehicle.velocity) < 0.1:
             standing.append((tuple(vehicle.position), vehicle.yaw_rad))
 
-    outcome, notes, flight = flown(behaviour, [car], each=each)
+    outcome, notes, flight = active(behaviour, [car], each=each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert outcome.reason.endswith("1 stop")
@@ -75,7 +75,7 @@ def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_l
 def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way() -> None:
     car = SeenObject("car", 16.0, 9.0, track_id=3)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, wait_s=1.0)
-    outcome, notes, flight = flown(behaviour, [car])
+    outcome, notes, flight = active(behaviour, [car])
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert notes[1].startswith("patrol: reached car at")
@@ -87,14 +87,14 @@ def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way() -> None:
 @pytest.mark.parametrize("with_identity", [True, False])
 def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity: bool) -> None:
     car = SeenObject("car", 12.0, 5.0, track_id=7 if with_identity else None)
-    outcome, notes, _ = flown(
+    outcome, notes, _ = active(
         PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=600.0), [car], 400
     )
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert len(notes) == 1
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=20.0)
-    outcome, notes, _ = flown(behaviour, [car], 400)
+    outcome, notes, _ = active(behaviour, [car], 400)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert len(notes) >= 2
@@ -103,14 +103,14 @@ def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_iden
 def test_two_objects_of_a_class_stop_it_once_each() -> None:
     cars = [SeenObject("car", 15.0, 4.0, track_id=1), SeenObject("car", 20.0, 16.0, track_id=2)]
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, wait_s=1.0)
-    outcome, notes, _ = flown(behaviour, cars)
+    outcome, notes, _ = active(behaviour, cars)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert sorted(note.split("(")[1][:7] for note in notes) == ["track 1", "track 2"]
 
 
 def test_what_does_not_count_as_true_does_not_stop_it() -> None:
-    outcome, notes, _ = flown(
+    outcome, notes, _ = active(
         PatrolBehaviour(ROUND, ["car"], laps=1.0), [SeenObject("car", 15.0, 4.0, trusted=False)]
     )
     assert outcome is not None
@@ -126,7 +126,7 @@ def test_what_vanishes_before_it_is_faced_is_told_and_the_round_goes_on() -> Non
         if "looking at" in behaviour.status:
             car.visible = False
 
-    outcome, notes, _ = flown(behaviour, [car], each=each)
+    outcome, notes, _ = active(behaviour, [car], each=each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert notes == ["patrol: lost sight of a car (track 9) before it was faced"]

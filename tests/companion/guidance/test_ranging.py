@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from companion.guidance.behaviour import Situation
+from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.refusal import refusal
+from companion.guidance.requirements import check_requirements
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel
@@ -20,8 +20,8 @@ OTHERS = ("seek kite", "orbit", 'patrol "0,0 9,9" classes=kite')
 
 def why(command: str, means: RangeMeans) -> str | None:
     vehicle = KinematicVehicle()
-    situation = Situation(vehicle.now_ns, vehicle.state, (), 0.05, True, ranging=means)
-    return refusal(parse(command).build(NO_CONTEXT), situation, None)
+    context = BehaviourContext(vehicle.now_ns, vehicle.state, (), 0.05, True, ranging=means)
+    return check_requirements(parse(command).build(NO_CONTEXT), context, None)
 
 
 @pytest.mark.parametrize("command", NEEDING)

@@ -34,7 +34,7 @@ class Wait(Command):
 class WaitBehaviour(Behaviour):
     name = "{word}"
 
-    def update(self, dt_s, situation):
+    def update(self, dt_s, context):
         return Outcome(True, "waited")
 """
 

@@ -8,19 +8,19 @@ from typing import Any
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, Outcome, Situation
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.gimbal.sweep import GimbalSweep
-from companion.guidance.gimbal_sight import GimbalSight
-from companion.guidance.refusal import refusal
+from companion.guidance.gimbal_status import GimbalStatus
+from companion.guidance.requirements import check_requirements
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from companion.vehicle.setpoint import Setpoint
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import quaternion_from_euler
 
-CARRIED = GimbalSight(carries_camera=True)
+CARRIED = GimbalStatus(carries_camera=True)
 FIELD_RAD = math.radians(80.0)
 
 
@@ -39,11 +39,11 @@ def gimbal(now_ns: int, pitch_deg: float = 0.0, **changes: Any) -> GimbalState:
     return replace(replace(known, lowest_pitch_rad=low, highest_pitch_rad=high), **changes)
 
 
-def situation(told: GimbalState | None, sight: GimbalSight = CARRIED, now_ns: int = 0) -> Situation:
+def context(told: GimbalState | None, sight: GimbalStatus = CARRIED, now_ns: int = 0) -> BehaviourContext:
     vehicle = KinematicVehicle()
     vehicle.now_ns = now_ns or vehicle.now_ns
     state = replace(vehicle.state, gimbal=told)
-    return Situation(vehicle.now_ns, state, (), 0.05, not sight.undirected, gimbal=sight)
+    return BehaviourContext(vehicle.now_ns, state, (), 0.05, not sight.undirected, gimbal=sight)
 
 
 NOW_NS = KinematicVehicle().now_ns
@@ -67,7 +67,7 @@ NOW_NS = KinematicVehicle().now_ns
         ),
         pytest.param(
             gimbal(NOW_NS),
-            GimbalSight(carries_camera=True, elsewhere="245/190"),
+            GimbalStatus(carries_camera=True, elsewhere="245/190"),
             "control of the gimbal (245/190 has it, and must give it back)",
             id="another's",
         ),
@@ -85,25 +85,28 @@ NOW_NS = KinematicVehicle().now_ns
         ),
         pytest.param(
             gimbal(NOW_NS),
-            GimbalSight(),
+            GimbalStatus(),
             "the camera on the gimbal (camera.gimbal is not set)",
             id="no camera",
         ),
     ],
 )
 def test_a_seek_with_a_sweep_names_what_of_the_gimbal_is_missing(
-    told: GimbalState | None, sight: GimbalSight, words: str
+    told: GimbalState | None, sight: GimbalStatus, words: str
 ) -> None:
-    why = refusal(seek(), situation(told, sight), None)
+    why = check_requirements(seek(), context(told, sight), None)
     assert why is not None
     assert words in why
 
 
 def test_with_everything_there_nothing_is_missing_and_without_a_sweep_no_gimbal_is_needed() -> None:
-    assert refusal(seek(), situation(gimbal(NOW_NS)), None) is None
-    assert refusal(SeekBehaviour("car"), situation(None, GimbalSight()), None) is None
+    assert check_requirements(seek(), context(gimbal(NOW_NS)), None) is None
+    assert check_requirements(SeekBehaviour("car"), context(None, GimbalStatus()), None) is None
     assert (
-        refusal(PointGimbalBehaviour(GimbalAim(-0.5)), situation(gimbal(NOW_NS), GimbalSight()), None) is None
+        check_requirements(
+            PointGimbalBehaviour(GimbalAim(-0.5)), context(gimbal(NOW_NS), GimbalStatus()), None
+        )
+        is None
     )
 
 
@@ -111,8 +114,8 @@ def test_with_everything_there_nothing_is_missing_and_without_a_sweep_no_gimbal_
 def test_what_looks_through_a_camera_of_which_nobody_knows_where_it_looks_is_refused(
     behaviour: SeekBehaviour | ApproachBehaviour,
 ) -> None:
-    sight = GimbalSight(carries_camera=True, undirected="the gimbal that carries it: no gimbal answers")
-    why = refusal(behaviour, situation(None, sight), None)
+    sight = GimbalStatus(carries_camera=True, undirected="the gimbal that carries it: no gimbal answers")
+    why = check_requirements(behaviour, context(None, sight), None)
     assert why == (
         f"{behaviour.name} needs to know where its camera looks "
         "(the gimbal that carries it: no gimbal answers)"
@@ -120,13 +123,13 @@ def test_what_looks_through_a_camera_of_which_nobody_knows_where_it_looks_is_ref
 
 
 def fly(
-    behaviour: Behaviour, sights: list[GimbalSight], follows: bool = True, limit_s: float = 60.0
+    behaviour: Behaviour, sights: list[GimbalStatus], follows: bool = True, limit_s: float = 60.0
 ) -> Outcome | None:
     """20 turns a second; the gimbal looks where it is asked to, or does not; the last sight stays."""
     now_ns, pitch_deg, yaw_rad = NOW_NS, 0.0, 0.0
     for turn in range(round(limit_s * 20)):
         sight = sights[min(turn, len(sights) - 1)]
-        told = situation(gimbal(now_ns, pitch_deg), sight, now_ns)
+        told = context(gimbal(now_ns, pitch_deg), sight, now_ns)
         told = replace(told, state=replace(told.state, attitude=quaternion_from_euler(0.0, 0.0, yaw_rad)))
         if turn == 0:
             behaviour.on_activate(told)
@@ -186,7 +189,7 @@ def test_a_gimbal_whose_attitude_is_withdrawn_ends_the_sweep_and_the_reason_is_t
     left: GimbalState | None, words: str, vain: bool
 ) -> None:
     behaviour = SeekBehaviour("car", sweep=sweep())
-    told = situation(gimbal(NOW_NS))
+    told = context(gimbal(NOW_NS))
     behaviour.on_activate(told)
     assert isinstance(behaviour.update(0.05, told), Setpoint)
     behaviour._vain = "no car seen in 2 laps" if vain else ""  # the gimbal then goes back
@@ -196,7 +199,7 @@ def test_a_gimbal_whose_attitude_is_withdrawn_ends_the_sweep_and_the_reason_is_t
 
 def test_a_gimbal_that_is_gone_when_the_seek_begins_is_named_too() -> None:
     behaviour = seek()
-    told = situation(None)
+    told = context(None)
     behaviour.on_activate(told)
     assert behaviour.update(0.05, told) == Outcome(False, "seek lost the gimbal: none answers")
 

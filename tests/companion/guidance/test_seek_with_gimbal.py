@@ -40,7 +40,7 @@ def fly(
     seen: dict[int, Target] = {}
 
     def each(moment: Moment) -> None:
-        for target in moment.situation.targets:
+        for target in moment.context.targets:
             seen.setdefault(target.captured_ns, target)
 
     log = flight.fly(parse(command).build(BuildContext(FOOTPRINT)), limit_s, each=each)
@@ -67,7 +67,7 @@ def cut_off(target: Target) -> bool:
 def pitches(log: FlightLog) -> list[float]:
     found = []
     for moment in log.moments:
-        gimbal = moment.situation.state.gimbal
+        gimbal = moment.context.state.gimbal
         assert gimbal is not None
         assert gimbal.pitch_rad is not None
         found.append(math.degrees(gimbal.pitch_rad))
@@ -126,7 +126,7 @@ def test_directions_and_places_are_right_while_the_gimbal_moves_and_the_vehicle_
     assert pitches(log)[-1] == pytest.approx(pitches(log)[0], abs=5.0), "in vain, it looks where it did"
     assert min(pitches(log)) == pytest.approx(-60.0, abs=5.5)
     errors_rad, errors_m = [], []
-    stamps = np.array([moment.situation.now_ns for moment in log.moments])
+    stamps = np.array([moment.context.now_ns for moment in log.moments])
     whole = [target for target in seen if not cut_off(target)]
     for target in whole:
         index = int(np.argmin(np.abs(stamps - target.captured_ns)))

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from companion.guidance.formation.neighbours import Neighbour
 from companion.guidance.formation.separation import (
-    Row,
+    SpeedConstraint,
     allowed_speed,
-    apart,
-    around,
-    level_rows,
+    apply_separation,
+    avoid,
+    constraints_at,
+    level_constraints,
     pushed_apart,
-    rows_at,
 )
 from companion.guidance.limits.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
@@ -63,7 +63,7 @@ def test_from_the_allowed_speed_both_can_stop_in_the_way_there_is(
 directions = st.floats(-math.pi, math.pi)
 rows = st.lists(
     st.tuples(directions, st.floats(-1.5, 1.5), st.floats(0, 4)).map(
-        lambda row: Row(
+        lambda row: SpeedConstraint(
             math.cos(row[0]) * math.cos(row[1]),
             math.sin(row[0]) * math.cos(row[1]),
             math.sin(row[1]),
@@ -77,8 +77,10 @@ rows = st.lists(
 
 @settings(max_examples=200)
 @given(velocity, rows)
-def test_a_limit_takes_away_and_leaves_every_limit_kept(asked: Vector3, limits: list[Row]) -> None:
-    left, names = apart(asked, limits)
+def test_a_limit_takes_away_and_leaves_every_limit_kept(
+    asked: Vector3, limits: list[SpeedConstraint]
+) -> None:
+    left, names = apply_separation(asked, limits)
     assert math.hypot(*left) <= math.hypot(*asked) + 1e-6
     for row in limits:
         assert left[0] * row.north + left[1] * row.east + left[2] * row.down <= row.allowed_mps + 1e-5
@@ -86,19 +88,19 @@ def test_a_limit_takes_away_and_leaves_every_limit_kept(asked: Vector3, limits: 
 
 
 def test_a_virtual_vehicle_is_no_obstacle() -> None:
-    assert rows_at((0, 0, 0), [neighbour((1.0, 0.0, 0.0), role="virtual")], 3.0, 2.0) == []
+    assert constraints_at((0, 0, 0), [neighbour((1.0, 0.0, 0.0), role="virtual")], 3.0, 2.0) == []
 
 
 def test_above_another_the_way_over_ground_is_free_and_the_way_down_is_not() -> None:
-    (row,) = rows_at((0.0, 0.0, -10.0), [neighbour((0.0, 0.0, -6.0))], 3.0, 2.0)
+    (row,) = constraints_at((0.0, 0.0, -10.0), [neighbour((0.0, 0.0, -6.0))], 3.0, 2.0)
     assert row.down == 1.0
-    assert level_rows([row], 0.0) == []
-    assert apart((3.0, 0.0, 1.0), [row])[0] == pytest.approx((3.0, 0.0, row.allowed_mps))
+    assert level_constraints([row], 0.0) == []
+    assert apply_separation((3.0, 0.0, 1.0), [row])[0] == pytest.approx((3.0, 0.0, row.allowed_mps))
 
 
 def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_right() -> None:
     def side(east: float) -> float:
-        way, _ = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
+        way, _ = avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, east, 0.0))], 4.0)
         assert math.hypot(*way) == pytest.approx(2.0)
         return way[1]
 
@@ -108,14 +110,14 @@ def test_who_stands_in_the_way_is_passed_on_the_nearer_side_and_head_on_on_the_r
     assert side(6.0) == 0.0
     straight = ((2.0, 0.0), 1.0)
     # Not as far as there; and far above.
-    assert around((2.0, 0.0), 4.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0) == straight
-    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, -9.0))], 4.0) == straight
+    assert avoid((2.0, 0.0), 4.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0) == straight
+    assert avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, -9.0))], 4.0) == straight
     # The side it turned to is kept while the other is not much better.
-    (_, east), side_now = around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0, -1.0)
+    (_, east), side_now = avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), [neighbour((8.0, 0.0, 0.0))], 4.0, -1.0)
     assert (east < 0.0, side_now) == (True, -1.0)
     # Hemmed in on all sides it stays.
     ring = [neighbour((3.0 * math.cos(a), 3.0 * math.sin(a), 0.0)) for a in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)]
-    assert around((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), ring, 4.0)[0] == (0.0, 0.0)
+    assert avoid((2.0, 0.0), 20.0, (0.0, 0.0, 0.0), ring, 4.0)[0] == (0.0, 0.0)
 
 
 def test_who_is_too_near_is_pushed_away_and_nobody_else() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from companion.guidance.behaviour import Behaviour, Outcome, Requirement, Situation, Step
+from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
 from companion.guidance.missions.mission_file import plan_from
@@ -250,7 +250,7 @@ def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode: Fl
     harness.until(lambda: len(behaviour.records) >= 3)
     harness.autopilot.change_mode(mode)
     harness.until(future.done, 2.0)
-    sent, flown = len(harness.autopilot.setpoints), len(behaviour.records)
+    sent, active = len(harness.autopilot.setpoints), len(behaviour.records)
     ended = behaviour.told(future.result())
     assert ended.reason.startswith("step ")
     assert "the pilot took over" in ended.reason
@@ -258,7 +258,7 @@ def test_a_pilot_ends_the_mission_at_any_step_and_nothing_is_sent_after(mode: Fl
     harness.autopilot.change_mode(FlightMode.OFFBOARD)
     harness.run(5.0)
     assert len(harness.autopilot.setpoints) == sent
-    assert len(behaviour.records) == flown
+    assert len(behaviour.records) == active
     assert not harness.guidance.in_command
 
 
@@ -282,10 +282,10 @@ class Broken(Behaviour):
     requirements = frozenset({Requirement.POSITION})
     left = False
 
-    def update(self, dt_s: float, situation: Situation) -> Step:
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         if dt_s:
             raise ZeroDivisionError("no such luck")
-        return Setpoint.brake(situation.now_ns)
+        return Setpoint.brake(context.now_ns)
 
     def on_deactivate(self) -> None:
         self.left = True
@@ -326,6 +326,6 @@ def test_what_a_step_tells_and_needs_is_told_and_needed_by_the_mission() -> None
     harness.until(lambda: harness.guidance.phase == "offboard")
     assert behaviour.landing_target == TARGET
     assert [output.landing_target for output in harness.outputs if output.landing_target] == [TARGET], "once"
-    assert behaviour.flown is telling
+    assert behaviour.active is telling
     assert behaviour.requirements == telling.requirements
     harness.outcome(future)

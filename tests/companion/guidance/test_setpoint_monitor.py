@@ -28,13 +28,13 @@ class Sequence:
     largest_mps: float = 0.0
 
     def fly(
-        self, sent: Velocity | Setpoint, flown: Velocity, lasting_s: float, *, landing: bool = False
+        self, sent: Velocity | Setpoint, active: Velocity, lasting_s: float, *, landing: bool = False
     ) -> float | None:
         """Until the monitor says so (seconds since the beginning of this part) or the time is over (None)."""
         for index in range(round(lasting_s / PERIOD_S)):
             part_s = index * PERIOD_S
             self.seconds += PERIOD_S
-            velocity, position = flown(part_s), self.state.position_ned_m
+            velocity, position = active(part_s), self.state.position_ned_m
             assert position is not None
             north, east, down = (p + v * PERIOD_S for p, v in zip(position, velocity, strict=True))
             self.state = replace(
@@ -130,14 +130,14 @@ def test_a_vehicle_that_swings_about_the_setpoint_is_followed() -> None:
     """A badly tuned hold: 1.6 m/s to and fro, against setpoints that are a quarter of a period late."""
     rate_radps = 1.9
 
-    def flown(seconds: float) -> Vector3:
+    def active(seconds: float) -> Vector3:
         return (1.6 * math.cos(rate_radps * seconds), 1.6 * math.sin(rate_radps * seconds), 0.0)
 
     def sent(seconds: float) -> Vector3:
         return (-math.sin(rate_radps * seconds), math.cos(rate_radps * seconds), 0.0)
 
     sequence = Sequence()
-    assert sequence.fly(sent, flown, 20.0) is None
+    assert sequence.fly(sent, active, 20.0) is None
     assert sequence.largest_mps > 0.8
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from companion.guidance.behaviour import ModeRequest, Outcome, Situation
+from companion.guidance.behaviour import BehaviourContext, ModeRequest, Outcome
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
@@ -19,9 +19,9 @@ PARKED = replace(
 )
 
 
-def situation(seconds: float, state: VehicleState = PARKED, **changes: Any) -> Situation:
+def context(seconds: float, state: VehicleState = PARKED, **changes: Any) -> BehaviourContext:
     now_ns = START_NS + round(seconds * 1e9)
-    return Situation(now_ns, replace(state, attitude_ns=now_ns, position_ns=now_ns, **changes))
+    return BehaviourContext(now_ns, replace(state, attitude_ns=now_ns, position_ns=now_ns, **changes))
 
 
 def climbing(
@@ -32,40 +32,40 @@ def climbing(
 
 def test_takeoff_asks_the_autopilot_until_it_holds_near_the_height() -> None:
     behaviour = TakeoffBehaviour(5.0)
-    behaviour.on_activate(situation(0))
+    behaviour.on_activate(context(0))
     request = ModeRequest(FlightMode.TAKEOFF, 5.0, arm=True)
-    assert behaviour.update(0.0, situation(0)) == request
-    assert behaviour.update(0.02, situation(5, **climbing(4.8))) == request
+    assert behaviour.update(0.0, context(0)) == request
+    assert behaviour.update(0.02, context(5, **climbing(4.8))) == request
     holding = climbing(4.8, FlightMode.HOLD, LandedState.IN_AIR)
     rising = holding | {"velocity_ned_mps": (0.0, 0.0, -0.5)}
-    assert behaviour.update(0.02, situation(6, **rising)) == request
-    assert behaviour.update(0.02, situation(7, **holding)) == request
-    assert behaviour.update(0.02, situation(7.5, **holding)) == Outcome(
+    assert behaviour.update(0.02, context(6, **rising)) == request
+    assert behaviour.update(0.02, context(7, **holding)) == request
+    assert behaviour.update(0.02, context(7.5, **holding)) == Outcome(
         True, "took off, 4.8 m above home", (0.0, 0.0, -5.0)
     )
 
 
 def test_takeoff_climbs_the_rest_of_a_climb_that_was_ended_short() -> None:
     behaviour = TakeoffBehaviour(2.5)
-    behaviour.on_activate(situation(0))
+    behaviour.on_activate(context(0))
     short = climbing(2.1, FlightMode.HOLD, LandedState.IN_AIR)
-    assert isinstance(behaviour.update(0.02, situation(5.0, **short)), ModeRequest)
-    assert isinstance(behaviour.update(0.02, situation(5.9, **short)), ModeRequest)
-    step = behaviour.update(0.02, situation(6.1, **short))
+    assert isinstance(behaviour.update(0.02, context(5.0, **short)), ModeRequest)
+    assert isinstance(behaviour.update(0.02, context(5.9, **short)), ModeRequest)
+    step = behaviour.update(0.02, context(6.1, **short))
     assert isinstance(step, Setpoint)
     assert step.velocity_ned_mps is not None
     assert step.velocity_ned_mps[2] < -0.3
     risen = climbing(2.3, FlightMode.OFFBOARD, LandedState.IN_AIR)
-    assert isinstance(behaviour.update(0.02, situation(8.0, **risen)), Setpoint)
-    assert behaviour.update(0.02, situation(8.5, **risen)) == Outcome(
+    assert isinstance(behaviour.update(0.02, context(8.0, **risen)), Setpoint)
+    assert behaviour.update(0.02, context(8.5, **risen)) == Outcome(
         True, "took off, 2.3 m above home", (0.0, 0.0, -2.5)
     )
 
 
 def test_takeoff_that_never_leaves_the_ground_times_out_with_the_height_reached() -> None:
     behaviour = TakeoffBehaviour(5.0)
-    behaviour.on_activate(situation(0))
-    outcome = behaviour.update(0.02, situation(60, armed=True, mode=FlightMode.TAKEOFF))
+    behaviour.on_activate(context(0))
+    outcome = behaviour.update(0.02, context(60, armed=True, mode=FlightMode.TAKEOFF))
     assert outcome == Outcome(False, "take-off timed out: 0.0 m of 5 m reached")
 
 
@@ -80,14 +80,14 @@ def test_the_ways_down_end_when_the_autopilot_has_disarmed(
     kind: type[LandBehaviour] | type[ReturnBehaviour], mode: FlightMode, words: str
 ) -> None:
     behaviour = kind()
-    behaviour.on_activate(situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR)))
+    behaviour.on_activate(context(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR)))
     assert behaviour.update(
-        0.0, situation(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR))
+        0.0, context(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR))
     ) == ModeRequest(mode)
     touched: dict[str, Any] = {"armed": True, "mode": mode, "landed": LandedState.ON_GROUND}
-    assert behaviour.update(0.02, situation(9, **touched)) == ModeRequest(mode)
+    assert behaviour.update(0.02, context(9, **touched)) == ModeRequest(mode)
     # PX4 shows the mode from before the landing once it has disarmed.
-    assert behaviour.update(0.02, situation(11, mode=FlightMode.OFFBOARD)) == Outcome(True, words)
+    assert behaviour.update(0.02, context(11, mode=FlightMode.OFFBOARD)) == Outcome(True, words)
 
 
 @pytest.mark.parametrize("kind", [LandBehaviour, ReturnBehaviour])
@@ -95,8 +95,8 @@ def test_landing_what_stands_on_the_ground_is_done_at_once(
     kind: type[LandBehaviour] | type[ReturnBehaviour],
 ) -> None:
     behaviour = kind()
-    behaviour.on_activate(situation(0))
-    assert behaviour.update(0.0, situation(0)) == Outcome(True, "already on the ground, disarmed")
+    behaviour.on_activate(context(0))
+    assert behaviour.update(0.0, context(0)) == Outcome(True, "already on the ground, disarmed")
 
 
 @pytest.mark.parametrize(("kind", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
@@ -105,15 +105,15 @@ def test_a_way_down_that_does_not_end_times_out_with_where_the_vehicle_is(
 ) -> None:
     behaviour = kind()
     aloft = climbing(5.0, FlightMode.LAND, LandedState.LANDING)
-    behaviour.on_activate(situation(0, **aloft))
-    outcome = behaviour.update(0.02, situation(seconds, **aloft))
+    behaviour.on_activate(context(0, **aloft))
+    outcome = behaviour.update(0.02, context(seconds, **aloft))
     assert isinstance(outcome, Outcome)
     assert not outcome.success
     assert outcome.reason == f"{behaviour.name} timed out: landing and armed"
 
 
 def test_a_higher_or_further_vehicle_is_given_more_time() -> None:
-    near = situation(0, **climbing(5.0)).state
+    near = context(0, **climbing(5.0)).state
     far = replace(near, position_ned_m=(150.0, 0.0, -40.0))
     assert LandBehaviour().timeout_s(far) > LandBehaviour().timeout_s(near) + 50
     assert ReturnBehaviour().timeout_s(far) > ReturnBehaviour().timeout_s(near) + 50
@@ -121,13 +121,13 @@ def test_a_higher_or_further_vehicle_is_given_more_time() -> None:
 
 def test_stop_asks_for_hold_once_more_even_when_it_is_shown_already() -> None:
     behaviour = StopBehaviour()
-    behaviour.on_activate(situation(0))
-    assert behaviour.update(0.0, situation(0)) == ModeRequest(FlightMode.HOLD)
-    assert behaviour.update(0.02, situation(0.1)) == Outcome(True, "stopped: the autopilot holds")
+    behaviour.on_activate(context(0))
+    assert behaviour.update(0.0, context(0)) == ModeRequest(FlightMode.HOLD)
+    assert behaviour.update(0.02, context(0.1)) == Outcome(True, "stopped: the autopilot holds")
 
 
 def test_stop_that_the_autopilot_does_not_follow_times_out_with_its_mode() -> None:
     behaviour = StopBehaviour()
-    behaviour.on_activate(situation(0))
-    outcome = behaviour.update(0.02, situation(6, mode=FlightMode.OFFBOARD))
+    behaviour.on_activate(context(0))
+    outcome = behaviour.update(0.02, context(6, mode=FlightMode.OFFBOARD))
     assert outcome == Outcome(False, "hold mode was not reached in 5 s: offboard mode")

@@ -20,7 +20,7 @@ from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import euler_from_quaternion, quaternion_from_euler, slerp, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import DetectionRecord
-from vision.geolocation import foot_of_upright
+from vision.geolocation import range_from_known_height
 from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80))
@@ -240,7 +240,9 @@ def test_the_foot_of_what_stands_is_found_again_from_its_known_height(scene: Sce
     pixels = np.array([CAMERA.project(end)[0] for end in ends])
     (x, top), (_, bottom) = pixels + 0.5
     box = (x, top, x, bottom)  # thin: as deep as it is wide
-    found = foot_of_upright(CAMERA, MOUNT, matrix_from_quaternion(attitude), box, tall_m, min_spread=0.0)
+    found = range_from_known_height(
+        CAMERA, MOUNT, matrix_from_quaternion(attitude), box, tall_m, min_spread=0.0
+    )
     assert np.array(position) + found == pytest.approx(foot, abs=0.02 * distance)
 
 

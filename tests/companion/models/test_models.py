@@ -55,7 +55,7 @@ def test_a_bare_name_is_looked_for_in_the_models_folder(folder: Path, small_mode
 
 def test_info_tells_what_a_model_is() -> None:
     facts = json.loads(run("info", "default", "--json"))
-    assert facts["generation"] == "YOLOv8"
+    assert facts["model_family"] == "YOLOv8"
     assert facts["licence"] == "Apache-2.0"
     assert facts["classes"][0] == "person"
     assert facts["parameters"] > 100_000

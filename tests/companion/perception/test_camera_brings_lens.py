@@ -16,7 +16,7 @@ from companion.settings.reading import load_settings
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
 from mavlink_sim.testing import running_simulator
 from vision.camera_model import CameraModel
-from vision.geolocation import Sightlines
+from vision.geolocation import PixelRays
 from vision.shared_frame import segment_path
 
 HEIGHT_M = 3.0
@@ -52,7 +52,7 @@ def started_view(front: str, **camera: str) -> tuple[WorkerView, list[tuple[str,
 
     async def start() -> None:
         await view.start()
-        await view.keeper.stop()
+        await view.supervisor.stop()
 
     asyncio.run(start())
     return view, events, changes
@@ -65,7 +65,7 @@ def ground_range_m(view: WorkerView, true_m: float) -> float:
     pixels = DEFAULT_CAMERA.project(offset @ DEFAULT_MOUNT.ned_from_optical(np.eye(3)))
     camera = view.settings.camera
     model = camera.model(DEFAULT_CAMERA.width, DEFAULT_CAMERA.height)
-    return float(Sightlines.of(model, camera.mount(), np.eye(3), pixels).on_ground(HEIGHT_M)[0, 0])
+    return float(PixelRays.of(model, camera.mount(), np.eye(3), pixels).on_ground(HEIGHT_M)[0, 0])
 
 
 def test_a_ground_point_has_its_true_range_without_settings(front: str) -> None:

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.perception.keeper import PerceptionKeeper, PerceptionState
 from companion.perception.messages import Attitude, Ended, Hud, Report, packed, receive
-from companion.perception.outbox import Outbox
+from companion.perception.result_sender import ResultSender
+from companion.perception.supervisor import PerceptionState, PerceptionSupervisor
 from companion.perception.tracks import LiveTracks
-from companion.perception.worker import Orders
+from companion.perception.worker import ControlChannel
 from companion.settings import Settings
 from companion.settings.reading import load_settings
 from vision.attitude import quaternion_from_euler
@@ -100,14 +100,14 @@ def test_events_of_a_result_that_is_replaced_come_with_the_newer_one() -> None:
     ours, theirs = socket.socketpair()
     ours.settimeout(30)
     with ours, theirs:
-        outbox = Outbox(theirs, on_lost=lambda: None)
+        sender = ResultSender(theirs, on_lost=lambda: None)
         # Larger than the socket takes, so that everything after it waits.
         filler = Detections.empty(tuple(f"{number:01000}" for number in range(2000)))
-        outbox.put_newest(Report(PerceptionResult(0, 0, 0, 64, 48, filler, {}, 0), 1, 0))
-        outbox.put_newest(Report(result(1, event(NEW, 1), event(UPDATE, 2)), 2, 0))
-        outbox.put_newest(Report(result(2, event(UPDATE, 1), event(LOST, 2)), 3, 0))
-        outbox.put_newest(Report(result(3, event(UPDATE, 1), event(END, 2)), 4, 0))
-        closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", 4), 30.0))
+        sender.put_newest(Report(PerceptionResult(0, 0, 0, 64, 48, filler, {}, 0), 1, 0))
+        sender.put_newest(Report(result(1, event(NEW, 1), event(UPDATE, 2)), 2, 0))
+        sender.put_newest(Report(result(2, event(UPDATE, 1), event(LOST, 2)), 3, 0))
+        sender.put_newest(Report(result(3, event(UPDATE, 1), event(END, 2)), 4, 0))
+        closing = threading.Thread(target=sender.close, args=(Ended(True, "done", 4), 30.0))
         closing.start()
         first, second = receive(ours), receive(ours)
         closing.join()
@@ -120,16 +120,16 @@ def test_events_of_a_result_that_is_replaced_come_with_the_newer_one() -> None:
 def test_the_worker_takes_attitudes_beside_other_orders() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        orders = Orders(theirs)
+        control = ControlChannel(theirs)
         for step in range(6):
             ours.sendall(packed(Attitude(step * 20_000_000, quaternion_from_euler(0, 0, 0.1 * step))))
         ours.sendall(packed(Hud(("flying",), None)))
         deadline_s = time.monotonic() + DEADLINE_S
-        while orders.hud.lines != ("flying",):
+        while control.hud.lines != ("flying",):
             assert time.monotonic() < deadline_s
             time.sleep(0.001)
-        attitude = orders.telemetry.attitudes.at(50_000_000)
-        orders.finished()
+        attitude = control.telemetry.attitudes.at(50_000_000)
+        control.finished()
     assert attitude is not None
     np.testing.assert_allclose(attitude, matrix_from_euler(0, 0, 0.25), atol=1e-5)
 
@@ -185,7 +185,7 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
     settings: Settings,
 ) -> None:
     results: list[PerceptionResult] = []
-    keeper = PerceptionKeeper(settings, on_result=results.append, on_event=lambda *_: None)
+    supervisor = PerceptionSupervisor(settings, on_result=results.append, on_event=lambda *_: None)
 
     def told(kind: TrackEventKind) -> list[int]:
         return [e.track.track_id for r in results for e in r.track_events if e.kind is kind]
@@ -197,24 +197,24 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         """
         now_ns = time.monotonic_ns()
         yaw_rad = 2.5 * (now_ns // 500_000_000 % 2)
-        keeper.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, yaw_rad))
+        supervisor.send_attitude(now_ns, quaternion_from_euler(0.0, 0.0, yaw_rad))
         return bool(told(END))
 
-    await keeper.start()
+    await supervisor.start()
     try:
         await until(lambda: len(results) >= 5)
         assert told(NEW)
         assert told(END) == []
-        assert keeper.status.tracks == len(told(NEW))
+        assert supervisor.status.tracks == len(told(NEW))
         assert results[-1].timing_ms["track"] > 0
         assert set(ids_in(results[-1])) >= set(told(NEW))
 
         await until(spun)
 
-        pid = keeper.status.pid
+        pid = supervisor.status.pid
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
-        await until(lambda: keeper.status.state is PerceptionState.RESTARTING)
+        await until(lambda: supervisor.status.state is PerceptionState.RESTARTING)
         before, live = len(results), set(told(NEW)) - set(told(END))
         await until(lambda: len(results) > before + 3)
         after = results[before:]
@@ -223,7 +223,7 @@ async def test_a_worker_tracks_by_the_vehicles_attitude_and_the_one_after_it_tak
         newer = [number for r in after for number in ids_in(r) if number != NO_TRACK]
         assert min(newer) > max(number for r in results[:before] for number in ids_in(r))
     finally:
-        await keeper.stop()
+        await supervisor.stop()
 
 
 class Turned:
@@ -236,22 +236,22 @@ class Turned:
         self.stamps_ns.append(attitude.stamp_ns)
 
 
-def keeper_with(told: Turned, **overrides: str) -> PerceptionKeeper:
+def supervisor_with(told: Turned, **overrides: str) -> PerceptionSupervisor:
     settings = load_settings(os.devnull, overrides, {})
-    keeper = PerceptionKeeper(settings, on_result=lambda _: None, on_event=lambda *_: None)
-    keeper._process = told  # type: ignore[assignment]
-    return keeper
+    supervisor = PerceptionSupervisor(settings, on_result=lambda _: None, on_event=lambda *_: None)
+    supervisor._process = told  # type: ignore[assignment]
+    return supervisor
 
 
 @pytest.mark.parametrize("rate_hz", [30, 50, 77, 250])
 def test_at_most_fifty_attitudes_a_second_go_to_the_worker_and_none_twice(rate_hz: int) -> None:
     told = Turned()
-    keeper = keeper_with(told)
+    supervisor = supervisor_with(told)
     rng = np.random.default_rng(rate_hz)
     for step in range(4 * rate_hz):
         stamp_ns = round((1.0 + step / rate_hz + rng.uniform(0, 0.2) / rate_hz) * 1e9)
         for _ in range(2):  # other telemetry comes with the same attitude
-            keeper.send_attitude(stamp_ns, (1.0, 0.0, 0.0, 0.0))
+            supervisor.send_attitude(stamp_ns, (1.0, 0.0, 0.0, 0.0))
     assert (np.diff(told.stamps_ns) > 0).all()
     assert 0.85 * 4 * min(rate_hz, 50) <= len(told.stamps_ns) <= 4 * min(rate_hz, 50) + 2
 
@@ -262,6 +262,6 @@ def test_at_most_fifty_attitudes_a_second_go_to_the_worker_and_none_twice(rate_h
 )
 def test_an_attitude_nobody_wants_is_not_sent(detector: str, obstacles: str, wanted: bool) -> None:
     told = Turned()
-    keeper = keeper_with(told, **{"detector.enabled": detector, "guidance.obstacles": obstacles})
-    keeper.send_attitude(1, (1.0, 0.0, 0.0, 0.0))
+    supervisor = supervisor_with(told, **{"detector.enabled": detector, "guidance.obstacles": obstacles})
+    supervisor.send_attitude(1, (1.0, 0.0, 0.0, 0.0))
     assert told.stamps_ns == ([1] if wanted else [])

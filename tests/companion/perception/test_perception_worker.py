@@ -31,10 +31,10 @@ from companion.perception.messages import (
     read_message,
     receive,
 )
-from companion.perception.outbox import Outbox, OutboxHandler
 from companion.perception.process import PerceptionProcess, log_printed
-from companion.perception.pulse import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Pulse
-from companion.perception.worker import Orders
+from companion.perception.result_sender import ResultLogHandler, ResultSender
+from companion.perception.watchdog import FIRST_RESULT_S, LONGEST_S, SHORTEST_S, START_S, Watchdog
+from companion.perception.worker import ControlChannel
 from companion.settings.reading import load_settings
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
@@ -67,11 +67,11 @@ def test_a_service_that_does_not_read_never_holds_up_the_loop_and_gets_the_newes
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     service, worker = ends
-    outbox = Outbox(worker, on_lost=lambda: None)
+    sender = ResultSender(worker, on_lost=lambda: None)
     count = 5000  # far more than the socket takes
     for sequence in range(count):
-        outbox.put_newest(report(sequence))
-    closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", count), 30.0))
+        sender.put_newest(report(sequence))
+    closing = threading.Thread(target=sender.close, args=(Ended(True, "done", count), 30.0))
     closing.start()
     reports = [message for message in everything(service) if isinstance(message, Report)]
     closing.join()
@@ -84,27 +84,27 @@ def test_a_service_that_does_not_read_never_holds_up_the_loop_and_gets_the_newes
 
 def test_a_result_has_left_when_it_was_put(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
-    outbox = Outbox(worker, on_lost=lambda: None)
+    sender = ResultSender(worker, on_lost=lambda: None)
     service.setblocking(False)
     for sequence in range(100):
-        outbox.put_newest(report(sequence))
+        sender.put_newest(report(sequence))
         message = receive(service)  # nothing there would be a BlockingIOError
         assert isinstance(message, Report)
         assert (message.result.sequence, message.replaced) == (sequence, 0)
-    outbox.close(Ended(True, "done", 100), 30.0)
+    sender.close(Ended(True, "done", 100), 30.0)
 
 
 def test_what_the_socket_takes_in_part_comes_whole_and_before_what_follows(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     service, worker = ends
-    outbox = Outbox(worker, on_lost=lambda: None)
+    sender = ResultSender(worker, on_lost=lambda: None)
     names = tuple(f"{number:01000}" for number in range(2000))
     large = Report(PerceptionResult(1, 0, 0, 64, 48, Detections.empty(names), {}, 0), 1, 0)
-    outbox.put_newest(large)
-    outbox.put(LogLine(logging.INFO, "vision", "behind it"))
-    outbox.put_newest(report(2))
-    closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", 2), 30.0))
+    sender.put_newest(large)
+    sender.put(LogLine(logging.INFO, "vision", "behind it"))
+    sender.put_newest(report(2))
+    closing = threading.Thread(target=sender.close, args=(Ended(True, "done", 2), 30.0))
     closing.start()
     first, line, second, last = everything(service)
     closing.join()
@@ -118,13 +118,13 @@ def test_what_the_socket_takes_in_part_comes_whole_and_before_what_follows(
 
 def test_a_heartbeat_never_takes_the_place_of_a_result(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
-    outbox = Outbox(worker, on_lost=lambda: None)
+    sender = ResultSender(worker, on_lost=lambda: None)
     for _ in range(2000):
-        outbox.put_newest(report(0))
-        outbox.put_newest(Heartbeat(0))
-    outbox.put_newest(report(7))
-    outbox.put_newest(Heartbeat(9))
-    closing = threading.Thread(target=outbox.close, args=(Ended(True, "done", 0), 30.0))
+        sender.put_newest(report(0))
+        sender.put_newest(Heartbeat(0))
+    sender.put_newest(report(7))
+    sender.put_newest(Heartbeat(9))
+    closing = threading.Thread(target=sender.close, args=(Ended(True, "done", 0), 30.0))
     closing.start()
     reports = [message for message in everything(service) if isinstance(message, Report)]
     closing.join()
@@ -135,14 +135,14 @@ def test_the_end_is_told_last_and_lines_keep_their_order(
     ends: tuple[socket.socket, socket.socket], capfd: pytest.CaptureFixture[str]
 ) -> None:
     service, worker = ends
-    outbox = Outbox(worker, on_lost=lambda: None)
+    sender = ResultSender(worker, on_lost=lambda: None)
     log = logging.Logger("vision.test")
-    log.addHandler(OutboxHandler(outbox))
+    log.addHandler(ResultLogHandler(sender))
     log.warning("lost %s\nagain", "street.mp4")
     log.info("second")
     log.error("a fault", exc_info=ValueError("of ours"))
-    outbox.put_newest(report(3))
-    outbox.close(Ended(False, "broken", 4), 30.0)
+    sender.put_newest(report(3))
+    sender.close(Ended(False, "broken", 4), 30.0)
     first, second, third, *_, last = everything(service)
     assert first == LogLine(logging.WARNING, "vision.test", "lost street.mp4 again")
     assert second == LogLine(logging.INFO, "vision.test", "second")
@@ -154,32 +154,32 @@ def test_the_end_is_told_last_and_lines_keep_their_order(
 def test_a_service_that_is_gone_is_noticed(ends: tuple[socket.socket, socket.socket]) -> None:
     service, worker = ends
     gone = threading.Event()
-    outbox = Outbox(worker, on_lost=gone.set)
+    sender = ResultSender(worker, on_lost=gone.set)
     service.close()
-    outbox.put_newest(report(0))
+    sender.put_newest(report(0))
     assert gone.wait(30)
-    outbox.close(Ended(True, "done", 0), 30.0)
+    sender.close(Ended(True, "done", 0), 30.0)
 
 
 def test_a_signal_in_the_middle_of_being_told_to_stop_does_no_harm(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     service, worker = ends
-    orders = Orders(worker)
+    control = ControlChannel(worker)
 
     def signalled(*_: object) -> Any:
         """At every line: a second signal may find the first one's handler at work."""
-        orders.stop()
+        control.stop()
         return signalled
 
     tracing = sys.gettrace()
     sys.settrace(signalled)
     try:
-        orders.stop()
+        control.stop()
     finally:
         sys.settrace(tracing)
-        orders.finished()
-    assert orders.stopping
+        control.finished()
+    assert control.stopping
     service.close()
     for thread in threading.enumerate():
         if thread.name == "inbox":
@@ -265,12 +265,12 @@ def test_what_a_worker_prints_is_logged_and_a_flood_is_cut(caplog: pytest.LogCap
 
 
 def test_a_worker_that_may_still_be_loading_is_given_time() -> None:
-    pulse = Pulse(100.0, open_timeout_s=10.0)
-    assert pulse.stuck_after_s == START_S + 10.0
-    pulse.heard(105.0)
-    pulse.ready()
-    assert pulse.stuck_after_s == FIRST_RESULT_S
-    assert pulse.silent_s(107.5) == 2.5
+    watchdog = Watchdog(100.0, open_timeout_s=10.0)
+    assert watchdog.stuck_after_s == START_S + 10.0
+    watchdog.heard(105.0)
+    watchdog.ready()
+    assert watchdog.stuck_after_s == FIRST_RESULT_S
+    assert watchdog.silent_s(107.5) == 2.5
 
 
 @pytest.mark.parametrize(
@@ -278,21 +278,21 @@ def test_a_worker_that_may_still_be_loading_is_given_time() -> None:
     [(0.02, SHORTEST_S), (0.15, SHORTEST_S), (0.25, 5.0), (1.0, 20.0), (4.0, LONGEST_S)],
 )
 def test_what_counts_as_stuck_follows_what_is_usual(step_s: float, stuck_after_s: float) -> None:
-    pulse = Pulse(0.0, open_timeout_s=10.0)
+    watchdog = Watchdog(0.0, open_timeout_s=10.0)
     for count in range(1, 60):
         # Signs of life between the results say nothing of how long one takes.
         for part in range(4):
-            pulse.heard(count * 10.0 + part)
-        pulse.resulted(step_s)
-    assert pulse.stuck_after_s == pytest.approx(stuck_after_s)
+            watchdog.heard(count * 10.0 + part)
+        watchdog.resulted(step_s)
+    assert watchdog.stuck_after_s == pytest.approx(stuck_after_s)
 
 
 def test_silence_while_nobody_listened_is_forgiven() -> None:
-    pulse = Pulse(0.0, open_timeout_s=10.0)
-    pulse.forgive(50.0)
-    assert pulse.silent_s(51.0) == 1.0
+    watchdog = Watchdog(0.0, open_timeout_s=10.0)
+    watchdog.forgive(50.0)
+    assert watchdog.silent_s(51.0) == 1.0
 
 
 def test_the_service_side_brings_no_torch() -> None:
-    code = "import companion.perception.keeper, sys; sys.exit('torch' in sys.modules)"
+    code = "import companion.perception.supervisor, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

@@ -36,7 +36,7 @@ class Here(OtherCommanders):
         self, state: VehicleState, behaviour: Behaviour | None = None, *, in_command: bool = False
     ) -> str | None:
         command = CommandInput(1, "a command", behaviour or HoldBehaviour())
-        return self.refusal(command, state, in_command=in_command, now_ns=NOW_NS)
+        return self.check_requirements(command, state, in_command=in_command, now_ns=NOW_NS)
 
 
 def beside(uptime_s: float, *, in_command: bool = False, age_s: float = 0.5) -> VehicleState:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.guidance.behaviour import Situation
+from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.interface import StreamStatus
 from companion.perception.assembly import CameraTelemetry, _held_at, _view_at
 from companion.perception.messages import Attitude, GimbalAttitude
@@ -68,12 +68,12 @@ def see(service: Service, captured_ns: int) -> None:
     service.inputs.on_result(view, result, captured_ns)
 
 
-def step(service: Service, now_ns: int) -> Situation:
+def step(service: Service, now_ns: int) -> BehaviourContext:
     """One step of guidance; what behaviours would see."""
     inputs = service.inputs.assemble(now_ns, service.driver.state, StreamStatus())
     service.guidance.step(now_ns, inputs)
-    assert service.guidance.situation is not None
-    return service.guidance.situation
+    assert service.guidance.context is not None
+    return service.guidance.context
 
 
 async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_where_it_looks() -> None:
@@ -83,18 +83,18 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     assert not service.views[0].targets
     assert service.status()["targets"]["problem"] == "no attitude of the gimbal is known yet"
     assert service.status()["gimbal"]["problem"] == "no gimbal answers"
-    situation = step(service, now_ns)
-    assert not situation.perception_fresh
-    assert situation.gimbal.undirected == "the gimbal that carries it: no gimbal answers"
+    context = step(service, now_ns)
+    assert not context.perception_fresh
+    assert context.gimbal.undirected == "the gimbal that carries it: no gimbal answers"
 
     take(service, state_at(now_ns + 1, looking_down(now_ns + 1)))
     see(service, now_ns + 1)
     (target,) = service.views[0].targets
     assert target.elevation_rad == pytest.approx(PITCH_RAD, abs=0.01)
     assert target.bearing_rad == pytest.approx(HEADING_RAD, abs=0.01)
-    situation = step(service, now_ns + 1)
-    assert situation.perception_fresh
-    assert situation.targets == (target,)
+    context = step(service, now_ns + 1)
+    assert context.perception_fresh
+    assert context.targets == (target,)
     json.dumps(service.status(), allow_nan=False)
     # It grows old: what is seen then has no direction again, and the status says why.
     later_ns = now_ns + 2_000_000_000

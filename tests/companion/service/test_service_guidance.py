@@ -47,7 +47,7 @@ async def test_a_new_detection_is_flown_by_at_once_and_without_one_the_rate_hold
     service = Service(settings)
     hastened: list[int] = []
     turns = steps_of(service)
-    service.streamer.hasten = hastened.append  # type: ignore[assignment, method-assign]
+    service.streamer.send_now = hastened.append  # type: ignore[assignment, method-assign]
     steering = asyncio.create_task(service._loop.run())
     try:
         await until(lambda: len(turns) == 1)
@@ -66,7 +66,7 @@ async def test_a_new_detection_is_flown_by_at_once_and_without_one_the_rate_hold
 async def test_it_is_flown_by_before_it_is_published() -> None:
     service = Service(load_settings(os.devnull, {"guidance.rate_hz": SLOWEST_HZ}, {}))
     order: list[str] = []
-    service.streamer.hasten = lambda _: order.append("setpoint")  # type: ignore[assignment, method-assign]
+    service.streamer.send_now = lambda _: order.append("setpoint")  # type: ignore[assignment, method-assign]
     service.bus.publish = lambda topic, *_: order.append(topic.name)  # type: ignore[method-assign]
     steering = asyncio.create_task(service._loop.run())
     try:
@@ -76,7 +76,7 @@ async def test_it_is_flown_by_before_it_is_published() -> None:
             await until(lambda: len(order) >= 3)
             assert order == ["setpoint", "detections", "labels"]
             order.clear()
-        status = service.views[0].keeper.status
+        status = service.views[0].supervisor.status
         assert status.timing_p50_ms.keys() == {"publish"}  # the last of the stages, told when it is over
     finally:
         steering.cancel()
@@ -113,7 +113,7 @@ async def test_what_another_camera_sees_is_not_waited_for() -> None:
     service = Service(settings)
     hastened: list[int] = []
     turns = steps_of(service)
-    service.streamer.hasten = hastened.append  # type: ignore[assignment, method-assign]
+    service.streamer.send_now = hastened.append  # type: ignore[assignment, method-assign]
     steering = asyncio.create_task(service._loop.run())
     try:
         await until(lambda: len(turns) == 1)

@@ -11,8 +11,8 @@ from contextlib import asynccontextmanager
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.ardupilot_manners import ArduPilotManners
 from companion.vehicle.ardupilot_modes import custom_mode_of_mode, mode_of_custom_mode
+from companion.vehicle.ardupilot_profile import ArduPilotProfile
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import open_driver
@@ -106,10 +106,10 @@ async def test_a_pilots_mode_is_seen_and_guided_by_somebody_else_shows_as_offboa
         await state_shows(driver, lambda s: s.mode is FlightMode.HOLD)
         simulator.fault("pilot_takeover mode=POSCTL")
         await state_shows(driver, lambda s: s.mode is FlightMode.POSITION)  # LOITER
-    manners = ArduPilotManners()
+    profile = ArduPilotProfile()
     state = VehicleState(armed=True, landed=LandedState.IN_AIR)
-    manners.mode_request(FlightMode.HOLD, VehicleState())
-    told = [manners.heard("HEARTBEAT", {"custom_mode": mode}, state) for mode in (0, 4, 5, 4)]
+    profile.mode_request(FlightMode.HOLD, VehicleState())
+    told = [profile.translate("HEARTBEAT", {"custom_mode": mode}, state) for mode in (0, 4, 5, 4)]
     assert [fields["flight_mode"] for ((_, fields),) in told] == [
         FlightMode.STABILIZED,  # the request has not shown yet
         FlightMode.HOLD,
@@ -121,7 +121,7 @@ async def test_a_pilots_mode_is_seen_and_guided_by_somebody_else_shows_as_offboa
 def test_copter_is_never_given_an_acceleration() -> None:
     """It would go on adding it to its velocity for GUID_TIMEOUT when our setpoints end."""
     given = {"type_mask": 0b1000_0000_0111, "vx": 3.0, "afx": 1.0, "afy": -2.0, "afz": 0.0, "yaw_rate": 0.0}
-    sent = ArduPilotManners().setpoint_fields(given)
+    sent = ArduPilotProfile().setpoint_fields(given)
     assert sent["type_mask"] == 0b1001_1100_0111
     assert (sent["vx"], sent["afx"], sent["afy"], sent["afz"]) == (3.0, 0.0, 0.0, 0.0)
 
@@ -132,10 +132,10 @@ async def test_a_quick_reboot_is_noticed_by_timesync_and_streams_come_again(
     async with copter(2.0) as (driver, simulator):
         assert isinstance(driver, AutopilotDriver)
         # A restart is a clock that goes back by more than messages overtake each other.
-        await wait_until(lambda: driver._heard._boot_ms.get("TIMESYNC", 0) > 6_000, 10.0)
+        await wait_until(lambda: driver._telemetry._boot_ms.get("TIMESYNC", 0) > 6_000, 10.0)
         simulator.fault("reboot 1.2")
         await wait_until(lambda: "has restarted" in caplog.text, 10.0)
-        assert "LOCAL_POSITION_NED" not in driver._heard._boot_ms  # it has not come again yet
+        assert "LOCAL_POSITION_NED" not in driver._telemetry._boot_ms  # it has not come again yet
         await state_shows(driver, known)
         assert "is silent" not in caplog.text
 

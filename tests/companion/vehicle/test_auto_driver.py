@@ -14,11 +14,11 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.vehicle import autopilot_driver
 from companion.vehicle.auto_driver import AutoDriver
 from companion.vehicle.autopilot_driver import AutopilotDriver
+from companion.vehicle.autopilot_profile import ARDUPILOT, PX4
 from companion.vehicle.byte_link import ByteLink, Received, open_link
 from companion.vehicle.driver import Driver, LinkError
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.link_url import LinkUrl
-from companion.vehicle.manners import ARDUPILOT, PX4
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from mavlink_sim.testing import running_simulator
@@ -168,9 +168,9 @@ async def test_no_autopilot_and_one_that_is_not_flown_free_the_port(port: int) -
         await driver.close()
 
 
-@pytest.mark.parametrize("personality", ["px4", "ardupilot"])
-async def test_both_built_in_vehicles_arm_by_it(personality: str) -> None:
-    with running_simulator(autopilot=personality, ready_after=0.0, speed=2.0) as simulator:
+@pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
+async def test_both_built_in_vehicles_arm_by_it(firmware: str) -> None:
+    with running_simulator(autopilot=firmware, ready_after=0.0, speed=2.0) as simulator:
         driver = auto(simulator.onboard_port)
         await driver.connect(20.0)
         try:

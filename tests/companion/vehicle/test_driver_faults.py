@@ -198,7 +198,7 @@ async def test_a_reboot_is_noticed_and_the_vehicle_can_be_used_again(
             before = driver.state.home_altitude_amsl_m
             await driver.arm()
             # A restart is a clock that goes back by more than datagrams overtake each other.
-            await wait_until(lambda: driver._heard._boot_ms.get("LOCAL_POSITION_NED", 0) > 6_000, 10.0)
+            await wait_until(lambda: driver._telemetry._boot_ms.get("LOCAL_POSITION_NED", 0) > 6_000, 10.0)
             simulator.fault("reboot 2")
             await state_shows(driver, lambda s: not s.armed)
             await wait_until(lambda: "has restarted" in caplog.text, 10.0)
@@ -218,7 +218,9 @@ async def test_a_clock_that_jumps_back_costs_one_warning_and_no_data(
             await ready(driver)
             simulator.fault("time_jump 1000")
             # A message that was still on its way from before would not do.
-            await wait_until(lambda: driver._heard._boot_ms.get("LOCAL_POSITION_NED", 0) > 1_000_000, 10.0)
+            await wait_until(
+                lambda: driver._telemetry._boot_ms.get("LOCAL_POSITION_NED", 0) > 1_000_000, 10.0
+            )
             seen_ns = driver.state.position_ns
             await wait_until(lambda: driver.state.position_ns > seen_ns, 5.0)
             simulator.fault("end all")
@@ -259,7 +261,7 @@ async def test_a_second_autopilot_of_the_same_id_is_named(
             await wait_until(lambda: not driver.state.position_fresh(time.monotonic_ns()), 5.0)
             simulator.fault("end all")
             await asyncio.to_thread(simulator.wait_for_event, "second_autopilot ends")
-            await wait_until(lambda: not driver._heard.two_autopilots(time.monotonic_ns()), 10.0)
+            await wait_until(lambda: not driver._telemetry.two_autopilots(time.monotonic_ns()), 10.0)
             await state_shows(driver, lambda s: s.ready_to_arm)
             await driver.arm()
 

@@ -135,13 +135,13 @@ def test_neither_the_settings_nor_a_log_show_the_key(
     assert read_key(path).hex() not in told
 
 
-@pytest.mark.parametrize("personality", ["px4", "ardupilot"])
+@pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
 async def test_a_signed_link_is_flown_and_another_key_is_named(
-    tmp_path: Path, personality: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, firmware: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "simulator.key"
     path.write_bytes(KEY)
-    with running_simulator(autopilot=personality, signing_key=path, ready_after=0.0, speed=4.0) as simulator:
+    with running_simulator(autopilot=firmware, signing_key=path, ready_after=0.0, speed=4.0) as simulator:
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         other = open_driver("pymavlink", url, signing_key=os.urandom(32))
         with pytest.raises(LinkError, match=r"refused by signing .*wrong signature.*the same key"):
@@ -150,7 +150,7 @@ async def test_a_signed_link_is_flown_and_another_key_is_named(
         await driver.connect(20.0)
         try:
             await state_shows(driver, lambda state: state.ready_to_arm)
-            name = "COM_OF_LOSS_T" if personality == "px4" else "GUID_TIMEOUT"
+            name = "COM_OF_LOSS_T" if firmware == "px4" else "GUID_TIMEOUT"
             assert await driver.get_parameter(name) > 0.0
             await driver.arm()
             await driver.disarm()

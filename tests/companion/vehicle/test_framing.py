@@ -20,7 +20,7 @@ from companion.vehicle.framing import (
     with_sequence,
 )
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from companion.vehicle.telemetry_fold import FOLDED_MESSAGES, fold
+from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 
 CODEC = mavlink.MAVLink(None, 1, 1)
 HEARTBEAT = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 0x03040000, 3, 3).pack(CODEC))
@@ -147,7 +147,7 @@ def flight_log() -> Path:
 
 def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log: Path) -> None:
     """The log is a stamp of 8 bytes and a frame, again and again."""
-    folded_ids = {number for number, m in mavlink.mavlink_map.items() if m.msgname in FOLDED_MESSAGES}
+    folded_ids = {number for number, m in mavlink.mavlink_map.items() if m.msgname in TELEMETRY_MESSAGES}
     folded_ids.add(CURRENT_MODE_ID)
     data = flight_log.read_bytes()
     state = VehicleState()
@@ -164,7 +164,7 @@ def test_a_real_px4_flight_is_read_to_the_last_frame(flight_log: Path) -> None:
         if (frame.system_id, frame.component_id) != (1, 1) or frame.message_id not in folded_ids:
             continue
         name, fields = _decoded(frame)
-        state = fold(state, name, fields, count)
+        state = apply_message(state, name, fields, count)
         for seen, value in ((modes, state.mode), (landed, state.landed), (armed, state.armed)):
             if not seen or seen[-1] != value:
                 seen.append(value)

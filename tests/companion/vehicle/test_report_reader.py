@@ -16,10 +16,10 @@ from companion.vehicle.framing import (
     frames_of,
     pack_frame,
 )
-from companion.vehicle.heard_state import HeardState
 from companion.vehicle.report import Report
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.status_texts import StatusTexts
+from companion.vehicle.telemetry_state import TelemetryState
 
 
 def frame(message_id: int, payload: bytes) -> Frame:
@@ -120,7 +120,7 @@ class Link:
 
     def __init__(self) -> None:
         self.sent: list[tuple[int, bytes]] = []
-        self.heard = HeardState("udpin://test", lambda: None)
+        self.heard = TelemetryState("udpin://test", lambda: None)
         self.reader = ReportReader("udpin://test", self.heard, self.send, self.command, lambda: (1, 1))
 
     def send(self, message_id: int, payload: bytes) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.ardupilot_manners import ArduPilotManners
+from companion.vehicle.ardupilot_profile import ArduPilotProfile
 from companion.vehicle.stream_monitor import StreamMonitor
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
@@ -94,8 +94,8 @@ class CopterClient:
 
     def __init__(self) -> None:
         self.copter = LockstepVehicle(autopilot="ardupilot", seed=1, ready_after_s=0.0)
-        self.manners = ArduPilotManners()
-        self.monitor = StreamMonitor(self.manners.rates_hz, 0)
+        self.profile = ArduPilotProfile()
+        self.monitor = StreamMonitor(self.profile.rates_hz, 0)
         self.deaf = False
 
     def run(self, seconds: float) -> None:
@@ -107,7 +107,7 @@ class CopterClient:
             for message_id in self.monitor.due(now_ns):
                 self.monitor.asked(message_id, now_ns)
                 if not self.deaf:
-                    interval_us = round(1e6 / self.manners.rates_hz[message_id])
+                    interval_us = round(1e6 / self.profile.rates_hz[message_id])
                     self.copter.send(
                         dialect.MAVLink_command_long_message(
                             1,

@@ -63,8 +63,8 @@ def test_a_hastened_setpoint_leaves_at_once_and_only_once_between_two_ticks() ->
     bench.run(40)
     bench.now_ms += 5
     second = bench.submit(north_mps=2.0)
-    bench.streamer.hasten(bench.now_ms * MS)
-    bench.streamer.hasten(bench.now_ms * MS)
+    bench.streamer.send_now(bench.now_ms * MS)
+    bench.streamer.send_now(bench.now_ms * MS)
     bench.now_ms -= 5
     bench.run(40)
     assert bench.sent == [(1020, first), (1040, first), (1045, second), (1060, second), (1080, second)]
@@ -73,13 +73,13 @@ def test_a_hastened_setpoint_leaves_at_once_and_only_once_between_two_ticks() ->
 def test_haste_begins_no_stream_and_takes_none_up_again() -> None:
     bench = Bench(brake_ms=500)
     bench.submit(300)
-    bench.streamer.hasten(bench.now_ms * MS)
+    bench.streamer.send_now(bench.now_ms * MS)
     assert bench.sent == []
     bench.run(1000)
     assert bench.streamer.state is StreamState.EXPIRED
     count = bench.streamer.sent_count
     bench.submit(300)
-    bench.streamer.hasten(bench.now_ms * MS)
+    bench.streamer.send_now(bench.now_ms * MS)
     assert bench.streamer.sent_count == count
 
 

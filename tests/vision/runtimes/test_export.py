@@ -14,7 +14,7 @@ import pytest
 from tests.vision.runtimes.conftest import NAMES, lively_model, picture
 from vision.detector import Detector
 from vision.runtimes import export as export_module
-from vision.runtimes.contract import (
+from vision.runtimes.base import (
     RUNTIMES,
     RuntimeMissingError,
     RuntimeName,
@@ -51,7 +51,7 @@ def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
         needs(*{"onnx": ("onnx", "onnxruntime"), "openvino": ("openvino",)}.get(kind, ()))
         if kind not in made:
             path = folder / f"net{SUFFIXES[kind]}"
-            made[kind] = export(checkpoint, kind, path, 96, generation="YOLOv8")
+            made[kind] = export(checkpoint, kind, path, 96, model_family="YOLOv8")
         return made[kind]
 
     return of
@@ -113,7 +113,7 @@ def test_an_exported_file_carries_its_facts(exported: Any, checkpoint: Path, kin
     assert facts is not None
     assert facts.class_names == NAMES
     assert facts.strides == (8, 16, 32)
-    assert facts.generation == "YOLOv8"
+    assert facts.model_family == "YOLOv8"
     assert facts.source_sha256 == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
 
 

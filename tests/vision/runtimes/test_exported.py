@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vision.runtimes.contract import RuntimeUnusableError
+from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.exported import FORMAT, MAGIC, ExportedFacts, kind_of, split_facts, with_facts
 
 PATH = Path("net.engine")
@@ -29,7 +29,7 @@ names = st.text(min_size=1, max_size=20)
     metadata=st.dictionaries(names, st.integers() | names, max_size=3),
 )
 def test_facts_come_back_as_they_were(**values: object) -> None:
-    facts = ExportedFacts(image_size=320, source_sha256="00", generation="YOLO11", **values)  # type: ignore[arg-type]
+    facts = ExportedFacts(image_size=320, source_sha256="00", model_family="YOLO11", **values)  # type: ignore[arg-type]
     assert ExportedFacts.from_json(facts.to_json(), PATH) == facts
 
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from tests.vision.runtimes.conftest import NAMES, lively_model, picture
-from vision.runtimes.contract import RuntimeUnusableError
+from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.yolo.architecture import build, yolov8_description
-from vision.yolo.maps import LevelMaps
+from vision.yolo.level_outputs import LevelOutput
 
 
 def whole_maps(image: np.ndarray) -> list[Tensor]:
@@ -22,7 +22,7 @@ def whole_maps(image: np.ndarray) -> list[Tensor]:
     return maps
 
 
-def run(network: Network, image: np.ndarray) -> list[LevelMaps]:
+def run(network: Network, image: np.ndarray) -> list[LevelOutput]:
     with torch.inference_mode():
         maps = network(torch.from_numpy(image)[None])
     return network.head.levels([level[0].numpy() for level in maps])
@@ -100,7 +100,7 @@ def test_a_frame_with_thousands_of_cells_is_done_in_parts(monkeypatch: pytest.Mo
     assert level.neck is not None
     every = np.arange(level.classes[0].size)
     at_once = network.head.boxes[0].sides(level.neck, every)
-    monkeypatch.setattr("vision.yolo.maps._MOST_CELLS", 7)
+    monkeypatch.setattr("vision.yolo.level_outputs._MOST_CELLS", 7)
     np.testing.assert_allclose(network.head.boxes[0].sides(level.neck, every), at_once, atol=1e-5)
 
 

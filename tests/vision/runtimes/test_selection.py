@@ -13,8 +13,8 @@ import pytest
 
 from tests.vision.runtimes.conftest import picture
 from vision.detector import Detector
-from vision.runtimes import contract, trial
-from vision.runtimes.contract import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
+from vision.runtimes import autotune, base
+from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.export import export
 from vision.runtimes.selection import cache_folder, runtime_of_file, start_runtime
 from vision.runtimes.source import read_source
@@ -23,7 +23,7 @@ from vision.runtimes.source import read_source
 def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     """As if these runtimes alone were installed."""
     real = importlib.util.find_spec
-    absent = set(contract.RUNTIMES) - set(names)
+    absent = set(base.RUNTIMES) - set(names)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
 
 
@@ -45,7 +45,7 @@ def test_a_runtime_that_is_installed_and_broken_says_so(monkeypatch: pytest.Monk
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(importlib, "import_module", broken)
     with pytest.raises(RuntimeMissingError, match=r"cannot be loaded: libsomething"):
-        contract.required("openvino")
+        base.required("openvino")
 
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
@@ -97,8 +97,8 @@ class Trial:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: dict[RuntimeName, float | str]) -> None:
         self.answer, self.asked = answer, 0
-        monkeypatch.setattr(trial, "_measured", self._measured)
-        monkeypatch.setattr(trial, "version", lambda name: "1.0")
+        monkeypatch.setattr(autotune, "_measured", self._measured)
+        monkeypatch.setattr(autotune, "version", lambda name: "1.0")
 
     def _measured(
         self, source: Any, candidates: list[RuntimeName], *_: Any
@@ -130,12 +130,12 @@ def test_auto_takes_the_fastest_and_says_why(
     asked = Trial(monkeypatch, answer)
     caplog.set_level(logging.INFO)
     source = read_source(checkpoint)
-    name, reason = trial.fastest_runtime(source, list(answer), **CHOICE)
+    name, reason = autotune.fastest_runtime(source, list(answer), **CHOICE)
     assert name == best
     assert reason.startswith("measured now: ")
     assert all(f"{key} {value:.1f} ms" in reason for key, value in answer.items() if value != str(value))
     assert f"runtime auto: {best}" in caplog.text
-    again = trial.fastest_runtime(source, list(answer), **CHOICE)
+    again = autotune.fastest_runtime(source, list(answer), **CHOICE)
     # One that failed may run next time: that is asked again.
     failed = any(isinstance(value, str) for value in answer.values())
     assert again == (best, reason if failed else reason.replace("measured now", "measured before"))
@@ -149,17 +149,17 @@ def test_a_choice_is_measured_again_when_what_it_hangs_on_changes(
     asked = Trial(monkeypatch, {"torch": 2.0, "openvino": 1.0})
     source = read_source(checkpoint)
     names: list[RuntimeName] = ["torch", "openvino"]
-    trial.fastest_runtime(source, names, **CHOICE)
-    trial.fastest_runtime(source, names, **CHOICE | {"image_size": 128})
-    trial.fastest_runtime(source, names, **CHOICE | {"threads": 1})
-    monkeypatch.setattr(trial, "version", lambda name: "2.0")
-    trial.fastest_runtime(source, names, **CHOICE)
-    monkeypatch.setattr(trial, "board", lambda: ["another"])
-    trial.fastest_runtime(source, names, **CHOICE)
+    autotune.fastest_runtime(source, names, **CHOICE)
+    autotune.fastest_runtime(source, names, **CHOICE | {"image_size": 128})
+    autotune.fastest_runtime(source, names, **CHOICE | {"threads": 1})
+    monkeypatch.setattr(autotune, "version", lambda name: "2.0")
+    autotune.fastest_runtime(source, names, **CHOICE)
+    monkeypatch.setattr(autotune, "board", lambda: ["another"])
+    autotune.fastest_runtime(source, names, **CHOICE)
     assert asked.asked == 5
     for kept in cache_folder().glob("trial-*.json"):
         kept.write_text(json.dumps({"question": {}, "answer": []}))
-    trial.fastest_runtime(source, names, **CHOICE)
+    autotune.fastest_runtime(source, names, **CHOICE)
     assert asked.asked == 6
 
 
@@ -169,7 +169,7 @@ def test_a_choice_that_cannot_be_kept_is_made_all_the_same(
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     Trial(monkeypatch, {"torch": 2.0, "openvino": 1.0})
-    name, _ = trial.fastest_runtime(read_source(checkpoint), ["torch", "openvino"], **CHOICE)
+    name, _ = autotune.fastest_runtime(read_source(checkpoint), ["torch", "openvino"], **CHOICE)
     assert name == "openvino"
     assert "cannot be kept" in caplog.text
 
@@ -180,12 +180,12 @@ def test_when_none_runs_it_everybodys_reason_is_told(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     Trial(monkeypatch, {"openvino": "no", "onnxruntime": "never"})
     with pytest.raises(RuntimeUnusableError, match="openvino: no; onnxruntime: never"):
-        trial.fastest_runtime(read_source(checkpoint), ["openvino", "onnxruntime"], **CHOICE)
+        autotune.fastest_runtime(read_source(checkpoint), ["openvino", "onnxruntime"], **CHOICE)
 
 
 def test_a_trial_is_a_real_measurement_in_a_process_of_its_own(checkpoint: Path) -> None:
     source = read_source(checkpoint)
-    answer = trial._measured(source, ["torch", "tensorrt"], [1, 2], "float32", 1, 64)
+    answer = autotune._measured(source, ["torch", "tensorrt"], [1, 2], "float32", 1, 64)
     assert isinstance(answer["torch"], float)
     assert answer["torch"] > 0
     if not installed("tensorrt"):
@@ -202,6 +202,6 @@ def test_a_runtime_that_another_package_brings_has_that_ones_version(monkeypatch
     monkeypatch.setattr(
         importlib.metadata, "packages_distributions", lambda: {"onnxruntime": ["onnxruntime-gpu"]}
     )
-    assert contract.version("onnxruntime") == "1.2.3"
+    assert base.version("onnxruntime") == "1.2.3"
     monkeypatch.setattr(importlib.metadata, "packages_distributions", dict)
-    assert contract.version("onnxruntime") == "unknown"
+    assert base.version("onnxruntime") == "unknown"

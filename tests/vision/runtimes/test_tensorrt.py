@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from vision.runtimes.contract import RuntimeMissingError, RuntimeUnusableError, installed
+from vision.runtimes.base import RuntimeMissingError, RuntimeUnusableError, installed
 from vision.runtimes.exported import ExportedFacts, with_facts
 from vision.runtimes.source import read_source
 from vision.runtimes.tensorrt_build import build_plan

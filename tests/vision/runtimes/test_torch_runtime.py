@@ -7,21 +7,21 @@ import pytest
 import torch
 
 from tests.vision.runtimes.conftest import lively_model, picture
-from vision.runtimes import contract
+from vision.runtimes import base
 from vision.runtimes import torch_runtime as torch_runtime_module
-from vision.runtimes.contract import RuntimeUnusableError
+from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.runtimes.torch_runtime import TorchRuntime, torch_product
 
 
 @pytest.fixture
 def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contract, "bfloat16_instructions", lambda: "")
+    monkeypatch.setattr(base, "bfloat16_instructions", lambda: "")
 
 
 @pytest.fixture
 def with_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contract, "bfloat16_instructions", lambda: "amx_bf16")
+    monkeypatch.setattr(base, "bfloat16_instructions", lambda: "amx_bf16")
 
 
 def expected(image: np.ndarray) -> list[np.ndarray]:

@@ -1,0 +1,92 @@
+"""What a behaviour cannot do without, checked before it begins: a refusal names what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Requirement
+from companion.guidance.formation.neighbours import missing_neighbours
+from companion.guidance.gimbal_status import missing_gimbal
+from companion.guidance.limits.battery import NO_MINIMUM, BatteryMinimum
+from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
+from companion.vehicle.state import LandedState
+
+PERCEPTION_GAP_S = 1.5
+"""A detector that was heard within this is at work.
+
+It may be late for a moment: a small computer that starts the very program that sends the command is busy.
+Steering asks more (`perception_fresh`); until then behaviours brake.
+"""
+
+AIRBORNE = (LandedState.IN_AIR, LandedState.TAKING_OFF, LandedState.LANDING)
+
+
+def check_requirements(
+    behaviour: Behaviour,
+    context: BehaviourContext | None,
+    class_names: Sequence[str] | None,
+    battery: BatteryMinimum = NO_MINIMUM,
+    obstacles: ObstacleRules = NO_RULES,
+) -> str | None:
+    """Why this behaviour cannot begin now, in one line; None: it can.
+
+    Args:
+        context: the newest; None before there is one.
+        class_names: what the detector knows; None: not known, not checked.
+        battery: the least charge to begin with. obstacles: whether depth is needed.
+    """
+    if context is None:
+        return "the vehicle's state is not known yet"
+    state, now_ns = context.state, context.now_ns
+    if not state.connected(now_ns):
+        return "there is no link to the autopilot"
+    missing = []
+    for requirement in sorted(behaviour.requirements):
+        match requirement:
+            case Requirement.POSITION if (fault := state.position_fault(now_ns)) is not None:
+                missing.append(f"position ({fault})")
+            case Requirement.IN_AIR if not (state.armed and state.landed in AIRBORNE):
+                missing.append(f"to be in the air ({_where(context)})")
+            case Requirement.ON_GROUND if state.landed is not LandedState.ON_GROUND:
+                missing.append(f"to be on the ground ({_where(context)})")
+            case Requirement.PERCEPTION if not _perceiving(context):
+                missing.append(f"perception ({_perception_age(context)})")
+            case Requirement.PERCEPTION if context.gimbal.undirected:
+                missing.append(f"to know where its camera looks ({context.gimbal.undirected})")
+            case Requirement.GIMBAL:
+                missing += missing_gimbal(state, now_ns, context.gimbal, behaviour.gimbal_pitches_rad)
+                if Requirement.PERCEPTION in behaviour.requirements and not context.gimbal.carries_camera:
+                    missing.append("the camera on the gimbal (camera.gimbal is not set)")
+            case Requirement.DEPTH_OR_SIZE:
+                if (why := context.ranging.missing(behaviour.class_names)) is not None:
+                    missing.append(why)
+            case Requirement.NEIGHBOURS:
+                missing += missing_neighbours(context.neighbourhood, behaviour.neighbour_names)
+            case Requirement.MARKER if (what := context.markers.unavailable(PERCEPTION_GAP_S)) is not None:
+                missing.append(what)
+    if (charge := battery.missing(behaviour, state, now_ns)) is not None:
+        missing.append(charge)
+    if (depth := obstacles.missing(behaviour, context)) is not None:
+        missing.append(depth)
+    if class_names is not None:
+        unknown = [name for name in behaviour.class_names if name not in class_names]
+        if unknown:
+            missing.append(f"a detector that knows {', '.join(unknown)}")
+    return f"{behaviour.name} needs {' and '.join(missing)}" if missing else None
+
+
+def _where(context: BehaviourContext) -> str:
+    armed = "armed" if context.state.armed else "disarmed"
+    landed = context.state.landed.value.replace("_", " ")
+    return f"{armed}, {'not known where' if landed == 'unknown' else landed}"
+
+
+def _perceiving(context: BehaviourContext) -> bool:
+    age_s = context.perception_age_s
+    return context.perception_fresh or (age_s is not None and age_s <= PERCEPTION_GAP_S)
+
+
+def _perception_age(context: BehaviourContext) -> str:
+    if context.perception_age_s is None:
+        return "nothing came from the detector yet"
+    return f"its newest frame is {context.perception_age_s:.1f} s old"

@@ -1,0 +1,478 @@
+"""The perception worker's supervisor: starts it, reads it, and starts it again when it is dead or stuck.
+
+Nothing here waits for the worker: what it says is taken as it comes. A worker that is silent for too long is
+killed. At most `MAX_RESTARTS` restarts in `RESTART_WINDOW_S`, then the supervisor gives up and says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from companion.perception.messages import (
+    Attitude,
+    Ended,
+    GimbalAttitude,
+    Heartbeat,
+    Hud,
+    LogLine,
+    Message,
+    Preview,
+    ProtocolError,
+    Ready,
+    Report,
+    StartFailed,
+)
+from companion.perception.process import PerceptionProcess
+from companion.perception.rate_limiter import RateLimiter
+from companion.perception.standard_input import STANDARD_INPUT, StandardInput
+from companion.perception.status import PerceptionState, PerceptionStatus
+from companion.perception.timing import StageTimes
+from companion.perception.tracks import LiveTracks
+from companion.perception.watchdog import Watchdog
+from companion.settings import Settings
+from vision.attitude import Quaternion
+from vision.camera_model import CameraCalibration
+from vision.pipeline import PerceptionResult
+
+logger = logging.getLogger(__name__)
+
+__all__ = ["PerceptionStartError", "PerceptionState", "PerceptionStatus", "PerceptionSupervisor"]
+
+MAX_RESTARTS = 5
+RESTART_WINDOW_S = 60.0
+STOP_S, TERMINATE_S = 5.0, 1.0
+_BACK_OFF_S = (0.2, 1.0, 2.0, 4.0, 8.0)
+_TICK_S = 0.25
+_RATE_WINDOW_S = 2.0
+
+
+class PerceptionStartError(RuntimeError):
+    """Perception cannot start as it is set up. The text is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class _End:
+    """How a worker ended. `finished`: in order, and not to be started again."""
+
+    finished: bool
+    text: str
+
+
+@dataclass(slots=True)
+class _Counts:
+    frames: int = 0
+    dropped: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    def add(self, other: _Counts) -> None:
+        self.frames += other.frames
+        self.dropped += other.dropped
+        self.left_out = _sum(self.left_out, other.left_out)
+
+
+class PerceptionSupervisor:
+    """Keeps one perception worker running. Everything is called, and calls back, in one asyncio loop.
+
+    The loop must run in a thread that lasts: the kernel ends the worker when the thread that started it ends.
+
+    Args:
+        settings: the sections source, detector, recording and log are the worker's.
+        on_result: called with every result. Its sequence numbers go on when a worker is replaced.
+        on_event: called with a level (`info`, `warning`, `error`) and a line for people.
+        on_preview: called with pictures, while `watch(True)`.
+        on_calibration: called when a worker is ready, with what its camera brings; None: nothing.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        on_result: Callable[[PerceptionResult], None],
+        on_event: Callable[[str, str], None],
+        on_preview: Callable[[Preview], None] = lambda _: None,
+        on_calibration: Callable[[CameraCalibration | None], None] = lambda _: None,
+    ) -> None:
+        self._settings = settings
+        self._on_calibration = on_calibration
+        self._on_preview = on_preview
+        self._watched = False
+        self._on_result = on_result
+        self._on_event = on_event
+        self._state = PerceptionState.STOPPED
+        self._task: asyncio.Task[None] | None = None
+        self._stop_asked = asyncio.Event()
+        self._killed = False
+        self._process: PerceptionProcess | None = None
+        self._pulse: Watchdog | None = None
+        self._input: StandardInput | None = None
+        self._ready: Ready | None = None
+        self._hud = Hud((), None)
+        self._problem = ""
+        self._restarts = 0
+        self._deaths_s: deque[float] = deque()
+        self._lost_s: float | None = None
+        self._newest: PerceptionResult | None = None
+        self._results = 0
+        self._arrivals_s: deque[float] = deque()
+        self._before, self._now = _Counts(), _Counts()
+        self._times = StageTimes()
+        self._first_sequence = 0
+        self._tracks = LiveTracks()
+        self._vehicle_pace, self._gimbal_pace = RateLimiter(), RateLimiter()
+
+    async def start(self) -> None:
+        """Start the worker; returns when its model is loaded and its source has given a frame.
+
+        Raises:
+            PerceptionStartError: it cannot: no such model, an unknown class, a source that does not open.
+        """
+        if self._task is not None:
+            raise RuntimeError("a perception supervisor is started once; make another")
+        self._state = PerceptionState.STARTING
+        started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._task = asyncio.create_task(self._keep(started), name="perception supervisor")
+        self._task.add_done_callback(self._on_fault)
+        try:
+            await asyncio.wait({started, self._task}, return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:
+            await self.stop()
+            raise
+        if not started.done():
+            await self._task
+            raise PerceptionStartError(self._problem)
+
+    async def stop(self) -> None:
+        """End the worker: asked (it finishes the video), then terminated, then killed; in at most 7 s.
+
+        An end that is not in order is a warning: the video may not be whole then.
+        """
+        task = self._task
+        if task is None or self._stop_asked.is_set():
+            return
+        self._stop_asked.set()
+        if self._process is not None:
+            self._process.ask_to_stop()
+        await asyncio.wait({task}, timeout=STOP_S)
+        if self._process is not None:
+            self._process.terminate()
+            await asyncio.wait({task}, timeout=TERMINATE_S)
+        if self._process is not None:
+            self._killed = True
+            self._process.kill()
+        await asyncio.wait({task})
+        if self._input is not None:
+            self._input.close()
+        self._state = PerceptionState.STOPPED
+
+    def send_hud(self, lines: Sequence[str], highlight: str | None = None) -> None:
+        """What to draw on the recorded video from now on.
+
+        Args:
+            lines: text for the panel.
+            highlight: the class whose surest detection is the one that matters now.
+        """
+        self._hud = Hud(tuple(lines), highlight)
+        if self._process is not None and self._settings.recording.video is not None:
+            self._process.show(self._hud)
+
+    def published(self, result: PerceptionResult) -> None:
+        """A result is on the network now: the last of its stages, from when it was known, is over."""
+        self._times.add({"publish": (time.monotonic_ns() - result.inferred_ns) / 1e6})
+
+    def watch(self, watched: bool) -> None:
+        """Whether anybody wants pictures; until then none is made."""
+        if watched != self._watched:
+            self._watched = watched
+            if self._process is not None:
+                self._process.watch(watched)
+
+    def send_attitude(self, stamp_ns: int, attitude: Quaternion, height_m: float | None = None) -> None:
+        """Where the vehicle was turned to, for tracker and obstacles. At most 50 a second go on; never waits.
+
+        Args:
+            stamp_ns: CLOCK_MONOTONIC nanoseconds.
+            attitude: (w, x, y, z), body FRD to NED.
+            height_m: above home, None where unknown.
+        """
+        if self._needs_attitude and self._process is not None and self._vehicle_pace.due(stamp_ns):
+            self._process.turn(Attitude(stamp_ns, attitude, height_m))
+
+    def send_gimbal(self, stamp_ns: int, attitude: Quaternion) -> None:
+        """Where the gimbal of this camera looked, as `send_attitude`; (w, x, y, z), its FRD to NED."""
+        if self._needs_attitude and self._process is not None and self._gimbal_pace.due(stamp_ns):
+            self._process.turn(GimbalAttitude(stamp_ns, attitude))
+
+    @property
+    def _needs_attitude(self) -> bool:
+        # The tracker removes the camera's turning; ranges from depth need to know where down is.
+        return self._settings.detector.enabled or self._settings.guidance.obstacles != "off"
+
+    @property
+    def state(self) -> PerceptionState:
+        """What it is doing now."""
+        return self._state
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """What the model knows, id → name; empty before the start and without a detector."""
+        return () if self._ready is None else self._ready.class_names
+
+    @property
+    def status(self) -> PerceptionStatus:
+        """What is known now."""
+        newest = self._newest
+        return PerceptionStatus(
+            state=self._state,
+            pid=None if self._process is None else self._process.pid,
+            restarts=self._restarts,
+            frames=self._before.frames + self._now.frames,
+            results=self._results,
+            rate_hz=self._rate_hz(),
+            newest=newest,
+            age_s=None if newest is None else (time.monotonic_ns() - newest.captured_ns) / 1e9,
+            timing_ms={} if newest is None else newest.timing_ms,
+            timing_p50_ms=self._times.quantile_ms(0.5),
+            timing_p99_ms=self._times.quantile_ms(0.99),
+            dropped=self._before.dropped + self._now.dropped,
+            left_out=_sum(self._before.left_out, self._now.left_out),
+            stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
+            class_names=self.class_names,
+            runtime=None if self._ready is None else self._ready.runtime,
+            runtime_reason="" if self._ready is None else self._ready.reason,
+            tracks=len(self._tracks),
+            problem=self._problem,
+        )
+
+    def _rate_hz(self) -> float:
+        now_s = time.monotonic()
+        while self._arrivals_s and now_s - self._arrivals_s[0] > _RATE_WINDOW_S:
+            self._arrivals_s.popleft()
+        if len(self._arrivals_s) < 2:
+            return 0.0
+        return (len(self._arrivals_s) - 1) / (now_s - self._arrivals_s[0])
+
+    def _on_fault(self, task: asyncio.Task[None]) -> None:
+        """A fault of ours, or of a callback, ended the supervisor: that must not pass in silence."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._state = PerceptionState.FAILED
+            self._problem = f"{type(error).__name__}: {error}"
+            logger.error("perception's supervisor failed", exc_info=error)
+            self._on_event("error", f"perception failed: {self._problem}")
+
+    # --- worker after worker
+
+    async def _keep(self, started: asyncio.Future[None]) -> None:
+        while True:
+            end = await self._run_one(started)
+            if self._stop_asked.is_set():
+                self._after_stop(end)
+                return
+            if end.finished:
+                self._state = PerceptionState.FINISHED
+                self._on_event("info", f"perception: {end.text}, after {self._before.frames} frames")
+                return
+            self._problem = end.text
+            if not started.done():
+                self._state = PerceptionState.FAILED
+                return
+            pause_s = self._after_death(end)
+            if pause_s is None:
+                self._state = PerceptionState.FAILED
+                return
+            self._state = PerceptionState.RESTARTING
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause_s):
+                    await self._stop_asked.wait()
+                return
+            self._restarts += 1
+
+    def _after_stop(self, end: _End) -> None:
+        """Say it when a worker that had been seeing did not end as it should have."""
+        if end.finished or self._state is not PerceptionState.RUNNING:
+            return
+        text = f"did not end in order: {end.text}"
+        if self._killed:
+            text = f"did not end when asked: {end.text}"
+        if self._settings.recording.video is not None:
+            text += f"; the video {self._settings_of_worker().recording.video} may not be whole"
+        self._on_event("warning", f"perception {text}")
+
+    def _after_death(self, end: _End) -> float | None:
+        """Say what was lost; the seconds until the next start, None to give up."""
+        now_s = time.monotonic()
+        self._lost_s = self._lost_s or now_s
+        self._deaths_s.append(now_s)
+        while now_s - self._deaths_s[0] > RESTART_WINDOW_S:
+            self._deaths_s.popleft()
+        deaths = len(self._deaths_s)
+        if deaths > MAX_RESTARTS:
+            self._on_event(
+                "error",
+                f"perception failed {deaths} times in {RESTART_WINDOW_S:g} s, the last time: {end.text}; "
+                "it is not started again",
+            )
+            return None
+        self._on_event(
+            "warning", f"perception lost: {end.text}; starting it again ({deaths} of {MAX_RESTARTS})"
+        )
+        return _BACK_OFF_S[min(deaths, len(_BACK_OFF_S)) - 1]
+
+    async def _run_one(self, started: asyncio.Future[None]) -> _End:
+        """Start one worker and stay with it until it is dead."""
+        try:
+            process = await self._spawn()
+        except OSError as error:
+            return _End(False, f"the perception process cannot be started: {error}")
+        watchdog = Watchdog(time.monotonic(), self._settings.source.open_timeout_s)
+        reading = asyncio.create_task(self._read(process, watchdog, started), name="perception reader")
+        self._process, self._pulse = process, watchdog
+        try:
+            if self._stop_asked.is_set():  # while it was being started
+                process.ask_to_stop()
+            stuck = await self._until_stuck(reading, watchdog)
+            told = None if stuck else reading.result()
+            # A worker that has closed its end has nothing left to do; one that is stuck never will.
+            if stuck or not await process.ends_within(TERMINATE_S):
+                process.kill()
+            died = await process.wait()
+            return stuck or told or _End(False, died)
+        finally:
+            reading.cancel()
+            process.kill()
+            process.close()
+            self._process = self._pulse = None
+            self._before.add(self._now)
+            self._now = _Counts()
+            self._tracks.worker_ended()
+            self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
+
+    async def _spawn(self) -> PerceptionProcess:
+        settings = self._settings_of_worker()
+        if settings.source.uri != STANDARD_INPUT:
+            return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, self._tracks.next_id)
+        if self._input is None:
+            self._input = StandardInput(settings.source)
+        descriptor = self._input.for_worker()
+        try:
+            return await PerceptionProcess.spawn(settings, descriptor, self._tracks.next_id)
+        finally:
+            # The worker's copy must be the only one, or its death would not be seen.
+            os.close(descriptor)
+
+    def _settings_of_worker(self) -> Settings:
+        video = self._settings.recording.video
+        if video is None or self._restarts == 0:
+            return self._settings
+        # The video of the worker before is left as it is; the next part goes beside it.
+        path = Path(video)
+        part = str(path.with_name(f"{path.stem}-{self._restarts + 1}{path.suffix}"))
+        recording = self._settings.recording.model_copy(update={"video": part})
+        return self._settings.model_copy(update={"recording": recording})
+
+    async def _until_stuck(self, reading: asyncio.Task[_End | None], watchdog: Watchdog) -> _End | None:
+        """Wait until nothing more can be read (None), or until the worker is silent for too long."""
+        while True:
+            before_s = time.monotonic()
+            await asyncio.wait({reading}, timeout=_TICK_S)
+            if reading.done():
+                return None
+            now_s = time.monotonic()
+            if now_s - before_s > 4 * _TICK_S:
+                # We stood still ourselves; what the worker said meanwhile is still to be read.
+                watchdog.forgive(now_s)
+            # Once it is asked to stop it says nothing more, and `stop` has limits of its own.
+            elif not self._stop_asked.is_set() and watchdog.silent_s(now_s) > watchdog.stuck_after_s:
+                assert self._process is not None
+                text = (
+                    f"process {self._process.pid} is stuck, no message for {watchdog.silent_s(now_s):.1f} s"
+                )
+                return _End(False, text)
+
+    async def _read(
+        self, process: PerceptionProcess, watchdog: Watchdog, started: asyncio.Future[None]
+    ) -> _End | None:
+        """Take every message; returns what the worker told of its end, None if it told nothing."""
+        while True:
+            try:
+                message = await process.read()
+            except ProtocolError as error:
+                return _End(False, str(error))
+            if message is None:
+                return None
+            watchdog.heard(time.monotonic())
+            match message:
+                case Report():
+                    self._take(message)
+                    watchdog.resulted(message.result.timing_ms.get("total", 0.0) / 1e3)
+                case Ready():
+                    watchdog.ready()
+                    self._on_ready(message, process)
+                    if not started.done():
+                        started.set_result(None)
+                case Preview():
+                    self._on_preview(replace(message, sequence=message.sequence + self._first_sequence))
+                case StartFailed():
+                    return _End(False, message.text)
+                case Ended():
+                    self._now.frames = message.frames
+                    return _End(message.finished, message.text)
+                case _:
+                    self._note(message)
+
+    def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
+        self._ready = ready
+        self._state = PerceptionState.RUNNING
+        self._on_calibration(ready.calibration)
+        self.send_hud(self._hud.lines, self._hud.highlight)
+        process.watch(self._watched)
+        if self._lost_s is not None:
+            self._on_event("info", f"perception is back after {time.monotonic() - self._lost_s:.1f} s")
+            self._lost_s = None
+            return
+        model = "no detector"
+        if ready.model is not None:
+            model = f"model {ready.model} with {len(ready.class_names)} classes"
+            model += f" by {ready.runtime}" if ready.runtime else ""
+            model += f" in {ready.precision}" if ready.precision else ""
+        self._on_event("info", f"perception sees {ready.source}, {model} (process {process.pid})")
+
+    def _take(self, report: Report) -> None:
+        result = self._tracks.take(
+            replace(report.result, sequence=report.result.sequence + self._first_sequence)
+        )
+        self._count(report.frames, result.dropped, result.left_out, report.replaced)
+        result = replace(result, dropped=self._before.dropped + self._now.dropped)
+        self._newest = result
+        self._results += 1
+        self._arrivals_s.append(time.monotonic())
+        self._rate_hz()
+        self._times.add(result.timing_ms)
+        self._on_result(result)
+
+    def _count(self, frames: int, dropped: int, left_out: Mapping[str, int], unsent: int) -> None:
+        """What the present worker has read and lost so far."""
+        self._now = _Counts(frames, dropped + unsent, {**left_out, "unsent": unsent})
+
+    def _note(self, message: Message) -> None:
+        if isinstance(message, Heartbeat):
+            unsent = self._now.left_out.get("unsent", 0)
+            self._count(message.frames, message.dropped, message.left_out, unsent)
+        elif isinstance(message, LogLine):
+            # What a person should know is an event; the rest is only for the log. Never both.
+            if message.level >= logging.WARNING:
+                level = "error" if message.level >= logging.ERROR else "warning"
+                self._on_event(level, message.text)
+            else:
+                logging.getLogger(message.logger).log(message.level, "%s", message.text)
+
+
+def _sum(one: dict[str, int], other: dict[str, int]) -> dict[str, int]:
+    return {reason: one.get(reason, 0) + other.get(reason, 0) for reason in {**one, **other}}

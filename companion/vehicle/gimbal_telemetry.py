@@ -1,0 +1,125 @@
+"""The messages of a gimbal into the vehicle's next snapshot. Pure, as `telemetry`.
+
+Of several gimbals the first that is heard is the vehicle's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from companion.vehicle.gimbal import LAST_ATTACHED_DEVICE, GimbalState, Quaternion, YawFrame
+from companion.vehicle.state import VehicleState
+
+Fields = Mapping[str, Any]
+
+ATTITUDE_STATUS = "GIMBAL_DEVICE_ATTITUDE_STATUS"
+# GIMBAL_DEVICE_FLAGS
+_NEUTRAL, _YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 2, 16, 32, 64
+_UNKNOWN_YAW = (
+    "its attitude says neutral and locked to north at once, so nobody can tell what its yaw counts from "
+    "(PX4 does for gimbals on servo outputs, which measure nothing)"
+)
+
+
+def apply_information(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    """GIMBAL_MANAGER_INFORMATION: what the gimbal can do."""
+    gimbal = _told(state, fields)
+    if gimbal is None:
+        return state
+    low, high = _number(fields["pitch_min"]), _number(fields["pitch_max"])
+    return replace(
+        state,
+        gimbal=replace(
+            gimbal,
+            information_ns=now_ns,
+            lowest_pitch_rad=low if math.isfinite(low) else -math.inf,
+            highest_pitch_rad=high if math.isfinite(high) else math.inf,
+        ),
+    )
+
+
+def apply_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    """GIMBAL_MANAGER_STATUS: who may move the gimbal."""
+    gimbal = _told(state, fields)
+    if gimbal is None:
+        return state
+    primary = (int(fields["primary_control_sysid"]), int(fields["primary_control_compid"]))
+    return replace(state, gimbal=replace(gimbal, status_ns=now_ns, primary_control=primary))
+
+
+def apply_attitude(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    """GIMBAL_DEVICE_ATTITUDE_STATUS: where the gimbal looks."""
+    gimbal = _told(state, fields)
+    if gimbal is None:
+        return state
+    frame = _yaw_frame(int(fields["flags"]))
+    if frame is None:
+        return replace(state, gimbal=replace(gimbal, attitude=None, attitude_problem=_UNKNOWN_YAW))
+    attitude = _unit(fields["q"])
+    if attitude is None:
+        return state if gimbal is state.gimbal else replace(state, gimbal=gimbal)
+    return replace(
+        state,
+        gimbal=replace(gimbal, attitude_ns=now_ns, attitude=attitude, yaw_frame=frame, attitude_problem=""),
+    )
+
+
+def from_gimbal_device(state: VehicleState, name: str, component_id: int) -> bool:
+    """Whether a message of another component than the autopilot's is the vehicle's gimbal's attitude."""
+    return (
+        name == ATTITUDE_STATUS
+        and state.gimbal is not None
+        and component_id > LAST_ATTACHED_DEVICE
+        and component_id == state.gimbal.device
+    )
+
+
+def _told(state: VehicleState, fields: Fields) -> GimbalState | None:
+    """The gimbal that a message is about; None: another one than the vehicle's."""
+    device = int(fields.get("gimbal_device_id") or 0)
+    gimbal = state.gimbal
+    if gimbal is None:
+        return GimbalState(device)
+    if device in (0, gimbal.device):
+        return gimbal
+    if gimbal.device == 0:
+        return replace(gimbal, device=device)
+    return None
+
+
+def _yaw_frame(flags: int) -> YawFrame | None:
+    """What the yaw in an attitude counts from; None: the flags do not tell."""
+    if flags & _YAW_IN_EARTH_FRAME:
+        return None if flags & _YAW_IN_VEHICLE_FRAME else YawFrame.NORTH
+    if flags & _YAW_IN_VEHICLE_FRAME:
+        return YawFrame.NOSE
+    # Older devices say neither; the lock decides, and a neutral gimbal (which overrides locks) has none.
+    if flags & _YAW_LOCK:
+        return None if flags & _NEUTRAL else YawFrame.NORTH
+    return YawFrame.NOSE
+
+
+def _unit(values: Any) -> Quaternion | None:
+    """A unit quaternion; None for what is none."""
+    if not isinstance(values, list | tuple) or len(values) != 4:
+        return None
+    w, x, y, z = (_number(value) for value in values)
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if not 0.5 < norm < 2.0:  # NaN also fails the comparison
+        return None
+    return (w / norm, x / norm, y / norm, z / norm)
+
+
+def _number(value: float | None) -> float:
+    """JSON has no NaN: there it is None."""
+    return math.nan if value is None else float(value)
+
+
+GIMBAL_STEPS: dict[str, Callable[[VehicleState, Fields, int], VehicleState]] = {
+    "GIMBAL_MANAGER_INFORMATION": apply_information,
+    "GIMBAL_MANAGER_STATUS": apply_status,
+    ATTITUDE_STATUS: apply_attitude,
+}

@@ -1,0 +1,229 @@
+"""One message of the autopilot into the next snapshot of the vehicle. Pure: no link, no clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from companion.vehicle.gimbal_telemetry import GIMBAL_STEPS
+from companion.vehicle.px4_modes import mode_of_custom_mode
+from companion.vehicle.state import FlightMode, LandedState, Odometry, Vector3, VehicleState
+
+Fields = Mapping[str, Any]
+
+_SAFETY_ARMED = 128  # MAV_MODE_FLAG
+_STATE_CRITICAL, _STATE_EMERGENCY = 5, 6  # MAV_STATE
+_PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
+_LOCAL_NED = 1  # MAV_FRAME
+# ESTIMATOR_STATUS_FLAGS; EKF_STATUS_REPORT has the same bits. CONST_POS_MODE (128) is no fault: PX4 sets it
+# at rest with a valid position.
+_VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT = 2, 8 | 16, 32 | 64
+# A position this far from where the one before and the mean velocity lead is a reset; an estimate of PX4 in
+# its own simulation was 0.03 m from there at most. Over a gap, accelerations of up to 10 m/s2 that neither
+# velocity shows are allowed for; over more than a second no reset can be measured.
+_JUMP_M = 0.5
+_JUMP_MPS2 = 2.5
+_LONGEST_GAP_S = 1.0
+# Of a reset that the counter tells: what is less is the estimate's own wander.
+_LEAST_RESET_M = 0.2
+_LANDED = {
+    1: LandedState.ON_GROUND,
+    2: LandedState.IN_AIR,
+    3: LandedState.TAKING_OFF,
+    4: LandedState.LANDING,
+}
+
+
+def apply_message(state: VehicleState, name: str, fields: Fields, now_ns: int) -> VehicleState:
+    """The snapshot after a message.
+
+    Args:
+        name: the message's name, as in MAVLink common.
+        fields: its fields by name; a float that is not a number may be None (as JSON has it).
+        now_ns: CLOCK_MONOTONIC of its arrival.
+
+    Returns:
+        A new snapshot, or the same object when the message says nothing new of the vehicle.
+    """
+    step = _STEPS.get(name)
+    return state if step is None else step(state, fields, now_ns)
+
+
+def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    return replace(
+        state,
+        heartbeat_ns=now_ns,
+        armed=bool(fields["base_mode"] & _SAFETY_ARMED),
+        mode=_mode(fields),
+        failsafe=fields["system_status"] in (_STATE_CRITICAL, _STATE_EMERGENCY),
+    )
+
+
+def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    mode = _mode(fields)
+    if mode is FlightMode.UNKNOWN:
+        return state
+    intended, beside = state.intended_mode, state.intended_beside
+    if "intended_custom_mode" in fields:
+        intended, beside = mode_of_custom_mode(fields["intended_custom_mode"]), mode
+    if (mode, intended, beside) == (state.mode, state.intended_mode, state.intended_beside):
+        return state
+    return replace(state, mode=mode, intended_mode=intended, intended_beside=beside)
+
+
+def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    landed = _LANDED.get(fields["landed_state"], LandedState.UNKNOWN)
+    return replace(state, landed_ns=now_ns, landed=landed)
+
+
+def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    w, x, y, z = (_number(fields[key]) for key in ("q1", "q2", "q3", "q4"))
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    rates = _vector(fields, "rollspeed", "pitchspeed", "yawspeed")
+    if not 0.5 < norm < 2.0 or rates is None:  # NaN also fails the comparison
+        return state
+    attitude = (w / norm, x / norm, y / norm, z / norm)
+    return replace(state, attitude_ns=now_ns, attitude=attitude, angular_velocity_frd_radps=rates)
+
+
+def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    position, velocity = _vector(fields, "x", "y", "z"), _vector(fields, "vx", "vy", "vz")
+    if position is None or velocity is None:
+        return state
+    boot_ms = fields["time_boot_ms"]
+    dt_s = (boot_ms - state.position_boot_ms) * 1e-3
+    told = _less(position, state.reset_offset_ned_m)
+    if state.position_ned_m is not None and state.velocity_ned_mps is not None:
+        jump = _jump(state.position_ned_m, state.velocity_ned_mps, told, velocity, dt_s)
+        if jump is not None and math.hypot(*jump) > _JUMP_M + _JUMP_MPS2 * dt_s * dt_s:
+            state, told = _reset_by(state, jump), _less(told, jump)
+    return replace(
+        state,
+        position_ns=now_ns,
+        position_boot_ms=boot_ms,
+        position_ned_m=told,
+        velocity_ned_mps=velocity,
+    )
+
+
+def _odometry(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    """A changed counter tells of a reset that a position alone does not show, or not yet.
+
+    LOCAL_POSITION_NED may have shown it before: what that made of it is in the offset, and nothing is left.
+    """
+    position, velocity = _vector(fields, "x", "y", "z"), state.velocity_ned_mps
+    if position is None or velocity is None or fields["frame_id"] != _LOCAL_NED:
+        return state
+    told = _less(position, state.reset_offset_ned_m)
+    seen = Odometry(fields["time_usec"], fields["reset_counter"], told, velocity)
+    last, state = state.odometry, replace(state, odometry=seen)
+    if last is None or last.reset_counter == seen.reset_counter:
+        return state
+    dt_s = (seen.time_us - last.time_us) * 1e-6
+    jump = _jump(last.position_ned_m, last.velocity_ned_mps, told, velocity, dt_s)
+    if jump is None or math.hypot(*jump) < _LEAST_RESET_M:
+        return state
+    return _reset_by(replace(state, odometry=replace(seen, position_ned_m=_less(told, jump))), jump)
+
+
+def _jump(
+    before: Vector3, velocity: Vector3, after: Vector3, velocity_after: Vector3, dt_s: float
+) -> Vector3 | None:
+    """What of the way between two positions their velocities do not explain; None after too long a gap."""
+    if abs(dt_s) > _LONGEST_GAP_S:
+        return None
+    north, east, down = (
+        b - a - (u + v) / 2.0 * dt_s
+        for a, u, b, v in zip(before, velocity, after, velocity_after, strict=True)
+    )
+    return (north, east, down)
+
+
+def _reset_by(state: VehicleState, jump: Vector3) -> VehicleState:
+    """The autopilot's coordinates of every place are other ones; those of home are still the same."""
+    north, east, down = (o + j for o, j in zip(state.reset_offset_ned_m, jump, strict=True))
+    home = state.home_position_ned_m
+    return replace(
+        state,
+        reset_count=state.reset_count + 1,
+        reset_offset_ned_m=(north, east, down),
+        home_position_ned_m=None if home is None else _less(home, jump),
+    )
+
+
+def _less(place: Vector3, offset: Vector3) -> Vector3:
+    return (place[0] - offset[0], place[1] - offset[1], place[2] - offset[2])
+
+
+def _estimator_status(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    """It holds until the next one: age does not make it untrue, and a missing stream is asked for."""
+    flags = fields["flags"]
+    valid = all(flags & group for group in (_VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT))
+    return state if valid is state.position_valid else replace(state, position_valid=valid)
+
+
+def _global_position_int(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    return replace(
+        state,
+        global_ns=now_ns,
+        latitude_deg=fields["lat"] * 1e-7,
+        longitude_deg=fields["lon"] * 1e-7,
+        altitude_amsl_m=fields["alt"] * 1e-3,
+    )
+
+
+def _home_position(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
+    home = replace(state, home_altitude_amsl_m=fields["altitude"] * 1e-3)
+    local = _vector(fields, "x", "y", "z")
+    if local is not None:
+        home = replace(home, home_position_ned_m=_less(local, state.reset_offset_ned_m))
+    return state if home == state else home
+
+
+def _sys_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    ready = bool(fields["onboard_control_sensors_health"] & _PREARM_CHECK)
+    return _battery_status(replace(state, ready_to_arm=ready), fields, now_ns)
+
+
+def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:
+    # Of several batteries the first speaks for the vehicle, as in SYS_STATUS.
+    if fields.get("id", 0) != 0 or fields["battery_remaining"] < 0:
+        return state
+    fraction = min(fields["battery_remaining"] / 100.0, 1.0)
+    return replace(state, battery_ns=now_ns, battery_fraction=fraction)
+
+
+def _mode(fields: Fields) -> FlightMode:
+    """As a driver has named it (`flight_mode`), else by PX4's number."""
+    named: FlightMode | None = fields.get("flight_mode")
+    return mode_of_custom_mode(fields["custom_mode"]) if named is None else named
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _vector(fields: Fields, *names: str) -> tuple[float, float, float] | None:
+    """Three finite numbers, or None: an estimate that is not a number is no estimate."""
+    x, y, z = (_number(fields[name]) for name in names)
+    return (x, y, z) if math.isfinite(x) and math.isfinite(y) and math.isfinite(z) else None
+
+
+_STEPS: dict[str, Callable[[VehicleState, Fields, int], VehicleState]] = {
+    "HEARTBEAT": _heartbeat,
+    "CURRENT_MODE": _current_mode,
+    "EXTENDED_SYS_STATE": _extended_sys_state,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "LOCAL_POSITION_NED": _local_position_ned,
+    "ODOMETRY": _odometry,
+    "ESTIMATOR_STATUS": _estimator_status,
+    "GLOBAL_POSITION_INT": _global_position_int,
+    "HOME_POSITION": _home_position,
+    "SYS_STATUS": _sys_status,
+    "BATTERY_STATUS": _battery_status,
+    **GIMBAL_STEPS,
+}
+
+TELEMETRY_MESSAGES = frozenset(_STEPS)

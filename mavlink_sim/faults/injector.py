@@ -1,0 +1,92 @@
+"""Faults of a vehicle in real time: its sockets, the console and the zenoh key, in one place for the loop."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+from mavlink_sim.faults.console import FaultConsole
+from mavlink_sim.faults.zenoh_control import FaultControl
+from mavlink_sim.wire.faulty_socket import FaultySocket
+
+if TYPE_CHECKING:
+    from mavlink_sim.vehicle import Vehicle
+    from mavlink_sim.wire.endpoint import UdpEndpoint
+
+
+class FaultOptions(Protocol):
+    """What of a simulation's options is about faults."""
+
+    @property
+    def faults(self) -> tuple[str, ...]: ...
+    @property
+    def console(self) -> bool | None: ...
+    @property
+    def control(self) -> str | None: ...
+
+
+class FaultInjector:
+    """What the loop of a simulation does for faults; see `fault_injector`."""
+
+    def __init__(
+        self,
+        sockets: Mapping[str, FaultySocket],
+        console: FaultConsole | None,
+        control: FaultControl | None,
+    ) -> None:
+        self._sockets = sockets
+        self._console = console
+        self._control = control
+
+    def poll(self) -> None:
+        """Once a turn of the loop: what was typed or asked for."""
+        if self._console is not None:
+            self._console.poll()
+        if self._control is not None:
+            self._control.poll()
+
+    def delivered(self) -> list[str]:
+        """Once a step: send what is due; the links on which delayed datagrams have arrived."""
+        arrived = []
+        for name, socket in self._sockets.items():
+            socket.pump()
+            if socket.has_arrivals:
+                arrived.append(name)
+        return arrived
+
+
+@contextmanager
+def fault_injector(
+    vehicle: Vehicle,
+    endpoints: Mapping[str, UdpEndpoint],
+    options: FaultOptions,
+    say: Callable[[str], None],
+) -> Iterator[FaultInjector]:
+    """Put the links' stages between the endpoints and their sockets, begin the faults, open the ways in.
+
+    Raises:
+        FaultError: a fault that cannot be.
+        ControlError: the control endpoint cannot be opened.
+    """
+    faults = vehicle.faults
+    sockets = {}
+    for name, endpoint in endpoints.items():
+        sockets[name] = FaultySocket(endpoint.socket, faults.stage(name), lambda: faults.now_s)
+        endpoint.socket = sockets[name]
+    for line in options.faults:
+        faults.begin(line)
+    with ExitStack() as stack:
+        console = control = None
+        if options.control is not None:
+            control = FaultControl(options.control, vehicle.system_id, faults)
+            stack.callback(control.close)
+        if options.console or (options.console is None and _is_terminal()):
+            console = FaultConsole(0, faults.command, say)
+            stack.callback(console.close)
+        yield FaultInjector(sockets, console, control)
+
+
+def _is_terminal() -> bool:
+    return sys.stdin is not None and sys.stdin.isatty()

@@ -1,0 +1,115 @@
+"""The one contract of all runtimes: a letterboxed picture in, raw maps out."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.yolo.level_outputs import Head, LevelOutput, Product
+
+RuntimeName = Literal["torch", "onnxruntime", "openvino", "tensorrt"]
+RUNTIMES: tuple[RuntimeName, ...] = ("torch", "onnxruntime", "openvino", "tensorrt")
+Precision = Literal["auto", "float32", "bfloat16", "float16"]
+PRECISIONS: tuple[Precision, ...] = ("auto", "float32", "bfloat16", "float16")
+
+
+class RuntimeUnusableError(ValueError):
+    """A runtime cannot do what it was asked: the file, the precision or the machine does not allow it."""
+
+
+class RuntimeMissingError(RuntimeUnusableError):
+    """A runtime was asked for by name and is not installed. The message names the extra that brings it."""
+
+
+class Runtime(Protocol):
+    """A network made ready. Not to be shared between threads.
+
+    The picture's colours and range are the runtime's affair: it takes the pixels as they are.
+
+    Attributes:
+        name: of the runtime.
+        precision: what the network computes in, `float32`, `bfloat16` or `float16`.
+        precision_reason: why, in words.
+        threads: processor threads that it computes with.
+        head: how its maps are read.
+    """
+
+    @property
+    def name(self) -> RuntimeName: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def precision_reason(self) -> str: ...
+    @property
+    def threads(self) -> int: ...
+    @property
+    def head(self) -> Head: ...
+
+    @property
+    def product(self) -> Product:
+        """Of two float32 matrices, with the runtime's own threads where it has such a thing."""
+
+    def prepare(self, height: int, width: int) -> None:
+        """Make ready for inputs of one size, so that the first `infer` is as fast as the rest."""
+
+    def infer(self, image_bgr: NDArray[np.uint8]) -> Sequence[LevelOutput]:
+        """(H, W, 3) uint8 BGR, C-contiguous, sides multiples of the largest stride → one level's maps each.
+
+        The maps may lie in the runtime's own memory: they hold until the next `infer`.
+        """
+
+
+def installed(runtime: RuntimeName) -> bool:
+    """Whether the runtime's package can be imported. Nothing is imported."""
+    return importlib.util.find_spec(runtime) is not None
+
+
+def version(runtime: RuntimeName) -> str:
+    """The installed runtime's version; `unknown` of one that was put there without a package."""
+    try:
+        return importlib.metadata.version(runtime)
+    except importlib.metadata.PackageNotFoundError:
+        # Another package may bring it, such as onnxruntime-gpu.
+        packages = importlib.metadata.packages_distributions().get(runtime, [])
+        return importlib.metadata.version(packages[0]) if packages else "unknown"
+
+
+def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
+    """The runtime's module. Raises `RuntimeMissingError`, which names the extra to install."""
+    for package in filter(None, (runtime, also)):
+        try:
+            if importlib.util.find_spec(package) is None:
+                raise RuntimeMissingError(
+                    f"the runtime {runtime} is not installed ({package} is missing): "
+                    f"pip install 'mavlink-companion[{runtime}]'"
+                )
+        except ModuleNotFoundError:  # of a dotted name, when even the first part is missing
+            raise RuntimeMissingError(
+                f"the runtime {runtime} is not installed ({package} is missing): "
+                f"pip install 'mavlink-companion[{runtime}]'"
+            ) from None
+    try:
+        return importlib.import_module(runtime)
+    except ImportError as error:
+        raise RuntimeMissingError(
+            f"the runtime {runtime} is installed but cannot be loaded: {error}; "
+            f"install it again: pip install --force-reinstall 'mavlink-companion[{runtime}]'"
+        ) from error
+
+
+def bfloat16_instructions() -> str:
+    """The processor's own bfloat16 arithmetic, as Linux names it; empty where it has none."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    # x86 lists `flags`, ARM lists `Features`.
+    flags = {flag for line in lines if line.startswith(("flags", "Features")) for flag in line.split()}
+    return " ".join(sorted(flags & {"avx512_bf16", "amx_bf16", "bf16"}))
