@@ -38,7 +38,7 @@ from vision.evaluation.samples import Dataset, Sample, read_image
 from vision.yolo.metrics import WRONG, ImageResult, box_iou, judge, operating_points, score_detections
 from vision.yolo.recipe import HELD_OUT_SEED
 
-CONFIRMED = TrackerSection().true_score
+CONFIRMED = TrackerSection().confirm_score
 """A track is confirmed, and may be flown to, from this median confidence on."""
 DEFAULT_WORLDS = 20
 """The default world is drawn with the seeds 1 to this; training has others."""

@@ -88,7 +88,7 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         seen = ", ".join(_words(record) for record in detections.records())
         return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {seen or 'no objects detected'}"
     # Nobody measures ranges here, and without a tracker there are no tracks.
-    left_out = (
+    frames_skipped = (
         ("depth_m", "nearest_camera_m")
         if detections.track_id is not None
         else ("depth_m", "nearest_camera_m", *TRACK_FIELDS)
@@ -100,7 +100,7 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         "height": frame.height,
         "inference_ms": round(timing.inference_ms, 2),
         "detections": [
-            {key: value for key, value in record.items() if key not in left_out}
+            {key: value for key, value in record.items() if key not in frames_skipped}
             for record in detections.records()
         ],
     }

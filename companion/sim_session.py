@@ -250,11 +250,11 @@ def session_settings(
     """Settings for a vehicle on a port of loopback and a simulated camera, whose frames bring lens and mount.
 
     Args:
-        chosen: settings that are kept but for vehicle, source, camera and views; None: whatever is configured
+        chosen: settings that are kept but for vehicle, source, camera and cameras; None: what is configured
             on this machine, defaults, and zenoh on a free port.
     """
     values: dict[str, Any] = {} if chosen is None else chosen.model_dump(exclude_unset=True)
-    for section in ("source", "camera", "views"):
+    for section in ("source", "camera", "cameras"):
         values.pop(section, None)
     values["guidance"] = {"perception_max_age_s": 1.0, **values.get("guidance", {})}
     # A laptop draws the world, looks at it and films it all at once: frames may come late.
@@ -263,7 +263,7 @@ def session_settings(
         # The size at which the bundled model was trained; see docs/models.md.
         detector.setdefault("image_size", 320)
     values["detector"] = detector
-    values["guidance"].pop("view", None)
+    values["guidance"].pop("camera", None)
     values["vehicle"] = {"driver": driver, **values.get("vehicle", {})}
     values["vehicle"] |= {"url": f"udpin://127.0.0.1:{port}", "system_id": system_id}
     # The worker is started together with the simulator, and the first frame takes some seconds.

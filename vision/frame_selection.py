@@ -37,21 +37,21 @@ class FrameSelector:
     """Says frame by frame whether to look at it, and counts what is left out.
 
     Attributes:
-        left_out: reason → frames so far.
+        frames_skipped: reason → frames so far.
     """
 
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
         self._read = 0
         self._due_ns = 0
-        self.left_out = {EVERY: 0, RATE: 0, TOO_OLD: 0}
+        self.frames_skipped = {EVERY: 0, RATE: 0, TOO_OLD: 0}
 
     def look_at(self, frame: Frame, now_ns: int) -> bool:
         """Whether to look at this frame, picked up at `now_ns` of CLOCK_MONOTONIC."""
         reason = self._reason_against(frame, now_ns)
         self._read += 1
         if reason is not None:
-            self.left_out[reason] += 1
+            self.frames_skipped[reason] += 1
             return False
         return True
 

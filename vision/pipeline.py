@@ -39,7 +39,7 @@ class PerceptionResult:
             `decode`; `wait`: until the frame was picked up; then `preprocess`, `inference`, `postprocess`,
             `track`, `range`; `total`: from picking it up to here.
         dropped: frames lost so far, between the source and here; those left out on purpose do not count.
-        left_out: reason → frames so far that were not looked at. `replaced`: a newer one came first;
+        frames_skipped: reason → frames so far that were not looked at. `replaced`: a newer one came first;
             `unreadable`; `too_old`; and on purpose `every` and `rate`.
         track_events: what happened to tracks, the oldest first; all since the result before.
         markers: those in the frame; None where none are looked for.
@@ -55,7 +55,7 @@ class PerceptionResult:
     timing_ms: dict[str, float]
     dropped: int
     track_events: tuple[TrackEvent, ...] = ()
-    left_out: Mapping[str, int] = field(default_factory=dict)
+    frames_skipped: Mapping[str, int] = field(default_factory=dict)
     markers: tuple[Marker, ...] | None = None
     obstacles: ObstacleSectors | None = None
 
@@ -141,17 +141,17 @@ class Pipeline:
         self.frames = 0
 
     @property
-    def left_out(self) -> dict[str, int]:
+    def frames_skipped(self) -> dict[str, int]:
         """Reason → frames so far that were not looked at; see `PerceptionResult`."""
         unreadable = self._source.statistics.unreadable
         # The source counts the unreadable ahead of the gap that they leave; a count never goes back.
         self._replaced = max(self._replaced, self._missing - unreadable)
-        return {"replaced": self._replaced, "unreadable": unreadable, **self._selector.left_out}
+        return {"replaced": self._replaced, "unreadable": unreadable, **self._selector.frames_skipped}
 
     @property
     def dropped(self) -> int:
         """Frames lost so far between the source and here; those left out on purpose do not count."""
-        return self._missing + self._selector.left_out[TOO_OLD]
+        return self._missing + self._selector.frames_skipped[TOO_OLD]
 
     def step(self, timeout_s: float, deliver: Callable[[PerceptionResult], None]) -> bool:
         """Read one frame, look at it if it is its turn, hand the result to `deliver`, then record the frame.
@@ -169,12 +169,12 @@ class Pipeline:
         self._missing += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
         self.frames += 1
-        too_old = self._selector.left_out[TOO_OLD]
+        too_old = self._selector.frames_skipped[TOO_OLD]
         if self._selector.look_at(frame, picked_ns):
             result = self._look(frame, picked_ns)
             self._newest = result.detections
             deliver(result)
-        if self._selector.left_out[TOO_OLD] > too_old:
+        if self._selector.frames_skipped[TOO_OLD] > too_old:
             self._log_too_old((picked_ns - frame.captured_ns) / 1e9, picked_ns)
         if self._recorder is not None:
             self._recorder.write(frame, self._newest)
@@ -233,7 +233,7 @@ class Pipeline:
             timing_ms=timing_ms,
             dropped=self.dropped,
             track_events=events,
-            left_out=self.left_out,
+            frames_skipped=self.frames_skipped,
             markers=markers,
             obstacles=obstacles,
         )

@@ -392,8 +392,8 @@ def camera_settings(
         "camera.mount_roll_deg": math.degrees(mount.roll_rad),
         "camera.mount_pitch_deg": math.degrees(mount.pitch_rad),
         "camera.mount_yaw_deg": math.degrees(mount.yaw_rad),
-        "camera.mount_levelled": str(mount.levelled).lower(),
-        "camera.gimbal": str(mount.on_gimbal).lower(),
+        "camera.stabilized": str(mount.levelled).lower(),
+        "camera.on_gimbal": str(mount.on_gimbal).lower(),
     }
     return plain_settings({key: str(value) for key, value in values.items()} | dict(changes or {}))
 

@@ -59,7 +59,7 @@ class RenderedCamera:
         if state.attitude is not None:
             self._perception.add_attitude(state.attitude_ns, state.attitude, state.altitude_m)
         gimbal = state.gimbal
-        if gimbal is not None and gimbal.attitude is not None and self.view.settings.camera.gimbal:
+        if gimbal is not None and gimbal.attitude is not None and self.view.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):
                 self._perception.add_gimbal(gimbal.attitude_ns, history.gimbal_at(gimbal.attitude_ns))
 

@@ -171,7 +171,7 @@ def believed(
             track
             for track in tracker.tracks
             if track.state is TrackState.CONFIRMED
-            and stamp_ns - track.last_ns < settings.lost_s * 1e9
+            and stamp_ns - track.last_ns < settings.coast_timeout_s * 1e9
             and _in_picture(track.xyxy)
         ]
         boxes = np.array([track.xyxy for track in tracks]).reshape(-1, 4)

@@ -53,7 +53,7 @@ def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: s
     """What every message about one frame begins with."""
     return {
         "vehicle": vehicle,
-        "view": view,
+        "camera": view,
         "sequence": result.sequence,
         "captured_ns": result.captured_ns,
         "published_ns": published_ns,

@@ -2,7 +2,7 @@
 
 zenoh calls back on threads of its own; whatever comes in hops into the asyncio loop. A publication never
 waits: `DROP` where the network is slow. While the session is not open yet, what is published is counted as
-unsent, not queued: old detections are of no use to anybody.
+publish_failed, not queued: old detections are of no use to anybody.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Bus:
 
     Attributes:
         published: path of a topic (`Topic.path`) → messages handed to zenoh.
-        unsent: messages that came while there was no session, or that zenoh refused.
+        publish_failed: messages that came while there was no session, or that zenoh refused.
         intake: which commands are taken.
     """
 
@@ -98,7 +98,7 @@ class Bus:
         self._streams: list[tuple[Topic, str | None]] = [(topic, None) for topic in TOPICS]
         self._streams += [(topic, view) for view in views for topic in VIEW_TOPICS]
         self.published: dict[str, int] = {topic.path(view): 0 for topic, view in self._streams}
-        self.unsent = 0
+        self.publish_failed = 0
         self.intake = CommandIntake()
         self._logged_s, self._unlogged = -_LOG_PERIOD_S, 0
 
@@ -165,7 +165,7 @@ class Bus:
         path = topic.path(view)
         publisher = self._publishers.get(path)
         if publisher is None or path in self._sending:
-            self.unsent += 1
+            self.publish_failed += 1
             return
         self._sending.add(path)
         self._spawn(self._send(path, publisher, picture, json.dumps(attachment)))
@@ -175,7 +175,7 @@ class Bus:
             await asyncio.to_thread(publisher.put, picture, attachment=attachment)
             self.published[path] += 1
         except zenoh.ZError as error:
-            self.unsent += 1
+            self.publish_failed += 1
             logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))
         finally:
             self._sending.discard(path)
@@ -188,13 +188,13 @@ class Bus:
         path = topic.path(view)
         publisher = self._publishers.get(path)
         if publisher is None:
-            self.unsent += 1
+            self.publish_failed += 1
             return
         payload = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            self.unsent += 1
+            self.publish_failed += 1
             logger.warning("zenoh did not take a message for %s: %s", path, _first_line(error))
             return
         self.published[path] += 1

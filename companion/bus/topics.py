@@ -39,7 +39,7 @@ class Topic:
 
     def path(self, view: str | None = None) -> str:
         """The key behind the vehicle's name."""
-        return self.name if view is None else f"views/{view}/{self.name}"
+        return self.name if view is None else f"cameras/{view}/{self.name}"
 
 
 _JSON = zenoh.Encoding.APPLICATION_JSON

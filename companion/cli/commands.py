@@ -142,7 +142,7 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
 
     def on_ready() -> None:
         _keep_what_is_loaded()
-        views = [settings.of_view(name) for name in (None, *settings.views)]
+        views = [settings.of_view(name) for name in (None, *settings.cameras)]
         _warn_synthetic_model(
             (view.source.uri, view.detector.model)
             for view in views

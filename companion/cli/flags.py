@@ -13,7 +13,7 @@ import typer
 import typer.core
 import typer.main
 
-from companion.settings.reading import ConfigurationError, Flag, flags, load_settings
+from companion.settings.reading import RENAMED, ConfigurationError, Flag, flags, load_settings
 
 EXIT_BAD_INPUT = 2
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
@@ -126,7 +126,11 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
     chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
-    return {flag.key.replace(".", "__"): flag for flag in chosen}
+    # Former names are flags too, hidden: given, they are an error that names the new one.
+    former = [
+        Flag(old, str, None, "") for old, new in RENAMED.items() if new in {flag.key for flag in chosen}
+    ]
+    return {flag.key.replace(".", "__"): flag for flag in (*chosen, *former)}
 
 
 @functools.cache
@@ -142,15 +146,19 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
         if short := SHORT_NAMES.get(flag.key):
             names.insert(0, short)
         panel = flag.key.partition(".")[0]
-        parameters.append(_option(name, str | None, *names, help=flag.help, panel=panel))
+        parameters.append(
+            _option(name, str | None, *names, help=flag.help, panel=panel, hidden=flag.key in RENAMED)
+        )
     _declare(settings, parameters)
     app = typer.Typer(add_completion=False)
     app.command()(settings)
     return list(typer.main.get_command(app).params)
 
 
-def _option(name: str, kind: Any, *names: str, help: str, panel: str | None = None) -> inspect.Parameter:
-    option = typer.Option(*names, help=help, rich_help_panel=panel, show_default=False)
+def _option(
+    name: str, kind: Any, *names: str, help: str, panel: str | None = None, hidden: bool = False
+) -> inspect.Parameter:
+    option = typer.Option(*names, help=help, rich_help_panel=panel, show_default=False, hidden=hidden)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option]
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any, ClassVar, get_args, get_type_hints
 
@@ -41,11 +41,13 @@ class Command(ABC):
     Attributes:
         word: how it is called. help: what it does, one line.
         takes_attachment: further lines may come with it.
+        renamed: former key of an argument → its key now, for the error message.
     """
 
     word: ClassVar[str]
     help: ClassVar[str]
     takes_attachment: ClassVar[bool] = False
+    renamed: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         for field, argument in arguments_of(type(self)):

@@ -223,6 +223,10 @@ def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, 
     for token in tokens:
         if token.key is None:
             continue
+        if token.key not in by_key and (now := kind.renamed.get(token.key)):
+            raise GrammarError(
+                f"{kind.word}: {token.key}= was renamed to {now}= in version 0.2.0: {usage(kind)}"
+            )
         if token.key not in by_key:
             known = nearest(token.key, list(by_key)) if by_key else "it takes none"
             raise GrammarError(f"{kind.word}: unknown argument {token.key!r}; {known}")

@@ -56,7 +56,7 @@ def check_requirements(
             case Requirement.GIMBAL:
                 missing += missing_gimbal(state, now_ns, context.gimbal, behaviour.gimbal_pitches_rad)
                 if Requirement.PERCEPTION in behaviour.requirements and not context.gimbal.carries_camera:
-                    missing.append("the camera on the gimbal (camera.gimbal is not set)")
+                    missing.append("the camera on the gimbal (camera.on_gimbal is not set)")
             case Requirement.DEPTH_OR_SIZE:
                 if (why := context.ranging.missing(behaviour.class_names)) is not None:
                     missing.append(why)

@@ -71,7 +71,7 @@ class _Collector:
         if status is None:
             return
         yield from _of_service(status)
-        yield from _of_views({"": status["perception"], **status["views"]})
+        yield from _of_views({"": status["perception"], **status["cameras"]})
 
 
 def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
@@ -108,7 +108,7 @@ def _of_service(status: Status) -> Iterator[GaugeMetricFamily | CounterMetricFam
         value=float(len(vehicle["other_commanders"])),
     )
     yield CounterMetricFamily(
-        "companion_messages_unsent", "messages that zenoh did not take", value=float(bus["unsent"])
+        "companion_publish_failed", "messages that zenoh did not take", value=float(bus["publish_failed"])
     )
 
 
@@ -120,24 +120,26 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
         ("results", "results", "results that reached the service"),
         ("restarts", "perception_restarts", "perception processes replaced"),
     ):
-        counter = CounterMetricFamily(f"companion_{name}", meaning, labels=["view"])
+        counter = CounterMetricFamily(f"companion_{name}", meaning, labels=["camera"])
         for view, state in views.items():
             counter.add_metric([view], float(state[key]))
         yield counter
-    left_out = CounterMetricFamily(
-        "companion_frames_left_out", "frames that led to no message", labels=["view", "reason"]
+    frames_skipped = CounterMetricFamily(
+        "companion_frames_skipped", "frames that led to no message", labels=["camera", "reason"]
     )
     stages = GaugeMetricFamily(
         "companion_stage_milliseconds",
         "time of one stage, newest 200 results",
-        labels=["view", "stage", "quantile"],
+        labels=["camera", "stage", "quantile"],
     )
-    age = GaugeMetricFamily("companion_newest_result_age_seconds", "from its capture", labels=["view"])
-    rate = GaugeMetricFamily("companion_results_per_second", "over the last two seconds", labels=["view"])
-    running = GaugeMetricFamily("companion_perception_running", "1 while its process works", labels=["view"])
+    age = GaugeMetricFamily("companion_newest_result_age_seconds", "from its capture", labels=["camera"])
+    rate = GaugeMetricFamily("companion_results_per_second", "over the last two seconds", labels=["camera"])
+    running = GaugeMetricFamily(
+        "companion_perception_running", "1 while its process works", labels=["camera"]
+    )
     for view, state in views.items():
-        for reason, count in state["left_out"].items():
-            left_out.add_metric([view, reason], float(count))
+        for reason, count in state["frames_skipped"].items():
+            frames_skipped.add_metric([view, reason], float(count))
         for quantile, key in (("0.5", "timing_p50_ms"), ("0.99", "timing_p99_ms")):
             for stage, value in state[key].items():
                 stages.add_metric([view, stage, quantile], float(value))
@@ -145,4 +147,4 @@ def _of_views(views: dict[str, Status]) -> Iterator[GaugeMetricFamily | CounterM
             age.add_metric([view], float(state["age_s"]))
         rate.add_metric([view], float(state["rate_hz"]))
         running.add_metric([view], float(state["state"] == "running"))
-    yield from (left_out, stages, age, rate, running)
+    yield from (frames_skipped, stages, age, rate, running)

@@ -124,11 +124,11 @@ class Preview:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The loop turns, though nothing is looked at. `dropped` and `left_out` are as a result has them."""
+    """The loop runs although no frame was processed. `dropped` and `frames_skipped`: as in a result."""
 
     frames: int
     dropped: int = 0
-    left_out: Mapping[str, int] = field(default_factory=dict)
+    frames_skipped: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,8 @@ class PerceptionStatus:
         timing_p50_ms, timing_p99_ms: stage → milliseconds that half, and 99 of 100, of the newest 200 results
             did not exceed. `publish` is the way from the worker onto the bus.
         dropped: frames lost before they were looked at, and results replaced by newer ones before they left.
-        left_out: reason → frames that were not looked at, or whose result a newer one replaced on its way
-            (`unsent`); see `PerceptionResult`.
+        frames_skipped: reason → frames that were not processed, or whose result was replaced by a newer one
+            before it was sent (`superseded`); see `PerceptionResult`.
         stuck_after_s: the silence after which the worker counts as stuck.
         class_names: what the model knows; empty before the start and without a detector.
         tracks: objects that are followed now and count as true.
@@ -59,7 +59,7 @@ class PerceptionStatus:
     timing_p50_ms: Mapping[str, float] = field(default_factory=dict)
     timing_p99_ms: Mapping[str, float] = field(default_factory=dict)
     dropped: int = 0
-    left_out: Mapping[str, int] = field(default_factory=dict)
+    frames_skipped: Mapping[str, int] = field(default_factory=dict)
     stuck_after_s: float | None = None
     class_names: tuple[str, ...] = ()
     tracks: int = 0
@@ -82,7 +82,7 @@ class PerceptionStatus:
             "timing_p50_ms": _rounded(self.timing_p50_ms),
             "timing_p99_ms": _rounded(self.timing_p99_ms),
             "dropped": self.dropped,
-            "left_out": dict(self.left_out),
+            "frames_skipped": dict(self.frames_skipped),
             "stuck_after_s": self.stuck_after_s,
             "class_names": list(self.class_names),
             "tracks": self.tracks,

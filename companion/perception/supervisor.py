@@ -70,12 +70,12 @@ class _End:
 class _Counts:
     frames: int = 0
     dropped: int = 0
-    left_out: dict[str, int] = field(default_factory=dict)
+    frames_skipped: dict[str, int] = field(default_factory=dict)
 
     def add(self, other: _Counts) -> None:
         self.frames += other.frames
         self.dropped += other.dropped
-        self.left_out = _sum(self.left_out, other.left_out)
+        self.frames_skipped = _sum(self.frames_skipped, other.frames_skipped)
 
 
 class PerceptionSupervisor:
@@ -242,7 +242,7 @@ class PerceptionSupervisor:
             timing_p50_ms=self._times.quantile_ms(0.5),
             timing_p99_ms=self._times.quantile_ms(0.99),
             dropped=self._before.dropped + self._now.dropped,
-            left_out=_sum(self._before.left_out, self._now.left_out),
+            frames_skipped=_sum(self._before.frames_skipped, self._now.frames_skipped),
             stuck_after_s=None if self._pulse is None else self._pulse.stuck_after_s,
             class_names=self.class_names,
             runtime=None if self._ready is None else self._ready.runtime,
@@ -448,7 +448,7 @@ class PerceptionSupervisor:
         result = self._tracks.take(
             replace(report.result, sequence=report.result.sequence + self._first_sequence)
         )
-        self._count(report.frames, result.dropped, result.left_out, report.replaced)
+        self._count(report.frames, result.dropped, result.frames_skipped, report.replaced)
         result = replace(result, dropped=self._before.dropped + self._now.dropped)
         self._newest = result
         self._results += 1
@@ -457,14 +457,14 @@ class PerceptionSupervisor:
         self._times.add(result.timing_ms)
         self._on_result(result)
 
-    def _count(self, frames: int, dropped: int, left_out: Mapping[str, int], unsent: int) -> None:
+    def _count(self, frames: int, dropped: int, frames_skipped: Mapping[str, int], superseded: int) -> None:
         """What the present worker has read and lost so far."""
-        self._now = _Counts(frames, dropped + unsent, {**left_out, "unsent": unsent})
+        self._now = _Counts(frames, dropped + superseded, {**frames_skipped, "superseded": superseded})
 
     def _note(self, message: Message) -> None:
         if isinstance(message, Heartbeat):
-            unsent = self._now.left_out.get("unsent", 0)
-            self._count(message.frames, message.dropped, message.left_out, unsent)
+            superseded = self._now.frames_skipped.get("superseded", 0)
+            self._count(message.frames, message.dropped, message.frames_skipped, superseded)
         elif isinstance(message, LogLine):
             # What a person should know is an event; the rest is only for the log. Never both.
             if message.level >= logging.WARNING:

@@ -41,7 +41,7 @@ class View:
         settings: with this view's own sections; `camera` as the camera brings it, where it does.
         newest: the newest result; None before the first.
         targets: where the newest result's objects are, after `place`.
-        unplaced: why they have no place; empty if they have.
+        localization_error: why they have no place; empty if they have.
         class_names: what the detector knows; None while there is none to ask.
     """
 
@@ -52,7 +52,7 @@ class View:
         self.settings = settings
         self.newest: PerceptionResult | None = None
         self.targets: tuple[Target, ...] = ()
-        self.unplaced = ""
+        self.localization_error = ""
         self._class_names = class_names
         self._depth_came = False
         self._between_s: deque[float] = deque(maxlen=9)
@@ -99,10 +99,10 @@ class View:
                 history,
                 self.settings.detector.heights(),
             )
-            self.unplaced = ""
+            self.localization_error = ""
         except HistoryError as error:
             # Without the attitude of that moment a box has no direction: seen and published, not steered by.
-            self.targets, self.unplaced = (), str(error)
+            self.targets, self.localization_error = (), str(error)
 
     def take(self, result: PerceptionResult) -> None:
         """A new result; where its objects are is `place`'s."""
@@ -161,14 +161,14 @@ class WorkerView(View):
         except PerceptionStartError as error:
             if self.name is None:
                 raise
-            raise PerceptionStartError(f"view {self.name}: {error}") from error
+            raise PerceptionStartError(f"camera {self.name}: {error}") from error
 
     def send_state(self, state: VehicleState, history: StateHistory) -> None:
         """The worker's tracker needs to know where its camera looked."""
         if state.attitude is not None:
             self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.altitude_m)
         gimbal = state.gimbal
-        if gimbal is None or not self.settings.camera.gimbal or gimbal.attitude is None:
+        if gimbal is None or not self.settings.camera.on_gimbal or gimbal.attitude is None:
             return
         if gimbal.attitude_ns != self._gimbal_ns:
             self._gimbal_ns = gimbal.attitude_ns
@@ -182,7 +182,7 @@ class WorkerView(View):
         except Exception as error:
             # Perception itself is well: it must not be ended for a fault on this side.
             logger.exception("a detection message could not be used")
-            self.targets, self.unplaced = (), f"{type(error).__name__}: {error}"
+            self.targets, self.localization_error = (), f"{type(error).__name__}: {error}"
 
     def _adopt(self, calibration: CameraCalibration | None) -> None:
         """Go by what the camera brings; the worker does the same with its own copy of the settings."""
@@ -196,13 +196,13 @@ class WorkerView(View):
             if not adopted.conflict:
                 self._tell("info", "lens and mount are those that the camera brings")
             else:
-                key = "camera" if self.name is None else f"views.{self.name}.camera"
+                key = "camera" if self.name is None else f"cameras.{self.name}.camera"
                 self._tell("warning", f"{key}: settings win over what the camera brings: {adopted.conflict}")
         self.settings = self.settings.model_copy(update={"camera": camera})
         self._on_calibration()
 
     def _tell(self, level: str, text: str) -> None:
-        self._on_event(level, text if self.name is None else f"view {self.name}: {text}")
+        self._on_event(level, text if self.name is None else f"camera {self.name}: {text}")
 
 
 def open_views(
@@ -217,7 +217,7 @@ def open_views(
 
     `on_calibration` is called after a view's `settings.camera` changed to what its camera brings.
     """
-    own_settings = {name: settings.of_view(name) for name in (None, *settings.views)}
+    own_settings = {name: settings.of_view(name) for name in (None, *settings.cameras)}
     threads = threads_each([own.detector for own in own_settings.values()])
     shared = {f"shm://{source.share}" for source in settings.sources().values() if source.share}
     views = []

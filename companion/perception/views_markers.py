@@ -53,13 +53,13 @@ class MarkerTracker:
         placed: Sequence[MarkerTarget | None] = targets or [None] * len(markers)
         return {
             "vehicle": vehicle,
-            "view": view.name,
+            "camera": view.name,
             "sequence": result.sequence,
             "captured_ns": result.captured_ns,
             "published_ns": published_ns,
             "width": result.width,
             "height": result.height,
-            "unplaced": problem,
+            "localization_error": problem,
             "markers": [_message(marker, place) for marker, place in zip(markers, placed, strict=True)],
         }
 
@@ -80,10 +80,10 @@ class MarkerTracker:
 
     def _no_camera_below(self) -> str:
         cameras = ", ".join(
-            ("camera" if view.name is None else f"views.{view.name}.camera")
+            ("camera" if view.name is None else f"cameras.{view.name}.camera")
             + (
                 "'s gimbal does not look down, or does not tell where it looks: gimbal pitch=-90"
-                if view.settings.camera.gimbal
+                if view.settings.camera.on_gimbal
                 else f".mount_pitch_deg is {view.settings.camera.mount_pitch_deg:g}"
             )
             for view in self._looking

@@ -270,7 +270,7 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
         perception.preview.watched = control.watched
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - said_s >= HEARTBEAT_S:
-            sender.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.left_out))
+            sender.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.frames_skipped))
             said_s = time.monotonic()
 
 

@@ -35,23 +35,25 @@ def driver_of(settings: Settings) -> Driver:
 def guidance_options(settings: Settings, own_address: Address) -> GuidanceOptions:
     """What guidance keeps to. `own_address`: system and component id of our messages."""
     guidance = settings.guidance
-    cameras = [settings.of_view(name).camera for name in (None, *settings.views)]
+    cameras = [settings.of_view(name).camera for name in (None, *settings.cameras)]
     return GuidanceOptions(
         limits=limits_of(settings),
         own_address=own_address,
         lifetime_s=guidance.setpoint_lifetime_s,
         battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
-        obstacles=ObstacleRules(guidance.obstacles, guidance.obstacle_margin_m, guidance.unknown_speed_mps),
+        obstacles=ObstacleRules(
+            guidance.obstacles, guidance.obstacle_margin_m, guidance.max_speed_unobserved_mps
+        ),
         perception_max_age_s=guidance.perception_max_age_s,
-        gimbal=gimbal_mounting(cameras, settings.of_view(guidance.view).camera),
+        gimbal=gimbal_mounting(cameras, settings.of_view(guidance.camera).camera),
     )
 
 
 def gimbal_mounting(cameras: Sequence[CameraSection], steering: CameraSection) -> GimbalMounting:
     """How the gimbal stands to the cameras of all views and to the one that steers."""
     return GimbalMounting(
-        carries_camera=any(camera.gimbal for camera in cameras),
-        carries_steering=steering.gimbal,
+        carries_camera=any(camera.on_gimbal for camera in cameras),
+        carries_steering=steering.on_gimbal,
         camera_pitch_rad=steering.mount().pitch_rad,
     )
 

@@ -40,7 +40,7 @@ class InputAssembler:
     """Gathers what comes in between two steps of guidance.
 
     Args:
-        views: the cameras; the one that `guidance.view` names steers.
+        views: the cameras; the one that `guidance.camera` names steers.
         on_event: called with (level, text) for what a person should know.
 
     Raises:
@@ -57,7 +57,7 @@ class InputAssembler:
     ) -> None:
         load_plugins(settings.plugins.modules)
         self._settings = settings
-        self.steering = next(view for view in views if view.name == settings.guidance.view)
+        self.steering = next(view for view in views if view.name == settings.guidance.camera)
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
         self._markers = MarkerTracker(views)
@@ -133,7 +133,7 @@ class InputAssembler:
     def camera_pitch_rad(self, state: VehicleState) -> float:
         """Of the steering camera above the horizon, with the vehicle level."""
         camera, gimbal = self.steering.settings.camera, state.gimbal
-        held_rad = gimbal.pitch_rad if camera.gimbal and gimbal is not None else None
+        held_rad = gimbal.pitch_rad if camera.on_gimbal and gimbal is not None else None
         return math.radians(camera.mount_pitch_deg) + (held_rad or 0.0)
 
     def read_command(

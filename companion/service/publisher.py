@@ -44,7 +44,7 @@ class Publisher:
         except Exception as error:
             # It was flown by, and that goes on; that it was not published must not pass in silence.
             logger.exception("a detection message could not be published")
-            view.unplaced = f"{type(error).__name__}: {error}"
+            view.localization_error = f"{type(error).__name__}: {error}"
 
     def _publish_result(
         self, view: WorkerView, result: PerceptionResult, markers: dict[str, Any] | None
@@ -63,7 +63,7 @@ class Publisher:
 
     def publish_preview(self, view: WorkerView, preview: Preview) -> None:
         """A picture for whoever watches, with what it is of."""
-        stamps = {"view": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
+        stamps = {"camera": view.name, "sequence": preview.sequence, "captured_ns": preview.captured_ns}
         self._bus.publish_picture(topics.IMAGE, preview.jpeg, stamps, view.name)
 
     async def publish_vehicle(

@@ -79,7 +79,7 @@ class Service:
             settings.vehicle.name,
             on_event=self._event,
             on_command=self.command,
-            views=tuple(settings.views),
+            views=tuple(settings.cameras),
             listeners=[
                 (topics.POSE, lambda data: self.inputs.poses.hear(data, time.monotonic_ns())),
                 (topics.STATUS, lambda data: self.others.on_status(data, time.monotonic_ns())),

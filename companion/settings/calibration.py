@@ -26,7 +26,7 @@ def adopt_calibration(section: CameraSection, calibration: CameraCalibration) ->
     """Take lens and mount from the camera, but for the keys that were given: those win.
 
     The lens is one thing: with any key of it given, all of it is the settings' own. So is what the angles of
-    the mount count from (`mount_levelled`, `gimbal`); where that differs, the angles are the settings' too.
+    the mount count from (`stabilized`, `on_gimbal`); where that differs, the angles are the settings' too.
     `conflict` names each value that was given and differs, with the camera's; empty: none.
     """
     given = section.model_fields_set
@@ -79,7 +79,7 @@ def _adopt_mount(
         "mount_right_m": mount.right_m,
         "mount_down_m": mount.down_m,
     }
-    reference = {"mount_levelled": mount.levelled, "gimbal": mount.on_gimbal}
+    reference = {"stabilized": mount.levelled, "on_gimbal": mount.on_gimbal}
     differing = [key for key, value in reference.items() if getattr(section, key) != value]
     if differing and given & reference.keys():
         conflicts += [f"{key} {getattr(section, key)} (camera: {reference[key]})" for key in differing]

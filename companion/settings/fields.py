@@ -22,10 +22,10 @@ _LONGEST_SHOWN = 80
 
 
 def sections_of_file() -> dict[str, type[Section]]:
-    """Name → section, in the order of the file; without the views."""
+    """Name → section, in the order of the file; without further cameras."""
     sections = {}
     for name, field in Settings.model_fields.items():
-        if name == "views":
+        if name == "cameras":
             continue
         section = field.annotation
         assert isinstance(section, type)
@@ -35,7 +35,7 @@ def sections_of_file() -> dict[str, type[Section]]:
 
 
 def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
-    """Section → name → field, in the order of the file; without the views."""
+    """Section → name → field, in the order of the file; without further cameras."""
     return {name: section.model_fields for name, section in sections_of_file().items()}
 
 
@@ -44,11 +44,11 @@ SECTIONS_OF_VIEW = tuple(ViewSections.model_fields)
 
 
 def section_of(table: str) -> str | None:
-    """`detector` and `views.down.detector` → `detector`; None where the table is no section."""
+    """`detector` and `cameras.down.detector` → `detector`; None where the table is no section."""
     match table.split("."):
         case [section] if section in fields_of_sections():
             return section
-        case ["views", _, section] if section in SECTIONS_OF_VIEW:
+        case ["cameras", _, section] if section in SECTIONS_OF_VIEW:
             return section
     return None
 

@@ -53,12 +53,12 @@ class GuidanceSection(Section):
     """depth slows flight towards obstacles: where it comes (auto), or nothing flies without it (required)"""
     obstacle_margin_m: Annotated[float, Field(gt=0, le=50)] = 2.0
     """distance kept from obstacles, from the vehicle's middle, metres"""
-    unknown_speed_mps: Annotated[float | None, Field(gt=0, le=30)] = None
+    max_speed_unobserved_mps: Annotated[float | None, Field(gt=0, le=30)] = None
     """largest speed towards what the depth camera does not see; unset: not limited, metres a second"""
     perception_max_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """detections older than this do not steer, seconds from capture"""
-    view: Annotated[str | None, VIEW_NAME] = None
-    """the view that steers; unset: the one of the sections source, camera and detector"""
+    camera: Annotated[str | None, VIEW_NAME] = None
+    """the camera that steers; unset: the one of the sections source, camera and detector"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

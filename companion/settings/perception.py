@@ -48,7 +48,7 @@ class SourceSection(Section):
     read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
     """a live source that is silent for so long is opened again, seconds"""
     share: Annotated[str | None, KEY_WORD] = None
-    """also offer the frames to other programs of this computer, and to other views, as shm://NAME"""
+    """also offer the frames to other programs of this computer, and to other cameras of the service, as shm://NAME"""
 
     @model_validator(mode="after")
     def _can_be_opened(self) -> Self:
@@ -77,9 +77,9 @@ class CameraSection(Section):
     """the camera's pitch on the body, degrees; negative looks down"""
     mount_yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """the camera's yaw on the body, degrees clockwise"""
-    mount_levelled: bool = False
+    stabilized: bool = False
     """a gimbal holds the camera: its roll and pitch count from the horizon, its yaw from the nose"""
-    gimbal: bool = False
+    on_gimbal: bool = False
     """the camera sits on the autopilot's gimbal, which tells where it looks; mount angles count from that"""
     fx_px: Annotated[float | None, Field(gt=0)] = None
     """calibrated focal length along x, pixels; with it fy_px, cx_px, cy_px and calibrated_* are needed"""
@@ -105,10 +105,10 @@ class CameraSection(Section):
         missing = [name for name, value in calibration.items() if value is None]
         if missing and len(missing) < len(calibration):
             raise ValueError(f"a calibration needs all of {', '.join(calibration)}; {missing[0]} is not set")
-        if self.gimbal and self.mount_levelled:
+        if self.on_gimbal and self.stabilized:
             raise ValueError(
-                "gimbal and mount_levelled exclude each other: a gimbal that tells where it looks (gimbal), "
-                "or one that is silent and holds the camera level (mount_levelled)"
+                "on_gimbal and stabilized exclude each other: a gimbal reports its attitude (on_gimbal), "
+                "or one that reports nothing and holds the camera level (stabilized)"
             )
         if len(self.distortion) not in (0, 4, 5):
             raise ValueError(f"distortion must have 0, 4 or 5 numbers, got {len(self.distortion)}")
@@ -154,8 +154,8 @@ class CameraSection(Section):
             math.radians(self.mount_roll_deg),
             math.radians(self.mount_pitch_deg),
             math.radians(self.mount_yaw_deg),
-            self.mount_levelled,
-            self.gimbal,
+            self.stabilized,
+            self.on_gimbal,
         )
 
 
@@ -188,7 +188,7 @@ class DetectorSection(Section):
     """look at no more than so many frames a second; unset: at all that come"""
     max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
     """do not look at a frame that was captured longer ago, seconds; unset: look at all"""
-    known_heights: tuple[Annotated[str, HEIGHT_TEXT], ...] = ("person:1.7", "car:1.5", "bicycle:1.1")
+    class_heights_m: tuple[Annotated[str, HEIGHT_TEXT], ...] = ("person:1.7", "car:1.5", "bicycle:1.1")
     """class:metres, how tall they stand: tells the range where neither depth nor the ground does"""
     tiles: bool = False
     """look at large frames in overlapping tiles too, for small objects; 1080p takes some 14 times as long"""
@@ -199,11 +199,13 @@ class DetectorSection(Section):
 
     @model_validator(mode="after")
     def _heights_that_stand(self) -> Self:
-        if len(self.heights()) < len(self.known_heights):
-            raise ValueError(f"known_heights: a class is given twice in {', '.join(self.known_heights)}")
+        if len(self.heights()) < len(self.class_heights_m):
+            raise ValueError(f"class_heights_m: a class is given twice in {', '.join(self.class_heights_m)}")
         for name, height_m in self.heights().items():
             if not 0 < height_m <= 100:
-                raise ValueError(f"known_heights: {name} must be above 0 and at most 100 m, got {height_m:g}")
+                raise ValueError(
+                    f"class_heights_m: {name} must be above 0 and at most 100 m, got {height_m:g}"
+                )
         return self
 
     def loading(self, confidence: float) -> DetectorSettings:
@@ -225,7 +227,7 @@ class DetectorSection(Section):
 
     def heights(self) -> dict[str, float]:
         """Class name → metres."""
-        pairs = (text.rpartition(":") for text in self.known_heights)
+        pairs = (text.rpartition(":") for text in self.class_heights_m)
         return {name: float(height) for name, _, height in pairs}
 
 
@@ -238,13 +240,13 @@ class TrackerSection(Section):
     """a detection this sure can begin a track (never less than detector.confidence)"""
     low_confidence: Annotated[float, Field(ge=0, le=1)] = 0.1
     """a detection this sure can continue a track, and is then kept in spite of detector.confidence"""
-    true_score: Annotated[float, Field(ge=0, le=1)] = 0.4
+    confirm_score: Annotated[float, Field(ge=0, le=1)] = 0.4
     """a track counts as true when the median of its confidences reaches this; only such can be flown to"""
-    true_frames: Annotated[int, Field(ge=1, le=1000)] = 3
+    min_hits: Annotated[int, Field(ge=1, le=1000)] = 3
     """and when it was seen in so many frames"""
-    lost_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    coast_timeout_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     """unseen for so long, a track is lost, seconds"""
-    end_s: Annotated[float, Field(gt=0, le=600)] = 2.0
+    max_age_s: Annotated[float, Field(gt=0, le=600)] = 2.0
     """unseen for so long, a track has ended: what comes then is another, seconds"""
     camera_motion: bool = True
     """remove the camera's turning by the vehicle's attitude; false for recorded films"""

@@ -37,6 +37,18 @@ __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "l
 DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
 # COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. A section's name has no underscore.
 ENVIRONMENT_PREFIX = "COMPANION_"
+# Keys that were renamed in version 0.2.0; the old ones are errors that name the new ones.
+RENAMED = {
+    "camera.gimbal": "camera.on_gimbal",
+    "camera.mount_levelled": "camera.stabilized",
+    "detector.known_heights": "detector.class_heights_m",
+    "guidance.unknown_speed_mps": "guidance.max_speed_unobserved_mps",
+    "guidance.view": "guidance.camera",
+    "tracker.end_s": "tracker.max_age_s",
+    "tracker.lost_s": "tracker.coast_timeout_s",
+    "tracker.true_frames": "tracker.min_hits",
+    "tracker.true_score": "tracker.confirm_score",
+}
 
 
 class ConfigurationError(ValueError):
@@ -106,9 +118,9 @@ def load_settings(
 def to_toml(settings: Settings) -> str:
     """The settings as a TOML file with a comment on every key; `load_settings` reads the same back."""
     paragraphs = [_table(section, getattr(settings, section)) for section in sections_of_file()]
-    for view, sections in settings.views.items():
+    for view, sections in settings.cameras.items():
         paragraphs += [
-            _table(f"views.{view}.{section}", getattr(sections, section)) for section in SECTIONS_OF_VIEW
+            _table(f"cameras.{view}.{section}", getattr(sections, section)) for section in SECTIONS_OF_VIEW
         ]
     return "\n".join(paragraphs)
 
@@ -126,7 +138,7 @@ def _table(name: str, section: Section) -> str:
 class _Reading:
     """Values gathered key by key, each with where it came from, and the problems met on the way.
 
-    A table is what stands between brackets in the file: `detector`, or `views.down.detector`.
+    A table is what stands between brackets in the file: `detector`, or `cameras.down.detector`.
     """
 
     def __init__(self) -> None:
@@ -139,7 +151,7 @@ class _Reading:
     def take_file(self, path: Path) -> None:
         origin = f"in {path}"
         for name, content in _read_toml(path).items():
-            if name == "views" and isinstance(content, dict):
+            if name == "cameras" and isinstance(content, dict):
                 for view, sections in content.items():
                     self._take_view(view, sections, origin)
             else:
@@ -158,7 +170,7 @@ class _Reading:
         table, _, name = key.rpartition(".")
         field = self._field(table, name)
         if field is None:
-            self._problems.append(f"unknown key {key} ({origin}); {_nearest(key, self._keys)}")
+            self._problems.append(self._unknown(table, name, origin))
             return
         try:
             value = value_from_text(field, text)
@@ -191,18 +203,20 @@ class _Reading:
     def _take_view(self, view: str, sections: Any, origin: str) -> None:
         if not isinstance(sections, dict):
             self._problems.append(
-                f"views.{view}: must hold sections such as [views.{view}.source], got {shown(sections)} "
+                f"cameras.{view}: must hold sections such as [cameras.{view}.source], got {shown(sections)} "
                 f"({origin})"
             )
             return
-        # An empty table is a view, too: all defaults.
-        self._values.setdefault(f"views.{view}", {})
+        # An empty table is a camera too: all defaults.
+        self._values.setdefault(f"cameras.{view}", {})
         for section, content in sections.items():
-            self._take_table(f"views.{view}.{section}", content, origin)
+            self._take_table(f"cameras.{view}.{section}", content, origin)
 
     def _take_table(self, table: str, content: Any, origin: str) -> None:
-        if section_of(table) is None:
-            known = SECTIONS_OF_VIEW if table.startswith("views.") else self._fields
+        if table == "views":
+            self._problems.append(f"[views] ({origin}) was renamed to [cameras] in version 0.2.0")
+        elif section_of(table) is None:
+            known = SECTIONS_OF_VIEW if table.startswith("cameras.") else self._fields
             self._problems.append(
                 f"unknown section [{table}] ({origin}); {_nearest(table.rpartition('.')[2], known)}"
             )
@@ -215,18 +229,26 @@ class _Reading:
     def _take(self, table: str, name: str, value: Any, origin: str) -> None:
         key = f"{table}.{name}"
         if self._field(table, name) is None:
-            own = f"{section_of(table)}.{name}"
-            self._problems.append(f"unknown key {key} ({origin}); {_nearest(own, self._keys)}")
+            self._problems.append(self._unknown(table, name, origin))
             return
         # TOML has arrays; the settings are frozen and hold tuples.
         self._values.setdefault(table, {})[name] = tuple(value) if isinstance(value, list) else value
         self._origins[key] = origin
 
+    def _unknown(self, table: str, name: str, origin: str) -> str:
+        key = f"{table}.{name}" if table else name
+        section = section_of(table) or table
+        own = f"{section}.{name}" if section else name
+        if now := RENAMED.get(own):
+            now = f"{table}.{now.partition('.')[2]}"
+            return f"{key} ({origin}) was renamed to {now} in version 0.2.0"
+        return f"unknown key {key} ({origin}); {_nearest(own, self._keys)}"
+
     def _explain(self, details: ErrorDetails) -> str:
         parts = [str(part) for part in details["loc"]]
-        if parts[-1:] == ["[key]"]:  # a view's name
-            return f"views.{parts[1]}: a view's name must be {expectation_of_key()}, got {parts[1]!r}"
-        depth = 3 if parts[:1] == ["views"] else 1
+        if parts[-1:] == ["[key]"]:  # a camera's name
+            return f"cameras.{parts[1]}: a camera's name must be {expectation_of_key()}, got {parts[1]!r}"
+        depth = 3 if parts[:1] == ["cameras"] else 1
         table, rest = ".".join(parts[:depth]), parts[depth:]
         if not rest:  # a rule about several keys of the section, or of several sections
             origins = {origin for key, origin in self._origins.items() if key.startswith(f"{table}.")}

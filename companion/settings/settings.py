@@ -24,7 +24,7 @@ from companion.settings.vehicle import VehicleSection
 
 
 class ViewSections(Section):
-    """A further camera or model, with a process of its own, published as views/NAME."""
+    """A further camera or model, with a process of its own, published as cameras/NAME."""
 
     source: SourceSection = SourceSection()
     camera: CameraSection = CameraSection()
@@ -50,13 +50,15 @@ class Settings(Section):
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()
-    views: dict[ViewName, ViewSections] = Field(default_factory=dict)
+    cameras: dict[ViewName, ViewSections] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _views_fit_together(self) -> Self:
-        if self.guidance.view is not None and self.guidance.view not in self.views:
-            known = ", ".join(self.views) or "none"
-            raise ValueError(f"guidance.view: there is no view {self.guidance.view!r} (views: {known})")
+        if self.guidance.camera is not None and self.guidance.camera not in self.cameras:
+            known = ", ".join(self.cameras) or "none"
+            raise ValueError(
+                f"guidance.camera: there is no camera {self.guidance.camera!r} (cameras: {known})"
+            )
         openers: dict[str, str] = {}
         sharers: dict[str, str] = {}
         for key, source in self.sources().items():
@@ -78,38 +80,38 @@ class Settings(Section):
 
     @model_validator(mode="after")
     def _films_are_files_of_their_own(self) -> Self:
-        films = [self.recording.video, *(sections.recording.video for sections in self.views.values())]
+        films = [self.recording.video, *(sections.recording.video for sections in self.cameras.values())]
         named = [film for film in films if film is not None]
         if len(set(named)) < len(named):
-            raise ValueError(f"every view needs a recording.video of its own, got {', '.join(named)}")
+            raise ValueError(f"every camera needs a recording.video of its own, got {', '.join(named)}")
         return self
 
     @model_validator(mode="after")
     def _tracks_outlive_the_pause_between_frames(self) -> Self:
-        views: dict[str, Settings | ViewSections] = {"": self}
-        views |= {f"views.{name}.": sections for name, sections in self.views.items()}
-        for prefix, view in views.items():
-            rate_hz, end_s = view.detector.rate_hz, view.tracker.end_s
-            if view.tracker.enabled and rate_hz is not None and 1 / rate_hz >= end_s:
+        cameras: dict[str, Settings | ViewSections] = {"": self}
+        cameras |= {f"cameras.{name}.": sections for name, sections in self.cameras.items()}
+        for prefix, view in cameras.items():
+            rate_hz, max_age_s = view.detector.rate_hz, view.tracker.max_age_s
+            if view.tracker.enabled and rate_hz is not None and 1 / rate_hz >= max_age_s:
                 raise ValueError(
-                    f"{prefix}tracker.end_s must be longer than one period of {prefix}detector.rate_hz "
-                    f"({1 / rate_hz:.3g} s), got {end_s:g}: every track would end before the next frame"
+                    f"{prefix}tracker.max_age_s must be longer than one period of {prefix}detector.rate_hz "
+                    f"({1 / rate_hz:.3g} s), got {max_age_s:g}: every track would end before the next frame"
                 )
         return self
 
     def sources(self) -> dict[str, SourceSection]:
         """Key of the section → where that view's frames come from, the first view first."""
         return {"source": self.source} | {
-            f"views.{name}.source": sections.source for name, sections in self.views.items()
+            f"cameras.{name}.source": sections.source for name, sections in self.cameras.items()
         }
 
     def of_view(self, name: str | None) -> Settings:
         """What the worker of one view goes by: the same, with that view's own sections. None: the first."""
         if name is None:
-            return self.model_copy(update={"views": {}})
-        sections = self.views[name]
+            return self.model_copy(update={"cameras": {}})
+        sections = self.cameras[name]
         own = {section: getattr(sections, section) for section in ViewSections.model_fields}
-        return self.model_copy(update={"views": {}, **own})
+        return self.model_copy(update={"cameras": {}, **own})
 
 
 def _opens_once(uri: str) -> bool:

@@ -10,7 +10,7 @@ from pydantic import StringConstraints
 KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
 KeyWord = Annotated[str, KEY_WORD]
 HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
-# The same without a dot, as `views.NAME.source` is a key.
+# The same without a dot, as `cameras.NAME.source` is a key.
 VIEW_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
 ViewName = Annotated[str, VIEW_NAME]
 VehicleUrl = Annotated[

@@ -3,16 +3,7 @@
 import math
 from typing import Annotated
 
-from companion import (
-    Behaviour,
-    BehaviourContext,
-    BuildContext,
-    Command,
-    Number,
-    Requirement,
-    Setpoint,
-    behaviour,
-)
+from companion import Behaviour, BehaviourContext, Command, Number, Requirement, Setpoint, behaviour
 
 
 @behaviour("circle", "fly a circle about the point ahead, nose to its centre")
@@ -21,7 +12,7 @@ class Circle(Command):
     radius_m: Annotated[float, Number("radius", "m", 2.0, 50.0, "of the circle")] = 8.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "along the circle")] = 2.0
 
-    def build(self, context: BuildContext) -> Behaviour:
+    def build(self, context: object) -> Behaviour:
         return CircleBehaviour(self)
 
 

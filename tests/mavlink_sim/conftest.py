@@ -18,8 +18,8 @@ from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
 NAN = math.nan
 COMPANION = (1, 191)
 GROUND_STATION = (245, 190)
-# Most of a flight in lockstep is to build these messages, up to a hundred of each a second. A test hears
-# those that it says it reads: `@pytest.mark.streams("ATTITUDE")`, `hears("everything")`.
+# Most of a flight in lockstep is to build these messages, up to a hundred of each a second. A test names
+# those that it reads: `@pytest.mark.streams("ATTITUDE")`, `streams("everything")`.
 FAST_HZ = 5.0
 FAST_STREAMS = {
     name
@@ -34,16 +34,16 @@ class SimHarness:
     """A vehicle with an onboard and a ground-station link, without sockets and without a clock.
 
     Args:
-        hears: which of the fast streams it does not switch off at once, or everything.
+        streams: which of the fast streams it does not switch off at once, or everything.
     """
 
     # Most tests begin in the air: what nobody has touched flies there once, and is copied from then on.
     _in_the_air: ClassVar[dict[str, tuple[bytes, dict[str, list[tuple[float, Any]]]]]] = {}
 
-    def __init__(self, hears: Collection[str] = (), **options: Any) -> None:
-        if unknown := set(hears) - FAST_STREAMS - {EVERYTHING}:
+    def __init__(self, streams: Collection[str] = (), **options: Any) -> None:
+        if unknown := set(streams) - FAST_STREAMS - {EVERYTHING}:
             raise ValueError(f"no fast streams: {sorted(unknown)}; there are {sorted(FAST_STREAMS)}")
-        self._unheard = set() if EVERYTHING in hears else FAST_STREAMS - set(hears)
+        self._switched_off = set() if EVERYTHING in streams else FAST_STREAMS - set(streams)
         self._options = {"gusts_mps": 0.0, "noise": False, **options}
         self._vehicle: Vehicle | None = None
         self._events: list[str] = []
@@ -66,7 +66,7 @@ class SimHarness:
             self._vehicle.add_link("onboard")
             self._vehicle.add_link("gcs", GCS_RATES_HZ)
             for link in self._vehicle.links.values():
-                for name in self._unheard:
+                for name in self._switched_off:
                     if name in link.streams:
                         link.streams.set_interval(name, -1, 0)
         return self._vehicle
@@ -126,17 +126,17 @@ class SimHarness:
         self._take()
 
     def received(self, kind: str, link: str = "onboard") -> list[Any]:
-        if kind in self._unheard:
+        if kind in self._switched_off:
             raise LookupError(
-                f'{kind} is not heard: mark the test with hears("{kind}"), or make_harness(["{kind}"])'
+                f'{kind} is not received: mark the test with streams("{kind}"), or make_harness(["{kind}"])'
             )
         return [item.message for _, item in self._inbox[link] if item.message.get_type() == kind]
 
     @property
     def inbox(self) -> dict[str, list[tuple[float, Any]]]:
         """Every message received on each link since the last `forget`, as (time, message)."""
-        if self._unheard:
-            raise LookupError('not all is heard: mark the test with hears("everything"), or make_harness so')
+        if self._switched_off:
+            raise LookupError('mark the test with streams("everything"), or make_harness so')
         return self._inbox
 
     def forget(self) -> None:
@@ -215,7 +215,7 @@ class SimHarness:
         if self._vehicle is not None or self.heartbeats or not plain:
             self._fly_up(height_m)
             return
-        key = repr((sorted(self._options.items()), sorted(self._unheard), height_m))
+        key = repr((sorted(self._options.items()), sorted(self._switched_off), height_m))
         if key not in self._in_the_air:
             self._fly_up(height_m)
             inbox = {link: list(messages) for link, messages in self._inbox.items()}
@@ -259,8 +259,8 @@ def position(north: float, east: float, down: float, yaw: float = 0.0) -> Any:
 @pytest.fixture
 def harness(request: pytest.FixtureRequest) -> SimHarness:
     """A vehicle in still air, on the ground, just booted."""
-    marker = request.node.get_closest_marker("hears")
-    return SimHarness(hears=() if marker is None else marker.args)
+    marker = request.node.get_closest_marker("streams")
+    return SimHarness(streams=() if marker is None else marker.args)
 
 
 @pytest.fixture(scope="session")

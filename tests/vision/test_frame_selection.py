@@ -34,7 +34,7 @@ def test_a_rate_holds_on_average_though_the_cameras_rate_is_no_multiple_of_it() 
     thirty = [1000 + index * 1000 / 30 for index in range(300)]
     chosen, selector = looked_at(Selection(rate_hz=8), thirty)
     assert 78 <= len(chosen) <= 82
-    assert selector.left_out["rate"] == 300 - len(chosen)
+    assert selector.frames_skipped["rate"] == 300 - len(chosen)
 
 
 def test_a_camera_at_just_the_rate_asked_for_loses_nothing_to_its_jitter() -> None:
@@ -53,7 +53,7 @@ def test_after_a_gap_the_rate_starts_from_there_without_making_up_for_it() -> No
 def test_a_frame_that_is_too_old_when_it_comes_is_not_looked_at() -> None:
     chosen, selector = looked_at(Selection(max_age_s=0.2), [0, 100, 200], late_ms=250)
     assert chosen == []
-    assert selector.left_out == {"every": 0, "rate": 0, "too_old": 3}
+    assert selector.frames_skipped == {"every": 0, "rate": 0, "too_old": 3}
 
 
 @given(
@@ -66,7 +66,7 @@ def test_every_frame_is_looked_at_or_counted_once(
 ) -> None:
     stamps = list(np.cumsum(gaps_ms))
     chosen, selector = looked_at(Selection(every=every, rate_hz=rate_hz), stamps)
-    assert len(chosen) + sum(selector.left_out.values()) == len(stamps)
+    assert len(chosen) + sum(selector.frames_skipped.values()) == len(stamps)
     assert all(index % every == 0 for index in chosen)
 
 

@@ -122,14 +122,14 @@ def test_only_every_nth_frame_is_looked_at() -> None:
     assert [result.sequence for result in run(pipeline)] == [0, 3, 6]
     assert pipeline.frames == 7
     assert pipeline.dropped == 0
-    assert pipeline.left_out == {"replaced": 0, "unreadable": 0, "every": 4, "rate": 0, "too_old": 0}
+    assert pipeline.frames_skipped == {"replaced": 0, "unreadable": 0, "every": 4, "rate": 0, "too_old": 0}
 
 
 def test_frames_that_the_source_lost_are_counted() -> None:
     pipeline = Pipeline(Frames(frame_of(1), frame_of(2), frame_of(6)), BrightSpot())
     results = run(pipeline)
     assert [result.dropped for result in results] == [1, 1, 4]
-    assert [result.left_out["replaced"] for result in results] == [1, 1, 4]
+    assert [result.frames_skipped["replaced"] for result in results] == [1, 1, 4]
 
 
 def test_a_frame_that_is_too_old_is_counted_as_lost_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -137,7 +137,7 @@ def test_a_frame_that_is_too_old_is_counted_as_lost_and_told_once(caplog: pytest
     frames = Frames(*(replace(frame_of(number), captured_ns=second_ago_ns) for number in range(2)))
     pipeline = Pipeline(frames, BrightSpot(), selection=Selection(max_age_s=0.5))
     assert run(pipeline) == []
-    assert pipeline.dropped == pipeline.left_out["too_old"] == 2
+    assert pipeline.dropped == pipeline.frames_skipped["too_old"] == 2
     (line,) = caplog.messages
     assert line.startswith("frames: a frame is ")
 

@@ -187,7 +187,9 @@ class Tracker:
         unseen = np.array([life.last_ns != before_ns for life in self._lives])
         self._states.mean[unseen, 6:] = 0.0
         states = kalman.predicted(self._states, (captured_ns - before_ns) / 1e9)
-        ended = np.array([captured_ns - life.last_ns >= self.settings.end_s * 1e9 for life in self._lives])
+        ended = np.array(
+            [captured_ns - life.last_ns >= self.settings.max_age_s * 1e9 for life in self._lives]
+        )
         self._warn_of_rate(bool((ended & ~unseen).any()), (captured_ns - before_ns) / 1e9)
         if view is not None and before is not None and view.camera == before.camera:
             states, visible = turned(states, view.camera, view.turn_from(before))
@@ -200,10 +202,10 @@ class Tracker:
         if ended_though_seen and not self._warned_of_pace:
             self._warned_of_pace = True
             logger.warning(
-                "tracks end between two frames: %.1f s passed, and end_s is %g s; look at more frames "
-                "(every, rate_hz, a faster model), or raise end_s",
+                "tracks end between two frames: %.1f s passed, and max_age_s is %g s; look at more frames "
+                "(every, rate_hz, a faster model), or raise max_age_s",
                 interval_s,
-                self.settings.end_s,
+                self.settings.max_age_s,
             )
 
     def _associate(self, detections: Detections, captured_ns: int, track_of: Indices) -> None:
@@ -215,7 +217,9 @@ class Tracker:
         weak = ~strong & (detections.confidence >= settings.low_confidence)
         # A box seen once may be a mistake: it gets only what the others leave.
         known = np.array([life.seen > 1 or life.confirmed for life in self._lives])
-        recent = np.array([captured_ns - life.last_ns < settings.lost_s * 1e9 for life in self._lives])
+        recent = np.array(
+            [captured_ns - life.last_ns < settings.coast_timeout_s * 1e9 for life in self._lives]
+        )
         class_ids = np.array([life.class_id for life in self._lives])
         predicted, same_class = self._states.xyxy, class_ids[:, None] == detections.class_id
         free = np.ones(len(self._lives), np.bool_)
@@ -264,7 +268,7 @@ class Tracker:
         kind = TrackEventKind.UPDATE
         if not life.confirmed:
             settings = self.settings
-            if life.seen < settings.true_frames or life.scores.median < settings.true_score:
+            if life.seen < settings.min_hits or life.scores.median < settings.confirm_score:
                 return
             if life.class_in_doubt:
                 return
@@ -281,8 +285,8 @@ class Tracker:
             unseen_s = (captured_ns - life.last_ns) / 1e9
             if not life.confirmed:
                 # A rumour: the next frame confirms it, or soon after; else it was none.
-                unfounded[place] = life.seen == 1 or unseen_s >= self.settings.lost_s
-            elif unseen_s >= self.settings.lost_s and not life.lost:
+                unfounded[place] = life.seen == 1 or unseen_s >= self.settings.coast_timeout_s
+            elif unseen_s >= self.settings.coast_timeout_s and not life.lost:
                 life.lost = True
                 events.append(self._event(TrackEventKind.LOST, place, captured_ns))
         self._drop(unfounded, captured_ns, events)

@@ -29,7 +29,7 @@ class TrackEventKind(StrEnum):
     UPDATE = "update"
     """it was seen in this frame"""
     LOST = "lost"
-    """it has not been seen for `lost_s`; the next `update` ends that"""
+    """it has not been seen for `coast_timeout_s`; the next `update` ends that"""
     END = "end"
     """it will not come back: what is seen there later is another track"""
 
@@ -107,23 +107,23 @@ class TrackerSettings:
         low_confidence: weaker than that is not looked at; between the two a detection can only continue a
             track that was seen a moment ago.
         keep_confidence: a weaker detection is left out of the result if it belongs to no track.
-        true_score: a track counts as true when its median confidence reaches this,
-        true_frames: and it was seen in so many frames.
+        confirm_score: a track counts as true when its median confidence reaches this,
+        min_hits: and it was seen in so many frames.
         min_iou: a strong detection can be a track's if it overlaps its prediction by more than this,
         min_iou_weak: and a weak one by more than this.
-        lost_s: unseen for so long, a track is lost.
-        end_s: unseen for so long, it has ended.
+        coast_timeout_s: unseen for so long, a track is lost.
+        max_age_s: unseen for so long, it has ended.
     """
 
     high_confidence: float = 0.35
     low_confidence: float = 0.1
     keep_confidence: float = 0.25
-    true_score: float = 0.4
-    true_frames: int = 3
+    confirm_score: float = 0.4
+    min_hits: int = 3
     min_iou: float = 0.2
     min_iou_weak: float = 0.5
-    lost_s: float = 0.5
-    end_s: float = 2.0
+    coast_timeout_s: float = 0.5
+    max_age_s: float = 2.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.low_confidence <= self.high_confidence <= 1.0:
@@ -131,12 +131,13 @@ class TrackerSettings:
                 "low_confidence and high_confidence must be 0 to 1, low not above high, "
                 f"got {self.low_confidence:g} and {self.high_confidence:g}"
             )
-        for name in ("keep_confidence", "true_score", "min_iou", "min_iou_weak"):
+        for name in ("keep_confidence", "confirm_score", "min_iou", "min_iou_weak"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be 0 to 1, got {getattr(self, name):g}")
-        if self.true_frames < 1:
-            raise ValueError(f"true_frames must be at least 1, got {self.true_frames}")
-        if not 0.0 < self.lost_s <= self.end_s:
+        if self.min_hits < 1:
+            raise ValueError(f"min_hits must be at least 1, got {self.min_hits}")
+        if not 0.0 < self.coast_timeout_s <= self.max_age_s:
             raise ValueError(
-                f"lost_s must be above 0 and not above end_s, got {self.lost_s:g} and {self.end_s:g}"
+                "coast_timeout_s must be above 0 and not above max_age_s, "
+                f"got {self.coast_timeout_s:g} and {self.max_age_s:g}"
             )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar
 
 from companion.geometry.points import points_from
 from companion.guidance.arguments import EnumArgument, GrammarError, Number, Points
@@ -18,14 +18,15 @@ from companion.vehicle.state import Vector3
 
 @behaviour("follow-path", "fly along a row of points, slowing down for corners")
 class FollowPath(Command):
+    renamed: ClassVar[Mapping[str, str]] = {"nose": "yaw_mode"}
     points: Annotated[
         str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
     ]
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
-    nose: Annotated[
-        str, EnumArgument("nose", ("along", "still"), "where it points: along the way, or as it is")
-    ] = "along"
+    yaw_mode: Annotated[
+        str, EnumArgument("yaw_mode", ("path", "hold"), "yaw: along the path, or unchanged")
+    ] = "path"
 
     @property
     def endless(self) -> bool:
@@ -42,7 +43,7 @@ class FollowPath(Command):
         return points_from(self.points)
 
     def build(self, context: BuildContext) -> Behaviour:
-        along = self.nose == "along"
+        along = self.yaw_mode == "path"
         return FollowPathBehaviour(self.places, self.speed_mps, laps=self.laps, nose_along=along)
 
 

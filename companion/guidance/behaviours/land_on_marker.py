@@ -8,9 +8,9 @@ and tries again, a few times. Or the autopilot flies all of it, told by LANDING_
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from companion.guidance.arguments import EnumArgument, GrammarError, Number
 from companion.guidance.behaviour import (
@@ -72,6 +72,7 @@ class _Phase(StrEnum):
 
 @behaviour("land-on-marker", "find a marker below, descend onto it in a narrowing cone, land and disarm")
 class LandOnMarker(Command):
+    renamed: ClassVar[Mapping[str, str]] = {"pad": "target"}
     identifier: Annotated[float, Number("id", "", 0.0, 1023.0, "of the marker whose pad to land on")]
     method: Annotated[
         str,
@@ -79,7 +80,7 @@ class LandOnMarker(Command):
             "method", ("offboard", "autopilot"), "who flies: we, or the autopilot by LANDING_TARGET"
         ),
     ] = "offboard"
-    pad: Annotated[str, EnumArgument("pad", ("still", "moving"), "whether the pad may move")] = "still"
+    target: Annotated[str, EnumArgument("target", ("static", "moving"), "whether the pad moves")] = "static"
     attempts: Annotated[float, Number("attempts", "", 1.0, 10.0, "descents before giving up")] = 3.0
     search_m: Annotated[float, Number("search", "m", 0.0, 50.0, "how far around to look for it")] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 5.0, "over ground, at most")] = 1.5
@@ -89,14 +90,16 @@ class LandOnMarker(Command):
         for key, value in (("id", self.identifier), ("attempts", self.attempts)):
             if value != int(value):
                 raise GrammarError(f"land-on-marker: {key} must be a whole number, got {value:g}")
-        if self.method == "autopilot" and self.pad == "moving":
-            raise GrammarError("land-on-marker: the autopilot lands on a pad that is still; fly it offboard")
+        if self.method == "autopilot" and self.target == "moving":
+            raise GrammarError(
+                "land-on-marker: method=autopilot needs target=static; a moving pad needs method=offboard"
+            )
 
     def build(self, context: BuildContext) -> Behaviour:
         return LandOnMarkerBehaviour(
             int(self.identifier),
             by_autopilot=self.method == "autopilot",
-            moving=self.pad == "moving",
+            moving=self.target == "moving",
             attempts=int(self.attempts),
             search_m=self.search_m,
             speed_mps=self.speed_mps,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from companion.geometry.points import points_from
 from companion.guidance.arguments import ClassNames, EnumArgument, GrammarError, Number, Points, names_in
@@ -38,18 +38,24 @@ class _Known:
 
 @behaviour("patrol", "fly a round of points again and again, and stop for what is seen on the way")
 class Patrol(Command):
+    renamed: ClassVar[Mapping[str, str]] = {
+        "do": "on_detection",
+        "wait": "dwell",
+        "again": "revisit",
+        "apart": "merge_radius",
+    }
     points: Annotated[str, Points("points", "the round: north,east or north,east,height, metres from home")]
     class_names: Annotated[str, ClassNames("classes", "what to stop for, parted by commas")]
-    do: Annotated[
-        str, EnumArgument("do", ("hold", "approach"), "look at it from the way, or fly up to `distance`")
+    on_detection: Annotated[
+        str, EnumArgument("on_detection", ("hold", "approach"), "stop and face it, or fly up to `distance`")
     ] = "hold"
     distance_m: Annotated[float, Number("distance", "m", 1.0, 100.0, "where an approach stops")] = 5.0
-    wait_s: Annotated[float, Number("wait", "s", 0.0, 600.0, "how long it stays there")] = 5.0
-    again_s: Annotated[
-        float, Number("again", "s", 0.0, 3600.0, "the same object does not stop it again within this")
+    dwell_s: Annotated[float, Number("dwell", "s", 0.0, 600.0, "time spent at an object")] = 5.0
+    revisit_s: Annotated[
+        float, Number("revisit", "s", 0.0, 3600.0, "time within which the same object is passed by")
     ] = 120.0
-    apart_m: Annotated[
-        float, Number("apart", "m", 0.5, 100.0, "nearer than this to where an object was is the same one")
+    merge_radius_m: Annotated[
+        float, Number("merge_radius", "m", 0.5, 100.0, "detections within this distance are one object")
     ] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "at most")] = 3.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
@@ -80,10 +86,10 @@ class Patrol(Command):
             self.names,
             speed_mps=self.speed_mps,
             laps=self.laps,
-            approach_m=self.distance_m if self.do == "approach" else None,
-            wait_s=self.wait_s,
-            again_s=self.again_s,
-            apart_m=self.apart_m,
+            approach_m=self.distance_m if self.on_detection == "approach" else None,
+            dwell_s=self.dwell_s,
+            revisit_s=self.revisit_s,
+            merge_radius_m=self.merge_radius_m,
             confidence=self.confidence,
         )
 
@@ -95,9 +101,9 @@ class PatrolBehaviour(Behaviour):
         points: (north, east) or (north, east, height) metres from home; from the last on to the first.
         speed_mps: along the way. laps: 0: until another command.
         approach_m: fly to within so much of what was found; None: look at it from the way.
-        wait_s: how long it stays there.
-        again_s: an object that was stopped for does not stop the patrol again within this time.
-        apart_m: what is nearer than this to where an object was is the same one.
+        dwell_s: how long it stays there.
+        revisit_s: an object that was stopped for does not stop the patrol again within this time.
+        merge_radius_m: what is nearer than this to where an object was is the same one.
     """
 
     name = "patrol"
@@ -111,9 +117,9 @@ class PatrolBehaviour(Behaviour):
         speed_mps: float = 3.0,
         laps: float = 0.0,
         approach_m: float | None = None,
-        wait_s: float = 5.0,
-        again_s: float = 120.0,
-        apart_m: float = 5.0,
+        dwell_s: float = 5.0,
+        revisit_s: float = 120.0,
+        merge_radius_m: float = 5.0,
         confidence: float = 0.4,
     ) -> None:
         self.class_names = tuple(class_names)
@@ -122,8 +128,8 @@ class PatrolBehaviour(Behaviour):
         self._way = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
         self._sightings = DetectionConfirmer(class_names, confidence)
         self._speed_mps, self._confidence = speed_mps, confidence
-        self._approach_m, self._wait_s = approach_m, wait_s
-        self._again_s, self._apart_m = again_s, apart_m
+        self._approach_m, self._dwell_s = approach_m, dwell_s
+        self._revisit_s, self._merge_radius_m = revisit_s, merge_radius_m
         self._known: list[_Known] = []
         self._notes: list[str] = []
         self._gaze: YawAligner | None = None
@@ -208,7 +214,7 @@ class PatrolBehaviour(Behaviour):
                 )
                 self._approach.on_activate(context)
                 return self._fly_there(self._approach, 0.0, context, position)
-            self._wait_until_ns = now_ns + self._wait_s * 1e9
+            self._wait_until_ns = now_ns + self._dwell_s * 1e9
         return self._stand(context, position, gaze.target.bearing_rad)
 
     def _fly_there(
@@ -221,7 +227,7 @@ class PatrolBehaviour(Behaviour):
         self._approach = None
         self._note(step.reason)
         # What is seen from here is what was flown to: it is still looked at while waiting.
-        self._stop, self._wait_until_ns = None, context.now_ns + self._wait_s * 1e9
+        self._stop, self._wait_until_ns = None, context.now_ns + self._dwell_s * 1e9
         _, yaw_rad = position_and_yaw(context.state)
         return self._stand(context, position, yaw_rad)
 
@@ -263,7 +269,7 @@ class PatrolBehaviour(Behaviour):
         return False
 
     def _remember(self, target: Target, now_ns: int) -> None:
-        until_ns = now_ns + self._again_s * 1e9
+        until_ns = now_ns + self._revisit_s * 1e9
         for known in self._known:
             if self._same(known, target):
                 _update(known, target)
@@ -278,7 +284,7 @@ class PatrolBehaviour(Behaviour):
             return True
         if known.place is None or target.position_ned_m is None:
             return False
-        return math.dist(known.place[:2], target.position_ned_m[:2]) <= self._apart_m
+        return math.dist(known.place[:2], target.position_ned_m[:2]) <= self._merge_radius_m
 
     def _place_text(self, target: Target, context: BehaviourContext) -> str:
         place = target.position_ned_m

@@ -41,7 +41,7 @@ class GimbalMounting:
     """How the gimbal stands to the cameras.
 
     Attributes:
-        carries_camera: a camera sits on it (`camera.gimbal`), so it is looked for until it answers.
+        carries_camera: a camera sits on it (`camera.on_gimbal`), so it is looked for until it answers.
         carries_steering: the camera that steers sits on it.
         camera_pitch_rad: how far above the gimbal's axis that camera looks.
     """

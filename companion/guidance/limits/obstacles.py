@@ -7,8 +7,8 @@ what leads along it. Inside the margin the vehicle backs out, at 0.8 m/s at most
 
 What the camera cannot see is unknown, not free. By default its speed is not limited all the same: a camera
 that looks forward sees a fifth of the circle, and a vehicle that could not fly aside or follow its path round
-a bend would leave its pilot no good way out. `guidance.unknown_speed_mps` sets a limit for those who look
-where they fly.
+a bend would leave its pilot no good way out. `guidance.max_speed_unobserved_mps` sets a limit for vehicles
+that fly where they look.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ObstacleRules:
         use: "off"; "auto": depth is used where it comes, and once it came it is relied on; "required":
             nothing flies without it.
         margin_m: from the vehicle's middle to what is near, at least.
-        unknown_speed_mps: towards what is not seen; None: not limited.
+        max_speed_unobserved_mps: towards what is not seen; None: not limited.
 
     Raises:
         ValueError: a number is not positive.
@@ -58,10 +58,10 @@ class ObstacleRules:
 
     use: ObstacleUse = "off"
     margin_m: float = 2.0
-    unknown_speed_mps: float | None = None
+    max_speed_unobserved_mps: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("margin_m", "unknown_speed_mps"):
+        for name in ("margin_m", "max_speed_unobserved_mps"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} must be a finite number above 0, got {value}")
@@ -89,8 +89,8 @@ class ObstacleRules:
         for (north, east), distance_m in zip(DIRECTIONS, seen.distance_m, strict=True):
             if math.isfinite(distance_m):
                 rows.append((north, east, speed_towards(distance_m - self.margin_m, late_s)))
-            elif math.isnan(distance_m) and self.unknown_speed_mps is not None:
-                rows.append((north, east, self.unknown_speed_mps))
+            elif math.isnan(distance_m) and self.max_speed_unobserved_mps is not None:
+                rows.append((north, east, self.max_speed_unobserved_mps))
         nearest_m = min((value for value in seen.distance_m if math.isfinite(value)), default=math.inf)
         if math.isfinite(nearest_m):
             north, east = DIRECTIONS[seen.distance_m.index(nearest_m)]

@@ -17,7 +17,7 @@ class RangeMeans:
     Attributes:
         depth: it has given depth.
         ground: its picture shows ground, of a level vehicle above it.
-        classes: whose height is known (`detector.known_heights`).
+        classes: whose height is known (`detector.class_heights_m`).
     """
 
     depth: bool = True
@@ -33,7 +33,7 @@ class RangeMeans:
             return None
         return (
             f"a range to a {' or a '.join(unknown)} (a camera with depth, one that sees the ground, "
-            "or its height in detector.known_heights)"
+            "or its height in detector.class_heights_m)"
         )
 
 

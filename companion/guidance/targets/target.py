@@ -9,7 +9,7 @@ from enum import StrEnum
 from companion.vehicle.state import Vector3
 
 # What to say when only doubtful objects were seen.
-DOUBTED = "what was seen does not count as true (tracker.true_score), or may be of another class"
+DOUBTED = "what was seen does not count as true (tracker.confirm_score), or may be of another class"
 
 
 class RangeSource(StrEnum):

@@ -49,7 +49,7 @@ def one_car(depth_m: float) -> Detections:
 def test_a_detection_message_has_three_stamps_and_the_class_by_name() -> None:
     message = strictly(detections_message(result(one_car(11.5)), "alpha", 3_000))
     assert message == {
-        "view": None,
+        "camera": None,
         "vehicle": "alpha",
         "sequence": 7,
         "captured_ns": 1_000,
@@ -108,7 +108,7 @@ def test_what_happened_to_tracks_is_told_with_all_that_is_known_of_them() -> Non
     events = (TrackEvent(TrackEventKind.LOST, 1_000, track),)
     message = strictly(tracks_message(replace(result(one_car(1.0)), track_events=events), "alpha", 3_000))
     assert message == {
-        "view": None,
+        "camera": None,
         "vehicle": "alpha",
         "sequence": 7,
         "captured_ns": 1_000,

@@ -246,7 +246,7 @@ async def test_what_is_published_before_the_session_is_open_is_counted() -> None
     settings = ZenohSection(mode="client", connect=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
     bus = Bus(settings, "alpha", on_event=Events(), on_command=refuse)
     bus.publish(topics.LABELS, "car")
-    assert bus.unsent == 1
+    assert bus.publish_failed == 1
     assert bus.published["labels"] == 0
 
 

@@ -255,7 +255,7 @@ def test_without_a_camera_on_a_gimbal_tracking_is_refused_and_the_rest_is_not(wo
     now = flying(None, GimbalStatus(carries_camera=False))
     assert check_requirements(command(f"{word} person"), now, ("person",)) is None
     refused = check_requirements(command(f"{word} person gimbal=track"), now, ("person",))
-    assert refused == f"{word} needs the camera on the gimbal (camera.gimbal is not set)"
+    assert refused == f"{word} needs the camera on the gimbal (camera.on_gimbal is not set)"
     nobody = replace(now, state=replace(now.state, gimbal=None), gimbal=GimbalStatus(carries_camera=True))
     refused = check_requirements(command(f"{word} person gimbal=track"), nobody, ("person",))
     assert refused == f"{word} needs a gimbal (none answers)"

@@ -19,7 +19,7 @@ class FlightWithGimbal(LiveFlight):
     """With a camera on its gimbal, which sees nothing."""
 
     def __init__(self, port: int) -> None:
-        super().__init__("pymavlink", port, {"camera.gimbal": "true", "detector.enabled": "true"})
+        super().__init__("pymavlink", port, {"camera.on_gimbal": "true", "detector.enabled": "true"})
         self._view = self.inputs.steering
 
     def on_step(self, now_ns: int) -> None:

@@ -218,3 +218,16 @@ def test_every_field_of_every_command_has_its_place_in_the_grammar() -> None:
 )
 def test_a_command_says_whether_it_ends_by_itself(text: str, endless: bool) -> None:
     assert parse(text).endless is endless
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new"),
+    [
+        ('patrol "0,0 9,9" classes=car do=hold', "do=", "on_detection="),
+        ("follow-path 0,0 nose=along", "nose=", "yaw_mode="),
+        ("land-on-marker 7 pad=still", "pad=", "target="),
+    ],
+)
+def test_a_renamed_argument_names_the_new_one(text: str, old: str, new: str) -> None:
+    with pytest.raises(GrammarError, match=f"{old} was renamed to {new} in version"):
+        parse(text)

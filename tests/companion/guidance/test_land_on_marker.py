@@ -51,7 +51,7 @@ def test_a_command_becomes_the_behaviour_and_back() -> None:
     with pytest.raises(GrammarError, match="id must be a whole number, got 7"):
         parse("land-on-marker 7.5")
     with pytest.raises(GrammarError, match="pad that is still"):
-        parse("land-on-marker 7 method=autopilot pad=moving")
+        parse("land-on-marker 7 method=autopilot target=moving")
 
 
 def test_without_markers_it_is_refused_and_what_is_missing_is_named() -> None:

@@ -97,7 +97,7 @@ def test_a_place_behind_an_obstacle_is_not_flown_to() -> None:
 def test_unknown_is_not_limited_unless_the_operator_says_so() -> None:
     seen = sectors(KinematicVehicle().now_ns, rest=NAN)
     assert ObstacleRules("auto").rows(context(seen)) == ()
-    rows = ObstacleRules("auto", unknown_speed_mps=1.0).rows(context(seen))
+    rows = ObstacleRules("auto", max_speed_unobserved_mps=1.0).rows(context(seen))
     assert len(rows) == SECTORS
     assert {row[2] for row in rows} == {1.0}
 

@@ -48,7 +48,7 @@ def test_a_round_without_anything_to_see_is_flown_whole() -> None:
 
 def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_left_the_way() -> None:
     car = SeenObject("car", 18.0, 6.0, track_id=7)
-    behaviour = PatrolBehaviour(ROUND, ["person", "car"], laps=1.0, wait_s=4.0)
+    behaviour = PatrolBehaviour(ROUND, ["person", "car"], laps=1.0, dwell_s=4.0)
     standing: list[tuple[tuple[float, ...], float]] = []
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -74,7 +74,7 @@ def test_it_stops_for_an_object_faces_it_says_where_it_is_and_goes_on_where_it_l
 
 def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way() -> None:
     car = SeenObject("car", 16.0, 9.0, track_id=3)
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, wait_s=1.0)
+    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, dwell_s=1.0)
     outcome, notes, flight = active(behaviour, [car])
     assert outcome is not None
     assert outcome.success, outcome.reason
@@ -88,12 +88,12 @@ def test_with_approach_it_flies_up_to_the_object_and_back_to_its_way() -> None:
 def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_identity: bool) -> None:
     car = SeenObject("car", 12.0, 5.0, track_id=7 if with_identity else None)
     outcome, notes, _ = active(
-        PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=600.0), [car], 400
+        PatrolBehaviour(ROUND, ["car"], laps=2.0, dwell_s=1.0, revisit_s=600.0), [car], 400
     )
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert len(notes) == 1
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=2.0, wait_s=1.0, again_s=20.0)
+    behaviour = PatrolBehaviour(ROUND, ["car"], laps=2.0, dwell_s=1.0, revisit_s=20.0)
     outcome, notes, _ = active(behaviour, [car], 400)
     assert outcome is not None
     assert outcome.success, outcome.reason
@@ -102,7 +102,7 @@ def test_the_same_object_does_not_stop_it_twice_until_its_time_is_over(with_iden
 
 def test_two_objects_of_a_class_stop_it_once_each() -> None:
     cars = [SeenObject("car", 15.0, 4.0, track_id=1), SeenObject("car", 20.0, 16.0, track_id=2)]
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, wait_s=1.0)
+    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, dwell_s=1.0)
     outcome, notes, _ = active(behaviour, cars)
     assert outcome is not None
     assert outcome.success, outcome.reason
@@ -155,7 +155,9 @@ def test_a_silent_detector_stops_it_and_then_ends_it_and_a_short_silence_does_no
 
 
 def test_the_grammar_of_a_patrol() -> None:
-    command = parse('patrol "0,0 20,0 20,20" classes=Person,CAR do=approach distance=3', ("person", "car"))
+    command = parse(
+        'patrol "0,0 20,0 20,20" classes=Person,CAR on_detection=approach distance=3', ("person", "car")
+    )
     assert isinstance(command, Patrol)
     assert command.names == ("person", "car")
     assert parse(str(command)) == command
@@ -166,7 +168,7 @@ def test_the_grammar_of_a_patrol() -> None:
         ("patrol 0,0 9,9", "classes is missing"),
         ("patrol 0,0 9,9 classes=car,", "names of classes"),
         ("patrol 0,0 9,9 classes=car,zebra", "unknown class 'zebra'"),
-        ("patrol 0,0 9,9 classes=car do=photo", "hold or approach"),
+        ("patrol 0,0 9,9 classes=car on_detection=photo", "hold or approach"),
     ]:
         with pytest.raises(ValueError, match=said):
             parse(text, ("person", "car") if "zebra" in text else None)

@@ -14,7 +14,12 @@ from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_groun
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel
 
-NEEDING = ("approach kite", "follow kite", "orbit kite", 'patrol "0,0 9,9" classes=kite do=approach')
+NEEDING = (
+    "approach kite",
+    "follow kite",
+    "orbit kite",
+    'patrol "0,0 9,9" classes=kite on_detection=approach',
+)
 OTHERS = ("seek kite", "orbit", 'patrol "0,0 9,9" classes=kite')
 
 

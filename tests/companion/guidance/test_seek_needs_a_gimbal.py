@@ -86,7 +86,7 @@ NOW_NS = KinematicVehicle().now_ns
         pytest.param(
             gimbal(NOW_NS),
             GimbalStatus(),
-            "the camera on the gimbal (camera.gimbal is not set)",
+            "the camera on the gimbal (camera.on_gimbal is not set)",
             id="no camera",
         ),
     ],

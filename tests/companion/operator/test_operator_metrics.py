@@ -34,14 +34,14 @@ def test_a_running_service_tells_its_stages_and_what_became_of_every_frame(
     ):
         service.wait_for_line("autopilot heartbeat received")
         numbers = fetch(port)
-        while not numbers.get('companion_frames_left_out_total{reason="rate",view=""}'):
+        while not numbers.get('companion_frames_skipped_total{camera="",reason="rate"}'):
             numbers = fetch(port)
     assert numbers["companion_vehicle_armed"] == 0
-    assert numbers['companion_perception_running{view=""}'] == 1
+    assert numbers['companion_perception_running{camera=""}'] == 1
     assert numbers['companion_messages_published_total{topic="detections"}'] > 0
     for stage in ("capture", "decode", "wait", "preprocess", "inference", "postprocess", "track", "publish"):
         quantiles = [
-            numbers[f'companion_stage_milliseconds{{quantile="{q}",stage="{stage}",view=""}}']
+            numbers[f'companion_stage_milliseconds{{camera="",quantile="{q}",stage="{stage}"}}']
             for q in ("0.5", "0.99")
         ]
         assert 0 <= quantiles[0] <= quantiles[1]

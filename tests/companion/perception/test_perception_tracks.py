@@ -168,8 +168,8 @@ def settings(tmp_path: Path, model: Path) -> Settings:
         "detector.confidence": "0",
         "tracker.high_confidence": "0",
         "tracker.low_confidence": "0",
-        "tracker.true_score": "0",
-        "tracker.end_s": "600",
+        "tracker.confirm_score": "0",
+        "tracker.max_age_s": "600",
     }
     return load_settings(os.devnull, values, {})
 

@@ -86,7 +86,7 @@ def test_a_subscriber_gets_pictures_and_without_one_none_are_made(seeing: list[s
         assert image.shape == (120, 160, 3)
         assert sample.encoding == zenoh.Encoding.IMAGE_JPEG
         assert sample.attachment is not None
-        assert json.loads(sample.attachment.to_string())["view"] is None
+        assert json.loads(sample.attachment.to_string())["camera"] is None
         # The subscriber has gone: the count comes to rest.
         before, now = images_published(), images_published()
         while now != before:

@@ -26,8 +26,8 @@ def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alon
     shared = f"companion-test-{secrets.token_hex(4)}"
     (tmp_path / "companion.toml").write_text(
         f'[source]\nshare = "{shared}"\n'
-        f'[views.down.source]\nuri = "shm://{shared}"\n'
-        f"[views.down.detector]\nmodel = {str(small_model)!r}\nprecision = 'float32'\nimage_size = 96\n"
+        f'[cameras.down.source]\nuri = "shm://{shared}"\n'
+        f"[cameras.down.detector]\nmodel = {str(small_model)!r}\nprecision = 'float32'\nimage_size = 96\n"
         "classes = ['boat']\n"
     )
     received: queue.SimpleQueue[tuple[str, dict[str, Any]]] = queue.SimpleQueue()
@@ -35,9 +35,9 @@ def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alon
     def next_of(view: str | None) -> dict[str, Any]:
         while True:
             key, message = received.get(timeout=30)
-            own = "" if message["view"] is None else f"views/{message['view']}/"
+            own = "" if message["camera"] is None else f"cameras/{message['camera']}/"
             assert key == f"companion/vehicle1/{own}detections"
-            if message["view"] == view:
+            if message["camera"] == view:
                 return message
 
     with (
@@ -51,16 +51,16 @@ def test_two_models_look_through_one_camera_and_a_lost_one_leaves_the_other_alon
         first, down = next_of(None), next_of("down")
         assert (first["width"], first["height"]) == (down["width"], down["height"]) == (160, 120)
         status = statuses.get(timeout=10)
-        assert status["perception"]["pid"] != status["views"]["down"]["pid"]
-        assert status["targets"]["view"] is None
+        assert status["perception"]["pid"] != status["cameras"]["down"]["pid"]
+        assert status["targets"]["camera"] is None
 
-        os.kill(status["views"]["down"]["pid"], signal.SIGKILL)
-        service.wait_for_line("view down: perception lost")
-        service.wait_for_line("view down: perception is back")
+        os.kill(status["cameras"]["down"]["pid"], signal.SIGKILL)
+        service.wait_for_line("camera down: perception lost")
+        service.wait_for_line("camera down: perception is back")
         while not received.empty():
             received.get()
         next_of("down")
-        while (status := statuses.get(timeout=10))["views"]["down"]["restarts"] == 0:
+        while (status := statuses.get(timeout=10))["cameras"]["down"]["restarts"] == 0:
             pass
         assert status["perception"]["restarts"] == 0
     assert not Path("/dev/shm", shared).exists()
@@ -70,9 +70,10 @@ def test_the_view_that_steers_is_the_one_that_is_named(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "companion.toml").write_text(
-        '[detector]\nenabled = false\n[guidance]\nview = "side"\n'
-        f"[views.side.source]\nuri = {str(pictures)!r}\nloop = true\n"
-        f"[views.side.detector]\nmodel = {str(exported_model)!r}\nruntime = 'onnxruntime'\nimage_size = 96\n"
+        '[detector]\nenabled = false\n[guidance]\ncamera = "side"\n'
+        f"[cameras.side.source]\nuri = {str(pictures)!r}\nloop = true\n"
+        f"[cameras.side.detector]\nmodel = {str(exported_model)!r}\n"
+        "runtime = 'onnxruntime'\nimage_size = 96\n"
     )
     flags = ["--source", str(pictures), "--source-loop", "true", "--source-rate-hz", "10"]
     with (
@@ -87,29 +88,32 @@ def test_the_view_that_steers_is_the_one_that_is_named(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[views.down.detectr]\nx = 1", ["[views.down.detectr]", "did you mean detector"]),
-        ('[views."a b".source]\nuri = "x.mp4"', ["a view's name must be a word", "'a b'"]),
-        ("[views.down.detector]\nconfidence = 3", ["views.down.detector.confidence", "0 to 1", "got 3"]),
-        ("[views.down.detector]\nmodle = 3", ["views.down.detector.modle", "did you mean detector.model"]),
+        ("[cameras.down.detectr]\nx = 1", ["[cameras.down.detectr]", "did you mean detector"]),
+        ('[cameras."a b".source]\nuri = "x.mp4"', ["a camera's name must be a word", "'a b'"]),
+        ("[cameras.down.detector]\nconfidence = 3", ["cameras.down.detector.confidence", "0 to 1", "got 3"]),
         (
-            '[views.d.source]\nuri = "-"\n[views.up.source]\nuri = "-"',
-            ["views.up.source.uri", "opened once", "shm://NAME"],
-        ),
-        ('[guidance]\nview = "up"', ["guidance.view", "'up'", "views: none"]),
-        ('[views.a.source]\nuri = "shm://f"\nshare = "f"', ["views.a.source.share", "its own frames"]),
-        (
-            '[views.a.source]\nuri = "a.mp4"\nshare = "f"\n[views.b.source]\nuri = "b.mp4"\nshare = "f"',
-            ["views.b.source.share", "views.a.source.share", "'f'"],
+            "[cameras.down.detector]\nmodle = 3",
+            ["cameras.down.detector.modle", "did you mean detector.model"],
         ),
         (
-            '[recording]\nvideo = "f.webm"\n[views.a.recording]\nvideo = "f.webm"',
+            '[cameras.d.source]\nuri = "-"\n[cameras.up.source]\nuri = "-"',
+            ["cameras.up.source.uri", "opened once", "shm://NAME"],
+        ),
+        ('[guidance]\ncamera = "up"', ["guidance.camera", "'up'", "cameras: none"]),
+        ('[cameras.a.source]\nuri = "shm://f"\nshare = "f"', ["cameras.a.source.share", "its own frames"]),
+        (
+            '[cameras.a.source]\nuri = "a.mp4"\nshare = "f"\n[cameras.b.source]\nuri = "b.mp4"\nshare = "f"',
+            ["cameras.b.source.share", "cameras.a.source.share", "'f'"],
+        ),
+        (
+            '[recording]\nvideo = "f.webm"\n[cameras.a.recording]\nvideo = "f.webm"',
             ["recording.video of its own"],
         ),
         (
-            '[views.a.source]\nuri = "a.mp4"\n[views.a.detector]\nrate_hz = 0.5',
-            ["views.a.tracker.end_s", "views.a.detector.rate_hz", "2 s"],
+            '[cameras.a.source]\nuri = "a.mp4"\n[cameras.a.detector]\nrate_hz = 0.5',
+            ["cameras.a.tracker.max_age_s", "cameras.a.detector.rate_hz", "2 s"],
         ),
-        ("[views]\ndown = 1", ["views.down", "must hold sections", "got 1"]),
+        ("[cameras]\ndown = 1", ["cameras.down", "must hold sections", "got 1"]),
     ],
 )
 def test_a_bad_view_is_one_line_that_names_it(text: str, words: list[str], tmp_path: Path) -> None:
@@ -124,9 +128,9 @@ def test_a_bad_view_is_one_line_that_names_it(text: str, words: list[str], tmp_p
 
 def test_views_are_printed_as_they_are_read(tmp_path: Path) -> None:
     path = tmp_path / "companion.toml"
-    path.write_text('[views.down.source]\nuri = "down.mp4"\n[views.up-2.source]\nuri = "up.mp4"\n')
-    settings = load_settings(path, {"views.down.detector.confidence": "0.4"}, {})
-    assert list(settings.views) == ["down", "up-2"]
+    path.write_text('[cameras.down.source]\nuri = "down.mp4"\n[cameras.up-2.source]\nuri = "up.mp4"\n')
+    settings = load_settings(path, {"cameras.down.detector.confidence": "0.4"}, {})
+    assert list(settings.cameras) == ["down", "up-2"]
     assert settings.of_view("down").detector.confidence == 0.4
     assert settings.of_view(None).detector.confidence == settings.detector.confidence
     path.write_text(to_toml(settings))

@@ -57,7 +57,7 @@ def seen(captured_ns: int) -> PerceptionResult:
 
 
 def take(service: Service, state: VehicleState) -> None:
-    service.driver._heard.state = state  # type: ignore[attr-defined]
+    service.driver._telemetry.state = state  # type: ignore[attr-defined]
     service._on_state(state)
 
 
@@ -77,11 +77,11 @@ def step(service: Service, now_ns: int) -> BehaviourContext:
 
 
 async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_where_it_looks() -> None:
-    service, now_ns = service_of(camera__gimbal="true"), time.monotonic_ns()
+    service, now_ns = service_of(camera__on_gimbal="true"), time.monotonic_ns()
     take(service, state_at(now_ns, None))
     see(service, now_ns)
     assert not service.views[0].targets
-    assert service.status()["targets"]["problem"] == "no attitude of the gimbal is known yet"
+    assert service.status()["targets"]["localization_error"] == "no attitude of the gimbal is known yet"
     assert service.status()["gimbal"]["problem"] == "no gimbal answers"
     context = step(service, now_ns)
     assert not context.perception_fresh
@@ -101,7 +101,7 @@ async def test_what_a_camera_on_a_gimbal_sees_is_steered_by_once_it_is_known_whe
     take(service, replace(state_at(later_ns, looking_down(now_ns + 1))))
     see(service, later_ns)
     assert not service.views[0].targets
-    assert "newer than the newest attitude of the gimbal" in service.status()["targets"]["problem"]
+    assert "newer than the newest attitude of the gimbal" in service.status()["targets"]["localization_error"]
     assert "old" in step(service, later_ns).gimbal.undirected
 
 
@@ -115,7 +115,7 @@ async def test_a_camera_on_the_body_asks_no_gimbal() -> None:
 
 
 def test_a_search_over_an_area_counts_on_what_the_camera_sees_from_where_the_gimbal_points_it() -> None:
-    service, now_ns = service_of(camera__gimbal="true", camera__mount_pitch_deg="-10"), time.monotonic_ns()
+    service, now_ns = service_of(camera__on_gimbal="true", camera__mount_pitch_deg="-10"), time.monotonic_ns()
     take(service, state_at(now_ns, looking_down(now_ns)))
     assert service.inputs.camera_pitch_rad(service.driver.state) == pytest.approx(
         PITCH_RAD - math.radians(10.0)
@@ -136,7 +136,7 @@ async def test_a_gimbal_command_without_a_gimbal_is_refused() -> None:
 
 
 async def test_a_gimbal_that_carries_a_camera_is_looked_for_and_its_loss_is_told() -> None:
-    service, now_ns = service_of(camera__gimbal="true"), time.monotonic_ns()
+    service, now_ns = service_of(camera__on_gimbal="true"), time.monotonic_ns()
     take(service, state_at(now_ns, None))
     asked = asyncio.Event()
 
@@ -158,14 +158,14 @@ async def test_a_gimbal_that_carries_a_camera_is_looked_for_and_its_loss_is_told
 
 
 def test_a_silent_gimbal_and_one_that_tells_exclude_each_other() -> None:
-    with pytest.raises(ConfigurationError, match="gimbal and mount_levelled exclude each other"):
-        service_of(camera__gimbal="true", camera__mount_levelled="true")
+    with pytest.raises(ConfigurationError, match="gimbal and stabilized exclude each other"):
+        service_of(camera__on_gimbal="true", camera__stabilized="true")
 
 
 def test_the_tracker_is_told_where_a_camera_on_a_gimbal_looked() -> None:
     told = CameraTelemetry()
     frame = Frame(np.zeros((480, 640, 3), np.uint8), 1_010_000_000, 1)
-    settings = load_settings(os.devnull, {"camera.gimbal": "true"}, {})
+    settings = load_settings(os.devnull, {"camera.on_gimbal": "true"}, {})
     for stamp in (1_000_000_000, 1_020_000_000):
         told.attitudes.add(stamp, Attitude(stamp, quaternion_from_euler(0.3, -0.3, 1.0)).wxyz)
     assert _view_at(settings, told)(frame) is None

@@ -93,13 +93,13 @@ async def test_a_fault_on_one_side_does_not_silence_the_other(
     with monkeypatch.context() as broken:
         broken.setattr(type(view), "place", lambda *_: [][0])
         view._on_report(result(1))
-        assert view.unplaced == "IndexError: list index out of range"
+        assert view.localization_error == "IndexError: list index out of range"
         await until(lambda: published == ["detections", "labels"])
     with monkeypatch.context() as broken:
         broken.setattr("companion.service.publisher.labels_message", lambda *_: dict[str, str]()["nothing"])
         view._on_report(result(2))
-        assert view.unplaced == "no attitude of the vehicle is known yet"
-        await until(lambda: view.unplaced == "KeyError: 'nothing'")
+        assert view.localization_error == "no attitude of the vehicle is known yet"
+        await until(lambda: view.localization_error == "KeyError: 'nothing'")
     assert [record.getMessage() for record in caplog.records if record.exc_info] == [
         "a detection message could not be used",
         "a detection message could not be published",
@@ -108,7 +108,7 @@ async def test_a_fault_on_one_side_does_not_silence_the_other(
 
 async def test_what_another_camera_sees_is_not_waited_for() -> None:
     settings = load_settings(
-        os.devnull, {"guidance.rate_hz": SLOWEST_HZ, "views.down.source.uri": "down.mp4"}, {}
+        os.devnull, {"guidance.rate_hz": SLOWEST_HZ, "cameras.down.source.uri": "down.mp4"}, {}
     )
     service = Service(settings)
     hastened: list[int] = []

@@ -17,7 +17,7 @@ def test_identities_and_their_events_are_published(seeing: list[str], tmp_path: 
     flags = [
         *seeing,
         *("--confidence", "0", "--detector-iou", "0.05"),
-        *("--tracker-high-confidence", "0", "--tracker-low-confidence", "0", "--tracker-true-score", "0"),
+        *("--tracker-high-confidence", "0", "--tracker-low-confidence", "0", "--tracker-confirm-score", "0"),
     ]
     with (
         running_simulator() as simulator,
@@ -36,7 +36,7 @@ def test_identities_and_their_events_are_published(seeing: list[str], tmp_path: 
             message = tracks.get(timeout=30)
     assert message["captured_ns"] == frame["captured_ns"]
     assert message["vehicle"] == "vehicle1"
-    assert message["view"] is None
+    assert message["camera"] is None
     updates = {e["track_id"] for e in message["events"] if e["event"] in ("new", "update")}
     assert updates
     assert updates == {f["track_id"] for f in frame["detections"] if f["track_state"] == "confirmed"}

@@ -37,7 +37,7 @@ def test_distortion_and_gimbal_come_with_the_camera() -> None:
     lens = CameraModel(640, 480, 450.0, 451.0, 320.0, 239.0, (-0.1, 0.02, 0.0, 0.0))
     camera, _ = adopt_calibration(section_of(), CameraCalibration(lens, GIMBAL.mount))
     assert camera.model(640, 480) == lens
-    assert camera.gimbal
+    assert camera.on_gimbal
     assert camera.mount().on_gimbal
 
 
@@ -66,11 +66,11 @@ def test_a_lens_alone_leaves_the_mount_to_the_settings() -> None:
 
 
 def test_angles_are_not_mixed_between_body_and_gimbal() -> None:
-    camera, conflict = adopt_calibration(section_of(gimbal="true"), CAMERA)
+    camera, conflict = adopt_calibration(section_of(on_gimbal="true"), CAMERA)
     assert "gimbal True (camera: False)" in conflict
-    assert camera.gimbal
+    assert camera.on_gimbal
     assert camera.mount_pitch_deg == 0.0
-    agreed, conflict = adopt_calibration(section_of(gimbal="true"), GIMBAL)
+    agreed, conflict = adopt_calibration(section_of(on_gimbal="true"), GIMBAL)
     assert conflict == ""
     assert agreed.mount_forward_m == 0.12
 

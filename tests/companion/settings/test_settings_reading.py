@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.settings.reading import (
+    RENAMED,
     ConfigurationError,
     Settings,
     default_path,
@@ -119,7 +120,7 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
         ("detector.confidence", "high", "must be a number, 0 to 1, got 'high'"),
         ("detector.image_size", "330", "must be a whole number, 32 to 4096, a multiple of 32, got 330"),
         ("detector.image_size", "64.5", "must be a whole number, 32 to 4096, a multiple of 32, got '64.5'"),
-        ("tracker.lost_s", "0", "must be a number, above 0, at most 60, got 0.0"),
+        ("tracker.coast_timeout_s", "0", "must be a number, above 0, at most 60, got 0.0"),
         ("detector.precision", "int8", 'must be auto, float32, bfloat16 or float16, got "int8"'),
         ("source.loop", "maybe", "must be true or false, got 'maybe'"),
         ("source.uri", "", 'must be a text, not empty, got ""'),
@@ -134,7 +135,7 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
             'got "/dev/ttyS0"',
         ),
         (
-            "detector.known_heights",
+            "detector.class_heights_m",
             "person=1.7",
             'must be a list of texts, each CLASS:METRES such as person:1.7, got ["person=1.7"]',
         ),
@@ -154,11 +155,11 @@ def test_a_bad_value_is_told_in_one_line_with_its_key_its_range_and_what_came(
 
 def test_known_heights_are_metres_by_class_and_none_is_without_height() -> None:
     text = "person:1.7,dining table:0.75"
-    assert load_settings(overrides={"detector.known_heights": text}, environment={}).detector.heights() == {
+    assert load_settings(overrides={"detector.class_heights_m": text}, environment={}).detector.heights() == {
         "person": 1.7,
         "dining table": 0.75,
     }
-    (line,) = problems(overrides={"detector.known_heights": "person:0"})
+    (line,) = problems(overrides={"detector.class_heights_m": "person:0"})
     assert "person must be above 0 and at most 100 m, got 0" in line
 
 
@@ -337,3 +338,27 @@ def test_a_calibration_is_scaled_to_the_frames_size() -> None:
     assert camera.mount().pitch_rad == pytest.approx(-math.pi / 6)
     assert camera.field_rad == pytest.approx(2 * math.atan(320 / 500))
     assert Settings().camera.field_rad == pytest.approx(math.radians(80.0))
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_a_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> None:
+    section, _, name = old.partition(".")
+    path = tmp_path / "companion.toml"
+    path.write_text(f"[{section}]\n{name} = 1\n[cameras.down.{section}]\n{name} = 1\n")
+    variable = f"COMPANION_{section}_{name}".upper()
+    with pytest.raises(ConfigurationError) as failure:
+        load_settings(path, {old: "1"}, {variable: "1"})
+    renamed = [
+        line for line in failure.value.problems if line.endswith(f"was renamed to {new} in version 0.2.0")
+    ]
+    assert [line.startswith(f"{old} (") for line in renamed] == [True] * 3
+    assert any(variable in line for line in renamed)
+    if section != "guidance":  # one camera steers; its section has no copy for each camera
+        assert any(f"cameras.down.{new} in version" in line for line in failure.value.problems)
+
+
+def test_the_former_name_of_the_cameras_names_the_new_one(tmp_path: Path) -> None:
+    path = tmp_path / "companion.toml"
+    path.write_text('[views.down.source]\nuri = "down.mp4"\n')
+    with pytest.raises(ConfigurationError, match=r"\[views\].*was renamed to \[cameras\]"):
+        load_settings(path, {}, {})

@@ -109,7 +109,7 @@ def test_what_is_weaker_than_weak_is_not_looked_at() -> None:
 
 
 def test_a_weak_detection_does_not_wake_what_was_lost_long_ago() -> None:
-    film = Film(lost_s=0.5)
+    film = Film(coast_timeout_s=0.5)
     for _ in range(3):
         film.show((100, 100, 0.8))
     film.show(after_s=0.8)
@@ -118,7 +118,7 @@ def test_a_weak_detection_does_not_wake_what_was_lost_long_ago() -> None:
 
 
 def test_a_track_counts_as_true_past_the_second_threshold_of_its_median() -> None:
-    film = Film(true_score=0.5, true_frames=3)
+    film = Film(confirm_score=0.5, min_hits=3)
     states = []
     for confidence in (0.36, 0.9, 0.4, 0.45, 0.6, 0.6, 0.6, 0.6, 0.6):
         frame = film.show((100, 100, confidence))
@@ -140,7 +140,7 @@ def test_a_track_counts_as_true_past_the_second_threshold_of_its_median() -> Non
 
 
 def test_what_once_counted_as_true_goes_on_to_do_so() -> None:
-    film = Film(true_score=0.5)
+    film = Film(confirm_score=0.5)
     for confidence in [0.8] * 3 + [0.2] * 20:
         frame = film.show((100, 100, confidence))
     (record,) = frame.detections.records()
@@ -158,7 +158,7 @@ def test_what_is_seen_once_makes_no_event_and_is_forgotten() -> None:
 
 
 def test_one_frame_is_enough_where_it_is_set_so() -> None:
-    film = Film(true_frames=1)
+    film = Film(min_hits=1)
     film.show((100, 100, 0.9))
     film.show()
     film.show((100, 100, 0.9))
@@ -166,7 +166,7 @@ def test_one_frame_is_enough_where_it_is_set_so() -> None:
 
 
 def test_a_life_is_told_in_events() -> None:
-    film = Film(lost_s=0.3, end_s=1.0)
+    film = Film(coast_timeout_s=0.3, max_age_s=1.0)
     for _ in range(4):
         film.show((100, 100, 0.8))
     film.show(after_s=0.1)
@@ -186,7 +186,7 @@ def test_a_life_is_told_in_events() -> None:
 
 
 def test_a_long_time_without_frames_ends_what_was_followed_though_it_seems_to_be_still_there() -> None:
-    film = Film(end_s=2.0)
+    film = Film(max_age_s=2.0)
     for _ in range(4):
         film.show((100, 100, 0.8))
     assert ids(film.show((100, 100, 0.8), after_s=1.9)) == [1]
@@ -195,7 +195,7 @@ def test_a_long_time_without_frames_ends_what_was_followed_though_it_seems_to_be
 
 
 def test_a_slow_detector_has_tracks_too() -> None:
-    film = Film(lost_s=0.5, end_s=2.0)
+    film = Film(coast_timeout_s=0.5, max_age_s=2.0)
     for _ in range(4):
         frame = film.show((100, 100, 0.8), after_s=1.2)
     assert ids(frame) == [1]
@@ -203,15 +203,15 @@ def test_a_slow_detector_has_tracks_too() -> None:
 
 
 def test_frames_too_far_apart_to_follow_anything_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    film = Film(end_s=2.0)
+    film = Film(max_age_s=2.0)
     for _ in range(4):
         film.show((100, 100, 0.8), after_s=3.0)
     (line,) = caplog.messages
-    assert "tracks end between two frames: 3.0 s passed, and end_s is 2 s" in line
+    assert "tracks end between two frames: 3.0 s passed, and max_age_s is 2 s" in line
 
 
 def test_an_event_bears_the_box_that_was_seen_and_a_lost_one_where_it_should_be() -> None:
-    film = Film(lost_s=0.3)
+    film = Film(coast_timeout_s=0.3)
     for step in range(10):
         frame = film.show((100 + 10 * step, 100, 0.8))
     (update,) = frame.events
@@ -222,7 +222,7 @@ def test_an_event_bears_the_box_that_was_seen_and_a_lost_one_where_it_should_be(
 
 
 def test_a_rumour_is_not_kept_as_long_as_a_track() -> None:
-    film = Film(true_score=0.9, lost_s=0.3, end_s=5.0)
+    film = Film(confirm_score=0.9, coast_timeout_s=0.3, max_age_s=5.0)
     for _ in range(5):
         film.show((100, 100, 0.5))
     film.show(after_s=0.4)
@@ -273,7 +273,7 @@ def test_a_jerk_of_the_camera_changes_nothing_where_the_attitude_is_known(known:
 
 
 def test_what_the_camera_turns_away_from_is_known_again_when_it_turns_back() -> None:
-    film = Film(end_s=3.0)
+    film = Film(max_age_s=3.0)
     for _ in range(4):
         film.show((*thing_at(0, view(0)), 0.8), view=view(0))
     for yaw_deg in (20, 40, 60, 60, 40, 20):
@@ -339,7 +339,7 @@ frames_of_film = st.lists(
 def test_whatever_comes_the_promises_hold(
     frames: list[tuple[float, list[Seen], float | None]],
 ) -> None:
-    film = Film(true_frames=2)
+    film = Film(min_hits=2)
     live: set[int] = set()
     ended: set[int] = set()
     for after_s, seen, yaw_deg in frames:

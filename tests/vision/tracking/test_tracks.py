@@ -30,12 +30,12 @@ def test_without_a_confidence_the_median_is_nothing() -> None:
     [
         ({"low_confidence": 0.5, "high_confidence": 0.4}, "low not above high, got 0.5 and 0.4"),
         ({"high_confidence": 1.5}, "must be 0 to 1"),
-        ({"true_score": -0.1}, "true_score must be 0 to 1, got -0.1"),
+        ({"confirm_score": -0.1}, "confirm_score must be 0 to 1, got -0.1"),
         ({"keep_confidence": 2.0}, "keep_confidence must be 0 to 1, got 2"),
         ({"min_iou": float("nan")}, "min_iou must be 0 to 1, got nan"),
-        ({"true_frames": 0}, "true_frames must be at least 1, got 0"),
-        ({"lost_s": 0.0}, "lost_s must be above 0"),
-        ({"lost_s": 3.0, "end_s": 2.0}, "not above end_s, got 3 and 2"),
+        ({"min_hits": 0}, "min_hits must be at least 1, got 0"),
+        ({"coast_timeout_s": 0.0}, "coast_timeout_s must be above 0"),
+        ({"coast_timeout_s": 3.0, "max_age_s": 2.0}, "not above max_age_s, got 3 and 2"),
     ],
 )
 def test_settings_that_contradict_themselves_are_refused(bad: dict[str, float], message: str) -> None:
