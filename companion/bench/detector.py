@@ -2,7 +2,7 @@
 
 `python -m companion.bench.detector` is that process. It takes its order as a line of JSON, says when its
 first detection is done, then for each number it reads detects in so many pictures and tells how long each
-took. Whoever measures something else beside it (`development/bench_ultralytics.py`) speaks the same lines.
+took. Whoever measures something else beside it (`tools/bench_ultralytics.py`) speaks the same lines.
 """
 
 from __future__ import annotations

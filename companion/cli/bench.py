@@ -1,4 +1,4 @@
-"""The command line of measurements: `companion bench detector|tracking|latency|setpoints|deadman|flights`."""
+"""The command line of measurements: `companion bench detector|latency|setpoints|deadman`."""
 
 from __future__ import annotations
 
@@ -111,56 +111,6 @@ def bench_deadman(
         typer.echo(json.dumps(figures))
     else:
         Console().print(deadman_table(figures))
-
-
-@bench.command("tracking")
-def bench_tracking(
-    seconds: Annotated[float, typer.Option(min=1, help="of each rendered sequence")] = 12.0,
-    rate_hz: Annotated[float, typer.Option(min=1, max=120, help="frames a second")] = 30.0,
-    model: Annotated[str | None, typer.Option(help="a checkpoint; unset: boxes made of the truth")] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    as_json: _JSON = False,
-) -> None:
-    """Identity switches, fragmentation and MOTA with and without tracking, on rendered sequences."""
-    from rich.console import Console
-
-    from companion.bench.tracking import measure_tracking, tracking_table
-    from vision.yolo.safe_pickle import CheckpointError
-
-    with plain_errors(CheckpointError, ValueError):
-        figures = measure_tracking(seconds, rate_hz=rate_hz, model=model, seed=seed)
-    if as_json:
-        typer.echo(json.dumps(figures))
-    else:
-        Console().print(tracking_table(figures))
-        typer.echo(f"tracker: {figures['tracker_ms']}")
-
-
-@bench.command("flights")
-def bench_flights(
-    behaviour: Annotated[str, typer.Argument(help="which flight; any other word lists them")],
-    runs: Annotated[int, typer.Option(min=1, help="flights, one for each seed")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="the first one")] = 0,
-    processes: Annotated[int, typer.Option(min=1, help="flights at once")] = 1,
-    rendered: Annotated[
-        bool, typer.Option("--rendered", help="the rendered camera, and what looks at its pictures")
-    ] = False,
-    as_json: _JSON = False,
-) -> None:
-    """How well a behaviour flies over many seeds, in lockstep with the built-in vehicle."""
-    from rich.console import Console
-
-    from companion.bench.flights import UnknownFlightError, flights_table, fly, summary
-
-    with plain_errors(UnknownFlightError):
-        results = list(fly(behaviour, range(seed, seed + runs), processes, rendered=rendered))
-        figures = summary(behaviour, results)
-    if as_json:
-        typer.echo(json.dumps(figures))
-        return
-    Console().print(flights_table(figures))
-    for failed, reason in figures["failures"].items():
-        typer.echo(f"seed {failed}: {reason}")
 
 
 def _print_figures(figures: dict[str, Any], as_json: bool) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import pytest
 
-from companion.bench.scenes import MOTIONS, scene_frames
+from benchmarks.scenes import MOTIONS, scene_frames
 from companion.bus.client import listen
 from mavlink_sim.testing import RunningSimulator
 from tests.companion.command_line import companion

@@ -1,7 +1,7 @@
 """Every generation and scale: parameters, names, numbers, the checkpoints of releases old and new.
 
 The counts and the sums of maps are facts of the published networks, measured on the reference implementation
-by `development/ultralytics_parity.py` and `development/golden_maps.py`; no test needs it.
+by `tools/ultralytics_parity.py` and `tools/golden_maps.py`; no test needs it.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.bench.flights import UnknownFlightError, flight_named, flights, summary
-from companion.bench.flights_follow import run
+from benchmarks.flights import UnknownFlightError, flight_named, flights, summary
+from benchmarks.flights_follow import run
 from companion.guidance.behaviours.follow import FollowBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse

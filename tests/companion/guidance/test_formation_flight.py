@@ -8,7 +8,7 @@ from typing import TypedDict, Unpack
 
 import pytest
 
-from companion.bench.formation import Fleet, PointAirframe
+from benchmarks.formation import Fleet, PointAirframe
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.bench.flights_land import land
+from benchmarks.flights_land import land
 from companion.guidance.arguments import GrammarError
 from companion.guidance.behaviour import BehaviourContext, Requirement
 from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.bench.flights_obstacles import ALLOWED_M, MARGIN_M, run
+from benchmarks.flights_obstacles import ALLOWED_M, MARGIN_M, run
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.land import LandBehaviour

@@ -90,7 +90,7 @@ def test_the_service_lands_on_the_marker_that_it_is_told(tmp_path: Path, method:
     middle = sorted(math.dist(marker["pad_ned_m"][:2], PAD) for marker in ours)[len(ours) // 2]
     assert middle < 0.8  # with all that the vehicle's own estimate is off
     last = json.loads(truth.read_text().splitlines()[-1])
-    # In gusts, on a busy computer; how near it comes is measured by `companion bench flights land`.
+    # In gusts, on a busy computer; how near it comes is measured by `python -m benchmarks.flights land`.
     assert math.dist(last["position_ned_m"][:2], PAD) < 1.0
 
 

@@ -15,7 +15,7 @@ from mavlink_sim.testing import running_simulator
 from tests.companion.service_process import running_service
 
 WALL_NORTH_M, THICKNESS_M, MARGIN_M = 12.0, 0.4, 2.0
-# As for `companion bench flights obstacles`: in gusts it is blown a little into the margin.
+# As for `python -m benchmarks.flights obstacles`: in gusts it is blown a little into the margin.
 ALLOWED_M = 1.0
 SCENE = f"""
 name = "wall"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from companion.bench.scenes import MOTIONS, Motion, SyntheticDetector, scene_frames, without_image
-from companion.bench.tracking import Seen, attitudes_of, no_tracking, tracked
+from benchmarks.scenes import MOTIONS, Motion, SyntheticDetector, scene_frames, without_image
+from benchmarks.tracking import Seen, attitudes_of, no_tracking, tracked
 from vision.tracking import TrackerSettings
 from vision.tracking.clear_mot import MotScore, clear_mot
 

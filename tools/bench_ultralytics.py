@@ -4,7 +4,7 @@ Each contestant is a process of its own (`companion.bench.detector`), and they t
 else the machine does falls on all alike. Ultralytics is measured as anybody calls it, `predict` on a picture:
 as installed (it chooses its threads), with the threads forced, and on its own OpenVINO export.
 
-    PYTHONPATH=. OTHER_VENV/bin/python development/bench_ultralytics.py --model yolov8n.pt --threads 2
+    PYTHONPATH=. OTHER_VENV/bin/python tools/bench_ultralytics.py --model yolov8n.pt --threads 2
 
 `OTHER_VENV` holds `ultralytics` and what this project needs. Figures, never verdicts: see the ratios.
 """

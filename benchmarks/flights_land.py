@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bench.flights import FlightResult
+from benchmarks.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.guidance.behaviour import Outcome

@@ -1,6 +1,6 @@
 """What the attitude at the moment of capture is worth to a bearing."""
 
-from companion.bench.flights_bearing import run
+from benchmarks.flights_bearing import run
 
 
 def test_a_banking_vehicle_does_not_swing_what_it_looks_at() -> None:

@@ -1,6 +1,6 @@
 """The figures of `test_the_maps_are_those_of_the_reference`, from the reference, for development only.
 
-PYTHONPATH=. OTHER_VENV/bin/python development/golden_maps.py
+PYTHONPATH=. OTHER_VENV/bin/python tools/golden_maps.py
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import sys
 
 import torch
 from ultralytics.nn.tasks import DetectionModel, yaml_model_load
-from ultralytics_parity import oracle_maps
 
 from tests.vision.test_model_families import FEW, GOLDEN, facts, fill, picture
+from tools.ultralytics_parity import oracle_maps
 
 
 def main() -> int:

@@ -12,8 +12,8 @@ import random
 
 import numpy as np
 
-from companion.bench.flights import FlightResult
-from companion.bench.formation import Fleet, LockstepAirframe
+from benchmarks.flights import FlightResult
+from benchmarks.formation import Fleet, LockstepAirframe
 from companion.geometry.formation import SHAPES
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.formation import FormationBehaviour

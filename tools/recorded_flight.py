@@ -2,7 +2,7 @@
 
 The companion's half of the recording (everything that did not come from the autopilot) is played to a vehicle
 in lockstep, each message at its stamp; what the vehicle answers is held against what PX4 answered then. Run
-`python -m mavlink_sim.recorded_flight FLIGHT.tlog` to see every difference.
+`python -m tools.recorded_flight FLIGHT.tlog` to see every difference.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Mutated MAVLink thrown at a vehicle: whatever arrives, it flies on, answers, and keeps its time.
+"""Mutated MAVLink sent to a simulated vehicle: it must fly on, answer, and keep its time.
 
-`python -m mavlink_sim.fuzz --minutes 10` starts a vehicle in a process of its own, floods both of its sockets
-and asks it all the while whether it is well. Before that, a vehicle in lockstep takes a share of the same.
+`python -m tools.fuzz_simulator --minutes 10` starts a vehicle in a separate process, floods both of its
+sockets and checks its state meanwhile. Before that, a vehicle in lockstep takes a share of the same.
 Everything follows from the seed, which is printed. `--autopilot ardupilot`, `--gimbal` and `--signed` choose
 another vehicle; on a signed link half of the whole frames have a right signature. The exit code is 1 where
 the vehicle could not keep up.

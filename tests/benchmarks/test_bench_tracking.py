@@ -6,11 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from companion.bench.scenes import CLASS_NAMES, MOTIONS, SceneFrame, Walker, scene_frames, walkers
-from companion.bench.tracking import Seen, no_tracking
-from companion.cli import app
+from benchmarks.scenes import CLASS_NAMES, MOTIONS, SceneFrame, Walker, scene_frames, walkers
+from benchmarks.tracking import Seen, main, no_tracking
 from vision.detections import Detections
 
 
@@ -63,11 +61,9 @@ def test_those_who_walk_go_at_their_speed_and_look_where_they_go(walker: Walker)
             assert np.cos(np.arctan2(east, north) - before.yaw_rad) == pytest.approx(1.0)
 
 
-def test_the_command_tells_of_every_camera_and_way() -> None:
-    arguments = ["bench", "tracking", "--seconds", "1", "--rate-hz", "8", "--json"]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 0, done.output
-    figures = json.loads(done.stdout)
+def test_command_reports_every_motion_and_method(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--seconds", "1", "--rate-hz", "8", "--json"])
+    figures = json.loads(capsys.readouterr().out)
     for motion in ("still", "gusts", "turning"):
         for way in ("last frame", "tracker", "tracker, attitude"):
             score = figures[f"{motion}: {way}"]

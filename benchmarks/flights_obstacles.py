@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from companion.bench.flights import FlightResult
+from benchmarks.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera
 from companion.guidance.behaviours.goto import GotoBehaviour

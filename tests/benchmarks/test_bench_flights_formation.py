@@ -1,10 +1,10 @@
-"""Five built-in vehicles in formation through turns, as `companion bench flights formation` flies them."""
+"""Five built-in vehicles in formation through turns: the campaign `benchmarks.flights formation`."""
 
 from __future__ import annotations
 
 import pytest
 
-from companion.bench.flights import fly, summary
+from benchmarks.flights import fly, summary
 
 
 @pytest.mark.parametrize("seed", [1, 2])

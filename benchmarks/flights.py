@@ -1,4 +1,6 @@
-"""How well a behaviour flies: the same flight over many seeds, in lockstep, and a table of what came out.
+"""Flight campaigns: one flight over many seeds, in lockstep with the built-in vehicle, as a table.
+
+    python -m benchmarks.flights approach-depth --runs 40 --seed 100 --processes 2 [--rendered] [--json]
 
 A flight is a module `companion/bench/flights_NAME.py` with a function `run(seed: int) -> FlightResult`; it is
 found by that name (`_` is written `-`). The same seed gives the same flight, every time. One whose `run`
@@ -8,10 +10,13 @@ real perception.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
+import json
 import os
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -19,6 +24,7 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 
@@ -50,7 +56,7 @@ class UnknownFlightError(LookupError):
 
 def flights() -> tuple[str, ...]:
     """What can be flown, by name, in order."""
-    package = importlib.import_module("companion.bench")
+    package = importlib.import_module("benchmarks")
     modules = (module.name for module in pkgutil.iter_modules(package.__path__))
     return tuple(
         sorted(name.removeprefix(_PREFIX).replace("_", "-") for name in modules if name.startswith(_PREFIX))
@@ -62,7 +68,7 @@ def flight_named(name: str) -> Flight:
     known = flights()
     if name not in known:
         raise UnknownFlightError(f"no flight is called {name!r}; there are: {', '.join(known) or 'none'}")
-    flight: Flight = importlib.import_module(f"companion.bench.{_PREFIX}{name.replace('-', '_')}").run
+    flight: Flight = importlib.import_module(f"benchmarks.{_PREFIX}{name.replace('-', '_')}").run
     return flight
 
 
@@ -137,3 +143,33 @@ def flights_table(figures: dict[str, Any]) -> Table:
     for name, spread in figures["values"].items():
         table.add_row(name, *(f"{spread[key]:.3g}" for key in _FIGURES))
     return table
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line. Returns the exit code: 2 for a flight that does not exist."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.flights", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("name", help=f"one of: {', '.join(flights())}")
+    parser.add_argument("--runs", type=int, default=100, help="flights, one per seed")
+    parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--processes", type=int, default=1, help="flights at once")
+    parser.add_argument("--rendered", action="store_true", help="the rendered camera with the real detector")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    given = parser.parse_args(arguments)
+    seeds = range(given.seed, given.seed + given.runs)
+    try:
+        figures = summary(given.name, list(fly(given.name, seeds, given.processes, rendered=given.rendered)))
+    except UnknownFlightError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if given.json:
+        print(json.dumps(figures))
+        return 0
+    Console().print(flights_table(figures))
+    for failed, reason in figures["failures"].items():
+        print(f"seed {failed}: {reason}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

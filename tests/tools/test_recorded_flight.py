@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mavlink_sim.recorded_flight import Difference, Flight, Heard, compare, deviations, fly_again, read_flight
+from tools.recorded_flight import Difference, Flight, Heard, compare, deviations, fly_again, read_flight
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"

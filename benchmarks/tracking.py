@@ -1,17 +1,22 @@
-"""What tracking is worth: the same detections with and without it, on rendered sequences with known truth."""
+"""What tracking is worth: the same detections with and without it, on rendered sequences with known truth.
+
+python -m benchmarks.tracking [--seconds 12] [--rate-hz 30] [--model yolov8n.pt] [--json]
+"""
 
 from __future__ import annotations
 
+import argparse
+import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.table import Table
 
-from companion.bench.percentiles import percentiles
-from companion.bench.scenes import (
+from benchmarks.scenes import (
     CAMERA,
     MOTIONS,
     MOUNT,
@@ -21,6 +26,7 @@ from companion.bench.scenes import (
     scene_frames,
     without_image,
 )
+from companion.bench.percentiles import percentiles
 from vision.detections import NO_TRACK, Detections
 from vision.tracking import AttitudeHistory, CameraView, Tracker, TrackerSettings, TrackState
 from vision.tracking.association import overlaps
@@ -211,3 +217,24 @@ def _against_truth(
     kept = ~needless | needed
     shown = [identity for identity, keep in zip(identities, kept, strict=True) if keep]
     return truth, Labelled(shown, xyxy[kept])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.tracking")
+    parser.add_argument("--seconds", type=float, default=12.0, help="length of each rendered sequence")
+    parser.add_argument("--rate-hz", type=float, default=30.0, help="frame rate")
+    parser.add_argument("--model", help="a checkpoint; default: boxes made from the truth")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    given = parser.parse_args(arguments)
+    figures = measure_tracking(given.seconds, rate_hz=given.rate_hz, model=given.model, seed=given.seed)
+    if given.json:
+        print(json.dumps(figures))
+        return
+    Console().print(tracking_table(figures))
+    print(f"tracker: {figures['tracker_ms']}")
+
+
+if __name__ == "__main__":
+    main()

@@ -8,8 +8,8 @@ file. Compared on one picture of noise:
 * folded: the same with our normalisation folded into the convolutions, and what folding costs on their side;
 * boxes: after NMS, or after the selection of an end-to-end head, at a confidence that leaves about 200 cells.
 
-    PYTHONPATH=. OTHER_VENV/bin/python development/ultralytics_parity.py yolov8n yolo11m yolo26n
-    PYTHONPATH=. OTHER_VENV/bin/python development/ultralytics_parity.py --counts yolov5 yolov8 yolo11
+    PYTHONPATH=. OTHER_VENV/bin/python tools/ultralytics_parity.py yolov8n yolo11m yolo26n
+    PYTHONPATH=. OTHER_VENV/bin/python tools/ultralytics_parity.py --counts yolov5 yolov8 yolo11
 
 Exit code 1 if a map differs by more than 1e-4 or a box by more than 0.01 pixels.
 """

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.bench.flights import FlightResult
+from benchmarks.flights import FlightResult
 from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera

@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 
-from mavlink_sim.fuzz import Fuzzer, SocketReport, Target, fuzz_in_lockstep, fuzz_over_sockets
 from mavlink_sim.wire.messages import parser
+from tools.fuzz_simulator import Fuzzer, SocketReport, Target, fuzz_in_lockstep, fuzz_over_sockets
 
 TARGETS = [Target(), Target(gimbal=True), Target("ardupilot"), Target(signed=True)]
 NAMES = ["px4", "gimbal", "ardupilot", "signed"]
@@ -25,7 +25,7 @@ def test_a_running_vehicle_answers_its_client_through_a_flood() -> None:
     assert report.datagrams > 400
     assert report.answers > 0
     # Of one processor's time, whatever else this machine does: it never works its loop full. That it keeps
-    # its time as well, `python -m mavlink_sim.fuzz` tells on a machine of its own.
+    # its time as well, `python -m tools.fuzz_simulator` tells on a machine of its own.
     assert report.load < 0.9
 
 

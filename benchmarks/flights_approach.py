@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from companion.bench.flights import FlightResult
+from benchmarks.flights import FlightResult
 from companion.bench.lockstep_flight import Camera, LockstepFlight, camera_settings
 from companion.bench.rendered_camera import RenderedCamera, rendered_scene
 from companion.bench.synthetic_camera import SyntheticCamera

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from companion.bench.flights import FlightResult
-from companion.bench.flights_approach import WITH_DEPTH_M, fly
+from benchmarks.flights import FlightResult
+from benchmarks.flights_approach import WITH_DEPTH_M, fly
 
 
 def run(seed: int, *, rendered: bool = False) -> FlightResult:
