@@ -6,9 +6,9 @@ TORCH_INDEX ?=
 # Gigabytes of CUDA come only when asked for: ALLOW_CUDA=1.
 ALLOW_CUDA ?=
 TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-# How many tests run at once that fly, and as many that compute; then half as many more that fly. Empty: one for
-# each processor.
-WORKERS ?=
+# Tests at once: of those that compute, and of those that fly in real time and mostly wait.
+WORKERS ?= auto
+REALTIME_WORKERS ?= 4
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -16,16 +16,20 @@ define REFUSE_CUDA
 import json, sys; names = [i["metadata"]["name"] for i in json.load(sys.stdin)["install"]]; cuda = [n for n in names if n.lower().startswith(("nvidia", "cuda", "triton"))]; sys.exit("torch would bring %s: name an index of CPU wheels with TORCH_INDEX=..., or ask for it with ALLOW_CUDA=1" % ", ".join(cuda) if cuda else 0)
 endef
 
-.PHONY: demo test lint format clean
+.PHONY: demo test test-slow lint format clean
 
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
 
-# The tests start hundreds of processes, in workers that all read all tests: not each is to compile them anew.
-# So bytecode is kept, whatever the environment says.
-test: export PYTHONDONTWRITEBYTECODE =
+# Hundreds of processes are started: bytecode is kept, whatever the environment says.
+test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	WORKERS=$(WORKERS) $(BIN)/python -m tests.side_by_side
+	$(BIN)/python -m pytest tests/alone
+	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
+	$(BIN)/python -m pytest --ignore tests/alone -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -n $(WORKERS) -m slow
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -2,7 +2,6 @@
 
 import gc
 import os
-import zlib
 from collections.abc import Iterator
 
 import pytest
@@ -13,8 +12,6 @@ from hypothesis import settings
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)
 settings.load_profile("steady")
-
-pytest_plugins = ["tests.late_workers", "tests.run_again"]
 
 # Tests run side by side: a thread pool of torch or OpenCV in each of them would only wait for the others'.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -34,18 +31,12 @@ def runs_by_the_clock(item: pytest.Item) -> bool:
     return not CLOCKED.isdisjoint({*vars(item.module), *item.fixturenames})
 
 
-@pytest.hookimpl(tryfirst=True)  # before `-m` leaves out what does not run by the clock, or what does
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what runs by the clock, which `make test` gives the processors first; and scatter the files.
-
-    Those that wait for flights in real time stand next to each other by their names. Workers that run side by
-    side take what is neighbouring; so while some wait, others compute. The order is the same every time, and
-    within a file it stays.
-    """
+    """Mark the tests that run in real time."""
     for item in items:
         if runs_by_the_clock(item):
-            item.add_marker("clocked")
-    items.sort(key=lambda item: zlib.crc32(item.path.relative_to(item.config.rootpath).as_posix().encode()))
+            item.add_marker("realtime")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -58,10 +49,7 @@ def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """What is imported stays: the garbage collector need not look through a million objects again and again.
-
-    Neither while they are imported (a tenth of the time that takes) nor in the tests (an eighth).
-    """
+    """Keep imported modules out of the garbage collector's sight: a tenth of the run time."""
     gc.disable()
     try:
         return (yield)

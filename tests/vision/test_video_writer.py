@@ -252,7 +252,7 @@ class Cinema(SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.mark.clocked
+@pytest.mark.realtime
 def test_a_browser_plays_the_film_to_its_end(tmp_path: Path) -> None:
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
