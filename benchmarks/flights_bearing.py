@@ -1,6 +1,6 @@
 """The bearing of a thing from a banking vehicle: orbits at 5 m/s, and what the attitude is worth.
 
-The vehicle circles at a radius of 12.5 m in wind of up to 5 m/s, leaning by 12° and more. What is told of the
+The vehicle circles at a radius of 12.5 m in wind of up to 5 m/s, leaning by 12° and more. What is reported of the
 thing in the middle is compared with the truth at the moment of capture in three ways: by the attitude at that
 moment, as the service does it; by the newest attitude when the result comes 80 ms later; and by the heading
 alone, as if the vehicle never leaned. A flight succeeds when the first is within 1.5° in 95 of 100 pictures.
@@ -101,14 +101,14 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
             true_rad = _bearing_rad(truth @ ray)
             newest = moment.context.state.attitude
             assert newest is not None
-            told = {
+            reported = {
                 "at_capture": target.bearing_rad,
                 "newest": _bearing_rad(matrix_from_quaternion(newest) @ ray),
                 "heading_alone": _bearing_rad(
                     _levelled(flight.inputs.history.at(target.captured_ns).ned_from_body) @ ray
                 ),
             }
-            for way, bearing_rad in told.items():
+            for way, bearing_rad in reported.items():
                 off = math.remainder(bearing_rad - true_rad, math.tau)
                 errors_deg[way].append(abs(math.degrees(off)))
             leaning_deg.append(math.degrees(math.acos(min(1.0, float(truth[2, 2])))))

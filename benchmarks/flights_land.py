@@ -71,7 +71,7 @@ def land(
     """One landing.
 
     Args:
-        by_autopilot: PX4's precision landing flies it, told by LANDING_TARGET.
+        by_autopilot: PX4's precision landing flies it, guided by LANDING_TARGET.
         pad_speed_mps: of a pad that moves in a line.
         rendered: pictures are drawn and searched; else corners are put where geometry has them.
         max_acceleration_mps2: of the envelope.

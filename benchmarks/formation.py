@@ -1,6 +1,6 @@
 """A fleet in one process: each vehicle with its guidance, its own clock and local origin, and a bad network.
 
-Everything but driver and sockets is what flies for real, the messages as they go over the bus too. The
+Only driver and sockets differ from the real service; the messages are those of the bus. The
 vehicles are the built-in one in lockstep, or points that follow a velocity late, of which many can be flown.
 """
 
@@ -261,10 +261,10 @@ class Fleet:
     def command(self, name: str, behaviour: Behaviour) -> str | None:
         """Let a vehicle fly it; the words of the refusal, if it is refused."""
         member = self.members[name]
-        told = len(member.flight.events)
+        before = len(member.flight.events)
         commanded = member.flight.command(behaviour)
         member.flight.step()
-        for event in member.flight.events[told:]:
+        for event in member.flight.events[before:]:
             if event.kind is EventKind.REFUSED and event.outcome is not None:
                 return event.outcome.reason
         member.commanded = commanded

@@ -221,7 +221,7 @@ def _with_depth(detections: Detections, view: View, depth_m: NDArray[np.float32]
 
 
 def _targets(detections: Detections, view: View, *, ground: bool = True) -> tuple[Target, ...]:
-    """Without `ground`, home is taken to be at the vehicle's height, and the ground tells nothing."""
+    """Without `ground`, home is taken to be at the vehicle's height, and the ground gives no range."""
     history = StateHistory()
     history.add(
         VehicleState(

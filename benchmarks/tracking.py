@@ -147,7 +147,7 @@ def tracked(
     attitudes: AttitudeHistory | None,
     timing_ms: list[float] | None = None,
 ) -> list[tuple[Labelled, Labelled]]:
-    """The truth, and the tracks that count as true."""
+    """The truth, and the confirmed tracks."""
     tracker = Tracker(settings)
     labelled = []
     for seen in sequence:
@@ -167,7 +167,7 @@ def tracked(
 def believed(
     sequence: Iterable[Seen], settings: TrackerSettings, attitudes: AttitudeHistory | None
 ) -> list[tuple[Labelled, Labelled]]:
-    """The truth, and where the tracks that count as true are believed to be until they are lost."""
+    """The truth, and the predicted positions of confirmed tracks until they are lost."""
     tracker = Tracker(settings)
     labelled = []
     for seen in sequence:
@@ -186,7 +186,7 @@ def believed(
 
 
 def attitudes_of(motion: Motion, seconds: float, seed: int = 0) -> AttitudeHistory:
-    """What the autopilot tells of its attitude during a sequence, with noise."""
+    """The attitude the autopilot reports during a sequence, with noise."""
     rng = np.random.default_rng((seed, 14))
     history = AttitudeHistory(keep_s=seconds + 2.0)
     for index in range(round(-0.5 * ATTITUDE_RATE_HZ), round((seconds + 0.5) * ATTITUDE_RATE_HZ)):

@@ -124,15 +124,15 @@ def room(module: str) -> str:
 def test_vision_imports_nothing_of_the_others() -> None:
     for name, path in modules().items():
         if name.startswith("vision"):
-            strangers = {m for m in imports_of(name, path) if not m.startswith("vision")}
-            assert not strangers, f"{name} imports {strangers}"
+            others = {m for m in imports_of(name, path) if not m.startswith("vision")}
+            assert not others, f"{name} imports {others}"
 
 
 def test_the_simulator_imports_only_geometry_and_frames_of_vision() -> None:
     for name, path in modules().items():
         if name.startswith("mavlink_sim"):
-            strangers = {m for m in imports_of(name, path) if not m.startswith("mavlink_sim")}
-            assert strangers <= SIMULATOR_MAY_IMPORT | {"vision"}, f"{name} imports {strangers}"
+            others = {m for m in imports_of(name, path) if not m.startswith("mavlink_sim")}
+            assert others <= SIMULATOR_MAY_IMPORT | {"vision"}, f"{name} imports {others}"
 
 
 def test_only_sim_session_demonstration_training_and_benchmarks_know_the_simulator() -> None:

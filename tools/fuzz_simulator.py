@@ -106,7 +106,7 @@ class Fuzzer:
         self.thrown: Counter[str] = Counter()
 
     def datagrams(self) -> Iterator[bytes]:
-        """One datagram after the other, for ever."""
+        """One datagram after the other; never returns."""
         while True:
             kind = self._random.choices(
                 ("frame", "bit flips", "truncated", "several", "random bytes", "old version", "burst"),
@@ -378,7 +378,7 @@ def _flood(
     source = Fuzzer(report.seed, target).datagrams()
     ground_station = ("127.0.0.1", simulator.gcs_bind)
     before_s, started_s = _processor_s(simulator.pid), time.monotonic()
-    booted_s, booted_at_s = examiner.boot_s, examiner.heard_at_s
+    booted_s, booted_at_s = examiner.boot_s, examiner.received_at_s
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as attacker:
         while (elapsed_s := time.monotonic() - started_s) < seconds:
             while report.datagrams < elapsed_s * rate_hz:
@@ -396,7 +396,7 @@ def _flood(
     report.load = (_processor_s(simulator.pid) - before_s) / report.flood_s
     examiner.wait_answer(ANSWER_LIMIT_S)
     report.boot_s = examiner.boot_s - booted_s
-    report.wall_s = examiner.heard_at_s - booted_at_s
+    report.wall_s = examiner.received_at_s - booted_at_s
 
 
 class _Examiner:
@@ -411,7 +411,7 @@ class _Examiner:
         self._asked_s: dict[int, float] = {}
         self._next_s = 0.0
         self.asked = 0
-        self.boot_s = self.heard_at_s = 0.0  # what its clock was in the newest answer, and ours
+        self.boot_s = self.received_at_s = 0.0  # what its clock was in the newest answer, and ours
         self.answer_s: list[float] = []
 
     def __enter__(self) -> _Examiner:
@@ -445,8 +445,8 @@ class _Examiner:
             if datagram[7:10] == b"\x6f\x00\x00":  # TIMESYNC; the rest would only cost us time
                 for message in self._reader.parse_buffer(datagram) or []:
                     if message.get_type() == "TIMESYNC" and message.tc1 and message.ts1 in self._asked_s:
-                        self.heard_at_s = time.monotonic()
-                        self.answer_s.append(self.heard_at_s - self._asked_s.pop(message.ts1))
+                        self.received_at_s = time.monotonic()
+                        self.answer_s.append(self.received_at_s - self._asked_s.pop(message.ts1))
                         self.boot_s = message.tc1 / 1e9
 
     def wait_answer(self, limit_s: float) -> None:

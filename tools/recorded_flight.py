@@ -65,7 +65,7 @@ _UNDECODED: dict[int, tuple[str, struct.Struct, tuple[str, ...]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Received:
     """A message of the autopilot: when (seconds since its boot), its kind, its fields, and was it signed."""
 
     time_s: float
@@ -78,8 +78,8 @@ class Heard:
 class Flight:
     """A recorded flight: what the autopilot said, and (time since its boot, message) of everybody else."""
 
-    heard: list[Heard]
-    told: list[tuple[float, Any]]
+    received: list[Received]
+    sent: list[tuple[float, Any]]
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -104,18 +104,18 @@ def read_flight(path: Path) -> Flight:
             booted_s = message._timestamp - message.time_boot_ms / 1000.0
     if booted_s is None:
         raise ValueError(f"{path} is no recorded flight: it holds no ATTITUDE message")
-    heard: list[Heard] = []
-    told: list[tuple[float, Any]] = []
+    received: list[Received] = []
+    sent: list[tuple[float, Any]] = []
     for stamp_s, message in stamped:
         found = received_by(stamp_s - booted_s, bytes(message.get_msgbuf()), message)
         if found is not None:
-            heard.append(found)
+            received.append(found)
         elif message.get_type() != "BAD_DATA":
-            told.append((stamp_s - booted_s, message))
-    return Flight(heard, told)
+            sent.append((stamp_s - booted_s, message))
+    return Flight(received, sent)
 
 
-def received_by(time_s: float, frame: bytes, message: Any) -> Heard | None:
+def received_by(time_s: float, frame: bytes, message: Any) -> Received | None:
     """What the autopilot (1/1) said in a frame; None if somebody else did."""
     if frame[0] != 0xFD or (frame[5], frame[6]) != (1, 1):
         return None
@@ -124,30 +124,30 @@ def received_by(time_s: float, frame: bytes, message: Any) -> Heard | None:
     if identifier in _UNDECODED:
         name, layout, fields = _UNDECODED[identifier]
         payload = frame[10 : 10 + frame[1]].ljust(layout.size, b"\0")
-        return Heard(time_s, name, dict(zip(fields, layout.unpack(payload), strict=True)), signed)
+        return Received(time_s, name, dict(zip(fields, layout.unpack(payload), strict=True)), signed)
     fields_of = message.to_dict()
-    return Heard(time_s, fields_of.pop("mavpackettype"), fields_of, signed)
+    return Received(time_s, fields_of.pop("mavpackettype"), fields_of, signed)
 
 
-def fly_again(flight: Flight, **options: Any) -> list[Heard]:
+def fly_again(flight: Flight, **options: Any) -> list[Received]:
     """What a vehicle answers to the companion's half, by the recording's clock.
 
     Args:
         options: of `Vehicle`; where nothing else is said, still air, so that the flight repeats itself, and
             sensors that are ready when PX4's were.
     """
-    ready_s = next((time_s for time_s, (ready,) in _prearm(flight.heard) if ready), 3.0)
+    ready_s = next((time_s for time_s, (ready,) in _prearm(flight.received) if ready), 3.0)
     vehicle = Vehicle(**{"gusts_mps": 0.0, "ready_after_s": ready_s, **options})
     vehicle.add_link("onboard")
     codec, reader = parser(), parser()
-    answers: list[Heard] = []
-    began_s, ended_s = flight.heard[0].time_s, max(flight.heard[-1].time_s, 0.0)
-    told = iter(flight.told)
-    following = next(told, None)
+    answers: list[Received] = []
+    began_s, ended_s = flight.received[0].time_s, max(flight.received[-1].time_s, 0.0)
+    sent = iter(flight.sent)
+    following = next(sent, None)
     while vehicle.now_s < ended_s:
         while following is not None and following[0] <= vehicle.now_s:
             vehicle.handle("onboard", following[1])
-            following = next(told, None)
+            following = next(sent, None)
         vehicle.step(STEP_S)
         for item in vehicle.outgoing("onboard"):
             frame = item.pack(codec)
@@ -161,7 +161,7 @@ def fly_again(flight: Flight, **options: Any) -> list[Heard]:
 # ---- comparing --------------------------------------------------------------------------------------------
 
 
-def compare(theirs: list[Heard], ours: list[Heard]) -> list[Difference]:
+def compare(theirs: list[Received], ours: list[Received]) -> list[Difference]:
     """Every kind of difference between PX4's answers and the vehicle's, sorted by key."""
     found: list[Difference] = []
     for comparison in (_kinds, _fields, _sequences, _signatures, _trajectories):
@@ -169,14 +169,14 @@ def compare(theirs: list[Heard], ours: list[Heard]) -> list[Difference]:
     return sorted(found)
 
 
-def _by_kind(messages: Iterable[Heard]) -> dict[str, list[Heard]]:
-    kinds: dict[str, list[Heard]] = {}
+def _by_kind(messages: Iterable[Received]) -> dict[str, list[Received]]:
+    kinds: dict[str, list[Received]] = {}
     for message in messages:
         kinds.setdefault(message.kind, []).append(message)
     return kinds
 
 
-def _kinds(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
+def _kinds(theirs: list[Received], ours: list[Received]) -> Iterator[Difference]:
     """Kinds of messages that one side alone sends, and how many of each."""
     real, own = _by_kind(theirs), _by_kind(ours)
     for kind in sorted(real.keys() | own.keys()):
@@ -189,7 +189,7 @@ def _kinds(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
             yield Difference(f"{kind} rate", f"PX4 sent {there}, this vehicle {here}")
 
 
-def _fields(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
+def _fields(theirs: list[Received], ours: list[Received]) -> Iterator[Difference]:
     """Fields that are constant on one side alone, or never have the values of the other."""
     real, own = _by_kind(theirs), _by_kind(ours)
     for kind in sorted((real.keys() & own.keys()) - COMPARED_BY_SEQUENCE):
@@ -203,7 +203,7 @@ def _fields(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
             yield from _field_difference(f"{kind}.{field}", there, here)
 
 
-def _values(messages: list[Heard], field: str) -> NDArray[np.float64] | None:
+def _values(messages: list[Received], field: str) -> NDArray[np.float64] | None:
     """A row of numbers a message; None where the field is a text or missing."""
     rows = [message.fields.get(field) for message in messages]
     if any(isinstance(row, str | bytes) or row is None for row in rows):
@@ -249,7 +249,7 @@ def _short(values: NDArray[np.float64]) -> str:
 Entry = tuple[float, tuple[Any, ...]]
 
 
-def _changes(messages: list[Heard], kind: str, *fields: str) -> list[Entry]:
+def _changes(messages: list[Received], kind: str, *fields: str) -> list[Entry]:
     """When these fields changed, and to what; the first values too."""
     found: list[Entry] = []
     for message in messages:
@@ -260,7 +260,7 @@ def _changes(messages: list[Heard], kind: str, *fields: str) -> list[Entry]:
     return found
 
 
-def _each(messages: list[Heard], kind: str, *fields: str) -> list[Entry]:
+def _each(messages: list[Received], kind: str, *fields: str) -> list[Entry]:
     return [
         (message.time_s, tuple(message.fields[field] for field in fields))
         for message in messages
@@ -268,7 +268,7 @@ def _each(messages: list[Heard], kind: str, *fields: str) -> list[Entry]:
     ]
 
 
-def _sequences(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
+def _sequences(theirs: list[Received], ours: list[Received]) -> Iterator[Difference]:
     """What happened in which order, and when."""
     watched: list[tuple[str, Callable[..., list[Entry]], tuple[str, ...]]] = [
         ("COMMAND_ACK", _each, ("command", "result", "progress", "target_system", "target_component")),
@@ -300,7 +300,7 @@ def _sequences(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
     yield from _sequence_difference("EVENT", there, here)
 
 
-def _prearm(messages: list[Heard]) -> list[Entry]:
+def _prearm(messages: list[Received]) -> list[Entry]:
     """When the vehicle was ready to arm, and when not."""
     found: list[Entry] = []
     for time_s, (health,) in _changes(messages, "SYS_STATUS", "onboard_control_sensors_health"):
@@ -312,22 +312,22 @@ def _prearm(messages: list[Heard]) -> list[Entry]:
 
 def _sequence_difference(kind: str, there: list[Entry], here: list[Entry]) -> Iterator[Difference]:
     if [values for _, values in there] != [values for _, values in here]:
-        yield Difference(f"{kind} sequence", f"PX4: {_told(there)}; this vehicle: {_told(here)}")
+        yield Difference(f"{kind} sequence", f"PX4: {_listed(there)}; this vehicle: {_listed(here)}")
         return
     if there:
         latest = max(abs(one - other) for (one, _), (other, _) in zip(there, here, strict=True))
         if latest > SEEN_LATE_S.get(kind.split()[0], TIME_TOLERANCE_S):
             yield Difference(
-                f"{kind} times", f"up to {latest:.2f} s apart: PX4: {_told(there)}; ours: {_told(here)}"
+                f"{kind} times", f"up to {latest:.2f} s apart: PX4: {_listed(there)}; ours: {_listed(here)}"
             )
 
 
-def _told(entries: list[Entry]) -> str:
+def _listed(entries: list[Entry]) -> str:
     shown = [f"{time_s:.2f} s {'/'.join(str(value) for value in values)}" for time_s, values in entries]
     return "nothing" if not shown else ", ".join(shown[:12]) + (", …" if len(shown) > 12 else "")
 
 
-def _signatures(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
+def _signatures(theirs: list[Received], ours: list[Received]) -> Iterator[Difference]:
     there, here = {message.signed for message in theirs}, {message.signed for message in ours}
     if there != here:
         yield Difference("signed", f"PX4: {sorted(there)}; this vehicle: {sorted(here)}")
@@ -355,7 +355,7 @@ _QUANTITIES = (
 )
 
 
-def deviations(theirs: list[Heard], ours: list[Heard]) -> list[Deviation]:
+def deviations(theirs: list[Received], ours: list[Received]) -> list[Deviation]:
     """The two trajectories compared at the recording's stamps."""
     found = []
     for quantity, unit, kind, fields, allowed in _QUANTITIES:
@@ -374,7 +374,9 @@ def deviations(theirs: list[Heard], ours: list[Heard]) -> list[Deviation]:
     return found
 
 
-def _track(messages: list[Heard], kind: str, field: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _track(
+    messages: list[Received], kind: str, field: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     pairs = [
         (message.fields["time_boot_ms"] / 1000.0, message.fields[field])
         for message in messages
@@ -384,7 +386,7 @@ def _track(messages: list[Heard], kind: str, field: str) -> tuple[NDArray[np.flo
     return times, values
 
 
-def _trajectories(theirs: list[Heard], ours: list[Heard]) -> Iterator[Difference]:
+def _trajectories(theirs: list[Received], ours: list[Received]) -> Iterator[Difference]:
     for deviation in deviations(theirs, ours):
         if deviation.rms > deviation.allowed:
             yield Difference(
@@ -402,9 +404,9 @@ def main() -> None:
     arguments.add_argument("flight", type=Path, help="a tlog with both directions")
     flight = read_flight(arguments.parse_args().flight)
     ours = fly_again(flight)
-    for difference in compare(flight.heard, ours):
+    for difference in compare(flight.received, ours):
         print(f"{difference.key}\n    {difference.found}")
-    for deviation in deviations(flight.heard, ours):
+    for deviation in deviations(flight.received, ours):
         print(f"{deviation.quantity}: rms {deviation.rms:.3f} {deviation.unit}, max {deviation.maximum:.3f}")
 
 

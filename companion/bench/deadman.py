@@ -1,7 +1,7 @@
 """What the vehicle does when a part of the companion hangs or dies in flight, timed by the simulator's truth.
 
 The service is a process of its own, as in use. It flies an orbit, or towards a car, at 2 m/s; then a process
-is stopped or killed (signal(7)), and the true velocity and mode tell the rest. Real time: a busy machine
+is stopped or killed (signal(7)), and the true velocity and mode give the rest. Real time: a busy machine
 shows.
 """
 
@@ -78,7 +78,7 @@ def reaction(rows: Sequence[dict[str, Any]], fault_ns: int) -> Reaction:
         rows: with `stamp_ns`, `velocity_ned_mps` and `mode`, in order, from a second before the fault on.
 
     Raises:
-        ValueError: nothing was told of the second before the fault.
+        ValueError: there is no record of the second before the fault.
     """
     speeds = [math.hypot(*row["velocity_ned_mps"][:2]) for row in rows]
     before = sorted(
@@ -87,7 +87,7 @@ def reaction(rows: Sequence[dict[str, Any]], fault_ns: int) -> Reaction:
         if fault_ns - 1_000_000_000 <= row["stamp_ns"] < fault_ns
     )
     if not before:
-        raise ValueError("the simulator told nothing of the second before the fault")
+        raise ValueError("no record of the second before the fault")
     slow_mps = BRAKING_SHARE * before[len(before) // 2]
     after = [
         ((row["stamp_ns"] - fault_ns) / 1e9, speed, row["mode"])
@@ -107,14 +107,14 @@ def measure_deadman(runs: int, faults: Sequence[Fault] = FAULTS) -> dict[str, di
     Raises:
         SimSessionError: the vehicle did not get as far as the fault.
     """
-    told: dict[str, dict[str, list[float | None]]] = {}
+    figures: dict[str, dict[str, list[float | None]]] = {}
     for fault in faults:
         reactions = [asyncio.run(_measure(fault, seed)) for seed in range(1, runs + 1)]
-        told[fault.name] = {
+        figures[fault.name] = {
             name: [getattr(one, name) for one in reactions]
             for name in ("braking_s", "standing_s", "failsafe_s")
         }
-    return told
+    return figures
 
 
 def deadman_table(figures: dict[str, dict[str, list[float | None]]]) -> Table:
@@ -201,7 +201,7 @@ def _command(session: zenoh.Session, settings: Settings, text: str, *, patient: 
 
 
 def _steady(truth: Path) -> bool:
-    """Whether the vehicle has been about as fast as it was told for the last seconds."""
+    """Whether the vehicle has been near its commanded speed for the last seconds."""
     since_ns = time.monotonic_ns() - round(_STEADY_S * 1e9)
     speeds = [math.hypot(*row["velocity_ned_mps"][:2]) for row in _rows(truth) if row["stamp_ns"] > since_ns]
     return len(speeds) > 10 and min(speeds) > BRAKING_SHARE * SPEED_MPS

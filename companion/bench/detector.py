@@ -1,7 +1,7 @@
 """Measuring the detector: every runtime in a process of its own, in turn, so that all meet the same weather.
 
 `python -m companion.bench.detector` is that process. It takes its order as a line of JSON, says when its
-first detection is done, then for each number it reads detects in so many pictures and tells how long each
+first detection is done, then for each number it reads detects in so many images and reports how long each
 took. Whoever measures something else beside it (`tools/bench_ultralytics.py`) speaks the same lines.
 """
 
@@ -39,11 +39,11 @@ _TABLE = {
 
 
 class BenchError(Exception):
-    """A measured process did not do what it was told; the message has its last words."""
+    """A measured process failed; the message has its last output."""
 
 
 class Measured:
-    """A process that detects when it is told. A context: leaving it ends the process.
+    """A process that detects on request. A context manager: leaving it ends the process.
 
     Attributes:
         label: how messages name it.
@@ -80,10 +80,10 @@ class Measured:
 
     def detect(self, pictures: int, *, count: bool = True) -> None:
         """Detect in so many pictures; `count` False: only to get warm."""
-        told = self._ask(str(pictures))
-        self.answer |= {"memory_mb": told["memory_mb"]}
+        answer = self._ask(str(pictures))
+        self.answer |= {"memory_mb": answer["memory_mb"]}
         if count:
-            self._times += told["times_ms"]
+            self._times += answer["times_ms"]
 
     def figures(self) -> dict[str, Any]:
         """All that was measured, milliseconds of one picture, pixels in, boxes out."""
@@ -109,15 +109,15 @@ class Measured:
         try:
             self._process.stdin.write(line + "\n")
             self._process.stdin.flush()
-            told: dict[str, Any] = json.loads(self._process.stdout.readline())
+            answer: dict[str, Any] = json.loads(self._process.stdout.readline())
         except (OSError, ValueError):
             self._process.wait(timeout=10)
             self._errors.seek(0)
             last = (self._errors.read().strip().splitlines() or ["it said nothing"])[-1]
             raise BenchError(f"{self.label}: {last}") from None
-        if "error" in told:
-            raise BenchError(f"{self.label}: {told['error']}")
-        return told
+        if "error" in answer:
+            raise BenchError(f"{self.label}: {answer['error']}")
+        return answer
 
 
 def measure_detectors(
@@ -221,7 +221,7 @@ def memory_mb() -> float:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return round(int(line.split()[1]) / 1024, 1)
-    raise BenchError("/proc/self/status does not tell the memory")
+    raise BenchError("/proc/self/status has no memory figures")
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
@@ -243,7 +243,7 @@ def main() -> int:
         )
         pictures = np.load(order["pictures"])
         detector.detect(pictures[0])
-    except (ValueError, OSError, RuntimeError) as error:  # told to who asked
+    except (ValueError, OSError, RuntimeError) as error:  # sent to the caller
         print(json.dumps({"error": " ".join(str(error).split())}), flush=True)
         return 1
     said = {"runtime": detector.runtime, "precision": detector.precision, "threads": detector.threads}

@@ -1,6 +1,6 @@
 """Flights in lockstep: the service's own parts without asyncio, sockets or a clock, the same every time.
 
-What flies is `Guidance.step` with inputs from the service's `InputAssembler` and its setpoints through the
+It flies `Guidance.step` with inputs from the service's `InputAssembler` and its setpoints through the
 service's `Streamer`. Only the driver is another one, and the perception worker's process: a camera here is
 either a detector made of the truth (`synthetic_camera`) or the rendered camera with the real pipeline
 (`rendered_camera`); simulated time stands still while it computes.
@@ -55,7 +55,7 @@ class Camera(Protocol):
     latency_s: float
 
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
-        """A new snapshot of the vehicle, already in the history, as the perception worker is told it."""
+        """A new snapshot of the vehicle, already in the history, as it is sent to the perception worker."""
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
         """Take a frame now. What is returned is called when its result is due; None: the frame is lost."""
@@ -79,7 +79,7 @@ class FlightLog:
 
     Attributes:
         outcome: how the command ended; None: it flew on until the time was over.
-        violations: every kind of limit that was left, in words, told once with its worst.
+        violations: every kind of limit that was left, in words, once each with the worst value.
     """
 
     outcome: Outcome | None = None
@@ -97,7 +97,7 @@ class LockstepFlight:
         options: replace what the settings say.
 
     Attributes:
-        events: everything guidance told.
+        events: every event of guidance.
         state_words: what the active behaviours were doing, as it changed (their status up to a comma).
     """
 
@@ -168,7 +168,7 @@ class LockstepFlight:
 
     @property
     def state(self) -> VehicleState:
-        """What the vehicle has told."""
+        """The telemetry of the vehicle."""
         return self.driver.state
 
     @property

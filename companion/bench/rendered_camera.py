@@ -55,7 +55,7 @@ class RenderedCamera:
         self._by_flight, self._depth = by_flight, depth
 
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
-        """As `WorkerView.send_state` tells the worker."""
+        """As `WorkerView.send_state` sends it to the worker."""
         if state.attitude is not None:
             self._perception.add_attitude(state.attitude_ns, state.attitude, state.altitude_m)
         gimbal = state.gimbal

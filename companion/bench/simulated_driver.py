@@ -45,7 +45,7 @@ GIMBAL_RATES_HZ = {"GIMBAL_DEVICE_ATTITUDE_STATUS": 50.0, "GIMBAL_MANAGER_STATUS
 
 
 class LockstepDriver(Protocol):
-    """What a flight in lockstep needs of a vehicle: a clock, a state, and time that passes when told to."""
+    """What a flight in lockstep needs of a vehicle: a clock, a state, and time that passes on request."""
 
     @property
     def now_ns(self) -> int:
@@ -204,10 +204,10 @@ class SimulatedDriver:
             if name == "COMMAND_ACK":
                 self._acknowledge(message)
             elif name in TELEMETRY_MESSAGES or self._kind == ARDUPILOT:
-                for told, fields in self._profile.translate(name, message.to_dict(), self._state):
-                    if told in ("HEARTBEAT", "CURRENT_MODE"):
+                for name_now, fields in self._profile.translate(name, message.to_dict(), self._state):
+                    if name_now in ("HEARTBEAT", "CURRENT_MODE"):
                         self._mode_ns = now_ns
-                    self._state = apply_message(self._state, told, fields, now_ns)
+                    self._state = apply_message(self._state, name_now, fields, now_ns)
         for pending in list(self._pending):
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)

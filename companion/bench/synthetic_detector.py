@@ -88,7 +88,7 @@ class SyntheticDetector:
 
     Args:
         with_depth: detections have a range, as with a depth camera.
-        gimbal: tells the true attitude of the camera's gimbal, (w, x, y, z), its FRD to NED; for a mount on
+        gimbal: gives the true attitude of the camera's gimbal, (w, x, y, z), its FRD to NED; for a mount on
             one.
     """
 

@@ -62,9 +62,9 @@ def test_the_demonstration_finds_the_car_stops_before_it_and_lands(tmp_path: Pat
     output = tmp_path / "demo"
     done = demo(output, "--duration", "150")
     assert done.returncode == 0, done.stdout + done.stderr
-    # What the service warns of (a film with gaps, on a busy machine) is said once, with its time.
-    told = [line for line in done.stdout.splitlines() if "missing" in line]
-    assert not any(line.split("s  ", 1)[-1] in done.stderr for line in told), done.stderr
+    # A warning of the service (a video with gaps, on a busy machine) is printed once, with its time.
+    lines = [line for line in done.stdout.splitlines() if "missing" in line]
+    assert not any(line.split("s  ", 1)[-1] in done.stderr for line in lines), done.stderr
     summary = json.loads((output / "summary.json").read_text())
     assert summary["success"]
     assert summary["found"]

@@ -9,13 +9,7 @@ from tools.check_words import findings, main
 
 @pytest.mark.parametrize(
     "text",
-    ["def _tell_state() -> None:", "class HeardState:", "# Keeper of it", "It is told.", "it counts as true"],
-        "def _tell_state() -> None:",
-        "class HeardState:",
-        "# Keeper of it",
-        "It is told once.",
-        "a track counts as true",
-    ],
+    ["def _tell_it() -> None:", "class HeardState:", "# Keeper of it", "It is told.", "it counts as true"],
 )
 def test_listed_words_are_found_in_names_and_prose(text: str) -> None:
     ((line, word, instead),) = findings(f"first\n{text}\n")

@@ -25,7 +25,7 @@ def test_a_running_vehicle_answers_its_client_through_a_flood() -> None:
     assert report.datagrams > 400
     assert report.answers > 0
     # Of one processor's time, whatever else this machine does: it never works its loop full. That it keeps
-    # its time as well, `python -m tools.fuzz_simulator` tells on a machine of its own.
+    # its time as well, `python -m tools.fuzz_simulator` measures on a quiet machine.
     assert report.load < 0.9
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.recorded_flight import Difference, Flight, Heard, compare, deviations, fly_again, read_flight
+from tools.recorded_flight import Difference, Flight, Received, compare, deviations, fly_again, read_flight
 
 DATA = Path(os.environ.get("COMPANION_TEST_DATA", Path(__file__).parents[2] / "../shared/data"))
 RECORDING = DATA / "px4" / "px4_sih_offboard_flight.tlog"
@@ -22,13 +22,13 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def ours(flight: Flight) -> list[Heard]:
+def ours(flight: Flight) -> list[Received]:
     return fly_again(flight)
 
 
 @pytest.fixture(scope="module")
-def differences(flight: Flight, ours: list[Heard]) -> list[Difference]:
-    return compare(flight.heard, ours)
+def differences(flight: Flight, ours: list[Received]) -> list[Difference]:
+    return compare(flight.received, ours)
 
 
 def known() -> list[str]:
@@ -45,7 +45,7 @@ def known() -> list[str]:
 def test_every_difference_is_on_the_page_by_its_own_name(differences: list[Difference]) -> None:
     listed = known()
     assert len(listed) > 40
-    assert not [key for key in listed if "*" in key]  # a pattern would hide what comes anew
+    assert not [key for key in listed if "*" in key]  # a pattern would hide new differences
     new = [f"{found.key}: {found.found}" for found in differences if found.key not in listed]
     assert not new, "\n".join(new)
 
@@ -58,18 +58,18 @@ def test_every_line_of_the_page_is_still_a_difference(differences: list[Differen
     assert not stale, f"no difference any more, take them off {PAGE.name}: {stale}"
 
 
-def test_the_figures_on_the_page_are_those_measured(flight: Flight, ours: list[Heard]) -> None:
+def test_the_figures_on_the_page_are_those_measured(flight: Flight, ours: list[Received]) -> None:
     page = PAGE.read_text(encoding="utf-8")
-    told = {
+    sent = {
         name: (float(rms), float(maximum), unit)
         for name, rms, unit, maximum in re.findall(
             r"^\| ([a-z ]+) \| ([\d.]+) (\S+) \| ([\d.]+) \3 \|$", page, re.MULTILINE
         )
     }
-    measured = deviations(flight.heard, ours)
-    assert list(told) == [deviation.quantity for deviation in measured]
+    measured = deviations(flight.received, ours)
+    assert list(sent) == [deviation.quantity for deviation in measured]
     for deviation in measured:
-        rms, maximum, unit = told[deviation.quantity]
+        rms, maximum, unit = sent[deviation.quantity]
         assert unit == deviation.unit
         assert rms == pytest.approx(deviation.rms, rel=0.05, abs=0.01), deviation
         assert maximum == pytest.approx(deviation.maximum, rel=0.05, abs=0.01), deviation
@@ -83,29 +83,31 @@ def test_what_happens_in_which_order_is_the_same(differences: list[Difference], 
     assert not [key for key in keys if key.startswith(kind) and key.endswith("sequence")]
 
 
-def test_the_trajectories_stay_together(flight: Flight, ours: list[Heard]) -> None:
-    apart = {deviation.quantity: deviation for deviation in deviations(flight.heard, ours)}
+def test_the_trajectories_stay_together(flight: Flight, ours: list[Received]) -> None:
+    apart = {deviation.quantity: deviation for deviation in deviations(flight.received, ours)}
     assert apart["horizontal position"].rms < 1.5
     assert apart["height"].rms < 0.5
     assert apart["yaw"].rms < 0.2
 
 
 def test_the_same_flight_has_no_differences(flight: Flight) -> None:
-    assert compare(flight.heard, flight.heard) == []
+    assert compare(flight.received, flight.received) == []
 
 
-def test_each_kind_of_difference_is_seen(ours: list[Heard]) -> None:
+def test_each_kind_of_difference_is_seen(ours: list[Received]) -> None:
     few = {"ATTITUDE", "VFR_HUD", "COMMAND_ACK", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED"}
-    ours = [heard for heard in ours if heard.kind in few]
+    ours = [received for received in ours if received.kind in few]
 
-    def keys(changed: list[Heard]) -> set[str]:
+    def keys(changed: list[Received]) -> set[str]:
         return {difference.key for difference in compare(ours, changed)}
 
     assert "ATTITUDE missing" not in keys(ours)
-    assert "VFR_HUD missing" in keys([heard for heard in ours if heard.kind != "VFR_HUD"])
-    acknowledged = [heard for heard in ours if heard.kind == "COMMAND_ACK"]
+    assert "VFR_HUD missing" in keys([received for received in ours if received.kind != "VFR_HUD"])
+    acknowledged = [received for received in ours if received.kind == "COMMAND_ACK"]
     refused = replace(acknowledged[0], fields=acknowledged[0].fields | {"result": 4})
-    assert "COMMAND_ACK sequence" in keys([refused if heard is acknowledged[0] else heard for heard in ours])
+    assert "COMMAND_ACK sequence" in keys(
+        [refused if received is acknowledged[0] else received for received in ours]
+    )
     later = [replace(h, time_s=h.time_s + 5.0) if h.kind == "EXTENDED_SYS_STATE" else h for h in ours]
     assert "EXTENDED_SYS_STATE landed_state times" in keys(later)
     tilted = [

@@ -34,21 +34,21 @@ def test_the_first_moment_of_each_counts(braked: int, stood: int, left: int, sta
     slow, still = braked, braked + stood
     speeds = [2.0] * (50 + slow) + [1.0] * (still - slow) + [0.1] * 10
     modes = ["OFFBOARD"] * (50 + min(left, still)) + ["HOLD"] * (len(speeds) - 50 - min(left, still))
-    told = reaction(flight(speeds, modes, start), start + 50 * 20_000_000)
-    assert told.braking_s == pytest.approx(slow * 0.02)
-    assert told.standing_s == pytest.approx(still * 0.02)
-    assert told.failsafe_s == pytest.approx(min(left, still) * 0.02)
+    figures = reaction(flight(speeds, modes, start), start + 50 * 20_000_000)
+    assert figures.braking_s == pytest.approx(slow * 0.02)
+    assert figures.standing_s == pytest.approx(still * 0.02)
+    assert figures.failsafe_s == pytest.approx(min(left, still) * 0.02)
 
 
 def test_what_never_came_is_none_and_a_flight_without_a_beginning_is_refused() -> None:
     rows = flight([2.0] * 100)
-    told = reaction(rows, 1_000_000_000)
-    assert (told.braking_s, told.standing_s, told.failsafe_s) == (None, None, None)
+    figures = reaction(rows, 1_000_000_000)
+    assert (figures.braking_s, figures.standing_s, figures.failsafe_s) == (None, None, None)
     with pytest.raises(ValueError, match="the second before the fault"):
         reaction(rows, 10_000_000_000)
 
 
-def test_the_table_tells_the_longest_and_how_often_it_never_came() -> None:
+def test_table_shows_the_longest_time_and_missing_ones() -> None:
     out = io.StringIO()
     figures: dict[str, dict[str, list[float | None]]] = {
         "x": {"braking_s": [0.2, 0.35], "standing_s": [None, 1.5], "failsafe_s": [None, None]}

@@ -31,7 +31,7 @@ def bench(model: Path, *more: str) -> str:
     return result.output
 
 
-def test_a_measurement_tells_all_its_figures_and_can_be_compared(small_model: Path, tmp_path: Path) -> None:
+def test_measurement_has_all_figures_and_can_be_compared(small_model: Path, tmp_path: Path) -> None:
     earlier = json.loads(bench(small_model, "--json", "--classes", "car"))
     (row,) = earlier["rows"]
     assert (row["runtime"], row["threads"], row["frames"]) == ("torch", 1, 6)
