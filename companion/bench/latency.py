@@ -56,7 +56,7 @@ def measure_latency(seconds: float, *, driver: str) -> dict[str, object]:
 
     `capture_to_setpoint` starts at the pose's stamp in the simulator, before the picture is drawn.
     `beyond_network` is what the companion adds to the network: from when the frame is there, less the
-    network's own time. Every stage is reported by its median: those of `PerceptionResult.timing_ms`, among them
+    network's own time. Every stage is a median: those of `PerceptionResult.timing_ms`, among them
     `capture` and `inference`, which are not the companion's; then `deliver`, from when the result was known
     until guidance has it, and `steer`, from there until the setpoint has left.
 
