@@ -39,14 +39,13 @@ PHRASES = {
     "counts as true": "is confirmed",
     "count as true": "be confirmed",
     "under way": "in progress",
-    "for ever": "forever, until cancelled",
+    r"for ever\b": "forever, until cancelled",
     "what flies": "the active behaviour, the vehicle",
 }
 # Names of others: of a library, and of a file format's key.
 ALLOWED = ("fcntl.flock", ".tell()")
 
 _WORDS = re.compile(r"(?<![A-Za-z])(" + "|".join(INSTEAD) + r")(?![a-z])", re.IGNORECASE)
-_PHRASES = re.compile("|".join(PHRASES), re.IGNORECASE)
 _CAPITALS = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
 
@@ -57,8 +56,9 @@ def findings(text: str) -> Iterator[tuple[int, str, str]]:
             line = line.replace(allowed, "")
         for match in _WORDS.finditer(_CAPITALS.sub("_", line)):
             yield number, match[0], INSTEAD[match[0].lower()]
-        for match in _PHRASES.finditer(line):
-            yield number, match[0], PHRASES[match[0].lower()]
+        for phrase, instead in PHRASES.items():
+            if match := re.search(phrase, line, re.IGNORECASE):
+                yield number, match[0], instead
 
 
 def main(arguments: Sequence[str]) -> int:
