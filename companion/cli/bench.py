@@ -35,7 +35,7 @@ def bench_detector(
     against: Annotated[Path | None, typer.Option(help="Earlier --json result to compare with.")] = None,
     as_json: _JSON = False,
 ) -> None:
-    """Measure milliseconds per frame, from pixels to boxes, of each runtime in turn."""
+    """Measure the time per frame of each runtime. Milliseconds from pixels to boxes."""
     from companion.bench.detector import BenchError, measure_detectors, read_result, table
     from vision.runtimes.base import RUNTIMES, installed
 
@@ -73,7 +73,7 @@ def bench_latency(
     driver: Annotated[str, typer.Option(help="Driver: mavsdk or pymavlink.")] = "mavsdk",
     as_json: _JSON = False,
 ) -> None:
-    """Measure the latency from a frame's capture to its first setpoint, with the simulated vehicle."""
+    """Measure the latency from frame to setpoint. Flies the simulated vehicle."""
     from companion.bench.latency import measure_latency
     from companion.bus.session import BusError
     from companion.perception.supervisor import PerceptionStartError
@@ -92,7 +92,7 @@ def bench_setpoints(
     load: Annotated[int, typer.Option(min=0, help="Number of CPU-bound processes beside the loop.")] = 2,
     as_json: _JSON = False,
 ) -> None:
-    """Measure the spacing of received setpoints under CPU load."""
+    """Measure setpoint spacing under CPU load."""
     from companion.bench.setpoints import measure_setpoints
 
     _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
@@ -103,7 +103,7 @@ def bench_deadman(
     runs: Annotated[int, typer.Option(min=1, help="Number of flights per fault, half a minute each.")] = 3,
     as_json: _JSON = False,
 ) -> None:
-    """Measure the seconds until the vehicle brakes, stops and leaves OFFBOARD after a process fault."""
+    """Measure the reaction to process faults. Seconds until braking, stop and leaving OFFBOARD."""
     from rich.console import Console
 
     from companion.bench.deadman import deadman_table, measure_deadman

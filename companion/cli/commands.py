@@ -89,7 +89,7 @@ def every_command(
 
 @settings_command(app)
 def run(settings: Settings) -> None:
-    """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
+    """Run the service. Ends on Ctrl-C or SIGTERM."""
     with gc_paused():
         from companion.bus.session import BusError
         from companion.operator.line_output import use_for_standard_error
@@ -181,7 +181,9 @@ def demo(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="With --seeds: print one JSON object.")] = False,
 ) -> None:
-    """Fly the demonstration: take off, find a car, approach it, return, land.
+    """Fly the demonstration.
+
+    Takes off, finds a car, approaches it, returns and lands.
 
     The vehicle is the simulated one. With --vehicle-url it is another autopilot, disarmed on the ground, and
     the camera is rendered from the position it reports; its parameters are not changed.
@@ -293,7 +295,7 @@ def detect(
         str | None, typer.Option(help="Plug-ins to load: modules or names, comma separated.")
     ] = None,
 ) -> None:
-    """Detect objects in the frames of a source; one line per frame on standard output."""
+    """Detect objects in the frames of a source. Prints one line per frame."""
     with gc_paused():
         from companion.detect import detect_source
         from companion.plugins import PluginError, load_plugins
@@ -378,7 +380,7 @@ def train(
     ] = None,
     held_out: Annotated[int, typer.Option(min=1, help="Number of scenes for the evaluation.")] = 400,
 ) -> None:
-    """Train the default detector on rendered scenes, evaluate it on held-out ones, and write it."""
+    """Train the default detector. Trains on rendered scenes and evaluates on held-out ones."""
     from companion.train import train_default
     from vision.yolo.safe_pickle import CheckpointError
 
@@ -403,7 +405,7 @@ def train(
 
 @settings_command(app)
 def config(settings: Settings) -> None:
-    """Print the effective settings as a TOML file with a comment on every key."""
+    """Print the effective settings. The output is a TOML file with a comment on every key."""
     from companion.settings.reading import to_toml
 
     typer.echo(to_toml(settings), nl=False)
@@ -415,7 +417,7 @@ def commands(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON Schema.")] = False,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown tables.")] = False,
 ) -> None:
-    """List the flight commands, including those of plug-ins: arguments, units and ranges."""
+    """List the flight commands. Prints arguments, units and ranges, including those of plug-ins."""
     from companion.guidance.grammar import describe, json_schema, markdown
     from companion.plugins import PluginError, load_plugins
 
@@ -440,7 +442,7 @@ def send(
     connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the outcome.")] = 300.0,
 ) -> None:
-    """Send one command to a running service and wait for its outcome."""
+    """Send a command to a running service. Waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
 
     with plain_errors(NoAnswerError):
@@ -459,7 +461,7 @@ def echo(
     connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of messages.")] = None,
 ) -> None:
-    """Print the messages of a running service: key and message, one line each."""
+    """Print the messages of a running service. One line each: key and message."""
     import queue
 
     from companion.bus.client import NoAnswerError, check_topic, client_settings, listen, open_client

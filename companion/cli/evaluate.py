@@ -43,7 +43,7 @@ def evaluate(
     misses: Annotated[Path, typer.Option(help="Output image of the worst misses.")] = Path("misses.png"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Evaluate a model on a labelled data set: mAP50, mAP50-95, per class, and the worst misses."""
+    """Evaluate a model on a labelled data set. Prints mAP50 and mAP50-95, overall and per class."""
     from companion.evaluate import (
         JUDGED_CONFIDENCE,
         evaluate_dataset,

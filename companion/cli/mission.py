@@ -25,7 +25,7 @@ def mission(
     connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the outcome.")] = 3600.0,
 ) -> None:
-    """Check a mission file, send it to a running service and wait for its outcome."""
+    """Check and fly a mission file. Sends it to a running service and waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
     from companion.guidance.missions.mission_file import (
         Mission,

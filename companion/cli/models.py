@@ -22,7 +22,7 @@ _FOLDER = Annotated[
 
 @models.command("list")
 def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
-    """List the bundled model, those in the models folder, and official ones for download."""
+    """List bundled, local and official models."""
     from companion.models.info import list_rows
     from vision.model_files import models_folder
 
@@ -50,7 +50,7 @@ def info(
     ] = "torch",
     as_json: _JSON = False,
 ) -> None:
-    """Print a model's family, classes, GFLOPs, licence, and its runtime and precision on this computer."""
+    """Describe a model file. Prints family, classes, GFLOPs, licence, runtime and precision."""
     from companion.models.info import info_lines, model_info
     from vision.yolo.safe_pickle import CheckpointError
 
@@ -71,7 +71,7 @@ def pull(
     folder: _FOLDER = None,
     url: Annotated[str | None, typer.Option(help="Mirror URL of the same file.")] = None,
 ) -> None:
-    """Download an official model into the models folder and verify its SHA-256. Resumes a download."""
+    """Download an official model. Verifies its SHA-256 and resumes an interrupted download."""
     import difflib
 
     from companion.models.catalog import KNOWN, LICENCE_NOTES
@@ -104,7 +104,7 @@ def export(
         int, typer.Option(min=32, help="Image size for tuning and checking, pixels.")
     ] = 640,
 ) -> None:
-    """Export a model for another runtime; the file is compared with the model before it is kept."""
+    """Export a model for another runtime. The file is compared with the model before it is kept."""
     from vision.runtimes.base import RuntimeUnusableError
     from vision.runtimes.export import export
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint

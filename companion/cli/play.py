@@ -36,7 +36,9 @@ def play(
         Literal["px4", "ardupilot"], typer.Option(help="Autopilot firmware to emulate.")
     ] = "px4",
 ) -> None:
-    """Run simulated vehicle, camera and service together; take commands until Ctrl-C.
+    """Run vehicle, camera and service together.
+
+    Takes commands on the terminal and by `companion send` until Ctrl-C.
 
     With --vehicle-url the vehicle is the autopilot that sends to that UDP port. A camera in the built-in
     world is rendered from its pose.
