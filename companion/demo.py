@@ -1,9 +1,8 @@
-"""The whole way in one command: a vehicle, its camera, our weights, and a flight to a car.
+"""`companion demo`: a vehicle with a camera finds a car, approaches it, returns and lands.
 
-The vehicle is the built-in one, or an autopilot that runs elsewhere. The simulator and the perception worker
-are processes of their own, the detections are counted by a zenoh subscriber that knows nothing of the
-service, and what is claimed is measured from the simulator's truth, or from the position that the autopilot
-reports.
+The vehicle is the simulated one, or another autopilot. The simulator and the perception worker are separate
+processes, an independent zenoh subscriber counts the detections, and the result is measured from ground
+truth, or from the position that the autopilot reports.
 """
 
 from __future__ import annotations
@@ -42,18 +41,18 @@ from mavlink_sim.world.world import demo_world
 from vision.video_encoders import has_pyav
 
 VIDEO_NAME = "flight.webm"
-# What two cores draw, look at and film at once. A slow encoder films every third frame: of an odd number of
-# frames to a picture none is between two.
-_CAMERA_RATE_HZ, _SLOW_FILM_RATE_HZ = 18.0, 6.0
+# Two cores render, process and record this rate. A slow encoder records every third frame: the camera's rate
+# is a multiple of the video's, so the video is evenly spaced.
+_CAMERA_RATE_HZ, _SLOW_VIDEO_RATE_HZ = 18.0, 6.0
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What happened. Ranges and landing are the simulator's truth, not our own estimate.
+    """Result of a demonstration. Ranges and landing are the simulator's ground truth.
 
-    Of an autopilot that is not built in they are its own position and state (`truth` is "autopilot").
+    With another autopilot they are its own position and state (`truth` is "autopilot").
     """
 
     success: bool
@@ -72,13 +71,13 @@ class Summary:
 
 
 def run_demo(output: Path, *, seed: int, limit_s: float, say: Say, vehicle_url: str | None = None) -> Summary:
-    """Fly it. Leaves `flight.webm`, `summary.json`, `events.jsonl` and `truth.jsonl` in `output`.
+    """Fly it; write `flight.webm`, `summary.json`, `events.jsonl` and `truth.jsonl` to `output`.
 
     Args:
-        vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the built-in vehicle.
+        vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the simulated vehicle.
 
     Raises:
-        SimSessionError: the simulator did not start, or there is no vehicle that can be flown.
+        SimSessionError: the simulator did not start, or the autopilot cannot be flown.
     """
     output.mkdir(parents=True, exist_ok=True)
     truth_path = output / "truth.jsonl"
@@ -90,12 +89,12 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say, vehicle_url: 
     landed = flight.ended and _landed(truth_path, flight.on_ground)
     failure = flight.failure
     if failure is None and not reached:
-        stood = "nowhere" if final_range_m is None else f"{final_range_m:.2f} m from the {TARGET_CLASS}"
-        failure = f"stood {stood}, not {STOP_DISTANCE_M:g} m from it"
+        reached_text = "unknown" if final_range_m is None else f"{final_range_m:.2f} m"
+        failure = f"range to the {TARGET_CLASS} {reached_text}, expected {STOP_DISTANCE_M:g} m"
     if failure is None and not flight.received:
-        failure = "no detection message came over zenoh"
+        failure = "no detection message received on zenoh"
     if failure is None and not landed:
-        failure = "the vehicle is not on the ground and disarmed"
+        failure = "vehicle not landed and disarmed"
     summary = Summary(
         success=failure is None,
         found=flight.found,
@@ -117,7 +116,7 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say, vehicle_url: 
 
 @dataclass(slots=True)
 class _Flight:
-    """What is gathered while flying."""
+    """Values collected in flight."""
 
     found: bool = False
     reached_ns: int | None = None
@@ -141,7 +140,7 @@ async def _fly(
         log_path=output / "simulator.log",
     )
     opened = simulator(options) if vehicle_url is None else camera_of_autopilot(vehicle_url, options)
-    rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_FILM_RATE_HZ
+    rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_VIDEO_RATE_HZ
     async with opened as vehicle:
         settings = session_settings(
             vehicle.port,
@@ -157,10 +156,10 @@ async def _fly(
                 events.write(json.dumps(asdict(event)) + "\n")
                 say(event.text)
 
-            # BuiltLayer while the camera starts: what it imports would hold up the relay's messages later.
+            # Created while the camera starts: its imports would delay the relay's messages later.
             service = Service(settings, on_event=on_event)
             await vehicle.until_ready()
-            say("the vehicle and its camera are running")
+            say("vehicle and camera are running")
             try:
                 await _until_finished(service, vehicle, flight, limit_s, say)
             finally:
@@ -172,9 +171,9 @@ async def _fly(
 async def _until_finished(
     service: Service, vehicle: SimProcess, flight: _Flight, limit_s: float, say: Say
 ) -> None:
-    """Until the mission has ended, or the time is up.
+    """Wait until the mission ends or the time limit is reached.
 
-    A simulator or camera that ends in flight is a failure; the mission goes on, to bring the vehicle home.
+    The end of the simulator or camera in flight is a failure; the mission continues, to return the vehicle.
     """
     deadline_s = time.monotonic() + limit_s
     flying = asyncio.create_task(with_service(service, lambda: _watched_mission(service, flight)))
@@ -188,7 +187,7 @@ async def _until_finished(
                 raise SimSessionError(flight.failure)
             await asyncio.wait({flying}, timeout=max(deadline_s - time.monotonic(), 0.0))
         if not flying.done():
-            flight.failure = flight.failure or f"not finished in {limit_s:g} s"
+            flight.failure = flight.failure or f"not finished within {limit_s:g} s"
     finally:
         for task in (flying, lost):
             task.cancel()
@@ -198,7 +197,7 @@ async def _until_finished(
 
 
 async def _watched_mission(service: Service, flight: _Flight) -> None:
-    """The mission, while a zenoh subscriber of its own counts the detection messages."""
+    """Fly the mission while an independent zenoh subscriber counts the detection messages."""
 
     def count(_key: str, text: str) -> None:
         json.loads(text)
@@ -213,7 +212,7 @@ async def _watched_mission(service: Service, flight: _Flight) -> None:
 
 
 async def _mission(service: Service, flight: _Flight) -> None:
-    """The mission; failing, it brings the vehicle home all the same."""
+    """Fly the mission, which returns the vehicle also after a failure."""
     await until_ready_to_arm(service)
     reply = await service.command(f"mission {MISSION}")
     if not reply["success"]:
@@ -221,32 +220,32 @@ async def _mission(service: Service, flight: _Flight) -> None:
     for step in reply.get("steps", ()):
         flight.found = flight.found or (step["title"] == FIND and step["success"])
         if step["title"] == STAND and step["success"]:
-            # The range is taken at the end of the hold, when all is still.
+            # The range is measured at the end of the hold, when the vehicle is still.
             flight.reached_ns = step["ended_ns"]
     state = service.driver.state
     flight.ended = not state.armed
     flight.on_ground = state.landed is LandedState.ON_GROUND
     if flight.failure is not None and state.armed:
-        flight.failure += f"; the vehicle is left armed, in {state.mode.value} mode"
+        flight.failure += f"; vehicle still armed, mode {state.mode.value}"
 
 
 def _range_at(truth_path: Path, stamp_ns: int, seed: int) -> float | None:
-    """The true range to the surface of the nearest car at a moment."""
+    """Return the true range at a time to the surface of the nearest car; None without truth."""
     rows = _rows(truth_path)
     if not rows:
         return None
-    place = min(rows, key=lambda row: abs(row["stamp_ns"] - stamp_ns))["position_ned_m"]
+    position = min(rows, key=lambda row: abs(row["stamp_ns"] - stamp_ns))["position_ned_m"]
     cars = [item for item in demo_world(seed).objects if item.class_name == TARGET_CLASS]
-    return min(surface_range_to(car, place) for car in cars)
+    return min(surface_range_to(car, position) for car in cars)
 
 
 def _landed(truth_path: Path, on_ground: bool) -> bool:
-    """Disarmed on the ground. `on_ground`: what the autopilot says, where the file does not have it."""
+    """Return whether the vehicle is disarmed on the ground. `on_ground`: used if the file lacks `landed`."""
     rows = _rows(truth_path)
     return bool(rows) and not rows[-1]["armed"] and bool(rows[-1].get("landed", on_ground))
 
 
 def _rows(truth_path: Path) -> list[dict[str, Any]]:
     lines = truth_path.read_text().splitlines() if truth_path.exists() else []
-    # The simulator may have been ended in the middle of its last line.
+    # The last line may be incomplete.
     return [json.loads(line) for line in lines if line.endswith("}")]

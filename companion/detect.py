@@ -1,4 +1,4 @@
-"""`companion detect`: every frame of a source through the detector, one line a frame."""
+"""`companion detect`: run the detector on a source's frames, one line per frame."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ def detect_source(
     """Detect in every `every`-th frame, at most `limit` of them.
 
     Args:
-        tracker: gives the detections their tracks; a recording's go by its own time, however fast it is read.
+        tracker: assigns tracks; a recording is tracked by its own time.
         save: folder for `<sequence>.jpg` (the input) and `<sequence>_detections.jpg` (annotated).
-        as_json: one JSON object a frame instead of a readable line.
-        write: takes each line.
+        as_json: one JSON object per frame instead of a readable line.
+        write: called with each line.
 
     Returns:
-        How many frames were looked at.
+        Number of processed frames.
 
     Raises:
-        OSError: a picture cannot be written.
+        OSError: an image cannot be written.
     """
     if save is not None:
         save.mkdir(parents=True, exist_ok=True)
-    looked_at = 0
+    processed = 0
     with _progress(source, every, limit) as advance:
         for index, frame in enumerate(source):
             if index % every:
@@ -66,14 +66,14 @@ def detect_source(
             write(_line(frame, detections, detector, as_json))
             if save is not None:
                 _save(save, frame, detections)
-            looked_at += 1
+            processed += 1
             advance()
-            if looked_at == limit:
+            if processed == limit:
                 break
     statistics = source.statistics
     if statistics.dropped or statistics.unreadable:
         logger.warning("%d frames dropped, %d unreadable", statistics.dropped, statistics.unreadable)
-    return looked_at
+    return processed
 
 
 def _stamp_ns(frame: Frame) -> int:
@@ -85,10 +85,10 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
     assert timing is not None
     if not as_json:
         total_ms = timing.preprocess_ms + timing.inference_ms + timing.postprocess_ms
-        seen = ", ".join(_words(record) for record in detections.records())
-        return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {seen or 'no objects detected'}"
-    # Nobody measures ranges here, and without a tracker there are no tracks.
-    frames_skipped = (
+        objects = ", ".join(_label(record) for record in detections.records())
+        return f"{frame.sequence:6d}  {total_ms:6.1f} ms  {objects or 'no objects detected'}"
+    # There are no ranges here, and without a tracker no tracks.
+    omitted = (
         ("depth_m", "nearest_camera_m")
         if detections.track_id is not None
         else ("depth_m", "nearest_camera_m", *TRACK_FIELDS)
@@ -100,19 +100,19 @@ def _line(frame: Frame, detections: Detections, detector: FrameDetector, as_json
         "height": frame.height,
         "inference_ms": round(timing.inference_ms, 2),
         "detections": [
-            {key: value for key, value in record.items() if key not in frames_skipped}
+            {key: value for key, value in record.items() if key not in omitted}
             for record in detections.records()
         ],
     }
     return json.dumps(message)
 
 
-def _words(record: DetectionRecord) -> str:
-    """`car 0.83 #7`, with a question mark while the track may be a mistake."""
-    words = f"{record['class_name']} {record['confidence']:.2f}"
+def _label(record: DetectionRecord) -> str:
+    """Return `car 0.83 #7`, with a question mark if the track is not confirmed."""
+    label = f"{record['class_name']} {record['confidence']:.2f}"
     if (track_id := record.get("track_id")) is None:
-        return words
-    return f"{words} #{track_id}{'' if record.get('track_state') == TRACK_CONFIRMED else '?'}"
+        return label
+    return f"{label} #{track_id}{'' if record.get('track_state') == TRACK_CONFIRMED else '?'}"
 
 
 def _save(folder: Path, frame: Frame, detections: Detections) -> None:
@@ -122,11 +122,11 @@ def _save(folder: Path, frame: Frame, detections: Detections) -> None:
 
 def _write_image(path: Path, image: NDArray[np.uint8]) -> None:
     if not cv2.imwrite(str(path), image):
-        raise OSError(f"cannot write {path}: is the disk full, or the folder not ours to write?")
+        raise OSError(f"cannot write {path}: check free disk space and write permission")
 
 
 def _progress(source: Source, every: int, limit: int | None) -> AbstractContextManager[Callable[[], None]]:
-    """A bar on standard error for sources with an end, where somebody looks."""
+    """Return a progress bar on standard error for finite sources, if it is a terminal."""
     if source.total_frames is None or not sys.stderr.isatty():
         return nullcontext(lambda: None)
     frames = -(-source.total_frames // every)
@@ -134,7 +134,7 @@ def _progress(source: Source, every: int, limit: int | None) -> AbstractContextM
 
 
 class _Bar:
-    """A progress bar as a context that gives what advances it."""
+    """A progress bar as a context manager that returns its advance function."""
 
     def __init__(self, total: int) -> None:
         self._progress = Progress(

@@ -1,4 +1,4 @@
-"""`companion evaluate`: a detector judged on a labelled data set, class by class, its worst misses shown."""
+"""`companion evaluate`: score a detector on a labelled data set, per class, and show its worst misses."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from vision.yolo.metrics import ImageResult, Score, score_detections
 logger = logging.getLogger(__name__)
 _LINE_EVERY = 100
 
-# So low that the whole curve of precision over recall is judged, as COCO's own judging asks for.
+# Low enough for the whole precision-recall curve, as in COCO's evaluation.
 JUDGED_CONFIDENCE = 0.001
 
 
 @dataclass(frozen=True, slots=True)
 class ClassMapping:
-    """Which class of the model is which of the data set.
+    """Mapping between the classes of the model and of the data set.
 
     Attributes:
-        names: the judged classes, by the data set's names.
-        of_model: (classes of the model,) int64, place in `names`, -1: not judged.
-        of_dataset: (classes of the data set,) int64, place in `names`, -1: the model does not know it.
-        unknown: names of the data set's classes that the model does not know.
+        names: the evaluated classes, by the data set's names.
+        of_model: (classes of the model,) int64, index in `names`, -1: not evaluated.
+        of_dataset: (classes of the data set,) int64, index in `names`, -1: unknown to the model.
+        unknown: names of the data set's classes that are unknown to the model.
     """
 
     names: tuple[str, ...]
@@ -50,9 +50,9 @@ class ClassMapping:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What came out: the score over the judged classes, who was not judged, and the mistakes.
+    """Result: the score over the evaluated classes, the number of other objects, and the worst misses.
 
-    `results` has each image's detections and true objects, numbered as `mapping.names`.
+    `results` has each image's detections and true objects, with class ids as in `mapping.names`.
     """
 
     score: Score
@@ -63,7 +63,7 @@ class Evaluation:
     results: tuple[ImageResult, ...]
 
     def plain(self) -> dict[str, Any]:
-        """For JSON: NaN, where a class has no object, is null."""
+        """Return plain values for JSON; NaN (a class without objects) is null."""
         return {
             "map50": _number(self.score.map50),
             "map50_95": _number(self.score.map50_95),
@@ -81,19 +81,18 @@ class Evaluation:
 
 
 def map_classes(model_names: Sequence[str], dataset: Dataset) -> ClassMapping:
-    """Pair the classes by name, whatever the case, spaces, `_` and `-`; by id where the data set has no
-    names.
+    """Match classes by name, ignoring case, spaces, `_` and `-`; by id without names.
 
     Raises:
-        DatasetError: not one class in common, or an id that the model does not have.
+        DatasetError: no common class, or an id that the model does not have.
     """
     if dataset.class_names is None:
         count = len(model_names)
         for sample in dataset.samples:
             if len(sample.class_ids) and sample.class_ids.max() >= count:
                 raise DatasetError(
-                    f"{sample.image}: has the class {sample.class_ids.max()}, the model knows "
-                    f"0..{count - 1}; the data set has no names to pair by (a data.yaml would give them)"
+                    f"{sample.image}: class id {sample.class_ids.max()}, expected 0..{count - 1}; "
+                    "add a data.yaml with names to match the classes by name"
                 )
         same = np.arange(count)
         return ClassMapping(tuple(model_names), same, same, ())
@@ -113,15 +112,15 @@ def map_classes(model_names: Sequence[str], dataset: Dataset) -> ClassMapping:
         of_dataset[index] = of_model[model_index]
     if not names:
         raise DatasetError(
-            f"{dataset.root}: the model knows none of its classes ({_few(dataset.class_names)}); "
-            f"the model's are {_few(model_names)}"
+            f"{dataset.root}: no class in common with the model: found {_few(dataset.class_names)}; "
+            f"expected some of {_few(model_names)}"
         )
     unknown = [name for index, name in enumerate(dataset.class_names) if of_dataset[index] < 0]
     return ClassMapping(tuple(names), of_model, of_dataset, tuple(unknown))
 
 
 def evaluate_dataset(dataset: Dataset, detector: FrameDetector, mapping: ClassMapping) -> Evaluation:
-    """Detect in every image and judge; the detector's confidence threshold should be `JUDGED_CONFIDENCE`."""
+    """Detect in every image and score; the detector's threshold should be `JUDGED_CONFIDENCE`."""
     results: list[ImageResult] = []
     misses = WorstMisses()
     unjudged = 0
@@ -129,12 +128,12 @@ def evaluate_dataset(dataset: Dataset, detector: FrameDetector, mapping: ClassMa
     with _progress(len(dataset.samples)) as advance:
         for sample in dataset.samples:
             image = read_image(sample.image)
-            found = _judged(detector.detect(image), mapping)
+            found = _evaluated(detector.detect(image), mapping)
             true_ids = mapping.of_dataset[sample.class_ids]
-            judged = true_ids >= 0
-            unjudged += int((~judged).sum())
-            boxes = sample.boxes_in(image.shape[1], image.shape[0])[judged]
-            true_ids, ignored = true_ids[judged], sample.ignored[judged]
+            known = true_ids >= 0
+            unjudged += int((~known).sum())
+            boxes = sample.boxes_in(image.shape[1], image.shape[0])[known]
+            true_ids, ignored = true_ids[known], sample.ignored[known]
             results.append(
                 ImageResult(found.xyxy, found.confidence, found.class_id, boxes, true_ids, ignored)
             )
@@ -145,30 +144,30 @@ def evaluate_dataset(dataset: Dataset, detector: FrameDetector, mapping: ClassMa
 
 
 def report_lines(evaluation: Evaluation) -> list[str]:
-    """The table for a person: every class that occurs, the best first."""
+    """Return the table as text: every class that occurs, the best first."""
     score = evaluation.score
-    seen = {name: one for name, one in score.per_class.items() if one.objects}
-    width = max([len("all"), *map(len, seen)])
+    present = {name: one for name, one in score.per_class.items() if one.objects}
+    width = max([len("all"), *map(len, present)])
     lines = [f"{'class':<{width}}  objects  mAP50  mAP50-95"]
-    for name, one in sorted(seen.items(), key=lambda item: -item[1].ap50_95):
+    for name, one in sorted(present.items(), key=lambda item: -item[1].ap50_95):
         lines.append(f"{name:<{width}}  {one.objects:7d}  {one.ap50:5.3f}  {one.ap50_95:8.3f}")
-    objects = sum(one.objects for one in seen.values())
+    objects = sum(one.objects for one in present.values())
     lines.append(f"{'all':<{width}}  {objects:7d}  {score.map50:5.3f}  {score.map50_95:8.3f}")
     lines.append(
         f"{score.images} images in {evaluation.seconds:.1f} s; at confidence 0.25 "
         f"{evaluation.misses.counts['missed']} objects missed, {evaluation.misses.counts['imagined']} "
-        "imagined"
+        "false positives"
     )
     if evaluation.mapping.unknown:
         lines.append(
-            f"not judged, as the model does not know them: {_few(evaluation.mapping.unknown)} "
+            f"not evaluated, unknown to the model: {_few(evaluation.mapping.unknown)} "
             f"({evaluation.unjudged_objects} objects)"
         )
     return lines
 
 
 def write_sheet(evaluation: Evaluation, path: Path) -> bool:
-    """Write the picture of the worst misses; False if there is none to show. Raises `OSError`."""
+    """Write the image of the worst misses; return False if there are none. Raises `OSError`."""
     sheet = evaluation.misses.sheet()
     if sheet is None:
         return False
@@ -180,8 +179,8 @@ def write_sheet(evaluation: Evaluation, path: Path) -> bool:
     return True
 
 
-def _judged(found: Detections, mapping: ClassMapping) -> Detections:
-    """The detections of judged classes, with the data set's names."""
+def _evaluated(found: Detections, mapping: ClassMapping) -> Detections:
+    """Return the detections of the evaluated classes, with the data set's names."""
     ids = mapping.of_model[found.class_id]
     kept = ids >= 0
     return Detections(found.xyxy[kept], found.confidence[kept], ids[kept], mapping.names)
@@ -201,7 +200,7 @@ def _number(value: float) -> float | None:
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[], None]]:
-    """A bar on standard error for a person, a line now and then for a log."""
+    """Show a progress bar on a terminal, else log a line per 100 images."""
     if sys.stderr.isatty():
         columns = (TextColumn("evaluating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:

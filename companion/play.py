@@ -1,4 +1,4 @@
-"""Vehicle, camera and service together, ready for commands until Ctrl-C: `companion play`."""
+"""`companion play`: vehicle, camera and service together, taking commands until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ _TCP = "tcp/"
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """What is started.
+    """Options of `play`.
 
     Attributes:
-        scene: a scene file or an example's name; None: the demo world.
-        seed: of the world, and of the built-in vehicles.
-        vehicles: number of built-in vehicles, with a service each; the first has the camera.
-        vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the built-in vehicle.
-        autopilot: firmware that the built-in vehicles emulate: px4 or ardupilot.
+        scene: scene file or name of a bundled scene; None: the demo world.
+        seed: random seed of the world and the simulated vehicles.
+        vehicles: number of simulated vehicles, one service each; the first has the camera.
+        vehicle_url: `udpin://HOST:PORT` to which an autopilot sends; None: the simulated vehicle.
+        autopilot: autopilot firmware to emulate: px4 or ardupilot.
     """
 
     scene: str | None = None
@@ -56,15 +56,15 @@ class PlayOptions:
 
 
 class SimulationLostError(SimSessionError):
-    """The simulator or its camera ended while it was in use."""
+    """The simulator or its camera ended in operation."""
 
 
 def play(settings: Settings, options: PlayOptions, say: Say) -> None:
-    """Start all, print what to type, and take commands until SIGINT, SIGTERM or `quit`.
+    """Start everything, print example commands, and take commands until SIGINT, SIGTERM or `quit`.
 
     Raises:
-        SimSessionError: it cannot start, for example without such a scene.
-        SimulationLostError: the simulator ended while it was in use.
+        SimSessionError: it cannot start, for example for an unknown scene.
+        SimulationLostError: the simulator ended in operation.
         LinkError, PerceptionStartError, BusError: as `Service.run`.
     """
     _check_zenoh_ports(settings)
@@ -76,7 +76,7 @@ def play(settings: Settings, options: PlayOptions, say: Say) -> None:
 
 
 def _check_zenoh_ports(settings: Settings) -> None:
-    """Before anything is started: the usual reason why it cannot be is a `companion` that still runs."""
+    """Check that the zenoh ports are free; usually another `companion` uses them."""
     for endpoint in settings.zenoh.listen if settings.zenoh.mode == "peer" else ():
         host, _, port = endpoint.removeprefix(_TCP).rpartition(":")
         if not endpoint.startswith(_TCP) or not port.isdigit():
@@ -88,8 +88,8 @@ def _check_zenoh_ports(settings: Settings) -> None:
                 probe.bind((host.strip("[]"), int(port)))
             except OSError as error:
                 raise SimSessionError(
-                    f"{endpoint}: {error.strerror}; another companion play or companion run listens there: "
-                    "end it, or give this one --zenoh-listen tcp/127.0.0.1:PORT"
+                    f"{endpoint}: {error.strerror}; expected a free port. End the other companion play or "
+                    "companion run, or set --zenoh-listen tcp/127.0.0.1:PORT"
                 ) from error
 
 
@@ -134,7 +134,7 @@ async def _until_stopped(
         try:
             await asyncio.wait({running, lost}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            # The services end first: they leave a vehicle that still flies in its hold.
+            # The services end first: they switch a flying vehicle to hold.
             running.cancel()
             lost.cancel()
             service_end, loss = await asyncio.gather(running, lost, return_exceptions=True)
@@ -160,11 +160,13 @@ def _opened(options: PlayOptions) -> AbstractAsyncContextManager[SimProcess]:
 
 
 def _services(settings: Settings, options: PlayOptions, vehicle: SimProcess, say: Say) -> list[Service]:
-    """A service for each vehicle; all but the first without a camera."""
+    """Create a service for each vehicle; only the first has a camera."""
     name = f"companion-play-{os.getpid()}"
     first = session_settings(vehicle.port, name, chosen=settings, driver="auto", system_id=vehicle.system_id)
     if options.vehicle_url is None:
-        first = _with(first, vehicle={"signing_key_file": None})  # that of the settings is another vehicle's
+        first = _with(
+            first, vehicle={"signing_key_file": None}
+        )  # the key in the settings is for another vehicle
     several = [first]
     for number in range(2, options.vehicles + 1):
         zenoh = first.zenoh
@@ -202,7 +204,7 @@ def _printer(say: Say, vehicle: str | None) -> Callable[[Event], None]:
 
 
 def _commands_of(services: list[Service]) -> Callable[[str], Any]:
-    """The console's commands: `vehicle2 takeoff 5` goes to that vehicle, all others to the first."""
+    """Return the console's handler: `vehicle2 takeoff 5` goes to that vehicle, others to the first."""
     by_name = {service.settings.vehicle.name: service for service in services}
 
     async def command(text: str) -> dict[str, Any]:
@@ -216,18 +218,18 @@ def _commands_of(services: list[Service]) -> Callable[[str], Any]:
 
 def _print_next_commands(services: list[Service], scene: Scene, say: Say) -> None:
     zenoh = services[0].settings.zenoh
-    where = "" if zenoh == type(zenoh)() else f" --connect {(zenoh.listen or zenoh.connect)[0]}"
+    connect = "" if zenoh == type(zenoh)() else f" --connect {(zenoh.listen or zenoh.connect)[0]}"
     known = services[0].perception.status.class_names
     classes = sorted({item.class_name for item in scene.world.objects} & set(known))
-    say(f"the scene {scene.name!r} has: {', '.join(classes) or 'nothing that the model knows'}")
+    say(f"the scene {scene.name!r} has: {', '.join(classes) or 'no class of the model'}")
     say("ready for commands; in another terminal:")
     for number, service in enumerate(services):
         name = service.settings.vehicle.name
-        to = where if name == "vehicle1" else f"{where} --vehicle-name {name}"
+        to = connect if name == "vehicle1" else f"{connect} --vehicle-name {name}"
         camera = classes and number == 0
         say(f'  companion send{to} "takeoff 5"{"" if len(services) == 1 else f"   # {name}"}')
         if camera:
             target = "car" if "car" in classes else classes[0]
             say(f'  companion send{to} "seek {target}"')
-    say(f"  companion echo{where} detections")
+    say(f"  companion echo{connect} detections")
     say("Ctrl-C ends it")

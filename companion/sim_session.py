@@ -1,8 +1,8 @@
-"""A service with a simulated camera, on loopback: with the built-in vehicle, or with another autopilot.
+"""A service with a simulated camera on loopback, with the simulated vehicle or another autopilot.
 
-For `companion play`, for the demonstration and for measuring. The built-in vehicle and its camera are one
-`mavlink-sim` process. For another autopilot `mavlink-sim camera` draws what a camera on it would see, and a
-relay gives the autopilot's messages to both.
+For `companion play`, the demonstration and benchmarks. The simulated vehicle and its camera are one
+`mavlink-sim` process. For another autopilot `mavlink-sim camera` renders the camera, and a relay forwards the
+autopilot's messages to both.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from mavlink_sim.camera.scene import CameraSettings
 from mavlink_sim.testing import free_port, free_udp_port_range
 from vision.camera_model import CameraCalibration
 
-# High enough to see far, low enough that a car at 5 m is in the picture.
+# High enough to see far, low enough that a car at 5 m is in the image.
 ALTITUDE_M = 4.0
 
-# What the demonstration flies: a mission file that comes with this package, and the steps that are judged.
+# The demonstration's mission file, bundled with this package, and its evaluated steps.
 MISSION = "demo"
 FIND, REACH, STAND = "find", "reach", "stand"
 TARGET_CLASS = "car"
-# Where the mission's approach stops, and how well the simulator must agree with that after the hold.
+# Stop distance of the mission's approach, and its tolerance by ground truth after the hold.
 STOP_DISTANCE_M, RANGE_TOLERANCE_M = 5.0, 0.5
-# The open field of the built-in world needs no 30 m on the way home (PX4's default).
+# The open field of the built-in world does not need the return altitude of 30 m (PX4's default).
 SIMULATOR_PARAMETERS = {"RTL_RETURN_ALT": 5.0}
 
-# An autopilot that has just started has no position for up to a minute; `mavlink-sim camera` waits for it.
+# An autopilot has no position for up to a minute after its start; `mavlink-sim camera` waits for it.
 _SIMULATOR_START_S = 90.0
 _SIMULATOR_END_S = 5.0
 _ARMABLE_S = 20.0
@@ -52,22 +52,22 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class SimSessionError(RuntimeError):
-    """The vehicle or its camera is not there, or not any more. The message is one line for a person."""
+    """The vehicle or its camera is missing or has ended. The message is one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """What is simulated.
+    """Options of the simulation.
 
     Attributes:
-        camera: name of the shared memory that the camera's frames go to.
-        seed: of the world, and of the built-in vehicle.
-        scene: a scene file or an example's name; None: the demo world.
+        camera: name of the shared memory for the camera's frames.
+        seed: random seed of the world and the simulated vehicle.
+        scene: scene file or name of a bundled scene; None: the demo world.
         camera_rate_hz: frames per second; None: the scene's own.
-        truth_path: file for the pose, 20 rows a second; None for none.
-        log_path: file for what the process prints; None for none.
-        vehicles: a fleet of so many built-in vehicles, the first with the camera.
-        autopilot: firmware that the built-in vehicle emulates.
+        truth_path: file for the true pose, 20 lines per second; None: no file.
+        log_path: file for the process's output; None: no file.
+        vehicles: number of simulated vehicles; the first has the camera.
+        autopilot: autopilot firmware to emulate.
         gcs_port: UDP port for a ground station; None: a free one.
     """
 
@@ -83,12 +83,11 @@ class SimOptions:
 
 
 class SimProcess:
-    """A running `mavlink-sim`, the vehicle with its camera or the camera alone.
+    """A running `mavlink-sim`: the vehicle with its camera, or the camera alone.
 
     Attributes:
-        port: the UDP port on loopback at which a service finds the vehicle; of a fleet the first of
-            consecutive ones.
-        system_id: MAVLink system id of the vehicle; of a fleet the first one's.
+        port: UDP port on loopback of the vehicle's link; of a fleet the first of consecutive ones.
+        system_id: MAVLink system id of the vehicle; of a fleet of the first one.
     """
 
     def __init__(
@@ -105,7 +104,7 @@ class SimProcess:
         return self._process.pid
 
     async def until_ready(self) -> None:
-        """Wait for its ready line. Raises SimSessionError when it does not start."""
+        """Wait until the process reports ready. Raises SimSessionError if it does not start."""
         lost = asyncio.create_task(self.until_lost())
         ready = asyncio.create_task(self._ready.wait())
         try:
@@ -114,19 +113,19 @@ class SimProcess:
             if not ready.done():
                 raise SimSessionError(f"the simulator did not start: {self._last_output()}")
         except TimeoutError as error:
-            raise SimSessionError(f"the simulator was not ready in {_SIMULATOR_START_S:g} s") from error
+            raise SimSessionError(f"the simulator was not ready within {_SIMULATOR_START_S:g} s") from error
         finally:
             lost.cancel()
             ready.cancel()
             await asyncio.gather(lost, ready, return_exceptions=True)
 
     async def until_lost(self) -> NoReturn:
-        """Wait until the process or its camera ends. Raises SimSessionError with what was printed last."""
+        """Wait until the process or its camera ends. Raises SimSessionError with the last line of output."""
         await self._lost.wait()
         raise SimSessionError(f"the simulator or its camera ended: {self._last_output()}")
 
     async def end(self) -> None:
-        """End the process, by SIGTERM and if that does not help by SIGKILL; read the rest of its output."""
+        """End the process by SIGTERM, after a time-out by SIGKILL; read the rest of its output."""
         if self._process.returncode is None:
             self._process.terminate()
         try:
@@ -158,7 +157,7 @@ class SimProcess:
 
 @asynccontextmanager
 async def simulator(options: SimOptions) -> AsyncIterator[SimProcess]:
-    """The built-in vehicle and its camera as a process of its own; see `SimProcess.until_ready`."""
+    """Run the simulated vehicle and its camera as a process; see `SimProcess.until_ready`."""
     port = free_udp_port_range(options.vehicles)
     gcs_port = free_port() if options.gcs_port is None else options.gcs_port
     arguments = ["--onboard-port", str(port), "--onboard-bind", "0"]
@@ -177,14 +176,14 @@ async def simulator(options: SimOptions) -> AsyncIterator[SimProcess]:
 
 @asynccontextmanager
 async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[SimProcess]:
-    """What the camera of an autopilot at `url` would see, drawn from its pose. Checks the autopilot first.
+    """Render a camera from the pose of an autopilot at `url`, after checking the autopilot.
 
     Raises:
-        LinkError: the url is not `udpin://`, or its port is not to be had.
-        SimSessionError: no autopilot, or not one that can be flown from here: see `Relay.check_autopilot`.
+        LinkError: the url is not `udpin://`, or its port is in use.
+        SimSessionError: no autopilot, or an unsuitable one: see `Relay.check_autopilot`.
     """
     service_port, camera_port = free_port(), free_port()
-    # It takes a second to load, which would hold up the relay's messages.
+    # Loading takes a second, which would delay the relay's messages.
     await asyncio.to_thread(_load_driver_for_px4)
     relay = await Relay.open(url, (service_port, camera_port))
     try:
@@ -205,7 +204,7 @@ async def camera_of_autopilot(url: str, options: SimOptions) -> AsyncIterator[Si
 
 
 def _load_driver_for_px4() -> None:
-    with suppress(ImportError, OSError):  # the driver "auto" says so, and takes the other one
+    with suppress(ImportError, OSError):  # the driver "auto" reports it and uses the other driver
         importlib.import_module("companion.vehicle.mavsdk_driver")
 
 
@@ -225,14 +224,14 @@ async def _spawn(arguments: Sequence[str], options: SimOptions) -> asyncio.subpr
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        # Ctrl-C is for the service: it must be able to leave a vehicle that still flies.
+        # Ctrl-C must not end the simulator before the service has released the vehicle.
         process_group=0,
         preexec_fn=_end_with_us,
     )
 
 
 def _end_with_us() -> None:
-    """Run in the new process: however we end, the simulator receives SIGTERM (prctl(2))."""
+    """Run in the new process: it receives SIGTERM when this process ends (prctl(2))."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
@@ -247,26 +246,26 @@ def session_settings(
     driver: str = "mavsdk",
     system_id: int = 1,
 ) -> Settings:
-    """Settings for a vehicle on a port of loopback and a simulated camera, whose frames bring lens and mount.
+    """Return settings for a vehicle on a loopback port and a simulated camera whose frames carry the lens.
 
     Args:
-        chosen: settings that are kept but for vehicle, source, camera and cameras; None: what is configured
-            on this machine, defaults, and zenoh on a free port.
+        chosen: settings to keep, except vehicle, source, camera and cameras; None: defaults, and zenoh on a
+            free port.
     """
     values: dict[str, Any] = {} if chosen is None else chosen.model_dump(exclude_unset=True)
     for section in ("source", "camera", "cameras"):
         values.pop(section, None)
     values["guidance"] = {"perception_max_age_s": 1.0, **values.get("guidance", {})}
-    # A laptop draws the world, looks at it and films it all at once: frames may come late.
+    # One computer renders, detects and records at once: frames may be late.
     detector = {"threads": 1, **values.get("detector", {})}
     if detector.get("model", DEFAULT_MODEL) == DEFAULT_MODEL:
-        # The size at which the bundled model was trained; see docs/models.md.
+        # The image size of the bundled model's training; see docs/models.md.
         detector.setdefault("image_size", 320)
     values["detector"] = detector
     values["guidance"].pop("camera", None)
     values["vehicle"] = {"driver": driver, **values.get("vehicle", {})}
     values["vehicle"] |= {"url": f"udpin://127.0.0.1:{port}", "system_id": system_id}
-    # The worker is started together with the simulator, and the first frame takes some seconds.
+    # The worker starts together with the simulator, whose first frame takes some seconds.
     values["source"] = {"uri": f"shm://{camera}", "open_timeout_s": _SIMULATOR_START_S}
     if chosen is None:
         values["zenoh"] = {"listen": (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",)}
@@ -276,21 +275,21 @@ def session_settings(
 
 
 def with_lens(settings: Settings, camera: CameraSettings = CameraSettings()) -> Settings:  # noqa: B008 - frozen
-    """The settings with a simulated camera's lens and mount, for where its frames do not bring them along."""
+    """Return the settings with a simulated camera's lens and mount, for frames without them."""
     calibration = CameraCalibration(camera.model, camera.mount)
     adopted = adopt_calibration(settings.camera, calibration).camera
     return settings.model_copy(update={"camera": adopted})
 
 
 async def with_service(service: Service, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """As `with_services`, of one."""
+    """Run one service, as `with_services`."""
     await with_services([service], work)
 
 
 async def with_services(services: Sequence[Service], work: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Run services, and `work` once all are ready; then end the services.
 
-    What fails in a service is raised here and ends the work, and the other way round.
+    An error of a service ends the work and is raised here, and vice versa.
 
     Raises:
         LinkError, PerceptionStartError, BusError: as `Service.run`.
@@ -311,28 +310,28 @@ async def with_services(services: Sequence[Service], work: Callable[[], Coroutin
         for task in running:
             if task.done():
                 task.result()
-                raise SimSessionError("the service ended before its work was done")
+                raise SimSessionError("the service ended before the work was done")
         working.result()
     finally:
         working.cancel()
         for service, task in zip(services, running, strict=True):
-            # Before it is ready there is nothing to leave in order.
+            # Before it is ready there is nothing to shut down.
             service.stop() if service.ready else task.cancel()
         ended = await asyncio.gather(*running, return_exceptions=True)
         await asyncio.gather(working, return_exceptions=True)
     for error in ended:
         if isinstance(error, BaseException):
-            raise error  # it went wrong after the work was done, which is no success
+            raise error  # failed after the work was done
 
 
 async def until_ready_to_arm(service: Service) -> None:
-    """Wait for the autopilot's pre-arm checks. Raises SimSessionError if they do not pass."""
+    """Wait until the autopilot's pre-arm checks pass. Raises SimSessionError after a time-out."""
     armable = asyncio.Event()
     unsubscribe = service.driver.subscribe(lambda state: armable.set() if state.ready_to_arm else None)
     try:
         async with asyncio.timeout(_ARMABLE_S):
             await armable.wait()
     except TimeoutError as error:
-        raise SimSessionError(f"the vehicle was not ready to arm in {_ARMABLE_S:g} s") from error
+        raise SimSessionError(f"the vehicle was not ready to arm within {_ARMABLE_S:g} s") from error
     finally:
         unsubscribe()

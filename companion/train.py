@@ -1,7 +1,7 @@
-"""`companion train`: the bundled detector, made again from nothing but this repository.
+"""`companion train`: train the bundled detector from this repository.
 
-The recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.datasets.training_scenes`) decide the weights;
-nothing is downloaded.
+The recipe (`vision.yolo.recipe`) and the scenes (`mavlink_sim.datasets.training_scenes`) determine the
+weights; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ def train_default(
     start: Path | None = None,
     held_out: int = 400,
 ) -> Score:
-    """Train by the recipe (with what is given here changed), judge, and write the result (`judge_and_save`).
+    """Train by the recipe with the given changes, evaluate, and write the result (`evaluate_and_save`).
 
-    The first course begins with random weights, the second refines what came of it. The state of each is kept
-    beside the output as `<output>.training` and `<output>.refining`, for `resume`. `steps` and
-    `time_limit_s` are of the courses that are run, each in proportion.
+    The first stage starts with random weights, the second refines them. The state of each is stored beside
+    the output as `<output>.training` and `<output>.refining`, for `resume`. `steps` and `time_limit_s` are
+    distributed over the stages in proportion.
 
     Args:
-        start: a model of the recipe's network to refine, in place of the first course.
+        start: a model of the recipe's network to refine; replaces the first stage.
 
     Raises:
         FileNotFoundError: `resume` without a state. CheckpointError: `start` cannot be read.
-        ValueError: the state or `start` is of another recipe.
+        ValueError: the state or `start` belongs to another recipe.
     """
     output.parent.mkdir(parents=True, exist_ok=True)
     changes: dict[str, Any] = {
@@ -59,7 +59,7 @@ def train_default(
     }
     first, second = replace(DEFAULT_RECIPE, **changes), replace(REFINEMENT, **changes)
     if tuple(first.class_names) != tuple(CLASS_NAMES):
-        raise ValueError(f"the recipe knows {first.class_names}, the scenes draw {CLASS_NAMES}")
+        raise ValueError(f"recipe classes {first.class_names}, expected those of the scenes {CLASS_NAMES}")
     if seed is not None:
         first, second = replace(first, seed=seed), replace(second, seed=seed + 1)
     share = 0.0 if start is not None else first.steps / (first.steps + second.steps)
@@ -70,26 +70,28 @@ def train_default(
         first = replace(first, time_limit_s=time_limit_s * share)
         second = replace(second, time_limit_s=time_limit_s * (1 - share))
     states = [output.with_suffix(f"{output.suffix}.{name}") for name in ("training", "refining")]
-    with _Shown() as shown:
+    with _ProgressDisplay() as display:
         if start is not None:
-            begun = load_checkpoint(start).model
+            initial = load_checkpoint(start).model
         else:
-            begun = train(first, random_scene, shown, checkpoint=states[0], resume=resume).model
+            initial = train(first, random_scene, display, checkpoint=states[0], resume=resume).model
         refined = train(
             second,
             training_scene,
-            shown,
+            display,
             checkpoint=states[1],
             resume=resume and (start is not None or states[1].is_file()),
-            start=begun,
+            start=initial,
         )
-    return judge_and_save(output, refined, second, held_out)
+    return evaluate_and_save(output, refined, second, held_out)
 
 
-def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettings, held_out: int) -> Score:
+def evaluate_and_save(
+    output: Path, trained: TrainedModel, settings: TrainingSettings, held_out: int
+) -> Score:
     """Score a model on held-out scenes and write it, fp16, with licence, score and settings.
 
-    Whatever the ending of `output`, what is written is the pair `NAME.safetensors` and `NAME.yaml`.
+    Writes the pair `NAME.safetensors` and `NAME.yaml`, whatever the suffix of `output`.
     """
     width, height = HELD_OUT_SIZE
     score = evaluate(trained.model, training_scene, HELD_OUT_SEED, held_out, width, height)
@@ -111,8 +113,8 @@ def judge_and_save(output: Path, trained: TrainedModel, settings: TrainingSettin
     return score
 
 
-class _Shown:
-    """Progress on standard error: a bar for a person, a line now and then for a log."""
+class _ProgressDisplay:
+    """Progress on standard error: a bar on a terminal, else a line per 100 steps."""
 
     _LINE_EVERY = 100
 
@@ -139,7 +141,7 @@ class _Shown:
         elif progress.step % self._LINE_EVERY == 0 or progress.step == progress.steps:
             print(f"{losses}, {progress.remaining_s / 60:.1f} min left", file=sys.stderr, flush=True)
 
-    def __enter__(self) -> _Shown:
+    def __enter__(self) -> _ProgressDisplay:
         if self._bar is not None:
             self._bar.start()
         return self

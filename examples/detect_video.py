@@ -1,4 +1,4 @@
-"""Detect and track objects in a film: `python detect_video.py street.mp4 yolo11n` prints what ends when."""
+"""Detect and track objects in a video: `python detect_video.py street.mp4 yolo11n` prints the tracks."""
 
 import sys
 
@@ -6,12 +6,12 @@ from vision import Detector, Tracker, open_source
 from vision.tracking import TrackerSettings, TrackEventKind
 
 
-def main(film: str, model: str = "default") -> None:
+def main(video: str, model: str = "default") -> None:
     settings = TrackerSettings()
-    # A tracker continues its tracks with weak detections too, and leaves out those that belong to none.
+    # A tracker continues tracks with weak detections too, and drops weak ones without a track.
     detector = Detector(model, confidence=settings.low_confidence)
     tracker = Tracker(settings)
-    with open_source(film) as source:
+    with open_source(video) as source:
         for frame in source:
             time_s = frame.media_s or 0.0
             tracked = tracker.update(detector.detect(frame.image), round(time_s * 1e9))
@@ -24,7 +24,7 @@ def main(film: str, model: str = "default") -> None:
                     )
             for event in tracked.events:
                 if event.kind is TrackEventKind.END:
-                    print(f"{time_s:7.2f} s  {event.track.class_name} #{event.track.track_id} has gone")
+                    print(f"{time_s:7.2f} s  {event.track.class_name} #{event.track.track_id} ended")
 
 
 if __name__ == "__main__":

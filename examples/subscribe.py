@@ -1,4 +1,4 @@
-"""Print what a running service detects, send it a command, print the answer.
+"""Print the detections of a running service, send it a command, print the reply.
 
 python subscribe.py tcp/127.0.0.1:7447 "takeoff altitude=3"
 """
@@ -11,7 +11,7 @@ from companion.settings import ZenohSection
 
 
 def on_detections(key: str, text: str) -> None:
-    """Called in a thread of zenoh's with every message; docs/messages.md has its fields."""
+    """Print one message; called in a zenoh thread. Fields: docs/messages.md."""
     message = json.loads(text)
     for record in message["detections"]:
         x, y = record["center"]
@@ -25,8 +25,8 @@ def on_detections(key: str, text: str) -> None:
 def main(endpoint: str, command: str, vehicle: str = "vehicle1") -> None:
     with open_client(client_settings(ZenohSection(), (endpoint,))) as session:
         listen(session, "detections", on_detections)
-        answer = send_command(session, vehicle, command, timeout_s=60.0)
-    print(f"{command}: {'done' if answer['success'] else 'failed'}: {answer['reason']}")
+        reply = send_command(session, vehicle, command, timeout_s=60.0)
+    print(f"{command}: {'done' if reply['success'] else 'failed'}: {reply['reason']}")
 
 
 if __name__ == "__main__":

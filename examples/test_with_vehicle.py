@@ -1,4 +1,4 @@
-"""Flights as tests: `pytest test_with_vehicle.py`. Simulated time, no sockets: the same flight every time."""
+"""Flights as tests: `pytest test_with_vehicle.py`. Simulated time, no sockets, deterministic."""
 
 import math
 
@@ -17,10 +17,10 @@ def test_vehicle_takes_off_and_lands_in_wind() -> None:
     assert not vehicle.truth.crashed
 
 
-def test_companion_flies_to_a_place_within_its_speed() -> None:
+def test_companion_reaches_position_within_speed() -> None:
     flight = LockstepFlight.airborne(seed=1, height_m=5.0)
-    log = flight.fly("goto north=12 east=5 speed=2", limit_s=30.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    record = flight.fly("goto north=12 east=5 speed=2", limit_s=30.0)
+    assert record.outcome is not None
+    assert record.outcome.success, record.outcome.reason
     assert math.dist(flight.vehicle.truth.position_ned_m, (12.0, 5.0, -5.0)) < 1.0
-    assert max(math.hypot(*moment.truth.velocity_ned_mps) for moment in log.moments) < 2.5
+    assert max(math.hypot(*moment.truth.velocity_ned_mps) for moment in record.moments) < 2.5

@@ -1,4 +1,4 @@
-"""What the documents say can be typed can be typed, and what they link to is there."""
+"""The commands in the documents are valid, and their links and file names exist."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def shell_lines(document: Path) -> Iterator[str]:
 
 
 def commands(document: Path) -> Iterator[list[str]]:
-    """Each command of the document's shell blocks and of its `code` in running text, split into words."""
+    """Each command in the document's shell blocks and inline `code`, split into words."""
     for line in shell_lines(document):
         for part in line.split(" | "):
             words = shlex.split(part, comments=True)
@@ -46,7 +46,7 @@ def commands(document: Path) -> Iterator[list[str]]:
             yield shlex.split(code)
 
 
-OURS = [
+COMMAND_LINES = [
     pytest.param(words, id=f"{document.name}: {' '.join(words)[:60]}")
     for document in DOCUMENTS
     for words in commands(document)
@@ -54,14 +54,14 @@ OURS = [
 ]
 
 
-@pytest.mark.parametrize("words", OURS)
-def test_every_command_in_the_documents_is_one_that_exists(words: list[str]) -> None:
+@pytest.mark.parametrize("words", COMMAND_LINES)
+def test_every_command_in_documents_is_valid(words: list[str]) -> None:
     command = typer.main.get_command(APPS[words[0]])
     arguments = words[1:]
     if words[0] == "mavlink-sim" and len(words) > 1 and words[1] in SIMULATOR_SUBCOMMANDS:
         command, arguments = typer.main.get_command(SIMULATOR_SUBCOMMANDS[words[1]]), words[2:]
     context = command.make_context(words[0], list(arguments), resilient_parsing=False)
-    # A group hands what is left to its command; that one must take it all.
+    # A group passes the rest to its command, which must accept all of it.
     while hasattr(command, "resolve_command"):
         rest = [*context._protected_args, *context.args]
         assert rest, f"{' '.join(words)}: no command"
@@ -70,7 +70,7 @@ def test_every_command_in_the_documents_is_one_that_exists(words: list[str]) -> 
         context = command.make_context(name, rest, parent=context)
 
 
-def test_every_make_target_in_the_documents_exists() -> None:
+def test_every_make_target_in_documents_exists() -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for document in DOCUMENTS:
         for words in commands(document):
@@ -79,41 +79,41 @@ def test_every_make_target_in_the_documents_exists() -> None:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
-def test_every_link_in_the_documents_leads_somewhere(document: Path) -> None:
+def test_every_link_in_documents_has_a_target(document: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)", document.read_text()):
         if "://" not in target:
             assert (document.parent / target).exists(), f"{document.name} links to {target}"
 
 
-def test_every_file_in_the_architecture_exists() -> None:
+def test_every_file_in_architecture_exists() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text()
     sections = re.split(r"^`(vision|mavlink_sim|companion)/` ", text, flags=re.MULTILINE)
     for package, section in zip(sections[1::2], sections[2::2], strict=True):
         table = section.split("\n## ")[0]
-        rooms = re.findall(r"^\| (?:\d \| )?(`[^|]+`) \|", table, re.MULTILINE)
-        assert rooms
-        for name in re.findall(r"`([^`]+)`", " ".join(rooms)):
+        cells = re.findall(r"^\| (?:\d \| )?(`[^|]+`) \|", table, re.MULTILINE)
+        assert cells
+        for name in re.findall(r"`([^`]+)`", " ".join(cells)):
             assert list((ROOT / package).glob(name)), f"docs/architecture.md: {package}/{name} does not exist"
 
 
-def test_every_flight_command_in_the_table_is_read_and_every_one_there_is_stands_in_it() -> None:
+def test_flight_command_table_is_complete() -> None:
     rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "flight.md").read_text(), re.MULTILINE)
     commands = [grammar.parse(text) for row in rows for text in re.findall(r"`([^`]+)`", row)]
     assert {type(command) for command in commands} == set(COMMANDS.values())
 
 
-def test_the_index_names_every_document() -> None:
+def test_index_lists_every_document() -> None:
     index = (ROOT / "docs" / "README.md").read_text()
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").glob("**/*.md")}
     assert not {page for page in pages - {"README.md"} if f"({page})" not in index}
 
 
-def test_the_readmes_python_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_python_in_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(ROOT)
     (block,) = re.findall(
         r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL
     )
     exec(compile(block, "README.md", "exec"), {})
-    seen, position = capsys.readouterr().out.splitlines()
-    assert "car" in seen
+    names, position = capsys.readouterr().out.splitlines()
+    assert "car" in names
     assert float(position.strip("()").split(", ")[2]) < -4.0

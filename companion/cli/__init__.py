@@ -1,4 +1,4 @@
-"""The command line: `companion`, one file for each command that is long; `flags.py` holds what they share."""
+"""The command line `companion`. Long commands have their own file; `flags.py` holds shared parts."""
 
 from vision.gc_pause import gc_paused
 

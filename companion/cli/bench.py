@@ -1,4 +1,4 @@
-"""The command line of measurements: `companion bench detector|latency|setpoints|deadman`."""
+"""The command line of `companion bench detector|latency|setpoints|deadman`."""
 
 from __future__ import annotations
 
@@ -10,28 +10,32 @@ import typer
 
 from companion.cli.flags import plain_errors
 
-bench = typer.Typer(help="Measure on this machine. Figures, never verdicts.", no_args_is_help=True)
+bench = typer.Typer(help="Measure performance on this machine.", no_args_is_help=True)
 
-_JSON = Annotated[bool, typer.Option("--json", help="one JSON object")]
+_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 @bench.command("detector")
 def bench_detector(
-    model: Annotated[str, typer.Option(help="a checkpoint, or an exported file")] = "default",
+    model: Annotated[str, typer.Option(help="Checkpoint or exported file.")] = "default",
     runtime: Annotated[
         str | None,
-        typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto; else all that are installed"),
+        typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: all installed."),
     ] = None,
-    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    frame: Annotated[str, typer.Option(help="size of the pictures, WIDTHxHEIGHT")] = "640x480",
-    frames: Annotated[int, typer.Option(min=5, help="measured, after a warm-up")] = 100,
-    threads: Annotated[int | None, typer.Option(min=1, help="of each runtime; else its own choice")] = None,
-    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "auto",
-    classes: Annotated[str | None, typer.Option(help="only these: names or ids, comma separated")] = None,
-    against: Annotated[Path | None, typer.Option(help="an earlier --json result to compare with")] = None,
+    image_size: Annotated[
+        int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
+    ] = 640,
+    frame: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT.")] = "640x480",
+    frames: Annotated[int, typer.Option(min=5, help="Number of frames after a warm-up.")] = 100,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: the runtime's.")] = None,
+    precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
+    classes: Annotated[
+        str | None, typer.Option(help="Classes to detect: names or ids, comma separated. Default: all.")
+    ] = None,
+    against: Annotated[Path | None, typer.Option(help="Earlier --json result to compare with.")] = None,
     as_json: _JSON = False,
 ) -> None:
-    """Milliseconds a frame, pixels in, boxes out, of each runtime, measured in turn."""
+    """Measure the time per frame of each runtime. Milliseconds from pixels to boxes."""
     from companion.bench.detector import BenchError, measure_detectors, read_result, table
     from vision.runtimes.base import RUNTIMES, installed
 
@@ -63,11 +67,13 @@ def bench_detector(
 
 @bench.command("latency")
 def bench_latency(
-    seconds: Annotated[float, typer.Option(min=1, help="measured, in flight")] = 10.0,
-    driver: Annotated[str, typer.Option(help="mavsdk or pymavlink")] = "mavsdk",
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Duration of the measurement in flight, seconds.")
+    ] = 10.0,
+    driver: Annotated[str, typer.Option(help="Driver: mavsdk or pymavlink.")] = "mavsdk",
     as_json: _JSON = False,
 ) -> None:
-    """From a frame's capture to the first setpoint that knows of it, with the built-in vehicle."""
+    """Measure the latency from frame to setpoint. Flies the simulated vehicle."""
     from companion.bench.latency import measure_latency
     from companion.bus.session import BusError
     from companion.perception.supervisor import PerceptionStartError
@@ -81,12 +87,12 @@ def bench_latency(
 
 @bench.command("setpoints")
 def bench_setpoints(
-    seconds: Annotated[float, typer.Option(min=1)] = 10.0,
-    rate_hz: Annotated[float, typer.Option(min=5, max=250)] = 50.0,
-    load: Annotated[int, typer.Option(min=0, help="busy processes beside the loop")] = 2,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 10.0,
+    rate_hz: Annotated[float, typer.Option(min=5, max=250, help="Setpoint rate, Hz.")] = 50.0,
+    load: Annotated[int, typer.Option(min=0, help="Number of CPU-bound processes beside the loop.")] = 2,
     as_json: _JSON = False,
 ) -> None:
-    """Spacing of setpoints as a receiver sees them, while other processes keep every core busy."""
+    """Measure setpoint spacing under CPU load."""
     from companion.bench.setpoints import measure_setpoints
 
     _print_figures(measure_setpoints(seconds, rate_hz=rate_hz, load=load), as_json)
@@ -94,10 +100,10 @@ def bench_setpoints(
 
 @bench.command("deadman")
 def bench_deadman(
-    runs: Annotated[int, typer.Option(min=1, help="flights of each fault, half a minute each")] = 3,
+    runs: Annotated[int, typer.Option(min=1, help="Number of flights per fault, half a minute each.")] = 3,
     as_json: _JSON = False,
 ) -> None:
-    """Seconds until the vehicle brakes, stands and leaves OFFBOARD when a process of ours hangs or dies."""
+    """Measure the reaction to process faults. Seconds until braking, stop and leaving OFFBOARD."""
     from rich.console import Console
 
     from companion.bench.deadman import deadman_table, measure_deadman

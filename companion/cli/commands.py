@@ -1,7 +1,7 @@
 """The command line: `companion run`, `play`, `demo`, `detect`, `send`, `echo` and the others in ORDER.
 
-Heavy parts are imported when their command runs, so that `companion send` starts at once.
-What a person did wrong is one line on standard error and exit code 2; what did not work out is exit code 1.
+Heavy modules are imported when their command runs, so that `companion send` starts quickly.
+Invalid input prints one line on standard error and exits with code 2; a failed operation exits with code 1.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from vision.object_detector import YOLO
 if TYPE_CHECKING:
     from companion.service import Service
 
-# What concerns a client of a running service.
+# Settings of a client of a running service.
 CLIENT_SETTINGS = ("zenoh", "vehicle.name")
-# Of the help: in the order of use.
+# Order of the commands in the help: by use.
 ORDER = (
     "play",
     "run",
@@ -53,7 +53,7 @@ ORDER = (
 
 app = typer.Typer(
     name="companion",
-    help="See, steer and share: the companion-computer service for PX4 vehicles.",
+    help="Companion-computer service for PX4 and ArduPilot: detection, offboard flight, zenoh.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -66,7 +66,7 @@ settings_command(app)(play)
 app.add_typer(bench, name="bench")
 
 EXIT_FAILED = 1
-_DEMO_S, _DEMO_ELSEWHERE_S = 150.0, 300.0
+_DEMO_S, _DEMO_AUTOPILOT_S = 150.0, 300.0
 
 
 def _print_version(wanted: bool) -> None:
@@ -81,15 +81,15 @@ def _print_version(wanted: bool) -> None:
 def every_command(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="show the version"),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version."),
     ] = False,
 ) -> None:
-    """What holds for every command."""
+    """Options of every command."""
 
 
 @settings_command(app)
 def run(settings: Settings) -> None:
-    """Run the service: frames, detections, flight, zenoh. Ends on Ctrl-C or SIGTERM."""
+    """Run the service. Ends on Ctrl-C or SIGTERM."""
     with gc_paused():
         from companion.bus.session import BusError
         from companion.operator.line_output import use_for_standard_error
@@ -99,7 +99,7 @@ def run(settings: Settings) -> None:
         from companion.service import Service
         from companion.vehicle.driver import LinkError
 
-    # From here on a reader of standard error that stalls stops nothing; before handlers take the stream.
+    # A stalled reader of standard error must not block the service. Before any handler uses the stream.
     output = use_for_standard_error()
     logging.basicConfig(
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
@@ -111,28 +111,27 @@ def run(settings: Settings) -> None:
         asyncio.run(_run_until_signal(settings, service))
 
 
-def _keep_what_is_loaded() -> None:
-    """From now on the garbage collector passes over what was loaded: looking through it holds a setpoint up.
+def _freeze_loaded_objects() -> None:
+    """Exclude all loaded objects from garbage collection.
 
-    All that this process imported takes it 15 ms.
+    A full collection of everything imported takes 15 ms, which would delay a setpoint.
     """
     gc.collect()
     gc.freeze()
 
 
-def _warn_synthetic_model(looked_at: Iterable[tuple[str, str]]) -> None:
-    """Say once that the bundled model is not for real pictures, if it is to look at any.
+def _warn_synthetic_model(detectors: Iterable[tuple[str, str]]) -> None:
+    """Warn once if the bundled model processes real images.
 
     Args:
-        looked_at: (address of a source, model) of each detector. The simulator's camera is read from shared
-            memory; what comes from anywhere else may be a photograph.
+        detectors: (source URI, model) of each detector. The simulated camera is read from shared memory; any
+            other source may have real images.
     """
-    real = [model for uri, model in looked_at if uri != NO_SOURCE and not uri.startswith("shm://")]
+    real = [model for uri, model in detectors if uri != NO_SOURCE and not uri.startswith("shm://")]
     if DEFAULT_MODEL in real:
         typer.echo(
-            f"companion: the bundled model '{DEFAULT_MODEL}' knows only scenes drawn by mavlink-sim and is "
-            "wrong about real pictures; for those run `companion models pull yolo11n`, then use "
-            "--model yolo11n",
+            f"companion: the bundled model '{DEFAULT_MODEL}' is trained on rendered scenes only and does not "
+            "work on real images; run `companion models pull yolo11n`, then use --model yolo11n",
             err=True,
         )
 
@@ -141,17 +140,17 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
     loop = asyncio.get_running_loop()
 
     def on_ready() -> None:
-        _keep_what_is_loaded()
-        views = [settings.of_view(name) for name in (None, *settings.cameras)]
+        _freeze_loaded_objects()
+        cameras = [settings.of_view(name) for name in (None, *settings.cameras)]
         _warn_synthetic_model(
-            (view.source.uri, view.detector.model)
-            for view in views
-            if view.detector.enabled and view.detector.kind == YOLO
+            (camera.source.uri, camera.detector.model)
+            for camera in cameras
+            if camera.detector.enabled and camera.detector.kind == YOLO
         )
 
     running = asyncio.ensure_future(service.run(on_ready))
     for number in (signal.SIGINT, signal.SIGTERM):
-        # Before the service is up there is nothing to leave in order: end at once.
+        # Before the service is ready there is nothing to shut down.
         loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
     try:
         await running
@@ -163,30 +162,34 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
 def demo(
     duration: Annotated[
         float | None,
-        typer.Option(min=20, help="give up after so many seconds; default: 150, with --vehicle-url 300"),
+        typer.Option(min=20, help="Time limit, seconds. Default: 150, with --vehicle-url 300."),
     ] = None,
-    output: Annotated[Path, typer.Option(help="where the video and summary.json go")] = Path("demo-output"),
-    seed: Annotated[int, typer.Option(min=0, help="of the world: where the car stands, the wind")] = 1,
+    output: Annotated[Path, typer.Option(help="Folder for the video and summary.json.")] = Path(
+        "demo-output"
+    ),
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the world and the wind.")] = 1,
     vehicle_url: Annotated[
         str | None,
-        typer.Option(help="fly the autopilot that sends to this UDP port instead: udpin://127.0.0.1:14540"),
+        typer.Option(help="Fly the autopilot that sends to this UDP port: udpin://127.0.0.1:14540."),
     ] = None,
     seeds: Annotated[
-        str | None, typer.Option(help="fly many in lockstep instead, without a video: 1..50, or 3,7,9..12")
+        str | None, typer.Option(help="Fly these seeds in lockstep, without a video: 1..50, or 3,7,9..12.")
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="flights at once, with --seeds")] = 1,
+    processes: Annotated[int, typer.Option(min=1, help="Number of parallel flights with --seeds.")] = 1,
     synthetic: Annotated[
-        bool, typer.Option("--synthetic", help="with --seeds: detections made of the truth, no network")
+        bool, typer.Option("--synthetic", help="With --seeds: detections from ground truth, no network.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="with --seeds: one JSON object")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --seeds: print one JSON object.")] = False,
 ) -> None:
-    """Fly a vehicle to a car it has to find: the whole way, from frames to landing.
+    """Fly the demonstration.
 
-    The vehicle is the built-in one. With --vehicle-url it is another autopilot, disarmed on the ground, and
-    the camera is drawn from the position it reports; its parameters are not changed.
+    Takes off, finds a car, approaches it, returns and lands.
+
+    The vehicle is the simulated one. With --vehicle-url it is another autopilot, disarmed on the ground, and
+    the camera is rendered from the position it reports; its parameters are not changed.
     """
     if seeds is not None and vehicle_url is not None:
-        typer.echo("companion: --seeds flies the built-in vehicle; leave out --vehicle-url", err=True)
+        typer.echo("companion: --seeds flies the simulated vehicle; remove --vehicle-url", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     if seeds is not None:
         _fly_seeds(seeds, processes, synthetic=synthetic, as_json=as_json)
@@ -198,22 +201,22 @@ def demo(
     from companion.vehicle.driver import LinkError
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
-    # What the service logs is said here with its time: once is enough.
+    # The service's events are printed here with their time; do not log them as well.
     service = logging.getLogger("companion.service")
     service.propagate = False
     service.addHandler(logging.NullHandler())
     with plain_errors(SimSessionError, LinkError, PerceptionStartError, BusError, OSError):
-        # PX4 comes home at 30 m (RTL_RETURN_ALT), and nobody's parameters are set unasked.
-        limit_s = duration or (_DEMO_S if vehicle_url is None else _DEMO_ELSEWHERE_S)
+        # PX4 returns at 30 m (RTL_RETURN_ALT), and no parameter of the autopilot is changed.
+        limit_s = duration or (_DEMO_S if vehicle_url is None else _DEMO_AUTOPILOT_S)
         summary = run_demo(
             output, seed=seed, limit_s=limit_s, say=_print_with_time(), vehicle_url=vehicle_url
         )
     if not summary.success:
         typer.echo(f"the demonstration failed: {summary.failure}; see {output}", err=True)
         raise typer.Exit(EXIT_FAILED)
-    source = "simulator's truth" if summary.truth == "simulator" else "autopilot's own position"
+    source = "ground truth" if summary.truth == "simulator" else "autopilot's own position"
     typer.echo(
-        f"found, reached (stopped {summary.final_range_m} m from the car, by the {source}), landed; "
+        f"found, reached (stopped {summary.final_range_m} m from the car, {source}), landed; "
         f"{summary.detections_published} detection messages. Video: {output / summary.video}"
     )
 
@@ -229,8 +232,8 @@ def _fly_seeds(text: str, processes: int, *, synthetic: bool, as_json: bool) -> 
     flights = []
     for flight in fly_demos(seeds, processes=processes, synthetic=synthetic):
         flights.append(flight)
-        words = "success" if flight.success else f"failed: {flight.failure}"
-        typer.echo(f"seed {flight.seed}: {words}", err=True)
+        outcome = "success" if flight.success else f"failed: {flight.failure}"
+        typer.echo(f"seed {flight.seed}: {outcome}", err=True)
     if as_json:
         typer.echo(json.dumps(demos_summary(flights)))
     else:
@@ -246,39 +249,53 @@ def _print_with_time() -> Callable[[str], None]:
 
 @app.command()
 def detect(
-    source: Annotated[str, typer.Argument(help="file, folder, /dev/video0, FIFO, - or network address")],
-    detector_kind: Annotated[str, typer.Option(help="yolo, or that of a plug-in")] = YOLO,
+    source: Annotated[
+        str, typer.Argument(help="File, folder, /dev/video0, FIFO, - (standard input) or URL.")
+    ],
+    detector_kind: Annotated[str, typer.Option(help="Detector kind: yolo, or that of a plug-in.")] = YOLO,
     model: Annotated[
-        str, typer.Option(help="a checkpoint, an exported file, or a name in the models folder")
+        str, typer.Option(help="Checkpoint, exported file, or name in the models folder.")
     ] = "default",
-    classes: Annotated[str | None, typer.Option(help="only these: names or ids, comma separated")] = None,
-    confidence: Annotated[float, typer.Option(min=0, max=1)] = 0.25,
-    iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
-    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    runtime: Annotated[str, typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto")] = "torch",
-    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "auto",
-    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
-    every: Annotated[int, typer.Option(min=1, help="look at every N-th frame")] = 1,
-    limit: Annotated[int | None, typer.Option(min=1, help="end after so many frames")] = None,
+    classes: Annotated[
+        str | None, typer.Option(help="Classes to detect: names or ids, comma separated. Default: all.")
+    ] = None,
+    confidence: Annotated[float, typer.Option(min=0, max=1, help="Confidence threshold.")] = 0.25,
+    iou: Annotated[float, typer.Option(min=0, max=1, help="NMS IoU threshold.")] = 0.7,
+    image_size: Annotated[
+        int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
+    ] = 640,
+    runtime: Annotated[
+        str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
+    ] = "torch",
+    precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Process every Nth frame.")] = 1,
+    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
     tiles: Annotated[
-        bool, typer.Option("--tiles", help="look at large frames in tiles too: small objects, much slower")
+        bool, typer.Option("--tiles", help="Process large frames in tiles too: small objects, much slower.")
     ] = False,
-    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the frame")] = 640,
-    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
-    track: Annotated[
-        bool, typer.Option("--track", help="tell which object is which from frame to frame")
-    ] = False,
-    save: Annotated[Path | None, typer.Option(help="folder for inputs and annotated images")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object a frame")] = False,
-    width: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
-    height: Annotated[int | None, typer.Option(min=1, help="of raw frames or a camera, pixels")] = None,
-    rate: Annotated[float | None, typer.Option(min=0.1, help="of a camera or raw file, Hz")] = None,
-    pixel_format: Annotated[str | None, typer.Option(help="bgr24, rgb24, gray8, y4m, mjpeg, YUYV…")] = None,
+    tile_size: Annotated[int, typer.Option(min=64, help="Side of a tile, pixels of the frame.")] = 640,
+    tile_overlap: Annotated[
+        float, typer.Option(min=0, max=0.8, help="Overlap of tiles, fraction of a tile.")
+    ] = 0.2,
+    track: Annotated[bool, typer.Option("--track", help="Enable multi-object tracking.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Folder for input and annotated images.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per frame.")] = False,
+    width: Annotated[int | None, typer.Option(min=1, help="Width of raw frames or a camera, pixels.")] = None,
+    height: Annotated[
+        int | None, typer.Option(min=1, help="Height of raw frames or a camera, pixels.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.1, help="Frame rate of a camera or raw file, Hz.")
+    ] = None,
+    pixel_format: Annotated[
+        str | None, typer.Option(help="Pixel format: bgr24, rgb24, gray8, y4m, mjpeg, YUYV…")
+    ] = None,
     plugins_modules: Annotated[
-        str | None, typer.Option(help="modules or names of plug-ins to load, comma separated")
+        str | None, typer.Option(help="Plug-ins to load: modules or names, comma separated.")
     ] = None,
 ) -> None:
-    """Detect objects in every frame of a source; one line a frame on standard output."""
+    """Detect objects in the frames of a source. Prints one line per frame."""
     with gc_paused():
         from companion.detect import detect_source
         from companion.plugins import PluginError, load_plugins
@@ -289,14 +306,14 @@ def detect(
         from vision.tracking import Tracker, TrackerSettings
 
     logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
-    following = TrackerSettings(keep_confidence=confidence)
+    tracking = TrackerSettings(keep_confidence=confidence)
     with plain_errors(PluginError, ValueError):  # CheckpointError is a ValueError
         load_plugins(parse_words(plugins_modules))
         wanted = DetectorSettings(
             model,
             classes=parse_classes(classes),
-            # A tracker wants to see the weak ones too, and leaves them out again.
-            confidence=min(confidence, following.low_confidence) if track else confidence,
+            # A tracker also uses weak detections, and drops those without a track.
+            confidence=min(confidence, tracking.low_confidence) if track else confidence,
             iou=iou,
             image_size=image_size,
             precision=precision,  # type: ignore[arg-type]
@@ -306,9 +323,9 @@ def detect(
         detector = open_detector(detector_kind, wanted)
         if runtime == "auto" and detector.runtime is not None:
             typer.echo(f"companion: on {detector.runtime} ({detector.reason})", err=True)
-        looking: FrameDetector = detector
+        frame_detector: FrameDetector = detector
         if tiles:
-            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
+            frame_detector = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
         settings = SourceSettings(
             width=width, height=height, rate_hz=rate, pixel_format=pixel_format, every_frame=True
         )
@@ -316,28 +333,28 @@ def detect(
     with plain_errors(SourceError, OSError), open_source(source, settings) as frames:
         if detector_kind == YOLO:
             _warn_synthetic_model([(source, model)])
-        looked_at = detect_source(
+        processed = detect_source(
             frames,
-            looking,
+            frame_detector,
             every=every,
             limit=limit,
             save=save,
             as_json=as_json,
-            tracker=Tracker(following) if track else None,
+            tracker=Tracker(tracking) if track else None,
             write=write,
         )
-    if not looked_at:
-        typer.echo(f"companion: {source} had no frames", err=True)
+    if not processed:
+        typer.echo(f"companion: {source}: contains no frames", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
 
 
 def parse_words(text: str | None) -> list[str]:
-    """`a, b` as a list; empty for None."""
+    """Split `a, b` into a list; empty for None."""
     return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
 def parse_classes(text: str | None) -> tuple[str | int, ...] | None:
-    """`person,car` or `0,2` as a detector takes them; None for all."""
+    """Parse `person,car` or `0,2` into class names and ids; None for all."""
     if text is None or not text.strip():
         return None
     return tuple(int(word) if word.isdigit() else word for word in parse_words(text))
@@ -345,19 +362,25 @@ def parse_classes(text: str | None) -> tuple[str | int, ...] | None:
 
 @app.command()
 def train(
-    output: Annotated[Path, typer.Option(help="what to write: NAME.safetensors and NAME.yaml")] = Path(
+    output: Annotated[Path, typer.Option(help="Output: NAME.safetensors and NAME.yaml.")] = Path(
         "runs/model.safetensors"
     ),
-    seed: Annotated[int | None, typer.Option(min=0, help="of weights and scenes; else the recipe's")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="a shorter or longer course")] = None,
-    hours: Annotated[float | None, typer.Option(min=0.001, help="stop after so long")] = None,
-    workers: Annotated[int | None, typer.Option(min=0, help="processes that draw scenes")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of torch")] = None,
-    resume: Annotated[bool, typer.Option(help="go on from OUTPUT's training state")] = False,
-    start: Annotated[Path | None, typer.Option(help="weights to refine, instead of the first course")] = None,
-    held_out: Annotated[int, typer.Option(min=1, help="scenes to judge the result on")] = 400,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Random seed of weights and scenes. Default: the recipe's.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Number of training steps.")] = None,
+    hours: Annotated[float | None, typer.Option(min=0.001, help="Time limit, hours.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Number of processes that render scenes.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of torch.")] = None,
+    resume: Annotated[bool, typer.Option(help="Continue from OUTPUT's training state.")] = False,
+    start: Annotated[
+        Path | None, typer.Option(help="Weights to refine, instead of the first training.")
+    ] = None,
+    held_out: Annotated[int, typer.Option(min=1, help="Number of scenes for the evaluation.")] = 400,
 ) -> None:
-    """Train the default detector on drawn scenes, judge it on held-out ones, write it with its score."""
+    """Train the default detector. Trains on rendered scenes and evaluates on held-out ones."""
     from companion.train import train_default
     from vision.yolo.safe_pickle import CheckpointError
 
@@ -382,7 +405,7 @@ def train(
 
 @settings_command(app)
 def config(settings: Settings) -> None:
-    """Print the effective settings as a TOML file with a comment on every key."""
+    """Print the effective settings. The output is a TOML file with a comment on every key."""
     from companion.settings.reading import to_toml
 
     typer.echo(to_toml(settings), nl=False)
@@ -391,10 +414,10 @@ def config(settings: Settings) -> None:
 @settings_command(app, "plugins")
 def commands(
     settings: Settings,
-    as_json: Annotated[bool, typer.Option("--json", help="as JSON Schema")] = False,
-    as_markdown: Annotated[bool, typer.Option("--markdown", help="as tables for documentation")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON Schema.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown tables.")] = False,
 ) -> None:
-    """List what `companion send` takes, plug-ins included: words, arguments, units and ranges."""
+    """List the flight commands. Prints arguments, units and ranges, including those of plug-ins."""
     from companion.guidance.grammar import describe, json_schema, markdown
     from companion.plugins import PluginError, load_plugins
 
@@ -413,16 +436,18 @@ def _known_commands() -> str:
 @settings_command(app, *CLIENT_SETTINGS, epilog=_known_commands)
 def send(
     settings: Settings,
-    command: Annotated[str, typer.Argument(help='such as "seek car" or "approach person distance=3"')],
-    connect: Annotated[str | None, typer.Option(help="zenoh endpoint of the service or its router")] = None,
-    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for the outcome")] = 300.0,
+    command: Annotated[
+        str, typer.Argument(help='Command, for example "seek car" or "approach person distance=3".')
+    ],
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the outcome.")] = 300.0,
 ) -> None:
-    """Send one command to a running service and wait for its outcome."""
+    """Send a command to a running service. Waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
 
     with plain_errors(NoAnswerError):
-        where = client_settings(settings.zenoh, (connect,) if connect else ())
-        with open_client(where) as session:
+        client = client_settings(settings.zenoh, (connect,) if connect else ())
+        with open_client(client) as session:
             reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
     typer.echo(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
     if not reply["success"]:
@@ -432,11 +457,11 @@ def send(
 @settings_command(app, *CLIENT_SETTINGS)
 def echo(
     settings: Settings,
-    key: Annotated[str, typer.Argument(help="a topic (labels), or a zenoh key with wildcards")] = "**",
-    connect: Annotated[str | None, typer.Option(help="zenoh endpoint of the service or its router")] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="end after so many messages")] = None,
+    key: Annotated[str, typer.Argument(help="Topic (labels), or zenoh key with wildcards.")] = "**",
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of messages.")] = None,
 ) -> None:
-    """Print what a running service publishes: key and message, one line each."""
+    """Print the messages of a running service. One line each: key and message."""
     import queue
 
     from companion.bus.client import NoAnswerError, check_topic, client_settings, listen, open_client
@@ -445,8 +470,8 @@ def echo(
     with plain_errors(ValueError):
         check_topic(key)
     with plain_errors(NoAnswerError):
-        where = client_settings(settings.zenoh, (connect,) if connect else ())
-        with open_client(where) as session:
+        client = client_settings(settings.zenoh, (connect,) if connect else ())
+        with open_client(client) as session:
             subscriber = listen(session, key, lambda name, text: messages.put((name, text)))
             try:
                 printed = 0
@@ -460,17 +485,17 @@ def echo(
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-def _place(command: typer.models.CommandInfo) -> int:
+def _help_position(command: typer.models.CommandInfo) -> int:
     name = command.name or getattr(command.callback, "__name__", "")
     return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
-app.registered_commands.sort(key=_place)
+app.registered_commands.sort(key=_help_position)
 
 
 def main() -> None:
-    """The console script."""
-    # The reader of our output may go (`| head`): end quietly, as other programs of a pipeline do.
+    """Run the console script."""
+    # End quietly when the reader of a pipe has gone (`| head`).
     if sys.argv[1:2] in (["detect"], ["echo"]):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     app()

@@ -15,23 +15,35 @@ from companion.cli.flags import plain_errors
 
 
 def evaluate(
-    dataset: Annotated[Path, typer.Argument(help="a YOLO-format folder or data.yaml, or a COCO JSON")],
-    model: Annotated[str, typer.Option(help="a checkpoint, or a name in the models folder")] = "default",
-    split: Annotated[str | None, typer.Option(help="of a data.yaml: train, val or test; else val")] = None,
-    images: Annotated[Path | None, typer.Option(help="folder of a COCO file's images")] = None,
-    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    iou: Annotated[float, typer.Option(min=0, max=1, help="overlap above which boxes are one")] = 0.7,
-    runtime: Annotated[str, typer.Option(help="torch, onnxruntime, openvino, tensorrt or auto")] = "torch",
-    precision: Annotated[str, typer.Option(help="auto, float32, bfloat16 or float16")] = "float32",
-    threads: Annotated[int | None, typer.Option(min=1, help="processor threads of the network")] = None,
-    tiles: Annotated[bool, typer.Option("--tiles", help="look in tiles too, as `detect --tiles`")] = False,
-    tile_size: Annotated[int, typer.Option(min=64, help="side of a tile, pixels of the image")] = 640,
-    tile_overlap: Annotated[float, typer.Option(min=0, max=0.8, help="of tiles, share of a tile")] = 0.2,
-    limit: Annotated[int | None, typer.Option(min=1, help="only the first so many images")] = None,
-    misses: Annotated[Path, typer.Option(help="the picture of the worst misses")] = Path("misses.png"),
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    dataset: Annotated[Path, typer.Argument(help="YOLO-format folder, data.yaml or COCO JSON.")],
+    model: Annotated[str, typer.Option(help="Checkpoint, or name in the models folder.")] = "default",
+    split: Annotated[
+        str | None, typer.Option(help="Split of a data.yaml: train, val or test. Default: val.")
+    ] = None,
+    images: Annotated[Path | None, typer.Option(help="Image folder of a COCO file.")] = None,
+    image_size: Annotated[
+        int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
+    ] = 640,
+    iou: Annotated[float, typer.Option(min=0, max=1, help="NMS IoU threshold.")] = 0.7,
+    runtime: Annotated[
+        str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
+    ] = "torch",
+    precision: Annotated[
+        str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")
+    ] = "float32",
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of the network.")] = None,
+    tiles: Annotated[
+        bool, typer.Option("--tiles", help="Process images in tiles too, as `detect --tiles`.")
+    ] = False,
+    tile_size: Annotated[int, typer.Option(min=64, help="Side of a tile, pixels of the image.")] = 640,
+    tile_overlap: Annotated[
+        float, typer.Option(min=0, max=0.8, help="Overlap of tiles, fraction of a tile.")
+    ] = 0.2,
+    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of images.")] = None,
+    misses: Annotated[Path, typer.Option(help="Output image of the worst misses.")] = Path("misses.png"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Judge a model on a labelled data set: mAP50 and mAP50-95, per class too, and the worst misses."""
+    """Evaluate a model on a labelled data set. Prints mAP50 and mAP50-95, overall and per class."""
     from companion.evaluate import (
         JUDGED_CONFIDENCE,
         evaluate_dataset,
@@ -60,11 +72,11 @@ def evaluate(
             threads=threads,
             runtime=runtime,  # type: ignore[arg-type]
         )
-        looking: FrameDetector = detector
+        frame_detector: FrameDetector = detector
         if tiles:
-            looking = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
-        evaluation = evaluate_dataset(data, looking, map_classes(detector.class_names, data))
-        shown = write_sheet(evaluation, misses)
+            frame_detector = TiledDetector(detector, tile_size=tile_size, overlap=tile_overlap)
+        evaluation = evaluate_dataset(data, frame_detector, map_classes(detector.class_names, data))
+        has_sheet = write_sheet(evaluation, misses)
     if as_json:
         settings = {
             "model": model,
@@ -74,10 +86,10 @@ def evaluate(
             "precision": detector.precision,
             "tiles": tiles,
         }
-        sheet = str(misses) if shown else None
+        sheet = str(misses) if has_sheet else None
         typer.echo(json.dumps({**settings, **evaluation.plain(), "misses_picture": sheet}))
         return
     for line in report_lines(evaluation):
         typer.echo(line)
-    if shown:
-        typer.echo(f"the worst misses: {misses}")
+    if has_sheet:
+        typer.echo(f"worst misses: {misses}")

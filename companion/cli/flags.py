@@ -1,4 +1,4 @@
-"""What the commands share: errors for a person, and settings as flags, `--detector-image-size 320`."""
+"""Shared parts of the commands: one-line errors, and settings as flags (`--detector-image-size 320`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from companion.settings.reading import RENAMED, ConfigurationError, Flag, flags,
 EXIT_BAD_INPUT = 2
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
 
-# The ones typed every day; each is also there under its full name.
+# Short names of frequent settings; the full names work too.
 SHORT_NAMES = {
     "source.uri": "--source",
     "detector.model": "--model",
@@ -33,7 +33,7 @@ SHORT_NAMES = {
 
 @contextmanager
 def plain_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Errors of these kinds are for the person at the keyboard: the message, and exit code 2."""
+    """Print errors of these types as one-line messages and exit with code 2."""
     try:
         yield
     except expected as error:
@@ -45,14 +45,14 @@ def plain_errors(*expected: type[Exception]) -> Iterator[None]:
 def settings_command(
     app: typer.Typer, *keys: str, epilog: Callable[[], str] = lambda: ""
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command of `app` that takes `--config` and settings as flags.
+    """Register a function as a command of `app` that takes `--config` and settings as flags.
 
-    Its first parameter, `settings`, is what they come to, checked; `given`, if it has that, is what was given
-    as flags, key → text; the others are its own.
+    The function's first parameter, `settings`, receives the validated settings. An optional parameter `given`
+    receives the flags that were set, key → text. All other parameters are the command's own.
 
     Args:
         keys: the settings that are flags, by key (`vehicle.name`) or by section (`zenoh`); none: all.
-        epilog: makes the text behind its help, line by line as it is to be shown.
+        epilog: returns the text after the help, with its line breaks.
     """
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
@@ -63,31 +63,31 @@ def settings_command(
 
 
 class _WithSettings(typer.core.TyperCommand):
-    """Its flags are made when it is run, or its help is asked for: of all commands they are hundreds."""
+    """A command whose settings flags are created on use: for all commands together they are hundreds."""
 
     keys: tuple[str, ...] = ()
     make_epilog: Callable[[], str]
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Its own parameters, the settings, and click's."""
+        """Return the command's parameters, the settings, and click's."""
         parameters = super().get_params(ctx)
         own = len(self.params)
         return [*parameters[:own], *_setting_parameters(self.keys), *parameters[own:]]
 
     def invoke(self, ctx: Any) -> Any:
-        """Run it; what was given for the settings goes by way of the context."""
+        """Run the command; the values of the settings flags are passed in the context."""
         given = {flag.key: ctx.params.pop(name) for name, flag in _flags_by_parameter(self.keys).items()}
         ctx.meta[_GIVEN] = given
         return super().invoke(ctx)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """The epilog is not wrapped."""
+        """Write the epilog without wrapping."""
         if text := type(self).make_epilog():
             formatter.write(f"\n{text}\n")
 
 
 def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """The command as typer shall see it: without `settings`, with `--config`."""
+    """Return the command with the signature for typer: without `settings`, with `--config`."""
     own = inspect.signature(command)
     hints = get_type_hints(command, include_extras=True)
 
@@ -107,7 +107,7 @@ def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
         if name not in ("settings", "given")
     ]
     parameters.append(
-        _option("config_file", Path | None, "--config", help="settings file; else ./companion.toml")
+        _option("config_file", Path | None, "--config", help="Settings file. Default: ./companion.toml.")
     )
     parameters.append(inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context))
     _declare(wrapper, parameters)
@@ -115,7 +115,7 @@ def _given_settings(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
-    """Let typer see these parameters."""
+    """Set the signature that typer reads."""
     function.__signature__ = inspect.Signature(parameters)
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
 
@@ -126,7 +126,7 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
     chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
-    # Former names are flags too, hidden: given, they are an error that names the new one.
+    # Former names are hidden flags; using one is an error that names the new one.
     former = [
         Flag(old, str, None, "") for old, new in RENAMED.items() if new in {flag.key for flag in chosen}
     ]
@@ -135,10 +135,10 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
 
 @functools.cache
 def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
-    """A flag for each setting, made by typer, as those of any command."""
+    """Return an option for each setting, created by typer."""
 
     def settings(**_values: Any) -> None:
-        """A command that is never run: typer makes parameters of commands alone."""
+        """Never run: typer creates parameters only for commands."""
 
     parameters = []
     for name, flag in _flags_by_parameter(keys).items():

@@ -15,15 +15,17 @@ EXIT_FAILED = 1
 
 def mission(
     settings: Settings,
-    file: Annotated[str, typer.Argument(help="a mission file, or the name of one that came along: demo")],
+    file: Annotated[str, typer.Argument(help="Mission file, or the name of a bundled one: demo.")],
     check: Annotated[
         bool,
-        typer.Option("--check", help="only check it, for the detector's classes too, and print the plan"),
+        typer.Option(
+            "--check", help="Only check the file, including the detector's classes, and print the plan."
+        ),
     ] = False,
-    connect: Annotated[str | None, typer.Option(help="zenoh endpoint of the service or its router")] = None,
-    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for the outcome")] = 3600.0,
+    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the outcome.")] = 3600.0,
 ) -> None:
-    """Check a mission file, send it to a running service and wait for its outcome."""
+    """Check and fly a mission file. Sends it to a running service and waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
     from companion.guidance.missions.mission_file import (
         Mission,
@@ -43,9 +45,9 @@ def mission(
             typer.echo(line)
         if check:
             return
-        where = client_settings(settings.zenoh, (connect,) if connect else ())
-        with open_client(where) as session:
-            # With its text: the service may run on another computer.
+        client = client_settings(settings.zenoh, (connect,) if connect else ())
+        with open_client(client) as session:
+            # The text is sent along: the service may run on another computer.
             command = f"{Mission(file)}\n{text}"
             reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
     typer.echo(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
@@ -54,7 +56,7 @@ def mission(
 
 
 def _class_names(settings: Settings) -> tuple[str, ...] | None:
-    """What the configured detector knows; None where nothing is to be detected."""
+    """Return the class names of the configured detector; None if it is disabled."""
     if not settings.detector.enabled:
         return None
     if settings.detector.kind != YOLO:

@@ -1,4 +1,4 @@
-"""The command line of models: `companion models list|info|pull|export|verify`."""
+"""The command line of `companion models list|info|pull|export|verify`."""
 
 from __future__ import annotations
 
@@ -11,29 +11,27 @@ import typer
 
 from companion.cli.flags import plain_errors
 
-models = typer.Typer(
-    help="Models: which there are, what is in a file, fetch, export, verify.", no_args_is_help=True
-)
+models = typer.Typer(help="List, inspect, download, export and verify models.", no_args_is_help=True)
 
-_JSON = Annotated[bool, typer.Option("--json", help="as JSON")]
+_JSON = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 _FOLDER = Annotated[
     Path | None,
-    typer.Option(help="the models folder; else $COMPANION_MODELS_FOLDER, else one in your data folder"),
+    typer.Option(help="Models folder. Default: $COMPANION_MODELS_FOLDER, else one in your data folder."),
 ]
 
 
 @models.command("list")
 def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
-    """The bundled model, those in the models folder, and the official ones that can be fetched by name."""
+    """List bundled, local and official models."""
     from companion.models.info import list_rows
     from vision.model_files import models_folder
 
-    where = folder or models_folder()
-    rows = list_rows(where)
+    searched = folder or models_folder()
+    rows = list_rows(searched)
     if as_json:
-        typer.echo(json.dumps({"folder": str(where), "models": rows}))
+        typer.echo(json.dumps({"folder": str(searched), "models": rows}))
         return
-    typer.echo(f"models folder: {where}")
+    typer.echo(f"models folder: {searched}")
     width = max(len(row["name"]) for row in rows)
     for row in rows:
         size = "       " if row["size_bytes"] is None else f"{row['size_bytes'] / 1e6:5.1f} MB"
@@ -45,14 +43,14 @@ def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
 
 @models.command()
 def info(
-    file: Annotated[str, typer.Argument(help="a checkpoint, `default`, or a name in the models folder")],
-    image_size: Annotated[int, typer.Option(min=32, help="for the GFLOPs, pixels")] = 640,
+    file: Annotated[str, typer.Argument(help="Checkpoint, `default`, or name in the models folder.")],
+    image_size: Annotated[int, typer.Option(min=32, help="Image size for the GFLOPs, pixels.")] = 640,
     runtime: Annotated[
-        str, typer.Option(help="torch, onnxruntime, openvino, tensorrt; auto measures")
+        str, typer.Option(help="Runtime: torch, onnxruntime, openvino, tensorrt or auto.")
     ] = "torch",
     as_json: _JSON = False,
 ) -> None:
-    """What a model file is, and what it computes in here: generation, classes, GFLOPs, licence, precision."""
+    """Describe a model file. Prints family, classes, GFLOPs, licence, runtime and precision."""
     from companion.models.info import info_lines, model_info
     from vision.yolo.safe_pickle import CheckpointError
 
@@ -67,11 +65,13 @@ def info(
 
 @models.command()
 def pull(
-    name: Annotated[str, typer.Argument(help="such as yolov8n; `companion models list` has them all")],
+    name: Annotated[
+        str, typer.Argument(help="Model name, for example yolov8n; see `companion models list`.")
+    ],
     folder: _FOLDER = None,
-    url: Annotated[str | None, typer.Option(help="fetch the same file from here instead")] = None,
+    url: Annotated[str | None, typer.Option(help="Mirror URL of the same file.")] = None,
 ) -> None:
-    """Fetch an official model, check its SHA-256, keep it in the models folder. Goes on where it stopped."""
+    """Download an official model. Verifies its SHA-256 and resumes an interrupted download."""
     import difflib
 
     from companion.models.catalog import KNOWN, LICENCE_NOTES
@@ -80,8 +80,8 @@ def pull(
 
     known = KNOWN.get(name.removesuffix(".pt"))
     if known is None:
-        near = difflib.get_close_matches(name.lower(), KNOWN, n=3, cutoff=0.0)
-        typer.echo(f"companion: no official model is called {name!r}; nearest: {', '.join(near)}", err=True)
+        nearest = difflib.get_close_matches(name.lower(), KNOWN, n=3, cutoff=0.0)
+        typer.echo(f"companion: unknown official model {name!r}; nearest: {', '.join(nearest)}", err=True)
         raise typer.Exit(2)
     typer.echo(f"{known.name}: {LICENCE_NOTES[known.licence]}", err=True)
     with plain_errors(PullError), _DownloadBar(known.file) as progress:
@@ -90,17 +90,21 @@ def pull(
             folder or models_folder(),
             progress=progress,
         )
-    typer.echo(f"{pulled.path} ({'fetched' if pulled.fetched else 'was there'}), SHA-256 {pulled.sha256}")
+    typer.echo(
+        f"{pulled.path} ({'downloaded' if pulled.fetched else 'already present'}), SHA-256 {pulled.sha256}"
+    )
 
 
 @models.command()
 def export(
-    file: Annotated[str, typer.Argument(help="a checkpoint, `default`, or a name in the models folder")],
-    to: Annotated[str, typer.Option(help="onnx, openvino, tensorrt or torchscript")],
-    output: Annotated[Path | None, typer.Option(help="the file to write; else beside the checkpoint")] = None,
-    image_size: Annotated[int, typer.Option(min=32, help="what it is tuned and checked for, pixels")] = 640,
+    file: Annotated[str, typer.Argument(help="Checkpoint, `default`, or name in the models folder.")],
+    to: Annotated[str, typer.Option(help="Format: onnx, openvino, tensorrt or torchscript.")],
+    output: Annotated[Path | None, typer.Option(help="Output file. Default: beside the checkpoint.")] = None,
+    image_size: Annotated[
+        int, typer.Option(min=32, help="Image size for tuning and checking, pixels.")
+    ] = 640,
 ) -> None:
-    """Write a model for another runtime; the file is checked against the model before it is kept."""
+    """Export a model for another runtime. The file is compared with the model before it is kept."""
     from vision.runtimes.base import RuntimeUnusableError
     from vision.runtimes.export import export
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
@@ -116,33 +120,35 @@ def export(
 
 @models.command()
 def verify(
-    source: Annotated[str, typer.Argument(help="the checkpoint")],
-    exported: Annotated[Path, typer.Argument(help="what `companion models export` made of it")],
+    source: Annotated[str, typer.Argument(help="Checkpoint.")],
+    exported: Annotated[Path, typer.Argument(help="File from `companion models export`.")],
     images: Annotated[
-        Path | None, typer.Option(help="folder of pictures to compare on; else drawn scenes")
+        Path | None, typer.Option(help="Folder of images to compare on. Default: rendered scenes.")
     ] = None,
-    count: Annotated[int, typer.Option(min=1, help="how many pictures")] = 8,
-    image_size: Annotated[int, typer.Option(min=32, help="longer side the network sees, pixels")] = 640,
-    map_tolerance: Annotated[float, typer.Option(min=0, help="of raw maps, logits")] = 0.02,
-    box_tolerance: Annotated[float, typer.Option(min=0, help="of the sides of boxes, pixels")] = 0.5,
-    threads: Annotated[int | None, typer.Option(min=1, help="processor threads")] = None,
+    count: Annotated[int, typer.Option(min=1, help="Number of images.")] = 8,
+    image_size: Annotated[
+        int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
+    ] = 640,
+    map_tolerance: Annotated[float, typer.Option(min=0, help="Tolerance of raw maps, logits.")] = 0.02,
+    box_tolerance: Annotated[float, typer.Option(min=0, help="Tolerance of box sides, pixels.")] = 0.5,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
     as_json: _JSON = False,
 ) -> None:
-    """Whether an exported model finds what its source finds. Exit code 1 if not."""
-    from companion.models.verify import parity_lines, sample_pictures, verify
+    """Compare an exported model with its source. Exit code 1 if they differ."""
+    from companion.models.verify import parity_lines, sample_images, verify
     from vision.runtimes.base import RuntimeUnusableError
     from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
-        pictures = sample_pictures(images, count)
-        parity = verify(_path(source), exported, pictures, image_size, threads=threads)
+        samples = sample_images(images, count)
+        parity = verify(_path(source), exported, samples, image_size, threads=threads)
     holds = parity.holds(map_tolerance, box_tolerance)
     if as_json:
         typer.echo(json.dumps({**parity.plain(), "holds": holds}))
     else:
         for line in parity_lines(parity, map_tolerance, box_tolerance):
             typer.echo(line)
-        typer.echo("the same" if holds else "NOT the same")
+        typer.echo("equivalent" if holds else "NOT equivalent")
     if not holds:
         raise typer.Exit(1)
 
@@ -156,7 +162,7 @@ def _path(model: str) -> Path:
 
 
 class _DownloadBar:
-    """Bytes, speed and time left on standard error, where somebody looks."""
+    """Bytes, speed and remaining time on standard error, if it is a terminal."""
 
     def __init__(self, what: str) -> None:
         self._what = what

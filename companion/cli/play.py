@@ -15,7 +15,7 @@ from companion.settings import Settings
 from vision.gc_pause import gc_paused
 
 EXIT_FAILED = 1
-# What play brings itself.
+# Sections that play sets itself.
 _OWN = ("source.", "camera.")
 
 
@@ -23,29 +23,33 @@ def play(
     settings: Settings,
     given: Mapping[str, str],
     scene: Annotated[
-        str | None, typer.Option(help="a scene file, or an example's name: village, obstacle_course…")
+        str | None, typer.Option(help="Scene file, or name of a bundled scene: village, obstacle_course…")
     ] = None,
     vehicles: Annotated[
         int,
-        typer.Option(min=1, max=8, help="built-in vehicles, with a service each; the first has the camera"),
+        typer.Option(
+            min=1, max=8, help="Number of simulated vehicles, one service each; the first has the camera."
+        ),
     ] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="of the world and the wind")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the world and the wind.")] = 1,
     autopilot: Annotated[
-        Literal["px4", "ardupilot"], typer.Option(help="firmware that the built-in vehicle emulates")
+        Literal["px4", "ardupilot"], typer.Option(help="Autopilot firmware to emulate.")
     ] = "px4",
 ) -> None:
-    """Start a vehicle, its camera and the service together, ready for commands until Ctrl-C.
+    """Run vehicle, camera and service together.
 
-    With --vehicle-url the vehicle is the autopilot that sends to that UDP port, and a camera in the built-in
-    world is drawn from its pose.
+    Takes commands on the terminal and by `companion send` until Ctrl-C.
+
+    With --vehicle-url the vehicle is the autopilot that sends to that UDP port. A camera in the built-in
+    world is rendered from its pose.
     """
-    if taken := [key for key in given if key.startswith(_OWN)]:
-        typer.echo(f"companion: {taken[0]}: play brings its own camera; leave it out", err=True)
+    if refused := [key for key in given if key.startswith(_OWN)]:
+        typer.echo(f"companion: {refused[0]}: play uses its own camera; remove the option", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     url = given.get("vehicle.url")
     if url is not None and vehicles > 1:
         typer.echo(
-            f"companion: --vehicles {vehicles}: with --vehicle-url there is one vehicle; leave it out",
+            f"companion: --vehicles {vehicles}: expected one vehicle with --vehicle-url; remove the option",
             err=True,
         )
         raise typer.Exit(EXIT_BAD_INPUT)
@@ -64,7 +68,7 @@ def play(
     use_for_standard_error()
     level = settings.log.level.upper() if "log.level" in given else "WARNING"
     logging.basicConfig(level=level, format="companion: %(message)s", stream=sys.stderr)
-    # What the service logs is printed here with its time: once is enough.
+    # The service's events are printed here with their time; do not log them as well.
     service = logging.getLogger("companion.service")
     service.propagate = False
     service.addHandler(logging.NullHandler())

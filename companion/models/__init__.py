@@ -1,1 +1,1 @@
-"""Models: which there are, fetching them, what is in one, whether its exports agree."""
+"""Model files: list, download, description, comparison of exports."""

@@ -1,8 +1,8 @@
-"""The official models that can be had by name, each with what its file must be.
+"""The official models for download by name, with size and SHA-256.
 
-Size and SHA-256 are those of the assets of Ultralytics' release v8.4.0, taken from published tables of them.
-Every digest was found in at least two independent ones, but for the scales m, l and x of YOLOv5u: those are
-of one table, whose n and s others confirm.
+They are those of the assets of Ultralytics' release v8.4.0, from published tables. Every digest was found in
+at least two independent tables, except the scales m, l and x of YOLOv5u: these are from one table, whose n
+and s others confirm.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ LICENCE_NOTES = {
 
 @dataclass(frozen=True, slots=True)
 class KnownModel:
-    """An official file.
+    """An official model file.
 
     Attributes:
-        name: what `pull` is given; the file is `NAME.pt`.
-        url: where it is published.
+        name: argument of `pull`; the file is `NAME.pt`.
+        url: address of the file.
         size_bytes: of the file.
         sha256: 64 hexadecimal digits.
         licence: SPDX identifier.
-        about: one line.
+        about: one-line description.
     """
 
     name: str
@@ -72,7 +72,7 @@ _PINNED = {
     "yolo26l": (53211173, "9fe3c544f2b19bebad7ea41e76d7ad3d88b7c2f10d11d24430c5311f6b32db26"),
     "yolo26x": (118667365, "9fdd44a31c504547ffb81d2c6d9e6dac3493c8eaa8b0398d3f43bae6c7003e92"),
 }
-_GENERATIONS = {
+_FAMILIES = {
     "yolov5": "YOLOv5u",
     "yolov8": "YOLOv8",
     "yolo11": "YOLO11",
@@ -82,7 +82,7 @@ _GENERATIONS = {
 
 
 def _about(name: str) -> str:
-    return f"{_GENERATIONS[name[:6]]}, scale {name[6]}, 80 classes of COCO"
+    return f"{_FAMILIES[name[:6]]}, scale {name[6]}, 80 classes of COCO"
 
 
 KNOWN: dict[str, KnownModel] = {
@@ -92,5 +92,5 @@ KNOWN: dict[str, KnownModel] = {
 
 
 def known_by_digest(sha256: str) -> KnownModel | None:
-    """The official model whose file has this SHA-256."""
+    """Return the official model whose file has this SHA-256; None if there is none."""
     return next((model for model in KNOWN.values() if model.sha256 == sha256), None)

@@ -1,4 +1,4 @@
-"""`companion models list` and `info`: what is there, and what a model file says of itself."""
+"""`companion models list` and `info`: the available models, and the description of a model file."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from vision.yolo.model_family import describe
 
 @dataclass(frozen=True, slots=True)
 class ModelInfo:
-    """What `info` tells.
+    """Description of a model file.
 
     Attributes:
         file, size_bytes, sha256: of the file that holds the weights.
-        model family, scale: such as YOLOv8 and n; a network of no published size has the scale "own".
-        parameters: numbers that training sets.
-        gflops: a multiplication and an addition each counted, for one image of `image_size` square.
-        end_to_end: the head needs no suppression of overlaps.
+        model_family, scale: for example YOLOv8 and n; an unpublished size has the scale "own".
+        parameters: number of trainable parameters.
+        gflops: multiplications and additions counted separately, for one square image of `image_size` pixels.
+        end_to_end: the head needs no NMS.
         classes: id → name.
-        licence: as the file states it; None where it states none.
-        official: the name under which the catalogue knows this very file; None for any other.
-        runtime, runtime_reason: what runs it on this computer, and why.
-        precision, precision_reason: what that computes in here, and why.
-        stated: whatever else the file tells of itself.
+        licence: as stated in the file; None if missing.
+        official: name of this file in the catalogue; None for other files.
+        runtime, runtime_reason: the runtime on this computer, and the reason.
+        precision, precision_reason: its precision on this computer, and the reason.
+        stated: further metadata in the file.
     """
 
     file: str
@@ -57,11 +57,11 @@ class ModelInfo:
 
 
 def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torch") -> ModelInfo:
-    """Read a checkpoint, describe it, and make it ready to see what it would compute in on this computer.
+    """Read and describe a checkpoint, and load it to determine its precision on this computer.
 
     Raises:
-        CheckpointError: it cannot be read. ValueError: the image size is no multiple of 32.
-        RuntimeUnusableError: the runtime is missing, or does not run it.
+        CheckpointError: it cannot be read. ValueError: the image size is not a multiple of 32.
+        RuntimeUnusableError: the runtime is missing or does not support the model.
     """
     if image_size < 32 or image_size % 32:
         raise ValueError(f"the image size must be a multiple of 32, got {image_size}")
@@ -95,16 +95,16 @@ def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice = "torc
 
 
 def info_lines(info: ModelInfo) -> list[str]:
-    """The same for a person."""
+    """Return the description as text lines."""
     shown_classes = ", ".join(info.classes[:12]) + (", …" if len(info.classes) > 12 else "")
     rows = {
         "file": f"{info.file} ({info.size_bytes} bytes)",
         "sha256": info.sha256,
         "official": f"{info.official} ({KNOWN[info.official].url})"
         if info.official
-        else "no file of the catalogue",
+        else "not in the catalogue",
         "family": f"{info.model_family}, scale {info.scale}",
-        "head": "end to end, without suppression" if info.end_to_end else "with suppression of overlaps",
+        "head": "end to end, without NMS" if info.end_to_end else "with NMS",
         "parameters": f"{info.parameters / 1e6:.2f} million",
         "work": f"{info.gflops:.1f} GFLOPs for {info.image_size}x{info.image_size}",
         "classes": f"{len(info.classes)}: {shown_classes}",
@@ -122,9 +122,7 @@ def info_lines(info: ModelInfo) -> list[str]:
 
 
 def list_rows(folder: Path) -> list[dict[str, Any]]:
-    """Every model there is to name: bundled, kept in `folder`, and known by address; with `state` for
-    each.
-    """
+    """Return every model: bundled, in `folder`, and official; with a `state` each."""
     kept = {path.name: path for path in kept_models(folder)}
     rows: list[dict[str, Any]] = [
         {
@@ -132,7 +130,7 @@ def list_rows(folder: Path) -> list[dict[str, Any]]:
             "state": "bundled",
             "size_bytes": DEFAULT_WEIGHTS.stat().st_size if DEFAULT_WEIGHTS.is_file() else None,
             "licence": "Apache-2.0",
-            "about": "the model of this package, for drawn scenes",
+            "about": "the model of this package, for rendered scenes",
             "path": str(DEFAULT_WEIGHTS),
         }
     ]

@@ -1,8 +1,6 @@
-"""`companion models pull`: one official file, fetched by its address, kept only if it is the one that was
-meant.
+"""`companion models pull`: download one official file and verify its size and SHA-256.
 
-What has come stays in `FILE.partial` when the line breaks, and the next attempt asks for the rest (RFC 9110,
-14.2).
+An interrupted download stays in `FILE.partial`, and the next attempt requests the rest (RFC 9110, 14.2).
 """
 
 from __future__ import annotations
@@ -21,20 +19,20 @@ from vision.yolo.checkpoint_pair import file_sha256
 
 _CHUNK_BYTES = 1 << 16
 _TIMEOUT_S = 30.0
-# A line that breaks is picked up again this often, as long as each attempt brings something.
+# Number of attempts to resume an interrupted download, as long as each one receives data.
 _ATTEMPTS = 5
 
 Progress = Callable[[int, int | None], None]
-"""Called with the bytes that are there and the bytes there will be (None: not known)."""
+"""Called with the received and the total bytes (None: unknown)."""
 
 
 class PullError(Exception):
-    """A model that could not be fetched; the text says why and what to do."""
+    """A model could not be downloaded; the text gives the reason and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pulled:
-    """A model that is there: its file, its SHA-256, and whether it had to be fetched."""
+    """A local model file, its SHA-256, and whether it was downloaded now."""
 
     path: Path
     sha256: str
@@ -47,16 +45,16 @@ def pull(
     *,
     progress: Progress = lambda done, total: None,
 ) -> Pulled:
-    """Have `model` in `folder`.
+    """Download `model` into `folder` unless it is there; verify it.
 
     Raises:
-        PullError: no way to the server, or another file than was meant.
+        PullError: the server cannot be reached, or the file differs.
     """
     target = folder / model.file
     if target.exists():
-        return _already_there(target, model.sha256)
+        return _verify_existing(target, model.sha256)
     if urllib.parse.urlsplit(model.url).scheme not in ("http", "https"):
-        raise PullError(f"{model.url}: only http and https addresses are fetched")
+        raise PullError(f"{model.url}: expected an http or https address")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         partial = target.with_name(f"{target.name}.partial")
@@ -65,9 +63,9 @@ def pull(
         if found != model.sha256:
             partial.unlink()
             raise PullError(
-                f"{model.url} is not the file that was meant: it has the SHA-256 {found}, expected "
-                f"{model.sha256}. It was deleted. If an earlier attempt had been interrupted, pull once "
-                "more; if this comes again, the file was changed, or somebody is between you and the server"
+                f"{model.url}: SHA-256 {found}, expected {model.sha256}; the file was deleted. If an "
+                "earlier attempt was interrupted, pull again; otherwise the file was changed on the server "
+                "or in transit"
             )
         os.replace(partial, target)
     except OSError as error:
@@ -76,25 +74,25 @@ def pull(
 
 
 def manual_instructions(model: KnownModel, target: Path) -> str:
-    """How to get the file without a network here."""
+    """Return instructions for a manual download."""
     return (
-        f"Without a network: download {model.url} elsewhere and put it at {target}. It must have the SHA-256 "
-        f"{model.sha256} and {model.size_bytes} bytes (`sha256sum {target.name}`)"
+        f"Manual download: copy {model.url} to {target}; expected SHA-256 {model.sha256} and "
+        f"{model.size_bytes} bytes (`sha256sum {target.name}`)"
     )
 
 
-def _already_there(target: Path, expected: str) -> Pulled:
+def _verify_existing(target: Path, expected: str) -> Pulled:
     found = file_sha256(target)
     if found != expected:
         raise PullError(
-            f"{target} is there with the SHA-256 {found}, expected {expected}: it is another file, or "
-            "damaged. Move it away and pull again"
+            f"{target}: SHA-256 {found}, expected {expected}: another or a damaged file. Move it away and "
+            "pull again"
         )
     return Pulled(target, found, fetched=False)
 
 
 def _fetch_all(model: KnownModel, target: Path, partial: Path, progress: Progress) -> None:
-    """Fetch into `partial` what is missing of it."""
+    """Download the missing part into `partial`."""
     failure = ""
     for _ in range(_ATTEMPTS):
         had = partial.stat().st_size if partial.exists() else 0
@@ -103,7 +101,7 @@ def _fetch_all(model: KnownModel, target: Path, partial: Path, progress: Progres
                 return
             failure = "the connection ended early"
         except urllib.error.HTTPError as error:
-            if error.code == 416 and had:  # What is there is not a beginning of what the server has.
+            if error.code == 416 and had:  # The partial file does not match the server's file.
                 partial.unlink()
                 continue
             raise PullError(
@@ -122,13 +120,13 @@ def _fetch_all(model: KnownModel, target: Path, partial: Path, progress: Progres
             break
     have = partial.stat().st_size if partial.exists() else 0
     raise PullError(
-        f"{model.url}: interrupted after {have} of {model.size_bytes} bytes ({failure}). They are kept: pull "
-        f"again to go on. {manual_instructions(model, target)}"
+        f"{model.url}: interrupted after {have} of {model.size_bytes} bytes ({failure}). Pull again "
+        f"to resume. {manual_instructions(model, target)}"
     )
 
 
 def _fetch(model: KnownModel, partial: Path, progress: Progress) -> bool:
-    """One request; whether the file is whole then."""
+    """Send one request; return whether the file is complete."""
     had = partial.stat().st_size if partial.exists() else 0
     if had and had == model.size_bytes:
         return True
@@ -138,13 +136,11 @@ def _fetch(model: KnownModel, partial: Path, progress: Progress) -> bool:
     request = urllib.request.Request(model.url, headers=headers)
     with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as response:
         if response.status != 206 or not _continues(response.headers.get("Content-Range"), had):
-            had = 0  # The server sends the whole file, or another part than was asked for.
+            had = 0  # The server sends the whole file, or a part that was not requested.
         length = response.headers.get("Content-Length")
         total = had + int(length) if length is not None and length.isdecimal() else None
         if total is not None and total != model.size_bytes:
-            raise PullError(
-                f"{model.url} has {total} bytes there, expected {model.size_bytes}: it is another file"
-            )
+            raise PullError(f"{model.url}: {total} bytes, expected {model.size_bytes}: another file")
         done = had
         with partial.open("r+b" if had else "wb") as file:
             file.seek(had)
@@ -152,7 +148,9 @@ def _fetch(model: KnownModel, partial: Path, progress: Progress) -> bool:
             while chunk := response.read(_CHUNK_BYTES):
                 done += len(chunk)
                 if done > model.size_bytes:
-                    raise PullError(f"{model.url} does not end after {done} bytes: it is another file")
+                    raise PullError(
+                        f"{model.url}: more than {done} bytes, expected {model.size_bytes}: another file"
+                    )
                 file.write(chunk)
                 progress(done, total)
             file.flush()
@@ -165,5 +163,5 @@ def _continues(content_range: str | None, start: int) -> bool:
 
 
 def at_address(model: KnownModel, url: str) -> KnownModel:
-    """The same model from another server: a mirror must have the same file."""
+    """Return the same model at another address: a mirror must have the same file."""
     return replace(model, url=url)

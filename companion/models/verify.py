@@ -1,4 +1,4 @@
-"""`companion models verify`: does an exported model say what its source says, on real pictures?"""
+"""`companion models verify`: compare the outputs of an exported model with its source on sample images."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from vision.yolo.metrics import box_iou
 from vision.yolo.postprocess import Boxes, Candidates, boxes_of, decode_ltrb
 
 CONFIDENCE = 0.25
-# A box so near the threshold may be said by one and not by the other without meaning anything.
+# A box this close to the threshold may be found by only one of them without significance.
 _CONFIDENCE_MARGIN = 0.02
 _SAMPLE_SIZE = (640, 480)
 
 
 @dataclass(frozen=True, slots=True)
 class Parity:
-    """How far an exported model is from its source.
+    """Differences between an exported model and its source.
 
     Attributes:
-        images: how many pictures were compared.
-        runtime, precision: what ran the exported model.
-        map_difference: largest absolute difference of any raw number, logits.
+        images: number of compared images.
+        runtime, precision: of the exported model.
+        map_difference: largest absolute difference of the raw maps, logits.
         score_difference: largest difference of a class probability, 0..1.
-        box_difference_px: largest difference of a side of a box that both found, pixels of the input.
-        boxes: found by the source above confidence 0.25.
-        unmatched: boxes that only one of the two found, those at the threshold not counted.
-        same_source: whether the export names this very file as what it was made from.
+        box_difference_px: largest difference of a side of a matched box, pixels of the input.
+        boxes: number of boxes of the source above confidence 0.25.
+        unmatched: number of boxes found by only one of the two, except those close to the threshold.
+        same_source: whether the export names this file as its source.
     """
 
     images: int
@@ -57,7 +57,7 @@ class Parity:
         return asdict(self)
 
     def holds(self, map_tolerance: float, box_tolerance_px: float) -> bool:
-        """Whether the two say the same."""
+        """Return whether the differences are within the tolerances and all boxes match."""
         return (
             self.map_difference <= map_tolerance
             and self.box_difference_px <= box_tolerance_px
@@ -65,57 +65,55 @@ class Parity:
         )
 
 
-def sample_pictures(folder: Path | None, count: int) -> Iterator[NDArray[np.uint8]]:
-    """The first pictures of a folder, or as many drawn scenes, each made when it is asked for.
+def sample_images(folder: Path | None, count: int) -> Iterator[NDArray[np.uint8]]:
+    """Return the first images of a folder, or as many rendered scenes, created lazily.
 
     Raises:
-        ValueError: at once, for an empty folder.
+        ValueError: immediately, for an empty folder.
     """
     if folder is None:
         rng = np.random.default_rng(0)
         return (random_scene(rng, *_SAMPLE_SIZE)[0] for _ in range(count))
     files = image_files(folder)[:count]
     if not files:
-        raise ValueError(f"{folder}: has no images")
+        raise ValueError(f"{folder}: contains no images")
     return (read_image(file) for file in files)
 
 
 def verify(
     source_path: Path,
     exported_path: Path,
-    pictures: Iterable[NDArray[np.uint8]],
+    images: Iterable[NDArray[np.uint8]],
     image_size: int = 640,
     *,
     threads: int | None = None,
 ) -> Parity:
-    """Run both on the same pictures: the source with torch in float32, the export with what it is for.
+    """Run both on the same images: the source with torch in float32, the export with its runtime.
 
     Raises:
-        CheckpointError, RuntimeUnusableError: one of the two cannot be read or run.
-        Whatever `pictures` raises, which is not asked for any before that is known.
+        CheckpointError, RuntimeUnusableError: one of the two cannot be read or run; checked before the first
+            image is created.
     """
     source, exported = read_source(source_path), read_source(exported_path)
     if exported.kind is None:
-        raise RuntimeUnusableError(f"{exported_path}: is a checkpoint; give a file that `models export` made")
+        raise RuntimeUnusableError(f"{exported_path}: is a checkpoint, expected a file from `models export`")
     if source.kind is not None:
-        raise RuntimeUnusableError(
-            f"{source_path}: is an export itself; give the checkpoint it was made from"
-        )
+        raise RuntimeUnusableError(f"{source_path}: is an export, expected its checkpoint")
     _check_same_kind(source, exported)
     assert exported.facts is not None
     original = start_runtime(
         source, "torch", precision="float32", threads=threads, image_size=image_size
     ).runtime
     runner = exported.runners()[0]
-    # A plan has its precision built in.
+    # The precision of a plan is fixed.
     precision: Precision = "auto" if exported.kind == "tensorrt" else "float32"
     other = start_runtime(
         exported, runner, precision=precision, threads=threads, image_size=image_size
     ).runtime
     largest = _Largest()
-    for picture in pictures:
-        box = fit(picture.shape[1], picture.shape[0], image_size, stride=max(source.strides))
-        pixels = np.ascontiguousarray(box.apply(picture)).copy()
+    for image in images:
+        box = fit(image.shape[1], image.shape[0], image_size, stride=max(source.strides))
+        pixels = np.ascontiguousarray(box.apply(image)).copy()
         largest.compare(_maps(original, pixels), _maps(other, pixels), original, other)
     return Parity(
         images=largest.images,
@@ -131,30 +129,29 @@ def verify(
 
 
 def parity_lines(parity: Parity, map_tolerance: float, box_tolerance_px: float) -> list[str]:
-    """For a person."""
+    """Return the comparison as text lines."""
     lines = [
-        f"{parity.images} pictures, {parity.runtime} in {parity.precision} against torch in float32",
+        f"{parity.images} images, {parity.runtime} in {parity.precision} against torch in float32",
         f"raw maps       differ by at most {parity.map_difference:.2e} (tolerance {map_tolerance:g})",
         f"probabilities  differ by at most {parity.score_difference:.2e}",
         f"boxes          {parity.boxes} found, sides differ by at most {parity.box_difference_px:.3g} px "
-        f"(tolerance {box_tolerance_px:g}), {parity.unmatched} found by one alone",
+        f"(tolerance {box_tolerance_px:g}), {parity.unmatched} found by only one",
     ]
     if not parity.same_source:
-        lines.append("note: the export says that it was made from another file")
+        lines.append("note: the export names another source file")
     return lines
 
 
 def _check_same_kind(source: ModelSource, exported: ModelSource) -> None:
     if source.class_names != exported.class_names or source.strides != exported.strides:
         raise RuntimeUnusableError(
-            f"{exported.path}: knows {len(exported.class_names)} classes at strides {exported.strides}, "
-            f"{source.path} {len(source.class_names)} at {source.strides}: it is another model "
-            f"(its {KEY} says so)"
+            f"{exported.path}: {len(exported.class_names)} classes at strides {exported.strides} "
+            f"(its {KEY}), expected {len(source.class_names)} at {source.strides} as {source.path}"
         )
 
 
 def _maps(runtime: Runtime, pixels: NDArray[np.uint8]) -> list[LevelOutput]:
-    """With the sides of every cell, which a runtime may leave to be computed for the cells that matter."""
+    """Run inference and compute the sides of all cells, which a runtime may compute only for candidates."""
     levels = runtime.infer(pixels)
     everywhere = [
         Candidates(np.arange(cells), np.zeros(cells, np.float32), np.zeros(cells, np.int64))
@@ -181,9 +178,9 @@ class _Largest:
         for a, b in zip(first, second, strict=True):
             assert a.sides is not None
             assert b.sides is not None
-            for mine, its in ((a.sides, b.sides), (a.classes, b.classes)):
-                # Not a number differs from everything.
-                self.maps = max(self.maps, _worst(mine, its))
+            for expected, found in ((a.sides, b.sides), (a.classes, b.classes)):
+                # NaN differs from everything.
+                self.maps = max(self.maps, _worst(expected, found))
             self.scores = max(self.scores, _worst(_probability(a.classes), _probability(b.classes)))
         self._compare_boxes(
             boxes_of(one.head, first, confidence=CONFIDENCE),
@@ -192,11 +189,11 @@ class _Largest:
 
     def _compare_boxes(self, first: Boxes, second: Boxes) -> None:
         self.boxes += len(first)
-        alike = box_iou(first.xyxy, second.xyxy) * (first.class_id[:, None] == second.class_id[None])
+        overlap = box_iou(first.xyxy, second.xyxy) * (first.class_id[:, None] == second.class_id[None])
         free = np.ones(len(second), np.bool_)
         for index in range(len(first)):
-            best = int(np.where(free, alike[index], -1).argmax()) if len(second) else -1
-            if best >= 0 and free[best] and alike[index, best] > 0.5:
+            best = int(np.where(free, overlap[index], -1).argmax()) if len(second) else -1
+            if best >= 0 and free[best] and overlap[index, best] > 0.5:
                 free[best] = False
                 self.boxes_px = max(self.boxes_px, _worst(first.xyxy[index], second.xyxy[best]))
             elif first.confidence[index] > CONFIDENCE + _CONFIDENCE_MARGIN:

@@ -1,4 +1,4 @@
-"""A source as a plug-in: `--source square://640x480?rate=10` is a red square that goes round."""
+"""A source plug-in: `--source square://640x480?rate=10` is a red square moving in a circle."""
 
 import math
 import re
@@ -27,13 +27,13 @@ class SquareCapture(Capture):
         return RawFrame(image, media_s=time_s)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close."""
 
 
-@source("square", "a red square that goes round")
+@source("square", "a red square moving in a circle")
 def open_square(uri: str, settings: SourceSettings) -> Source:
     match = re.fullmatch(r"square://(\d{2,4})x(\d{2,4})(?:\?rate=([1-9]\d{0,2}))?", uri)
     if match is None or min(int(match[1]), int(match[2])) <= SIDE_PX:
-        raise SourceError(f"{uri}: expected square://WIDTHxHEIGHT?rate=HZ, such as square://640x480?rate=10")
+        raise SourceError(f"{uri}: expected square://WIDTHxHEIGHT?rate=HZ, e.g. square://640x480?rate=10")
     width, height, rate_hz = int(match[1]), int(match[2]), float(match[3] or settings.rate_hz or 10)
     return LatestSource(uri, lambda: SquareCapture(width, height, rate_hz), settings, paced=True)

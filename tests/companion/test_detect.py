@@ -20,10 +20,10 @@ RATE_HZ = 5.0
 SHOWN = 20
 
 
-class WhiteThings:
-    """Finds what is white in a picture."""
+class WhiteBlobDetector:
+    """Detects white areas."""
 
-    class_names = ("thing",)
+    class_names = ("blob",)
     last_timing = Timing(0.0, 0.0, 0.0)
 
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
@@ -36,17 +36,17 @@ class WhiteThings:
 
 @pytest.fixture
 def two_squares(tmp_path: Path) -> Path:
-    """One goes to the right, one down and away; 3 s later, longer than a track lives, another comes."""
+    """One square moves right, one down out of the image; another appears 3 s later, after `max_age_s`."""
     path = tmp_path / "squares.avi"
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE_HZ, (160, 120))
     for index in range(SHOWN + 16):
-        picture = np.zeros((120, 160, 3), np.uint8)
+        image = np.zeros((120, 160, 3), np.uint8)
         if index < SHOWN:
-            picture[10:30, 4 + 3 * index : 24 + 3 * index] = 255
-            picture[50 + 2 * index : 70 + 2 * index, 120:140] = 255
+            image[10:30, 4 + 3 * index : 24 + 3 * index] = 255
+            image[50 + 2 * index : 70 + 2 * index, 120:140] = 255
         elif index == SHOWN + 15:
-            picture[10:30, 4 + 3 * SHOWN : 24 + 3 * SHOWN] = 255
-        video.write(picture)
+            image[10:30, 4 + 3 * SHOWN : 24 + 3 * SHOWN] = 255
+        video.write(image)
     video.release()
     return path
 
@@ -55,33 +55,39 @@ def tracks_of(path: Path, **options: Any) -> list[list[dict[str, Any]]]:
     lines: list[str] = []
     with open_source(str(path)) as source:
         tracker = Tracker(TrackerSettings())
-        detect_source(source, WhiteThings(), as_json=True, tracker=tracker, write=lines.append, **options)
+        detect_source(
+            source, WhiteBlobDetector(), as_json=True, tracker=tracker, write=lines.append, **options
+        )
     return [json.loads(line)["detections"] for line in lines]
 
 
-def test_every_object_keeps_its_number_and_a_later_one_gets_its_own(two_squares: Path) -> None:
+def test_objects_keep_ids_and_a_later_one_gets_a_new_id(two_squares: Path) -> None:
     started_s = time.monotonic()
     frames = tracks_of(two_squares)
     read_in_s = time.monotonic() - started_s
-    by_place = [{record["center"][0] > 118: record["track_id"] for record in seen} for seen in frames[:SHOWN]]
-    assert by_place == [{False: 1, True: 2}] * SHOWN or by_place == [{False: 2, True: 1}] * SHOWN
+    by_side = [
+        {record["center"][0] > 118: record["track_id"] for record in found} for found in frames[:SHOWN]
+    ]
+    assert by_side == [{False: 1, True: 2}] * SHOWN or by_side == [{False: 2, True: 1}] * SHOWN
     assert [record["track_state"] for record in frames[SHOWN - 1]] == ["confirmed", "confirmed"]
-    # By the recording's time it is gone for 3 s, however fast the recording is read.
+    # It is absent for 3 s of the recording's time, however fast the recording is read.
     assert [record["track_id"] for record in frames[-1]] == [3], f"read in {read_in_s:.1f} s"
 
 
-def test_people_read_the_number_and_whether_it_counts(two_squares: Path) -> None:
+def test_text_lines_show_id_and_confirmation(two_squares: Path) -> None:
     lines: list[str] = []
     with open_source(str(two_squares)) as source:
-        detect_source(source, WhiteThings(), limit=6, tracker=Tracker(TrackerSettings()), write=lines.append)
-    assert "thing 0.90 #1?, thing 0.90 #2?" in lines[0]
-    assert "thing 0.90 #1, thing 0.90 #2" in lines[-1] or "thing 0.90 #2, thing 0.90 #1" in lines[-1]
+        detect_source(
+            source, WhiteBlobDetector(), limit=6, tracker=Tracker(TrackerSettings()), write=lines.append
+        )
+    assert "blob 0.90 #1?, blob 0.90 #2?" in lines[0]
+    assert "blob 0.90 #1, blob 0.90 #2" in lines[-1] or "blob 0.90 #2, blob 0.90 #1" in lines[-1]
 
 
-def test_without_a_tracker_nothing_is_said_of_tracks(two_squares: Path) -> None:
+def test_without_tracker_there_are_no_track_fields(two_squares: Path) -> None:
     lines: list[str] = []
     with open_source(str(two_squares)) as source:
-        detect_source(source, WhiteThings(), limit=2, as_json=True, write=lines.append)
+        detect_source(source, WhiteBlobDetector(), limit=2, as_json=True, write=lines.append)
     records = [record for line in lines for record in json.loads(line)["detections"]]
     assert len(records) == 4
     assert not any(key.startswith("track_") for record in records for key in record)

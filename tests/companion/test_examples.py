@@ -1,4 +1,4 @@
-"""The examples, run as a person runs them; those that are plug-ins installed as packages of their own."""
+"""The examples; those that are plug-ins are installed as packages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run_python(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the source and the detector, as pip installs them."""
+    """Return a folder with the source and the detector installed by pip."""
     pytest.importorskip("setuptools")
     folder = tmp_path_factory.mktemp("plugins")
     copies = []
@@ -48,7 +48,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes that the test starts find them."""
+    """Make them importable in processes of the test."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]))
 
 
@@ -88,7 +88,7 @@ def test_detect_finds_the_square_of_the_plugins(tmp_path: Path) -> None:
         (("square://320x240", "--plugins-modules", "rad"), "no module 'rad'.* red, square"),
     ],
 )
-def test_what_detect_cannot_do_is_one_line(arguments: tuple[str, ...], words: str, tmp_path: Path) -> None:
+def test_invalid_plugin_options_are_one_line(arguments: tuple[str, ...], words: str, tmp_path: Path) -> None:
     done = companion("detect", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
@@ -106,7 +106,7 @@ def test_mission_is_checked_for_the_classes_of_the_plugin(tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("installed")
 @pytest.mark.timeout(200)
-def test_service_publishes_what_the_plugins_see(vehicle: RunningSimulator, tmp_path: Path) -> None:
+def test_service_publishes_detections_of_plugins(vehicle: RunningSimulator, tmp_path: Path) -> None:
     flags = [*("--source", "square://320x240?rate=10", "--detector-kind", "red"), *PLUGINS]
     with running_service(vehicle.onboard_port, flags, cwd=tmp_path) as service:
         with service.client() as session:
@@ -124,24 +124,24 @@ def test_service_publishes_what_the_plugins_see(vehicle: RunningSimulator, tmp_p
         service.take_off(3.0)
         done = run_python(EXAMPLES / "subscribe.py", service.endpoint, "land", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    *lines, answer = done.stdout.splitlines()
-    assert answer.startswith("land: done")
+    *lines, reply = done.stdout.splitlines()
+    assert reply.startswith("land: done")
     assert lines
-    seen = re.compile(r"vehicle1 frame \d+: blob 0\.82 at \d+, \d+ px, track \d+")
-    assert all(seen.match(line) for line in lines)
+    pattern = re.compile(r"vehicle1 frame \d+: blob 0\.82 at \d+, \d+ px, track \d+")
+    assert all(pattern.match(line) for line in lines)
 
 
-def test_film_is_detected_and_tracked(tmp_path: Path) -> None:
-    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (640, 480))
+def test_video_is_detected_and_tracked(tmp_path: Path) -> None:
+    video = cv2.VideoWriter(str(tmp_path / "video.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (640, 480))
     for frame in scene_frames(MOTIONS[0], seconds=1.6, rate_hz=5.0):
-        film.write(frame.image)
-    film.release()
-    done = run_python(EXAMPLES / "detect_video.py", "film.avi", cwd=tmp_path)
+        video.write(frame.image)
+    video.release()
+    done = run_python(EXAMPLES / "detect_video.py", "video.avi", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    seen = re.findall(r"^ +([\d.]+) s  (\w+) #(\d+) \d\.\d\d at \d", done.stdout, re.MULTILINE)
-    assert {name for _, name, _ in seen} & {"car", "person", "truck", "dog"}
-    # The same number in several frames.
-    assert len({(name, number) for _, name, number in seen}) < len(seen)
+    found = re.findall(r"^ +([\d.]+) s  (\w+) #(\d+) \d\.\d\d at \d", done.stdout, re.MULTILINE)
+    assert {name for _, name, _ in found} & {"car", "person", "truck", "dog"}
+    # The same track id in several frames.
+    assert len({(name, number) for _, name, number in found}) < len(found)
 
 
 def test_example_of_tests_passes(tmp_path: Path) -> None:

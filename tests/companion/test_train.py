@@ -1,4 +1,4 @@
-"""Training as `companion train` does it, a few steps of it: what is written can be used at once."""
+"""A few training steps as by `companion train`: the written model can be used."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
 
 
-def test_a_training_run_leaves_a_model_with_licence_and_score(
+def test_training_writes_model_with_licence_and_score(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The recipe's own pictures are too large for a test; everything else is as it is.
+    # Smaller images than the recipe's; everything else is unchanged.
     small = replace(
         DEFAULT_RECIPE, stages=(Stage(96, 96, 2, 2),), width_multiple=0.0625, workers=0, threads=1
     )
@@ -39,13 +39,13 @@ def test_a_training_run_leaves_a_model_with_licence_and_score(
     detector = Detector(output, image_size=96)
     assert detector.metadata["licence"] == "Apache-2.0"
     detector.detect(np.zeros((96, 96, 3), np.uint8))
-    # The state is there, and going on from it has nothing left to do.
+    # Resuming a finished training has nothing left to do.
     assert train_default(output, held_out=2, resume=True).map50 == pytest.approx(score.map50)
     refined = train_default(tmp_path / "refined.safetensors", start=output, held_out=2)
     assert 0.0 <= refined.map50 <= 1.0
     assert not (tmp_path / "refined.safetensors.training").exists()
 
 
-def test_going_on_without_a_state_is_refused(tmp_path: Path) -> None:
+def test_resume_without_state_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         train_default(tmp_path / "model.pt", resume=True)

@@ -1,4 +1,4 @@
-"""The command line as a person meets it: what it prints, on which stream, and its exit codes."""
+"""The command line: output, streams and exit codes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from companion.bus.topics import TOPICS
+from companion.bus.topics import NO_OBJECTS, TOPICS
 from companion.cli import commands as companion_commands
 from companion.cli.commands import app
 from companion.guidance.registry import COMMANDS
@@ -30,7 +30,7 @@ ONNX = ("--runtime", "onnxruntime")
 
 
 def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
-    """The one line on standard error; nothing else is said, and the exit code is 2."""
+    """Return the only line on standard error; check that the exit code is 2."""
     lines = [line for line in done.stderr.splitlines() if line.startswith("companion:")]
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
@@ -39,7 +39,7 @@ def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
     return lines[0]
 
 
-def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_writes_one_json_object_per_frame(small_model: Path, pictures: Path, tmp_path: Path) -> None:
     done = companion(
         "detect", pictures, "--model", small_model, "--precision", "float32", "--image-size", "160",
         "--confidence", "0", "--json", "--every", "3", "--limit", "4", "--save", tmp_path / "saved",
@@ -66,7 +66,9 @@ def test_detect_writes_one_json_object_a_frame(small_model: Path, pictures: Path
     assert drawn.shape == (120, 160, 3)
 
 
-def test_detect_tells_tracks_when_asked(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_reports_tracks_with_track_option(
+    exported_model: Path, pictures: Path, tmp_path: Path
+) -> None:
     done = companion(
         "detect", pictures, "--model", exported_model, *ONNX, "--image-size", "160", "--confidence", "0",
         "--json", "--limit", "2", "--track", cwd=tmp_path,
@@ -79,7 +81,7 @@ def test_detect_tells_tracks_when_asked(exported_model: Path, pictures: Path, tm
         assert record["track_state"] in ("none", "tentative", "confirmed")
 
 
-def test_detect_without_json_writes_a_readable_line_a_frame(
+def test_detect_without_json_writes_one_line_per_frame(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     done = companion(
@@ -97,10 +99,10 @@ def test_detect_without_json_writes_a_readable_line_a_frame(
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == 20
-    assert all(line.endswith("no objects detected") for line in lines)
+    assert all(line.endswith(NO_OBJECTS) for line in lines)
 
 
-def test_detect_sees_only_the_classes_asked_for(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_detect_reports_only_requested_classes(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
     common: list[str | Path] = [
         "detect",
         pictures,
@@ -123,15 +125,15 @@ def test_detect_sees_only_the_classes_asked_for(exported_model: Path, pictures: 
     assert names("--classes", one) == {one}
 
 
-def test_a_missing_model_is_one_line(pictures: Path, tmp_path: Path) -> None:
+def test_missing_model_is_one_line(pictures: Path, tmp_path: Path) -> None:
     line = one_line_of_bad_input(companion("detect", pictures, "--model", "no.pt", cwd=tmp_path))
     assert "no.pt" in line
 
 
-def test_a_truncated_checkpoint_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
+def test_truncated_checkpoint_is_one_line(small_model: Path, pictures: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.pt"
-    whole = small_model.read_bytes()
-    broken.write_bytes(whole[: len(whole) // 2])
+    content = small_model.read_bytes()
+    broken.write_bytes(content[: len(content) // 2])
     line = one_line_of_bad_input(companion("detect", pictures, "--model", broken, cwd=tmp_path))
     assert "broken.pt" in line
 
@@ -144,9 +146,7 @@ class _Hostile:
         return os.system, (f"touch {self.marker}",)
 
 
-def test_a_checkpoint_that_calls_the_system_is_refused_by_name_and_not_run(
-    pictures: Path, tmp_path: Path
-) -> None:
+def test_checkpoint_that_calls_system_is_refused(pictures: Path, tmp_path: Path) -> None:
     marker, hostile = tmp_path / "it-ran", tmp_path / "hostile.pt"
     with zipfile.ZipFile(hostile, "w") as archive:
         archive.writestr("hostile/data.pkl", pickle.dumps({"model": _Hostile(marker)}, protocol=2))
@@ -156,7 +156,7 @@ def test_a_checkpoint_that_calls_the_system_is_refused_by_name_and_not_run(
     assert not marker.exists()
 
 
-def test_an_unknown_class_is_one_line_with_the_nearest_names(
+def test_unknown_class_is_one_line_with_nearest_names(
     exported_model: Path, pictures: Path, tmp_path: Path
 ) -> None:
     arguments: list[str | Path] = ["detect", pictures, "--model", exported_model, *ONNX, "--classes", "persn"]
@@ -165,23 +165,21 @@ def test_an_unknown_class_is_one_line_with_the_nearest_names(
     assert "person" in line
 
 
-def test_an_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> None:
+def test_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> None:
     video = tmp_path / "broken.mp4"
     video.write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
     line = one_line_of_bad_input(companion("detect", video, "--model", exported_model, *ONNX, cwd=tmp_path))
     assert "broken.mp4" in line
 
 
-def test_a_bad_value_in_the_settings_file_is_one_line_with_key_and_range(tmp_path: Path) -> None:
+def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text("[detector]\nconfidence = 1.5\n")
     line = one_line_of_bad_input(companion("run", cwd=tmp_path))
     assert "detector.confidence" in line
     assert "0 to 1" in line
 
 
-def test_a_vehicle_that_never_answers_is_one_line(
-    exported_model: Path, pictures: Path, tmp_path: Path
-) -> None:
+def test_vehicle_without_answer_is_one_line(exported_model: Path, pictures: Path, tmp_path: Path) -> None:
     port = free_port()
     done = companion(
         "run", "--source", pictures, "--source-loop", "true",
@@ -193,9 +191,7 @@ def test_a_vehicle_that_never_answers_is_one_line(
     assert f"udpin://127.0.0.1:{port}" in line
 
 
-def test_a_source_that_cannot_be_opened_ends_the_service_with_one_line(
-    exported_model: Path, tmp_path: Path
-) -> None:
+def test_unopenable_source_ends_run_with_one_line(exported_model: Path, tmp_path: Path) -> None:
     done = companion(
         "run", "--source", tmp_path / "no.mp4",
         *("--model", exported_model, "--detector-runtime", "onnxruntime"),
@@ -211,7 +207,7 @@ def test_send_without_a_service_is_one_line(tmp_path: Path) -> None:
     assert endpoint in line
 
 
-def test_config_prints_what_the_file_the_environment_and_the_flags_make_together(tmp_path: Path) -> None:
+def test_config_merges_file_environment_and_flags(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text('[vehicle]\nname = "alpha"\n')
     done = companion("config", "--detector-image-size", "320", "--source", "-", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -220,13 +216,13 @@ def test_config_prints_what_the_file_the_environment_and_the_flags_make_together
     assert 'uri = "-"' in done.stdout
 
 
-def test_the_version_is_told(tmp_path: Path) -> None:
+def test_version_is_printed(tmp_path: Path) -> None:
     done = companion("--version", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, f"companion {version('mavlink-companion')}\n")
 
 
 @pytest.mark.parametrize("command", sorted(typer.main.get_group(app).commands))
-def test_every_command_tells_what_it_does(command: str) -> None:
+def test_every_command_has_help(command: str) -> None:
     done = CliRunner().invoke(app, [command, "--help"])
     assert done.exit_code == 0
     assert len(done.stdout.splitlines()) > 4
@@ -237,7 +233,7 @@ def test_small_commands_do_not_load_torch(command: str, tmp_path: Path) -> None:
     code = (
         "import sys\nfrom companion.cli import app\n"
         f"app({command.split()!r}, standalone_mode=False)\n"
-        "assert 'torch' not in sys.modules, 'torch was imported'"
+        "assert 'torch' not in sys.modules"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
@@ -245,7 +241,7 @@ def test_small_commands_do_not_load_torch(command: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_setpoints_are_measured_and_told_as_json(tmp_path: Path) -> None:
+def test_bench_setpoints_prints_json(tmp_path: Path) -> None:
     done = companion("bench", "setpoints", "--seconds", "1", "--load", "1", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
@@ -253,12 +249,10 @@ def test_setpoints_are_measured_and_told_as_json(tmp_path: Path) -> None:
     assert figures["setpoints"] > 10
 
 
-def test_the_bundled_model_is_not_for_photographs_and_says_so_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    picture = tmp_path / "photo.png"
-    cv2.imwrite(str(picture), np.full((64, 96, 3), 90, np.uint8))
-    done = companion("detect", picture, "--image-size", "96", cwd=tmp_path)
+def test_bundled_model_warns_once_for_real_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = tmp_path / "photo.png"
+    cv2.imwrite(str(image), np.full((64, 96, 3), 90, np.uint8))
+    done = companion("detect", image, "--image-size", "96", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
     assert "'default'" in line
@@ -269,15 +263,15 @@ def test_the_bundled_model_is_not_for_photographs_and_says_so_once(
     assert capsys.readouterr().err.count("models pull") == 1
 
 
-def test_help_has_the_commands_in_the_order_of_use() -> None:
+def test_help_lists_commands_in_order_of_use() -> None:
     shown = CliRunner().invoke(app, ["--help"]).stdout
     listed = shown.partition("Commands:")[2].split("\n")
-    words = [line.split()[0] for line in listed if line.startswith("  ") and line.strip()]
-    assert words[:6] == ["play", "run", "demo", "detect", "send", "echo"]
+    commands = [line.split()[0] for line in listed if line.startswith("  ") and line.strip()]
+    assert commands[:6] == ["play", "run", "demo", "detect", "send", "echo"]
     assert "--install-completion" in shown
 
 
-def test_help_of_send_has_the_flight_commands_and_few_settings() -> None:
+def test_help_of_send_has_flight_commands_and_few_settings() -> None:
     shown = CliRunner().invoke(app, ["send", "--help"]).stdout
     assert len(shown.splitlines()) < 100
     assert {f"  {word}" for word in COMMANDS} <= {
@@ -288,6 +282,6 @@ def test_help_of_send_has_the_flight_commands_and_few_settings() -> None:
     assert CliRunner().invoke(app, ["send", "hold", "--detector-model", "x.pt"]).exit_code == 2
 
 
-def test_echo_of_no_topic_lists_those_there_are(tmp_path: Path) -> None:
+def test_echo_of_unknown_topic_lists_topics(tmp_path: Path) -> None:
     line = one_line_of_bad_input(companion("echo", "bogus", cwd=tmp_path))
     assert {topic.name for topic in TOPICS} <= set(re.findall(r"[a-z]+", line))
