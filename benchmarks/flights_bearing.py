@@ -3,8 +3,9 @@
 The vehicle circles at a radius of 12.5 m in wind of up to 5 m/s, leaning by 12° and more. The reported
 bearing of the object in the middle is compared with the truth at the moment of capture in three ways: by the
 attitude at that moment, as the service does it; by the newest attitude when the result comes 80 ms later; and
-by the heading alone, as if the vehicle never leaned. A flight succeeds when the first is within 1.5° in 95 of 100 pictures.
-What is judged is the way from a box to a bearing, with boxes made of the truth or by the real detector.
+by the heading alone, as if the vehicle never leaned. A flight succeeds when the first is within 1.5° in 95
+of 100 pictures. What is judged is the way from a box to a bearing, with boxes made of the truth or by the
+real detector.
 """
 
 from __future__ import annotations

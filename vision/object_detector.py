@@ -63,7 +63,7 @@ class Timing:
 
 
 class ObjectDetector(ABC):
-    """Finds objects in single frames. BuiltLayer and used in one thread.
+    """Finds objects in single frames. Create and use it in one thread.
 
     A detector needs `class_names` and `detect`; the rest is what status and log say of it.
 
