@@ -1,4 +1,4 @@
-"""From detections to tracks: which box is which object, and whether it counts as true."""
+"""Multi-object tracking: detections to tracks with stable ids."""
 
 from vision.tracking.byte_track import TrackedFrame, Tracker
 from vision.tracking.camera_motion import AttitudeHistory, CameraView

@@ -1,4 +1,4 @@
-"""Which detection is which track: the pairs that overlap most, all together.
+"""Association of detections with tracks: the set of pairs with the largest total overlap.
 
 The assignment problem is solved exactly, by shortest augmenting paths (R. Jonker, A. Volgenant, "A shortest
 augmenting path algorithm for dense and sparse linear assignment problems", Computing 38, 1987).
@@ -13,7 +13,7 @@ Pairs = list[tuple[int, int]]
 
 
 def overlaps(first: NDArray[np.floating], second: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(N, 4) and (M, 4) boxes xyxy → (N, M) intersection over union; 0 where both are empty."""
+    """Intersection over union of (N, 4) and (M, 4) boxes xyxy → (N, M); 0 where both are empty."""
     one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
     sides = np.minimum(one[:, None, 2:], other[:, 2:]) - np.maximum(one[:, None, :2], other[:, :2])
     np.maximum(sides, 0.0, out=sides)
@@ -30,8 +30,8 @@ def _area(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     return area
 
 
-def grown(boxes: NDArray[np.floating], share: float) -> NDArray[np.float64]:
-    """(N, 4) boxes xyxy, larger by `share` of their size (the geometric mean of the sides) on every side."""
+def enlarge(boxes: NDArray[np.floating], share: float) -> NDArray[np.float64]:
+    """(N, 4) boxes xyxy, extended on every side by `share` of their size (geometric mean of the sides)."""
     corners = np.asarray(boxes, np.float64)
     if not share:
         return corners
@@ -41,24 +41,24 @@ def grown(boxes: NDArray[np.floating], share: float) -> NDArray[np.float64]:
 
 
 def match(similarity: NDArray[np.float64], least: float) -> Pairs:
-    """The pairs (row, column) with the largest sum of `similarity - least`, each row and column used once.
+    """Find the pairs (row, column) with the largest sum of `similarity - least`, without repeats.
 
     Args:
         similarity: (N, M).
-        least: a pair not more alike than this is never made.
+        least: pairs with a similarity not above this are excluded.
 
     Returns:
-        In the order of rows.
+        Pairs in row order.
     """
     gain = similarity - least
     possible = gain > 0.0
-    # Nearly always a track overlaps one detection and that one no other track.
-    alone = possible & (possible.sum(axis=1) == 1)[:, None] & (possible.sum(axis=0) == 1)[None, :]
-    pairs = [(int(row), int(column)) for row, column in np.argwhere(alone)]
-    disputed = possible & ~alone
-    if not disputed.any():
+    # Nearly always a track overlaps one detection and that detection overlaps no other track.
+    unambiguous = possible & (possible.sum(axis=1) == 1)[:, None] & (possible.sum(axis=0) == 1)[None, :]
+    pairs = [(int(row), int(column)) for row, column in np.argwhere(unambiguous)]
+    ambiguous = possible & ~unambiguous
+    if not ambiguous.any():
         return pairs
-    rows, columns = disputed.any(axis=1).nonzero()[0], disputed.any(axis=0).nonzero()[0]
+    rows, columns = ambiguous.any(axis=1).nonzero()[0], ambiguous.any(axis=0).nonzero()[0]
     part = gain[rows[:, None], columns].clip(0.0)
     pairs += [
         (int(rows[row]), int(columns[column])) for row, column in assign(-part) if part[row, column] > 0.0
@@ -67,26 +67,24 @@ def match(similarity: NDArray[np.float64], least: float) -> Pairs:
 
 
 def assign(cost: NDArray[np.float64]) -> Pairs:
-    """The pairs (row, column) with the smallest sum of costs that use all rows or all columns, each once.
+    """Find the pairs (row, column) with the smallest total cost that use all rows or all columns.
 
     Args:
         cost: (N, M), finite.
 
     Returns:
-        min(N, M) pairs in the order of rows.
+        min(N, M) pairs in row order.
 
     Raises:
         ValueError: a cost is not finite.
     """
     cost = np.asarray(cost, np.float64)
     if not np.isfinite(cost).all():
-        raise ValueError(
-            "every cost must be finite; leave out the pairs that cannot be, or give them a large one"
-        )
+        raise ValueError("every cost must be finite; give excluded pairs a large cost")
     if cost.shape[0] > cost.shape[1]:
         return sorted((row, column) for column, row in assign(cost.T))
     rows, columns = cost.shape
-    # To begin with each row has its cheapest column, if no row before it took that.
+    # Initial assignment: each row gets its cheapest column if no earlier row has it.
     row_price, column_price = cost.min(axis=1, initial=np.inf), np.zeros(columns)
     row_of, column_of = np.full(columns, -1), np.full(rows, -1)
     for row, column in enumerate(cost.argmin(axis=1).tolist() if columns else ()):
@@ -97,22 +95,22 @@ def assign(cost: NDArray[np.float64]) -> Pairs:
         distance = np.full(columns, np.inf)
         reached_from = np.full(columns, start)
         done = np.zeros(columns, np.bool_)
-        row, travelled = start, 0.0
+        row, path_cost = start, 0.0
         while True:
-            through = travelled + cost[row] - row_price[row] - column_price
-            nearer = (through < distance) & ~done
-            distance[nearer] = through[nearer]
-            reached_from[nearer] = row
+            through = path_cost + cost[row] - row_price[row] - column_price
+            cheaper = (through < distance) & ~done
+            distance[cheaper] = through[cheaper]
+            reached_from[cheaper] = row
             column = int(np.argmin(np.where(done, np.inf, distance)))
-            travelled = float(distance[column])
+            path_cost = float(distance[column])
             if row_of[column] < 0:
                 break
             done[column] = True
             row = int(row_of[column])
-        # Prices that keep every reduced cost at or above zero, and those of the chosen pairs at zero.
-        row_price[start] += travelled
-        row_price[row_of[done]] += travelled - distance[done]
-        column_price[done] -= travelled - distance[done]
+        # Dual prices that keep every reduced cost at or above zero, and at zero for the chosen pairs.
+        row_price[start] += path_cost
+        row_price[row_of[done]] += path_cost - distance[done]
+        column_price[done] -= path_cost - distance[done]
         while True:
             row = int(reached_from[column])
             before = int(column_of[row])

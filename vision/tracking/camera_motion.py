@@ -1,7 +1,7 @@
-"""What the turning of the camera does to boxes in its picture, and where it looked when.
+"""Effect of camera rotation on boxes in the image, and the attitude history.
 
-A pure rotation of the camera moves every pixel by the homography K R K⁻¹ whatever the depth there (Hartley,
-Zisserman, Multiple View Geometry, 8.4). The vehicle's attitude tells R.
+A pure rotation of the camera moves every pixel by the homography K R K⁻¹, independent of depth (Hartley,
+Zisserman, Multiple View Geometry, 8.4). R comes from the vehicle's attitude.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from vision.tracking.kalman import BoxStates
 Array = NDArray[np.float64]
 
 HISTORY_S = 3.0
-# Past its newest sample the history goes on turning as it did for so long: a link brings attitudes late.
+# Attitudes arrive late over a link: past the newest sample the rotation is extrapolated for this long.
 MAX_AHEAD_S = 0.1
-# Two samples farther apart than this say nothing of what was between them.
+# Samples farther apart than this are not interpolated.
 MAX_GAP_S = 0.5
-# A box seen more obliquely than this (cosine to the optical axis) is out of every picture.
+# A box seen more obliquely than this (cosine to the optical axis) is outside every image.
 MIN_COSINE = 0.17
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraView:
-    """Where a camera looked when it took a frame.
+    """Camera orientation when a frame was captured.
 
     Attributes:
-        camera: for frames of this size.
+        camera: the model at the frame's size.
         ned_from_optical: (3, 3) rotation from the optical frame to NED.
     """
 
@@ -48,33 +48,33 @@ class CameraView:
         return turn
 
 
-def turned(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[BoxStates, NDArray[np.bool_]]:
-    """The boxes after the camera alone has turned.
+def rotate_boxes(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[BoxStates, NDArray[np.bool_]]:
+    """Apply a pure camera rotation to the boxes.
 
-    To first order about each box's middle: the middle goes where the homography takes it, speeds are turned
-    with the picture, sides are stretched with it. Sides are not turned: an object that stands upright in the
-    world would grow its box by every roll and never lose that again.
+    To first order about each box's centre: the homography moves the centre, rotates the velocity and scales
+    the sides. Sides are not rotated: an upright object's box would grow with every roll and never shrink
+    back.
 
     Args:
         turn: (3, 3), directions in the earlier optical frame into the later one.
 
     Returns:
-        The boxes, and (N,) which of them a camera could still see; the others are as they were.
+        The boxes, and (N,) whether each can still be in view; boxes out of view are unchanged.
     """
     if not len(states):
         return states, np.ones(0, np.bool_)
     rays = camera.rays(states.mean[:, :2])
-    towards = rays @ turn.T
-    ahead: NDArray[np.bool_] = towards[:, 2] > MIN_COSINE
-    moved = camera.project(towards)
-    # (N, 2, 2) derivative of the new pixel by the old one; what the lens adds to it is left out.
+    rotated = rays @ turn.T
+    ahead: NDArray[np.bool_] = rotated[:, 2] > MIN_COSINE
+    moved = camera.project(rotated)
+    # (N, 2, 2) derivative of the new pixel by the old one; lens distortion is neglected.
     focal = np.array([camera.fx, camera.fy])
-    depth = np.where(ahead, towards[:, 2], 1.0)[:, None, None]
-    plane = towards[:, :2, None] / depth
+    depth = np.where(ahead, rotated[:, 2], 1.0)[:, None, None]
+    plane = rotated[:, :2, None] / depth
     slope = (turn[:2, :2] - plane * turn[2, :2]) * (rays[:, 2, None, None] / depth)
     slope *= focal[:, None] / focal
     slope[~ahead] = np.eye(2)
-    # Its polar decomposition is a turn of the picture by `roll` after a stretch; a side grows by the stretch.
+    # Polar decomposition: an image rotation by `roll` after a stretch; a side scales by the stretch.
     roll = np.arctan2(slope[:, 1, 0] - slope[:, 0, 1], slope[:, 0, 0] + slope[:, 1, 1])
     cosine, sine = np.cos(roll), np.sin(roll)
     step = np.zeros((len(states), 8, 8))
@@ -87,7 +87,7 @@ def turned(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[BoxStat
 
 
 class AttitudeHistory:
-    """The attitudes of the last few seconds. One thread may add while another asks."""
+    """The attitudes of the last few seconds. Thread-safe for one writer and one reader."""
 
     def __init__(self, keep_s: float = HISTORY_S) -> None:
         self._keep_ns = keep_s * 1e9
@@ -95,7 +95,7 @@ class AttitudeHistory:
         self._samples: deque[tuple[int, Quaternion]] = deque()
 
     def add(self, stamp_ns: int, attitude_wxyz: Quaternion) -> None:
-        """Remember one: body FRD to NED, CLOCK_MONOTONIC nanoseconds. One that is older is ignored."""
+        """Add a sample: body FRD to NED, CLOCK_MONOTONIC nanoseconds. Older than the newest: ignored."""
         with self._lock:
             if self._samples and stamp_ns <= self._samples[-1][0]:
                 return
@@ -104,7 +104,7 @@ class AttitudeHistory:
                 self._samples.popleft()
 
     def at(self, stamp_ns: int) -> Array | None:
-        """(3, 3) `ned_from_body` at a moment, by slerp; None where the history does not reach."""
+        """(3, 3) `ned_from_body` at `stamp_ns`, by slerp; None outside the history."""
         with self._lock:
             samples = list(self._samples)
         index = bisect_right(samples, stamp_ns, key=lambda sample: sample[0])
@@ -115,15 +115,15 @@ class AttitudeHistory:
         if index == len(samples):
             if stamp_ns - samples[-1][0] > MAX_AHEAD_S * 1e9:
                 return None
-            return self._ahead(samples, stamp_ns)
+            return self._extrapolate(samples, stamp_ns)
         (before_ns, before), (after_ns, after) = samples[index - 1], samples[index]
         if after_ns - before_ns > MAX_GAP_S * 1e9:
             return None
         return _between(before, before_ns, after, after_ns, stamp_ns)
 
     @staticmethod
-    def _ahead(samples: list[tuple[int, Quaternion]], stamp_ns: int) -> Array | None:
-        """Turned on past the newest sample, as fast as over a while before it: two samples are too noisy."""
+    def _extrapolate(samples: list[tuple[int, Quaternion]], stamp_ns: int) -> Array | None:
+        """Continue at the rate averaged over a longer interval: two adjacent samples are too noisy."""
         after_ns, after = samples[-1]
         for before_ns, before in reversed(samples[:-1]):
             if after_ns - before_ns > MAX_GAP_S * 1e9:

@@ -1,4 +1,4 @@
-"""How well tracks keep to the truth: CLEAR MOT and IDF1.
+"""Tracking quality against ground truth: CLEAR MOT and IDF1.
 
 K. Bernardin, R. Stiefelhagen, "Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics",
 EURASIP J. Image and Video Processing, 2008; fragmentations as in Y. Li et al., CVPR 2009; IDF1 as in E.
@@ -19,10 +19,10 @@ from vision.tracking.association import assign, match, overlaps
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labelled:
-    """Boxes of one frame with identities: the truth, or what was tracked.
+    """Boxes of one frame with identities: ground truth or tracker output.
 
     Attributes:
-        identity: N different numbers.
+        identity: N distinct numbers.
         xyxy: (N, 4) pixels.
     """
 
@@ -38,17 +38,17 @@ class Labelled:
 
 @dataclass(frozen=True, slots=True)
 class MotScore:
-    """The sums over a sequence.
+    """Totals over a sequence.
 
     Attributes:
-        frames: how many.
-        objects: true boxes, over all frames.
-        misses: true boxes that no tracked one covers.
-        false_positives: tracked boxes that cover no true one.
-        switches: a true object's identity is another than when it was last covered.
-        fragmentations: a true object is covered again after it was there and not covered.
+        frames: number of frames.
+        objects: ground truth boxes over all frames.
+        misses: ground truth boxes without a tracked box.
+        false_positives: tracked boxes without a ground truth box.
+        switches: matches where the object's track id differs from its previous match.
+        fragmentations: times an object is matched again after frames in which it was present and unmatched.
         iou: mean overlap of the pairs; NaN without pairs.
-        idf1: share of boxes with the right identity under the best one-to-one naming over the sequence.
+        idf1: share of boxes with the right identity under the best one-to-one assignment over the sequence.
     """
 
     frames: int
@@ -62,24 +62,25 @@ class MotScore:
 
     @property
     def mota(self) -> float:
-        """1 - (misses + false positives + switches) / objects; can be below 0. NaN without objects."""
+        """1 - (misses + false positives + switches) / objects; may be negative. NaN without objects."""
         if not self.objects:
             return float("nan")
         return 1.0 - (self.misses + self.false_positives + self.switches) / self.objects
 
     def as_dict(self) -> dict[str, float]:
-        """Plain values, `mota` among them."""
+        """All fields and `mota` as plain values."""
         return {"mota": self.mota, **asdict(self)}
 
 
 def clear_mot(frames: Iterable[tuple[Labelled, Labelled]], *, least_iou: float = 0.5) -> MotScore:
-    """Compare tracks with the truth, frame after frame.
+    """Compare tracks with ground truth, frame by frame.
 
-    A pair of the frame before stays a pair while it overlaps by `least_iou`; the others are paired so that as
-    many as possible are, with the largest overlap.
+    A pair from the previous frame is kept while it overlaps by `least_iou`; the rest are paired to maximise
+    first the number of pairs, then the overlap.
 
     Args:
-        frames: of each the truth and what was tracked.
+        frames: (ground truth, tracked) of each frame.
+        least_iou: smallest overlap of a pair.
     """
     count = objects = misses = false_positives = switches = fragmentations = 0
     overlap_sum, pairs_sum = 0.0, 0
@@ -130,24 +131,24 @@ def _pairs(
     last_identity: dict[int, int],
     least_iou: float,
 ) -> list[tuple[int, int]]:
-    place = {identity: column for column, identity in enumerate(tracked.identity)}
+    column_of = {identity: column for column, identity in enumerate(tracked.identity)}
     kept = []
     for row, true_id in enumerate(truth.identity):
-        column = place.get(last_identity.get(true_id, -1))
+        column = column_of.get(last_identity.get(true_id, -1))
         if column is not None and iou[row, column] >= least_iou:
             kept.append((row, column))
-            del place[tracked.identity[column]]
+            del column_of[tracked.identity[column]]
     free = iou.copy()
     free[[row for row, _ in kept], :] = 0.0
     free[:, [column for _, column in kept]] = 0.0
-    # One more pair counts for more than any overlaps: each is worth 1 at least, and at most 2 of 1 to 2.
+    # One more pair outweighs any overlap: each pair counts at least the number of objects.
     free[free < least_iou] = 0.0
-    worth = np.where(free > 0.0, free + len(iou), 0.0)
-    return kept + match(worth, 0.0)
+    weight = np.where(free > 0.0, free + len(iou), 0.0)
+    return kept + match(weight, 0.0)
 
 
 def _idf1(together: Counter[tuple[int, int]], truth_seen: Counter[int], tracked_seen: Counter[int]) -> float:
-    """Twice the boxes named right, by all true and all tracked boxes."""
+    """Twice the correctly identified boxes over all ground truth and tracked boxes."""
     true_ids, tracked_ids = list(truth_seen), list(tracked_seen)
     boxes = sum(truth_seen.values()) + sum(tracked_seen.values())
     if not true_ids or not tracked_ids:
@@ -157,5 +158,5 @@ def _idf1(together: Counter[tuple[int, int]], truth_seen: Counter[int], tracked_
     column_of = {identity: column for column, identity in enumerate(tracked_ids)}
     for (true_id, tracked_id), frames in together.items():
         gain[row_of[true_id], column_of[tracked_id]] = frames
-    named_right = sum(gain[pair] for pair in assign(-gain))
-    return float(2 * named_right / boxes)
+    correct = sum(gain[pair] for pair in assign(-gain))
+    return float(2 * correct / boxes)

@@ -1,8 +1,8 @@
-"""A constant-velocity Kalman filter of boxes, many at once.
+"""Constant-velocity Kalman filter for many boxes at once.
 
-The state of one box is (x, y, width, height and their rates): pixels of its middle, pixels, and pixels a
-second. Noise is in proportion to the box's own size (the geometric mean of its sides),
-and grows with time, not with frames: cameras drop frames.
+A box's state is (x, y, width, height) and their rates: centre and sides in pixels, rates in pixels per
+second. Noise is proportional to the box's size (geometric mean of its sides) and grows with time, not frames,
+because cameras drop frames.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# One sigma of a detected box's middle and sides, in box sizes.
+# One sigma of a detected box's centre and sides, in box sizes.
 MEASURED = 0.05
-# Where a box goes by itself: a random walk (sizes / √s) and changes of its speed (sizes / s / √s). At 30
-# frames a second 0.27 and 1.0 are the 1/20 and 1/160 a frame of ByteTrack's own filter; the vehicle's motion,
-# where it is not known, asks for quicker changes of speed (tuned on rendered sequences, flat from 1 to 3).
+# Process noise: random walk (sizes / √s) and velocity changes (sizes / s / √s). At 30 frames per second 0.27
+# and 1.0 equal the 1/20 and 1/160 per frame of ByteTrack's own filter; uncompensated vehicle motion needs
+# faster velocity changes (tuned on rendered sequences, flat from 1 to 3).
 WALK = 0.27
 ACCELERATION = 2.0
-# What may be the speed of a box that was seen once, sizes / s.
+# One sigma of the initial velocity, sizes / s.
 FIRST_SPEED = 2.0
-# No box is smaller than this, pixels: sizes must stay positive.
+# Smallest side, pixels: sizes must stay positive.
 SMALLEST_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxStates:
-    """N boxes as they are believed to be.
+    """Estimated states of N boxes.
 
     Attributes:
         mean: (N, 8).
@@ -50,7 +50,7 @@ class BoxStates:
         return BoxStates(self.mean[index], self.covariance[index])
 
     def joined(self, other: BoxStates) -> BoxStates:
-        """These and then the others."""
+        """These states followed by the other ones."""
         return BoxStates(
             np.concatenate([self.mean, other.mean]), np.concatenate([self.covariance, other.covariance])
         )
@@ -62,8 +62,8 @@ class BoxStates:
         return np.concatenate([self.mean[:, :2] - half, self.mean[:, :2] + half], axis=1)
 
 
-def begun(xyxy: NDArray[np.floating]) -> BoxStates:
-    """Boxes (N, 4) seen for the first time: of their rates nothing is known."""
+def initiate(xyxy: NDArray[np.floating]) -> BoxStates:
+    """States of boxes (N, 4) detected for the first time, with unknown rates."""
     measured = _measurement(xyxy)
     size = _size(measured)
     mean = np.concatenate([measured, np.zeros_like(measured)], axis=1)
@@ -73,8 +73,8 @@ def begun(xyxy: NDArray[np.floating]) -> BoxStates:
     return BoxStates(mean, _diagonal(deviation**2))
 
 
-def predicted(states: BoxStates, elapsed_s: float) -> BoxStates:
-    """Where the boxes are `elapsed_s` later."""
+def predict(states: BoxStates, elapsed_s: float) -> BoxStates:
+    """Predict the states `elapsed_s` ahead."""
     if elapsed_s <= 0.0 or not len(states):
         return states
     forward = np.eye(8)
@@ -89,8 +89,8 @@ def predicted(states: BoxStates, elapsed_s: float) -> BoxStates:
     return BoxStates(states.mean @ forward.T, forward @ states.covariance @ forward.T + noise)
 
 
-def corrected(states: BoxStates, xyxy: NDArray[np.floating]) -> BoxStates:
-    """The same boxes after each was seen at `xyxy` (N, 4)."""
+def correct(states: BoxStates, xyxy: NDArray[np.floating]) -> BoxStates:
+    """Correct each state with its detected box, (N, 4)."""
     measured = _measurement(xyxy)
     spread = states.covariance[:, :4, :4] + _diagonal(np.repeat((MEASURED * _size(measured)) ** 2, 4, 1))
     gain = np.linalg.solve(spread, states.covariance[:, :4, :]).transpose(0, 2, 1)
@@ -100,7 +100,7 @@ def corrected(states: BoxStates, xyxy: NDArray[np.floating]) -> BoxStates:
 
 
 def _measurement(xyxy: NDArray[np.floating]) -> Array:
-    """(N, 4) xyxy → (N, 4) middle and sides."""
+    """(N, 4) xyxy → (N, 4) centre and sides."""
     boxes = np.asarray(xyxy, np.float64).reshape(-1, 4)
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], SMALLEST_PX)
     return np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, sides], axis=1)

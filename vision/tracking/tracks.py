@@ -1,4 +1,4 @@
-"""The values of tracking: a track, what happened to it, and how it was followed."""
+"""Data types of tracking: tracks, track events and settings."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ XYXY = tuple[float, float, float, float]
 
 
 class TrackState(StrEnum):
-    """Whether a track counts as true."""
+    """Whether a track is confirmed."""
 
     TENTATIVE = TRACK_TENTATIVE
-    """too short, or its median confidence is too low: it may be a mistake of the detector"""
+    """too short, or its median confidence is too low: possibly a false detection"""
     CONFIRMED = TRACK_CONFIRMED
-    """it counts as true, once and for all; a detection is told as tentative while its class is in doubt"""
+    """confirmed, and stays so; its detections are reported as tentative while their class is in doubt"""
 
 
 class TrackEventKind(StrEnum):
-    """What happened to a track. Only what counts as true makes events."""
+    """What happened to a track. Only confirmed tracks have events."""
 
     NEW = "new"
-    """it counts as true from now on"""
+    """it was confirmed in this frame"""
     UPDATE = "update"
-    """it was seen in this frame"""
+    """it was detected in this frame"""
     LOST = "lost"
-    """it has not been seen for `coast_timeout_s`; the next `update` ends that"""
+    """not detected for `coast_timeout_s`; the next `update` ends this state"""
     END = "end"
-    """it will not come back: what is seen there later is another track"""
+    """it ended; a later detection there starts another track"""
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """One object through time, as it is known at one frame.
+    """The state of one track at one frame.
 
     Attributes:
-        track_id: 1 or more; never used again.
-        class_id, class_name: as the detector says; a track never changes its class.
-        state: whether it counts as true.
-        xyxy: pixels of the frame: as detected where it was seen in it, as predicted where not.
+        track_id: 1 or more; never reused.
+        class_id, class_name: from the detector; a track never changes its class.
+        state: whether it is confirmed.
+        xyxy: pixels of the frame: the detected box, or the predicted one where it was not detected.
         confidence: of its newest detection, 0..1.
         score: median of the confidences of its newest `SCORES_KEPT` detections, 0..1.
-        seen: in how many frames it was detected.
+        seen: number of frames in which it was detected.
         first_ns, last_ns: capture stamps of the first and the newest of these frames.
     """
 
@@ -63,7 +63,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class TrackEvent:
-    """Something happened to a track at the frame captured at `stamp_ns`."""
+    """An event of a track at the frame captured at `stamp_ns`."""
 
     kind: TrackEventKind
     stamp_ns: int
@@ -83,7 +83,7 @@ class ScoreHistory:
         self._sorted: list[float] = []
 
     def add(self, confidence: float) -> None:
-        """Take one more; the oldest falls out when there are too many."""
+        """Add one; above `SCORES_KEPT` the oldest is dropped."""
         self._newest.append(confidence)
         insort(self._sorted, confidence)
         if len(self._newest) > SCORES_KEPT:
@@ -91,7 +91,7 @@ class ScoreHistory:
 
     @property
     def median(self) -> float:
-        """The middle one; the mean of the two in the middle if their number is even. 0 if there is none."""
+        """The median; the mean of the middle two for an even count. 0 if empty."""
         count = len(self._sorted)
         if not count:
             return 0.0
@@ -100,19 +100,19 @@ class ScoreHistory:
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """What the tracker goes by. Confidences and overlaps (intersection over union) are in 0..1.
+    """Thresholds of the tracker. Confidences and overlaps (intersection over union) are in 0..1.
 
     Attributes:
-        high_confidence: from here on a detection can begin a track, and is associated first.
-        low_confidence: weaker than that is not looked at; between the two a detection can only continue a
-            track that was seen a moment ago.
-        keep_confidence: a weaker detection is left out of the result if it belongs to no track.
-        confirm_score: a track counts as true when its median confidence reaches this,
-        min_hits: and it was seen in so many frames.
-        min_iou: a strong detection can be a track's if it overlaps its prediction by more than this,
+        high_confidence: from here on a detection can start a track, and is associated first.
+        low_confidence: weaker detections are ignored; between the two a detection can only continue a track
+            detected less than `coast_timeout_s` ago.
+        keep_confidence: a weaker detection without a track is left out of the result.
+        confirm_score: a track is confirmed when its median confidence reaches this,
+        min_hits: and it was detected in this many frames.
+        min_iou: a strong detection matches a track if it overlaps the prediction by more than this,
         min_iou_weak: and a weak one by more than this.
-        coast_timeout_s: unseen for so long, a track is lost.
-        max_age_s: unseen for so long, it has ended.
+        coast_timeout_s: undetected for this long, a track is lost.
+        max_age_s: undetected for this long, it ends.
     """
 
     high_confidence: float = 0.35

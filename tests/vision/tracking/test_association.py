@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vision.tracking.association import assign, grown, match, overlaps
+from vision.tracking.association import assign, enlarge, match, overlaps
 
 # Whole numbers too: ties are where a shortest path goes astray.
 costs = arrays.arrays(
@@ -46,7 +46,7 @@ def test_no_assignment_is_cheaper(cost: np.ndarray) -> None:
     assert sum(cost[pair] for pair in pairs) == pytest.approx(cheapest(cost), abs=1e-9)
 
 
-def test_a_large_assignment_takes_every_row_once_and_cannot_be_bettered_by_a_swap() -> None:
+def test_large_assignment_is_optimal_under_swaps() -> None:
     cost = np.random.default_rng(3).random((60, 75))
     pairs = assign(cost)
     assert [row for row, _ in pairs] == list(range(60))
@@ -56,7 +56,7 @@ def test_a_large_assignment_takes_every_row_once_and_cannot_be_bettered_by_a_swa
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_cost_that_is_no_number_is_refused(bad: float) -> None:
+def test_non_finite_cost_is_rejected(bad: float) -> None:
     with pytest.raises(ValueError, match="every cost must be finite"):
         assign(np.array([[1.0, bad], [0.0, 1.0]]))
 
@@ -74,7 +74,7 @@ def best_gain(gain: np.ndarray) -> float:
 
 @settings(max_examples=150)
 @given(likenesses, st.sampled_from([0.0, 0.2, 0.45]))
-def test_no_other_pairs_are_more_alike(likeness: np.ndarray, least: float) -> None:
+def test_match_maximises_the_gain(likeness: np.ndarray, least: float) -> None:
     pairs = match(likeness, least)
     assert all(likeness[pair] > least for pair in pairs)
     assert len({row for row, _ in pairs}) == len({column for _, column in pairs}) == len(pairs)
@@ -86,7 +86,7 @@ def test_two_good_pairs_come_before_one_that_is_best() -> None:
     assert match(likeness, 0.2) == [(0, 1), (1, 0)]
 
 
-def test_far_apart_groups_do_not_touch_each_other() -> None:
+def test_separate_groups_are_independent() -> None:
     likeness = np.zeros((5, 5))
     likeness[:2, 3:] = [[0.9, 0.8], [0.85, 0.3]]
     likeness[3:, :2] = [[0.5, 0.6], [0.7, 0.3]]
@@ -100,13 +100,13 @@ def test_overlap_is_of_areas() -> None:
 
 
 @given(boxes, boxes)
-def test_overlap_lies_between_nothing_and_all_and_takes_no_side(one: np.ndarray, other: np.ndarray) -> None:
+def test_overlap_is_bounded_and_symmetric(one: np.ndarray, other: np.ndarray) -> None:
     iou = overlaps(one, other)
     assert iou.shape == (len(one), len(other))
     assert ((iou >= 0) & (iou <= 1 + 1e-12)).all()
     np.testing.assert_allclose(iou, overlaps(other, one).T)
 
 
-def test_a_grown_box_is_larger_on_every_side_by_a_share_of_its_size() -> None:
-    np.testing.assert_allclose(grown(np.array([[10, 10, 26, 74]]), 0.5), [[-6, -6, 42, 90]])
-    np.testing.assert_allclose(grown(np.array([[10, 10, 26, 74]]), 0.0), [[10, 10, 26, 74]])
+def test_enlarged_box_grows_by_a_share_of_its_size() -> None:
+    np.testing.assert_allclose(enlarge(np.array([[10, 10, 26, 74]]), 0.5), [[-6, -6, 42, 90]])
+    np.testing.assert_allclose(enlarge(np.array([[10, 10, 26, 74]]), 0.0), [[10, 10, 26, 74]])

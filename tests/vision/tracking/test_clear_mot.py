@@ -17,12 +17,12 @@ def score(*frames: Frame) -> MotScore:
     return clear_mot((labelled(truth), labelled(tracked)) for truth, tracked in frames)
 
 
-def labelled(places: dict[int, float]) -> Labelled:
-    boxes = np.array([[x, 0, x + 10, 10] for x in places.values()], np.float64).reshape(-1, 4)
-    return Labelled(list(places), boxes)
+def labelled(positions: dict[int, float]) -> Labelled:
+    boxes = np.array([[x, 0, x + 10, 10] for x in positions.values()], np.float64).reshape(-1, 4)
+    return Labelled(list(positions), boxes)
 
 
-def test_all_right_is_one() -> None:
+def test_perfect_tracking_scores_one() -> None:
     result = score(({1: 0, 2: 50}, {7: 0, 8: 51}), ({1: 1, 2: 50}, {7: 1, 8: 50}))
     assert result.mota == result.idf1 == 1.0
     assert (result.objects, result.frames) == (4, 2)
@@ -47,19 +47,19 @@ def test_a_swap_of_two_is_two_switches() -> None:
     assert score(({1: 0, 2: 50}, {7: 0, 8: 50}), ({1: 0, 2: 50}, {8: 0, 7: 50})).switches == 2
 
 
-def test_a_gap_is_a_fragmentation_and_a_switch_only_with_another_identity() -> None:
+def test_gap_is_a_fragmentation_and_maybe_a_switch() -> None:
     same = score(({1: 0}, {7: 0}), ({1: 0}, {}), ({1: 0}, {7: 0}))
     other = score(({1: 0}, {7: 0}), ({1: 0}, {}), ({1: 0}, {8: 0}))
     assert (same.fragmentations, same.switches) == (1, 0)
     assert (other.fragmentations, other.switches) == (1, 1)
 
 
-def test_an_object_that_was_away_itself_is_not_fragmented() -> None:
+def test_absent_object_is_not_fragmented() -> None:
     result = score(({1: 0}, {7: 0}), ({}, {}), ({1: 0}, {7: 0}))
     assert (result.fragmentations, result.misses) == (0, 0)
 
 
-def test_a_pair_stays_together_though_another_box_fits_better() -> None:
+def test_existing_pair_is_kept_over_a_better_one() -> None:
     result = score(({1: 0}, {7: 0}), ({1: 0}, {7: 2, 8: 0}))
     assert (result.switches, result.false_positives) == (0, 1)
 
@@ -70,20 +70,20 @@ def test_as_many_as_possible_are_paired() -> None:
     assert (result.misses, result.false_positives) == (0, 0)
 
 
-def test_a_box_that_is_half_off_covers_nothing() -> None:
+def test_box_with_low_iou_matches_nothing() -> None:
     result = score(({1: 0}, {7: 4}))
     assert (result.misses, result.false_positives) == (1, 1)
     assert math.isnan(result.iou)
 
 
-def test_nothing_at_all_has_no_score() -> None:
+def test_empty_sequence_has_no_score() -> None:
     result = score(({}, {}))
     assert math.isnan(result.mota)
     assert math.isnan(result.idf1)
     assert score(({}, {7: 0})).idf1 == 0.0
 
 
-def test_the_sums_are_given_as_plain_values() -> None:
+def test_score_as_plain_values() -> None:
     values = score(({1: 0}, {7: 0})).as_dict()
     assert values["mota"] == 1.0
     assert values["objects"] == 1

@@ -33,31 +33,29 @@ def scores() -> Scores:
 
 
 @pytest.mark.parametrize("motion", [motion.name for motion in MOTIONS])
-def test_a_tracker_switches_far_less_than_frame_by_frame_and_invents_less(
-    scores: Scores, motion: str
-) -> None:
-    ways = scores[motion]
-    assert ways["tracker"].switches < 0.5 * ways["last frame"].switches
-    assert ways["attitude"].switches < 0.15 * ways["last frame"].switches
-    assert ways["tracker"].false_positives < 0.3 * ways["last frame"].false_positives
-    assert ways["attitude"].idf1 > ways["last frame"].idf1 + 0.3
+def test_tracker_has_far_fewer_switches_than_matching(scores: Scores, motion: str) -> None:
+    by_method = scores[motion]
+    assert by_method["tracker"].switches < 0.5 * by_method["last frame"].switches
+    assert by_method["attitude"].switches < 0.15 * by_method["last frame"].switches
+    assert by_method["tracker"].false_positives < 0.3 * by_method["last frame"].false_positives
+    assert by_method["attitude"].idf1 > by_method["last frame"].idf1 + 0.3
 
 
 @pytest.mark.parametrize("motion", ["gusts", "turning"])
 def test_the_vehicles_attitude_keeps_identities_of_a_moving_camera(scores: Scores, motion: str) -> None:
-    ways = scores[motion]
-    assert ways["attitude"].switches < 0.5 * ways["tracker"].switches
-    assert ways["attitude"].mota > ways["tracker"].mota + 0.1
-    assert ways["attitude"].mota > ways["last frame"].mota + 0.2
-    assert ways["attitude"].idf1 > ways["tracker"].idf1 + 0.15
+    by_method = scores[motion]
+    assert by_method["attitude"].switches < 0.5 * by_method["tracker"].switches
+    assert by_method["attitude"].mota > by_method["tracker"].mota + 0.1
+    assert by_method["attitude"].mota > by_method["last frame"].mota + 0.2
+    assert by_method["attitude"].idf1 > by_method["tracker"].idf1 + 0.15
 
 
-def test_with_the_attitude_a_moving_camera_is_nearly_as_good_as_one_that_stands_still(scores: Scores) -> None:
+def test_attitude_makes_a_moving_camera_nearly_as_good(scores: Scores) -> None:
     still = scores["still"]["attitude"].mota
     assert scores["gusts"]["attitude"].mota > still - 0.1
     assert scores["turning"]["attitude"].mota > still - 0.15
 
 
-def test_a_camera_that_stands_still_needs_no_attitude(scores: Scores) -> None:
-    ways = scores["still"]
-    assert ways["attitude"].mota == pytest.approx(ways["tracker"].mota, abs=0.03)
+def test_static_camera_needs_no_attitude(scores: Scores) -> None:
+    by_method = scores["still"]
+    assert by_method["attitude"].mota == pytest.approx(by_method["tracker"].mota, abs=0.03)
