@@ -1,10 +1,11 @@
 """Frames between two processes of one host through shared memory: a ring of slots, the newest frame wins.
 
-A segment is a file in /dev/shm, mapped by both sides. The writer makes it under another name and then moves
-it into place, so a reader sees either none or a whole one. The writer holds a lock (`flock`) on it for life:
-the kernel frees that when the writer dies, however it dies, and the next writer of the name takes its place.
-Readers notice that by the file's identity and map the new one. (`multiprocessing.shared_memory` is not used:
-its resource tracker on Python 3.11 removes a segment when any reader exits.)
+A segment is a file in /dev/shm, mapped by both sides. The writer creates it under another name and then
+renames it, so a reader sees either none or a complete one. The writer holds a lock (`flock`) on it for its
+lifetime: the kernel releases the lock when the writer dies, and the next writer of the name then replaces the
+    segment. Readers
+detect that by the file's identity and map the new one. (`multiprocessing.shared_memory` is not used: its
+resource tracker on Python 3.11 removes a segment when any reader exits.)
 
 Layout, in 64-bit words of the host's byte order; the slots begin at the second page:
 
@@ -28,7 +29,7 @@ Layout, in 64-bit words of the host's byte order; the slots begin at the second 
 
 A slot's image starts 64 bytes into it, its depth after the image, at a multiple of 64. The slot's lock is a
 sequence lock (Lameter 2005, "Effective synchronization on Linux/NUMA systems"): a reader copies and then
-looks whether it has changed. With several slots it changes only for a reader more than `slots - 1` frames
+checks whether it has changed. With several slots it changes only for a reader more than `slots - 1` frames
 late.
 """
 
@@ -68,9 +69,9 @@ Words = NDArray[np.uint64]
 
 
 def segment_path(name: str) -> Path:
-    """The file of a segment. Raises ValueError for a name that is no plain file name."""
+    """The file of a segment. Raises ValueError for a name that is not a plain file name."""
     if not name or name in (".", "..") or "/" in name or "\0" in name or len(name) > 200:
-        raise ValueError(f"a shared memory's name must be a plain file name, got {name!r}")
+        raise ValueError(f"the name of a shared memory must be a plain file name, got {name!r}")
     if not SHARED_MEMORY_DIRECTORY.is_dir():
         raise FileNotFoundError(
             f"{SHARED_MEMORY_DIRECTORY} does not exist; shared frames need Linux's tmpfs there"
@@ -103,53 +104,53 @@ class _Slots:
 
 
 def slot_bytes(width: int, height: int, depth: bool) -> int:
-    """Bytes of one slot, header included, whole pages."""
+    """Bytes of one slot, header included, in whole pages."""
     pixels = width * height
     return _up(SLOT_HEADER_BYTES + _up(3 * pixels, 64) + (4 * pixels if depth else 0), PAGE)
 
 
 def _write_calibration(header: Words, calibration: CameraCalibration) -> None:
     model, mount = calibration.model, calibration.mount
-    numbers = header.view(np.float64)
+    floats = header.view(np.float64)
     flags = _HAS_LENS
-    numbers[_LENS] = (model.fx, model.fy, model.cx, model.cy)
+    floats[_LENS] = (model.fx, model.fy, model.cx, model.cy)
     header[_COEFFICIENTS] = len(model.distortion)
-    numbers[_DISTORTION][: len(model.distortion)] = model.distortion
+    floats[_DISTORTION][: len(model.distortion)] = model.distortion
     if mount is not None:
         flags |= _HAS_MOUNT | (mount.levelled and _STABILIZED) | (mount.on_gimbal and _ON_GIMBAL)
-        numbers[_POSITION] = (mount.forward_m, mount.right_m, mount.down_m)
-        numbers[_ROTATION] = (mount.roll_rad, mount.pitch_rad, mount.yaw_rad)
+        floats[_POSITION] = (mount.forward_m, mount.right_m, mount.down_m)
+        floats[_ROTATION] = (mount.roll_rad, mount.pitch_rad, mount.yaw_rad)
     header[_CALIBRATION] = flags
 
 
 def _read_calibration(header: Words, width: int, height: int) -> CameraCalibration | None:
-    """Raises ValueError for what no camera can be."""
+    """Raises ValueError for an invalid calibration."""
     flags, count = int(header[_CALIBRATION]), int(header[_COEFFICIENTS])
     if not flags & _HAS_LENS:
         return None
-    numbers = header.view(np.float64)
-    if not np.isfinite(numbers[_LENS.start : _ROTATION.stop]).all():
-        raise ValueError("the calibration has numbers that are not finite")
-    fx, fy, cx, cy = numbers[_LENS].tolist()
-    distortion = tuple(numbers[_DISTORTION].tolist()[:count])
+    floats = header.view(np.float64)
+    if not np.isfinite(floats[_LENS.start : _ROTATION.stop]).all():
+        raise ValueError("the calibration contains numbers that are not finite")
+    fx, fy, cx, cy = floats[_LENS].tolist()
+    distortion = tuple(floats[_DISTORTION].tolist()[:count])
     mount = None
     if flags & _HAS_MOUNT:
-        forward_m, right_m, down_m = numbers[_POSITION].tolist()
-        roll_rad, pitch_rad, yaw_rad = numbers[_ROTATION].tolist()
+        forward_m, right_m, down_m = floats[_POSITION].tolist()
+        roll_rad, pitch_rad, yaw_rad = floats[_ROTATION].tolist()
         stabilized, on_gimbal = bool(flags & _STABILIZED), bool(flags & _ON_GIMBAL)
         mount = CameraMount(forward_m, right_m, down_m, roll_rad, pitch_rad, yaw_rad, stabilized, on_gimbal)
     return CameraCalibration(CameraModel(width, height, fx, fy, cx, cy, distortion), mount)
 
 
 class SharedFrameWriter:
-    """Writes frames of one size under a name. One writer a name; the last one's leavings are taken over.
+    """Writes frames of one size under a name. One writer per name; the segment of a dead writer is replaced.
 
     Args:
-        calibration: the camera's lens, of this size, and its mount, for whoever reads; None: not known.
+        calibration: the camera's lens, at this size, and its mount, for readers; None: unknown.
 
     Raises:
         FileExistsError: another writer of that name is alive.
-        ValueError: the name or a size cannot be.
+        ValueError: the name or a size is invalid.
     """
 
     def __init__(
@@ -163,13 +164,13 @@ class SharedFrameWriter:
     ) -> None:
         if calibration is not None and (calibration.model.width, calibration.model.height) != (width, height):
             raise ValueError(
-                f"the calibration is of {calibration.model.width}x{calibration.model.height} pixels, "
+                f"the calibration is for {calibration.model.width}x{calibration.model.height} pixels, "
                 f"the frames have {width}x{height}"
             )
         if width <= 0 or height <= 0:
             raise ValueError(f"shared frames need a positive size, got {width}x{height}")
         if slots < 2:
-            raise ValueError(f"a ring of shared frames needs 2 slots or more, got {slots}")
+            raise ValueError(f"a ring of shared frames needs at least 2 slots, got {slots}")
         self.name, self.width, self.height, self.depth = name, width, height, depth
         self._path = segment_path(name)
         stride = slot_bytes(width, height, depth)
@@ -178,7 +179,7 @@ class SharedFrameWriter:
         self._file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Memory is taken now: a full /dev/shm is an error here, not a SIGBUS in the middle of a frame.
+            # Allocate now: a full /dev/shm is an error here, not a SIGBUS in the middle of a frame.
             os.posix_fallocate(self._file, 0, size)
             self._memory = mmap.mmap(self._file, size)
             self._views: _Slots | None = _Slots(self._memory, width, height, depth, slots)
@@ -197,7 +198,7 @@ class SharedFrameWriter:
             raise
 
     def write(self, frame: Frame) -> None:
-        """Copy a frame in. Raises ValueError if its size, or its having depth, is not the segment's."""
+        """Copy a frame in. Raises ValueError if its size or presence of depth differs from the segment's."""
         if self._views is None:
             raise ValueError(f"the writer of shared memory {self.name!r} is closed")
         if (frame.width, frame.height) != (self.width, self.height):
@@ -207,8 +208,8 @@ class SharedFrameWriter:
             )
         if (frame.depth_m is not None) != self.depth:
             raise ValueError(
-                f"shared memory {self.name!r} was made {'with' if self.depth else 'without'} depth, "
-                f"the frame comes {'without' if self.depth else 'with'} it"
+                f"shared memory {self.name!r} was created {'with' if self.depth else 'without'} depth, "
+                f"the frame has {'none' if self.depth else 'depth'}"
             )
         header = self._views.header
         count = int(header[_WRITTEN])
@@ -226,7 +227,7 @@ class SharedFrameWriter:
         header[_HEARTBEAT] = time.monotonic_ns()
 
     def close(self) -> None:
-        """Say that no more comes, and remove the segment's name. Readers keep what they have mapped."""
+        """Mark the segment as closed and remove its name. Readers keep their mapping."""
         if self._views is None:
             return
         self._views.header[_CLOSED] = 1
@@ -244,7 +245,7 @@ class SharedFrameWriter:
 
 
 def _move_into_place(draft: Path, path: Path) -> None:
-    """Give the draft its name, over a dead writer's segment if there is one."""
+    """Rename the draft, replacing the segment of a dead writer if there is one."""
     while True:
         try:
             os.link(draft, path)
@@ -257,7 +258,7 @@ def _move_into_place(draft: Path, path: Path) -> None:
 
 
 def _replace_dead(draft: Path, path: Path) -> bool:
-    """Move the draft over `path` if its writer is dead; False if the file went away meanwhile."""
+    """Move the draft over `path` if its writer is dead; False if the file disappeared meanwhile."""
     try:
         old = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     except FileNotFoundError:
@@ -277,22 +278,22 @@ def _replace_dead(draft: Path, path: Path) -> bool:
 
 
 def remove_leavings(name: str) -> bool:
-    """Take away what a writer that was killed has left; True if there was something. A living one's stays."""
+    """Remove the segment of a killed writer; True if there was one. A living writer's segment stays."""
     path = segment_path(name)
     try:
-        left = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+        stale = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     except FileNotFoundError:
         return False
     try:
-        fcntl.flock(left, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        dead = _same_file(path, left)
+        fcntl.flock(stale, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        dead = _same_file(path, stale)
         if dead:
             path.unlink()
         return dead
     except BlockingIOError:
         return False
     finally:
-        os.close(left)
+        os.close(stale)
 
 
 def _same_file(path: Path, descriptor: int) -> bool:
@@ -305,16 +306,16 @@ def _same_file(path: Path, descriptor: int) -> bool:
 
 
 class SharedFrameReader:
-    """Reads the newest frame that a writer of that name has put there. Any number of readers.
+    """Reads the newest frame of the writer with that name. Any number of readers.
 
     Raises:
-        FileNotFoundError: nobody has written under that name (yet).
-        ValueError: the file is no segment of this version.
+        FileNotFoundError: there is no segment of that name (yet).
+        ValueError: the file is not a segment of this version.
 
     Attributes:
-        torn_reads: copies thrown away because the writer overtook them.
-        reopened: how often a new writer's segment was taken up.
-        calibration: the lens and mount of the camera that writes; None: the writer does not know them.
+        torn_reads: copies discarded because the writer overtook them.
+        reopened: number of new writers' segments opened.
+        calibration: lens and mount of the writing camera; None: unknown to the writer.
     """
 
     def __init__(self, name: str) -> None:
@@ -323,7 +324,7 @@ class SharedFrameReader:
         self.reopened = 0
         self._path = segment_path(name)
         self._views: _Slots | None = None
-        self._looked_ns = 0
+        self._checked_ns = 0
         self._new_writer = False
         self._open()
 
@@ -332,15 +333,17 @@ class SharedFrameReader:
         try:
             size = os.fstat(file).st_size
             if size < PAGE:
-                raise ValueError(f"{self._path} is no segment of shared frames: only {size} bytes")
+                raise ValueError(f"{self._path} is not a segment of shared frames: only {size} bytes")
             memory = mmap.mmap(file, size, prot=mmap.PROT_READ)
             header: list[int] = np.frombuffer(memory, np.uint64, PAGE // 8)[: _PID + 1].tolist()
             if header[_MAGIC] != MAGIC:
-                raise ValueError(f"{self._path} is no segment of shared frames (magic {header[_MAGIC]:#x})")
+                raise ValueError(
+                    f"{self._path} is not a segment of shared frames (magic {header[_MAGIC]:#x})"
+                )
             if header[_VERSION] != VERSION:
                 raise ValueError(
                     f"{self._path} has layout version {header[_VERSION]}, expected {VERSION}: its writer "
-                    f"(process {header[_PID]}) is of another release; restart it with this one"
+                    f"(process {header[_PID]}) is from another release; restart it with this one"
                 )
             width, height, depth, slots = (
                 header[_WIDTH],
@@ -373,8 +376,7 @@ class SharedFrameReader:
     def latest(self, after_sequence: int | None = None) -> Frame | None:
         """A copy of the newest frame if its sequence is above `after_sequence`, else None.
 
-        A writer that was started anew counts from its own beginning: its first frame is given whatever
-        `after_sequence` says.
+        A restarted writer counts from 0 again: its first frame is returned regardless of `after_sequence`.
         """
         self._follow_writer()
         if self._views is None:
@@ -401,12 +403,12 @@ class SharedFrameReader:
         return None
 
     def _follow_writer(self) -> None:
-        """Take up the segment of a newer writer, looking for one every now and then."""
+        """Open the segment of a newer writer; checked at most every 0.1 s."""
         now = time.monotonic_ns()
         closed = self._views is None or bool(self._views.header[_CLOSED])
-        if not closed and now - self._looked_ns < LOOK_FOR_SUCCESSOR_NS:
+        if not closed and now - self._checked_ns < LOOK_FOR_SUCCESSOR_NS:
             return
-        self._looked_ns = now
+        self._checked_ns = now
         if self._views is not None and _same_file(self._path, self._file):
             return
         if not self._path.exists():
@@ -419,13 +421,13 @@ class SharedFrameReader:
 
     @property
     def writer_heartbeat_ns(self) -> int | None:
-        """CLOCK_MONOTONIC nanoseconds of the writer's last sign of life; None if it has closed or gone."""
+        """CLOCK_MONOTONIC nanoseconds of the writer's last write; None if it has closed or disappeared."""
         if self._views is None or bool(self._views.header[_CLOSED]):
             return None
         return int(self._views.header[_HEARTBEAT])
 
     def close(self) -> None:
-        """Unmap. The segment stays: it is the writer's."""
+        """Unmap. The segment itself stays with the writer."""
         self._release()
         self._path = Path(os.devnull) / "closed"
 

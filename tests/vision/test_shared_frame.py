@@ -112,9 +112,7 @@ def wait_for(read: Callable[[], Frame | None]) -> Frame:
     width=st.integers(1, 70), height=st.integers(1, 50), depth=st.booleans(), slots=st.integers(2, 6),
     count=st.integers(1, 15),
 )  # fmt: skip
-def test_the_newest_frame_comes_out_as_it_went_in(
-    width: int, height: int, depth: bool, slots: int, count: int
-) -> None:
+def test_newest_frame_is_read_unchanged(width: int, height: int, depth: bool, slots: int, count: int) -> None:
     name = f"test-frames-{os.getpid()}-{secrets.token_hex(4)}"
     with (
         SharedFrameWriter(name, width, height, depth, slots) as writer,
@@ -202,7 +200,7 @@ def test_a_reader_that_exits_leaves_the_segment(name: str) -> None:
             assert got.sequence == 5
 
 
-def test_a_killed_writers_segment_is_taken_over_and_its_reader_follows(
+def test_killed_writers_segment_is_replaced_and_followed(
     name: str, start_writer: Callable[..., subprocess.Popen[str]]
 ) -> None:
     first = start_writer(500, 3)
@@ -219,7 +217,7 @@ def test_a_killed_writers_segment_is_taken_over_and_its_reader_follows(
         assert reader.latest(0) is None
 
 
-def test_only_what_a_killed_writer_left_is_removed(
+def test_only_a_killed_writers_segment_is_removed(
     name: str, start_writer: Callable[..., subprocess.Popen[str]]
 ) -> None:
     assert not remove_leavings(name), "nothing is there"
@@ -249,7 +247,7 @@ def test_a_reader_follows_a_writer_of_another_size(name: str) -> None:
 
 def test_two_writers_of_one_name_are_refused(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, True) as writer:
-        with pytest.raises(FileExistsError, match="being written by another process"):
+        with pytest.raises(FileExistsError, match="another process"):
             SharedFrameWriter(name, 16, 12, True)
         writer.write(frame(1))
         with SharedFrameReader(name) as reader:
@@ -267,25 +265,25 @@ def test_the_heartbeat_follows_the_writes(name: str) -> None:
         assert before <= heartbeat <= time.monotonic_ns()
 
 
-def test_a_frame_that_does_not_fit_is_refused_with_both_sizes(name: str) -> None:
+def test_frame_of_another_size_is_rejected_with_both_sizes(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, True) as writer:
-        with pytest.raises(ValueError, match="holds 16x12 frames, got 8x6"):
+        with pytest.raises(ValueError, match=r"16x12 .*8x6"):
             writer.write(frame(0, 8, 6))
-        with pytest.raises(ValueError, match="made with depth, the frame comes without"):
+        with pytest.raises(ValueError, match="with depth"):
             writer.write(frame(0, depth=False))
     with pytest.raises(ValueError, match="closed"):
         writer.write(frame(0))
 
 
-def test_a_reader_of_nothing_says_what_is_missing(name: str) -> None:
+def test_reader_without_segment_names_it(name: str) -> None:
     with pytest.raises(FileNotFoundError):
         SharedFrameReader(name)
 
 
 @pytest.mark.parametrize("content", [b"", b"x" * 100, b"\0" * 8192, bytes(range(256)) * 64])
-def test_a_file_that_is_no_segment_is_refused(name: str, content: bytes) -> None:
+def test_file_that_is_not_a_segment_is_rejected(name: str, content: bytes) -> None:
     segment_path(name).write_bytes(content)
-    with pytest.raises(ValueError, match="no segment of shared frames"):
+    with pytest.raises(ValueError, match="not a segment"):
         SharedFrameReader(name)
 
 
@@ -298,7 +296,7 @@ def test_a_truncated_segment_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("bad", ["", "..", "a/b", "../x", "n" * 300, "a\0b"])
-def test_a_name_that_is_no_file_name_is_refused(bad: str) -> None:
+def test_invalid_segment_name_is_rejected(bad: str) -> None:
     with pytest.raises(ValueError, match="plain file name"):
         SharedFrameReader(bad)
 
@@ -319,7 +317,7 @@ def test_the_segment_is_for_its_owner_only(name: str) -> None:
     ],
     ids=["none", "fixed", "stabilized", "gimbal"],
 )
-def test_calibration_comes_out_as_it_went_in(
+def test_calibration_is_read_unchanged(
     name: str, distortion: tuple[float, ...], mount: CameraMount | None
 ) -> None:
     calibration = CameraCalibration(CameraModel(16, 12, 11.5, 11.25, 7.25, 5.75, distortion), mount)
@@ -330,7 +328,7 @@ def test_calibration_comes_out_as_it_went_in(
         assert reader.calibration == calibration
 
 
-def test_a_writer_without_calibration_brings_none(name: str) -> None:
+def test_writer_without_calibration_gives_none(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, depth=False), SharedFrameReader(name) as reader:
         assert reader.calibration is None
 

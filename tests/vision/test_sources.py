@@ -25,9 +25,9 @@ def write_image(path: Path, value: int, width: int = 32, height: int = 24) -> No
 
 
 @pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """20 frames at 50 Hz, each of its own grey; MJPEG in AVI, whose frames stand alone."""
-    path = tmp_path_factory.mktemp("film") / "film.avi"
+    path = tmp_path_factory.mktemp("video") / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 50.0, (64, 48))
     for index in range(20):
         writer.write(np.full((48, 64, 3), index * 10, np.uint8))
@@ -35,8 +35,8 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_video_gives_every_frame_in_order_with_rising_stamps(film: Path) -> None:
-    with open_source(str(film)) as source:
+def test_a_video_gives_every_frame_in_order_with_rising_stamps(video: Path) -> None:
+    with open_source(str(video)) as source:
         assert not source.live
         assert source.total_frames == 20
         frames = list(source)
@@ -50,13 +50,13 @@ def test_a_video_gives_every_frame_in_order_with_rising_stamps(film: Path) -> No
     assert stamps[-1] <= time.monotonic_ns()
 
 
-def test_a_file_address_is_a_file(film: Path) -> None:
-    with open_source(f"file://{film}") as source:
+def test_a_file_address_is_a_file(video: Path) -> None:
+    with open_source(f"file://{video}") as source:
         assert len(list(source)) == 20
 
 
-def test_a_video_in_a_loop_goes_on_after_its_end(film: Path) -> None:
-    with open_source(str(film), SourceSettings(loop=True)) as source:
+def test_looped_video_continues_after_its_end(video: Path) -> None:
+    with open_source(str(video), SourceSettings(loop=True)) as source:
         frames = [source.read() for _ in range(45)]
     assert [frame.sequence for frame in frames if frame] == list(range(45))
     assert frames[44] is not None
@@ -64,18 +64,18 @@ def test_a_video_in_a_loop_goes_on_after_its_end(film: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_single_picture_in_a_loop_stands_as_long_as_any_other(count: int, tmp_path: Path) -> None:
+def test_looped_single_image_keeps_the_interval(count: int, tmp_path: Path) -> None:
     paths = [tmp_path / f"{number}.png" for number in range(count)]
     for path in paths:
         cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
     capture = LoopingCapture(lambda: ImagesCapture(paths, rate_hz=10.0))
-    pictures = [capture.read(1.0) for _ in range(5)]
-    assert [picture.media_s for picture in pictures if picture] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    frames_at = [capture.read(1.0) for _ in range(5)]
+    assert [raw.media_s for raw in frames_at if raw] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 
-def test_a_video_in_real_time_keeps_its_own_pace_and_ends(film: Path) -> None:
+def test_a_video_in_real_time_keeps_its_own_pace_and_ends(video: Path) -> None:
     began_s = time.monotonic()
-    with open_source(str(film), SourceSettings(realtime=True)) as source:
+    with open_source(str(video), SourceSettings(realtime=True)) as source:
         assert source.live
         frames = list(source)
         statistics = source.statistics
@@ -88,8 +88,8 @@ def test_a_video_in_real_time_keeps_its_own_pace_and_ends(film: Path) -> None:
     )
 
 
-def test_a_slow_reader_of_a_video_in_real_time_gets_the_newest_and_the_rest_are_counted(film: Path) -> None:
-    with open_source(str(film), SourceSettings(realtime=True, loop=True)) as source:
+def test_slow_realtime_reader_gets_the_newest_frame(video: Path) -> None:
+    with open_source(str(video), SourceSettings(realtime=True, loop=True)) as source:
         first = source.read()
         assert first is not None
         deadline_s = time.monotonic() + 20
@@ -102,26 +102,26 @@ def test_a_slow_reader_of_a_video_in_real_time_gets_the_newest_and_the_rest_are_
         assert statistics.delivered + statistics.dropped >= second.sequence + 1
 
 
-def test_after_close_there_are_no_frames(film: Path) -> None:
+def test_after_close_there_are_no_frames(video: Path) -> None:
     for settings in (SourceSettings(), SourceSettings(realtime=True)):
-        source = open_source(str(film), settings)
+        source = open_source(str(video), settings)
         source.close()
         source.close()
         with pytest.raises(EndOfStream):
             source.read()
 
 
-def test_a_video_cut_short_gives_what_is_there_and_says_so(
-    film: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_truncated_video_gives_its_frames_and_a_warning(
+    video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    data = film.read_bytes()
+    data = video.read_bytes()
     short = tmp_path / "short.avi"
-    pictures = data.index(b"movi")
-    short.write_bytes(data[: (pictures + len(data)) // 2])
+    frames_at = data.index(b"movi")
+    short.write_bytes(data[: (frames_at + len(data)) // 2])
     with open_source(str(short)) as source:
         frames = list(source)
     assert 0 < len(frames) < 20
-    assert f"short.avi: ended after {len(frames)} frames: the file promises 20" in caplog.text
+    assert f"short.avi: ended after {len(frames)} frames: the file should have 20" in caplog.text
 
 
 def test_a_folder_gives_its_images_in_natural_order_of_any_size(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_a_folder_gives_its_images_in_natural_order_of_any_size(tmp_path: Path) 
     assert [frame.width for frame in frames] == [17, 18, 26]
 
 
-def test_an_unreadable_image_is_named_counted_and_leaves_a_gap(
+def test_unreadable_image_is_logged_counted_and_skipped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_image(tmp_path / "a.png", 10)
@@ -147,11 +147,11 @@ def test_an_unreadable_image_is_named_counted_and_leaves_a_gap(
         frames = list(source)
         assert source.statistics == SourceStatistics(delivered=2, unreadable=2)
     assert [frame.sequence for frame in frames] == [0, 3]
-    assert "b.png: passed over" in caplog.text
-    assert "c.jpg: passed over" in caplog.text
+    assert "b.png: skipped" in caplog.text
+    assert "c.jpg: skipped" in caplog.text
 
 
-def test_names_sort_as_people_count() -> None:
+def test_names_sort_in_natural_order() -> None:
     names = ["b2.png", "B10.png", "b1.png", "10.png", "9.png", "a.png", "01.png"]
     ordered = sorted((Path(name) for name in names), key=natural_key)
     assert [path.name for path in ordered] == [
@@ -165,7 +165,7 @@ def test_names_sort_as_people_count() -> None:
     ]
 
 
-def test_one_image_is_one_frame_and_grey_or_transparent_ones_become_colour(tmp_path: Path) -> None:
+def test_single_image_is_one_colour_frame(tmp_path: Path) -> None:
     for name, shape in (("grey.png", (8, 9)), ("alpha.png", (8, 9, 4)), ("deep.png", (8, 9))):
         kind = np.uint16 if name == "deep.png" else np.uint8
         cv2.imwrite(str(tmp_path / name), np.full(shape, 200 if kind is np.uint8 else 51200, kind))
@@ -177,7 +177,7 @@ def test_one_image_is_one_frame_and_grey_or_transparent_ones_become_colour(tmp_p
 
 
 def test_a_raw_file_is_read_with_the_format_and_size_given(tmp_path: Path) -> None:
-    path = tmp_path / "film.rgb"
+    path = tmp_path / "video.rgb"
     path.write_bytes(bytes([1, 2, 3]) * 12 * 2)
     with open_source(str(path), SourceSettings(width=4, height=3, pixel_format="rgb24")) as source:
         frames = list(source)
@@ -215,22 +215,20 @@ def broken_images(path: Path) -> str:
         pytest.param(
             missing_file, r"bike\.mp4: no such file.*did you mean .*bikes\.mp4", id="missing, with a hint"
         ),
-        pytest.param(
-            lambda path: str(path / "no/where.mp4"), "the folder .* does not exist either", id="no folder"
-        ),
+        pytest.param(lambda path: str(path / "no/where.mp4"), "does not exist", id="no folder"),
         pytest.param(empty_file, "the file is empty", id="empty"),
-        pytest.param(text_file, r"text\.mp4: no video that FFmpeg can read", id="not a video"),
+        pytest.param(text_file, r"text\.mp4: no video", id="not a video"),
         pytest.param(empty_folder, "no images in this folder", id="folder without images"),
-        pytest.param(broken_images, "none of the 1 images could be read", id="only broken images"),
-        pytest.param(lambda path: "gopher://x/y", "have no gopher://", id="unknown scheme"),
-        pytest.param(lambda path: "udp://127.0.0.1", "with a port from 1 to 65535", id="no port"),
+        pytest.param(broken_images, "none of the 1", id="only broken images"),
+        pytest.param(lambda path: "gopher://x/y", "gopher://", id="unknown scheme"),
+        pytest.param(lambda path: "udp://127.0.0.1", "1 to 65535", id="no port"),
         pytest.param(
             lambda path: "udp://127.0.0.1:1?format=vp9", "format must be mpegts, rtp-h264", id="RTP format"
         ),
-        pytest.param(lambda path: "shm://a/b", "plain file name", id="shared memory's name"),
+        pytest.param(lambda path: "shm://a/b", "plain file name", id="shared memory"),
     ],
 )
-def test_what_cannot_be_opened_is_one_clear_line(
+def test_open_failure_is_a_one_line_error(
     tmp_path: Path, make: object, words: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     uri = make(tmp_path)  # type: ignore[operator]
@@ -248,10 +246,10 @@ def test_what_cannot_be_opened_is_one_clear_line(
         ({"rate_hz": float("nan")}, "rate_hz must be above 0"),
         ({"open_timeout_s": 0.0}, "open_timeout_s must be above 0"),
         ({"retry_min_s": 5.0, "retry_max_s": 1.0}, "retry_max_s must be from retry_min_s"),
-        ({"pixel_format": "yuv"}, "pixel_format must be a camera's four letters"),
+        ({"pixel_format": "yuv"}, "pixel_format"),
     ],
 )
-def test_settings_out_of_range_name_themselves(values: dict[str, object], words: str) -> None:
+def test_settings_out_of_range_are_named(values: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         SourceSettings(**values)  # type: ignore[arg-type]
 

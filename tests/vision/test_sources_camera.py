@@ -71,9 +71,7 @@ def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_what_is_asked_goes_to_the_driver_pixel_format_first(
-    device: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_settings_reach_the_driver_pixel_format_first(device: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     wanted = SourceSettings(width=640, height=480, rate_hz=30.0, pixel_format="MJPG")
     with open_source("0", wanted) as source:
@@ -89,13 +87,15 @@ def test_what_is_asked_goes_to_the_driver_pixel_format_first(
         cv2.CAP_PROP_FRAME_HEIGHT,
         cv2.CAP_PROP_FPS,
     ]
-    assert "gives 640x480 MJPG at 30 Hz" in caplog.text
+    assert "640x480 MJPG at 30 Hz" in caplog.text
     assert camera.released
 
 
-def test_what_the_driver_gave_instead_is_said(device: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_settings_not_accepted_by_the_driver_are_logged(
+    device: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     open_source("0", SourceSettings(width=1280, height=720, rate_hz=60.0)).close()
-    assert "gives 640x480 YUYV at 30 Hz; asked for width 1280, height 720, rate_hz 60" in caplog.text
+    assert "640x480 YUYV at 30 Hz; not accepted: width 1280, height 720, rate_hz 60" in caplog.text
 
 
 def test_an_unplugged_camera_is_opened_again(
@@ -109,11 +109,11 @@ def test_an_unplugged_camera_is_opened_again(
         assert source.statistics.reopened == 1
     assert len(FakeCamera.opened) == 2
     assert all(camera.released for camera in FakeCamera.opened)
-    assert "lost: the camera gave no frame" in caplog.text
-    assert "back after" in caplog.text
+    assert "lost: the camera" in caplog.text
+    assert "recovered after" in caplog.text
 
 
-def test_the_driver_s_own_monotonic_stamp_is_taken(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_monotonic_driver_stamp_is_used(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stamp_ns = time.monotonic_ns() - 20_000_000
     monkeypatch.setattr(FakeCamera, "stamp_ms", stamp_ns / 1e6)
     with open_source("0") as source:
@@ -122,7 +122,7 @@ def test_the_driver_s_own_monotonic_stamp_is_taken(device: Path, monkeypatch: py
     assert abs(frame.captured_ns - stamp_ns) < 1000
 
 
-def test_a_stamp_of_another_clock_is_not_taken(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stamp_of_another_clock_is_not_used(device: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeCamera, "stamp_ms", time.time() * 1000)
     before_ns = time.monotonic_ns()
     with open_source("0") as source:
@@ -137,12 +137,12 @@ def test_a_camera_without_permission_names_the_group(device: Path, monkeypatch: 
         open_source("0")
 
 
-def test_a_pipe_s_pixel_format_is_no_camera_s(device: Path) -> None:
-    with pytest.raises(SourceError, match="four letters, such as MJPG"):
+def test_pipe_pixel_format_is_rejected_for_a_camera(device: Path) -> None:
+    with pytest.raises(SourceError, match="FOURCC"):
         open_source("0", SourceSettings(pixel_format="bgr24", width=4, height=4))
 
 
-def test_a_camera_that_is_not_there_is_one_clear_line() -> None:
+def test_missing_camera_is_a_one_line_error() -> None:
     with pytest.raises(SourceError, match=r"/dev/video98765: no such camera"):
         open_source("98765")
 
@@ -163,11 +163,11 @@ def test_a_camera_that_is_not_there_is_one_clear_line() -> None:
         ("²", None),
     ],
 )
-def test_what_is_a_camera_s_address(uri: str, device: str | None) -> None:
+def test_camera_addresses_are_recognised(uri: str, device: str | None) -> None:
     assert camera_device(uri) == (None if device is None else Path(device))
 
 
-def test_a_fourcc_is_letters_where_it_can_be() -> None:
+def test_fourcc_is_text_if_printable() -> None:
     assert fourcc_text(cv2.VideoWriter.fourcc(*"MJPG")) == "MJPG"
     assert fourcc_text(0) == "0x00000000"
     assert fourcc_text(-1) == "0x-0000001"

@@ -41,12 +41,12 @@ class CameraHandler(BaseHTTPRequestHandler):
         self.end_headers()
         with contextlib.suppress(OSError):
             while not server.stopping.is_set():
-                picture = jpeg(server.blue)
+                encoded = jpeg(server.blue)
                 # The length is wrong on purpose, as many a camera's is.
                 self.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: 1\r\n\r\n")
-                half = len(picture) // 2
-                self.wfile.write(picture[:half])
-                self.wfile.write(picture[half:] + b"\r\n")
+                half = len(encoded) // 2
+                self.wfile.write(encoded[:half])
+                self.wfile.write(encoded[half:] + b"\r\n")
                 server.stopping.wait(0.02)
 
     def log_message(self, format: str, *arguments: Any) -> None:
@@ -81,7 +81,7 @@ def serving(server: CameraServer) -> Iterator[CameraServer]:
         thread.join()
 
 
-def test_http_motion_jpeg_is_live_and_its_server_may_stop_and_return(
+def test_http_motion_jpeg_recovers_from_a_server_restart(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level("WARNING")
@@ -103,7 +103,7 @@ def test_http_motion_jpeg_is_live_and_its_server_may_stop_and_return(
             source.close()
     lines = [record.getMessage() for record in caplog.records]
     assert sum("lost: " in line for line in lines) == 1
-    assert sum("back after" in line for line in lines) == 1
+    assert sum("recovered after" in line for line in lines) == 1
 
 
 def test_http_close_does_not_wait_for_a_silent_server() -> None:
@@ -121,7 +121,7 @@ def test_http_close_does_not_wait_for_a_silent_server() -> None:
         assert closed.wait(30)
 
 
-def test_http_takes_user_and_password_from_the_address_and_shows_neither(
+def test_http_uses_credentials_from_the_address_without_logging(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level("DEBUG")
@@ -129,24 +129,22 @@ def test_http_takes_user_and_password_from_the_address_and_shows_neither(
         with open_source(f"http://user:se%20cret@127.0.0.1:{server.port}/video", QUICK) as source:
             wait_for_frame(source, is_blue(200))
             assert source.uri == f"http://user:***@127.0.0.1:{server.port}/video"
-        with pytest.raises(
-            SourceError, match=r"asks for a user and password .*HTTP 401.*USER:PASSWORD@"
-        ) as caught:
+        with pytest.raises(SourceError, match=r"HTTP 401.*USER:PASSWORD@") as caught:
             open_source(f"http://user:wr0ng@127.0.0.1:{server.port}/video", QUICK)
     assert "wr0ng" not in str(caught.value)
     assert "cret" not in caplog.text
 
 
-def test_http_with_nothing_there_says_so_at_once() -> None:
-    with serving(CameraServer()) as server, pytest.raises(SourceError, match="has nothing there"):
+def test_http_404_fails_at_once() -> None:
+    with serving(CameraServer()) as server, pytest.raises(SourceError, match="HTTP 404"):
         open_source(f"http://127.0.0.1:{server.port}/other", QUICK)
 
 
-def test_http_of_another_kind_goes_to_ffmpeg_and_its_failure_names_the_kind() -> None:
+def test_http_of_another_type_goes_to_ffmpeg_and_names_it() -> None:
     with serving(CameraServer()) as server:
         server.content_type = "text/plain"
         server.stopping.set()
-        with pytest.raises(SourceError, match="the server sends text/plain, and no video"):
+        with pytest.raises(SourceError, match="text/plain"):
             open_source(
                 f"http://127.0.0.1:{server.port}/video", SourceSettings(open_timeout_s=0.5, retry_min_s=0.1)
             )
@@ -159,7 +157,7 @@ def test_http_of_another_kind_goes_to_ffmpeg_and_its_failure_names_the_kind() ->
         ("rtsp://user:secret@127.0.0.1:{port}/live", "connection refused; is the camera on"),
     ],
 )
-def test_nobody_listening_is_one_clear_line_without_the_password(
+def test_refused_connection_is_one_line_without_password(
     address: str, words: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     uri = address.format(port=free_port(socket.SOCK_STREAM))

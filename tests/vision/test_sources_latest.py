@@ -64,7 +64,7 @@ def frame_of(source: LatestSource, value: int) -> Frame:
     raise AssertionError(f"frame {value} never came")
 
 
-def test_a_lost_feed_is_opened_again_and_both_are_said_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_lost_capture_is_reopened_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("WARNING")
     gate = threading.Event()
     first = ScriptedFeed([1, CaptureError("unplugged")], gate)
@@ -78,8 +78,8 @@ def test_a_lost_feed_is_opened_again_and_both_are_said_once(caplog: pytest.LogCa
         assert frame.sequence == 1
         assert source.statistics.reopened == 1
     lines = [record.getMessage() for record in caplog.records]
-    assert lines[0] == "camera: lost: unplugged; opening it again"
-    assert lines[1].startswith("camera: back after ")
+    assert lines[0] == "camera: lost: unplugged; reopening"
+    assert lines[1].startswith("camera: recovered after ")
     assert len(lines) == 2
     assert first.closed == second.closed == 1
 
@@ -88,10 +88,10 @@ def test_silence_is_a_loss(caplog: pytest.LogCaptureFixture) -> None:
     with LatestSource("camera", opener(ScriptedFeed([1]), ScriptedFeed([2])), QUICK) as source:
         frame_of(source, 1)
         frame_of(source, 2)
-    assert "lost: nothing came for 0." in caplog.text
+    assert "lost: no data for 0." in caplog.text
 
 
-def test_the_pause_between_attempts_doubles_up_to_its_cap(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_retry_pause_doubles_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     pauses: list[float] = []
     enough = threading.Event()
 
@@ -113,19 +113,19 @@ def test_the_pause_between_attempts_doubles_up_to_its_cap(monkeypatch: pytest.Mo
     assert pauses[:5] == [1.0, 2.0, 4.0, 5.0, 5.0]
 
 
-def test_one_that_never_opens_says_why_and_what_to_do() -> None:
+def test_source_that_never_opens_names_cause_and_action() -> None:
     settings = SourceSettings(open_timeout_s=0.2, retry_min_s=0.02)
     with pytest.raises(SourceError) as caught:
         LatestSource("camera", opener(), settings, advice="is it on?")
     assert str(caught.value) == "camera: no frame within 0.2 s: nobody there; is it on?"
 
 
-def test_an_error_no_attempt_can_mend_is_raised_at_once() -> None:
+def test_permanent_error_is_raised_at_once() -> None:
     with pytest.raises(SourceError, match="camera: no permission"):
         LatestSource("camera", opener(SourceError("no permission")), SourceSettings(open_timeout_s=600.0))
 
 
-def test_an_unexpected_error_reaches_the_reader_and_not_only_a_thread() -> None:
+def test_unexpected_error_is_raised_in_the_reader() -> None:
     gate = threading.Event()
     source = LatestSource("camera", opener(ScriptedFeed([1, ZeroDivisionError("a bug")], gate)), QUICK)
     with source:
@@ -155,7 +155,7 @@ def test_without_reopening_a_loss_is_an_error() -> None:
             source.read(20.0)
 
 
-def test_each_frame_is_given_once_and_waiting_ends_with_none() -> None:
+def test_each_frame_is_returned_once_then_none() -> None:
     settings = SourceSettings(read_timeout_s=60.0)
     with LatestSource("camera", opener(ScriptedFeed([7])), settings) as source:
         assert source.read(20.0) is not None
@@ -178,11 +178,11 @@ def test_close_wakes_a_reader_that_waits() -> None:
     assert ended.wait(20)
 
 
-def test_what_the_writer_overwrote_counts_as_dropped() -> None:
+def test_overwritten_frames_count_as_dropped() -> None:
     class Skipping(ScriptedFeed):
         def read(self, timeout_s: float) -> RawFrame | None:
-            picture = super().read(timeout_s)
-            return None if picture is None else RawFrame(picture.image, skipped=4)
+            raw = super().read(timeout_s)
+            return None if raw is None else RawFrame(raw.image, skipped=4)
 
     with LatestSource("shared", opener(Skipping([1])), QUICK) as source:
         assert frame_of(source, 1).sequence == 4

@@ -51,9 +51,7 @@ between = st.binary(max_size=40).filter(lambda data: b"\xff" not in data)
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(between, kinds), max_size=4), st.lists(st.integers(0, 1 << 20), max_size=12))
-def test_images_come_out_byte_for_byte_however_the_stream_is_cut(
-    parts: list[tuple[bytes, bytes]], cuts: list[int]
-) -> None:
+def test_images_are_identical_for_any_stream_split(parts: list[tuple[bytes, bytes]], cuts: list[int]) -> None:
     stream = b"".join(gap + image for gap, image in parts)
     splitter = MjpegSplitter()
     found = [image for piece in in_pieces(stream, cuts) for image in splitter.push(piece)]
@@ -75,7 +73,7 @@ def test_a_thumbnail_inside_a_segment_is_not_taken_for_an_image(
 
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400), st.lists(st.integers(0, 1 << 20), max_size=8))
-def test_any_bytes_are_survived_and_the_image_after_them_is_found(noise: bytes, cuts: list[int]) -> None:
+def test_image_after_any_bytes_is_found(noise: bytes, cuts: list[int]) -> None:
     image = jpeg(1)
     # Twice, since the noise may end in the beginning of a segment that swallows the first.
     stream = noise + (b"\0" * 65536 + image) * 2
@@ -84,7 +82,7 @@ def test_any_bytes_are_survived_and_the_image_after_them_is_found(noise: bytes, 
     assert found[-1:] == [image]
 
 
-def test_an_image_broken_off_by_the_next_is_counted_and_the_next_is_whole() -> None:
+def test_interrupted_image_is_counted_and_next_is_complete() -> None:
     image = jpeg(2)
     splitter = MjpegSplitter()
     found = splitter.push(image[: len(image) // 2] + image)
@@ -110,21 +108,19 @@ def test_fill_bytes_before_a_marker_are_allowed() -> None:
     assert MjpegSplitter().push(filled) == [filled]
 
 
-def test_pictures_are_decoded_in_order_and_an_undecodable_one_is_counted(
+def test_undecodable_image_is_counted(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     empty = b"\xff\xd8\xff\xd9"
     parser = MjpegParser()
-    pictures = parser.push(jpeg(6) + empty + jpeg(7))
+    images = parser.push(jpeg(6) + empty + jpeg(7))
     decoded = [cv2.imdecode(np.frombuffer(jpeg(seed), np.uint8), cv2.IMREAD_COLOR) for seed in (6, 7)]
-    assert [picture.shape for picture in pictures] == [
-        picture.shape for picture in decoded if picture is not None
-    ]
+    assert [image.shape for image in images] == [image.shape for image in decoded if image is not None]
     assert parser.unreadable == 1
-    assert "1 damaged images passed over" in caplog.text
+    assert "1 damaged" in caplog.text
 
 
-def test_what_is_left_at_the_end_is_told() -> None:
+def test_leftover_at_the_end_is_reported() -> None:
     parser = MjpegParser()
     parser.push(jpeg(8)[:-10])
     assert "incomplete" in parser.leftover()

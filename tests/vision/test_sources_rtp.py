@@ -16,7 +16,7 @@ from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import UdpStream
 
 
-def test_rtp_jpeg_is_received_and_its_sender_may_stop_and_return(caplog: pytest.LogCaptureFixture) -> None:
+def test_rtp_jpeg_recovers_from_a_sender_restart(caplog: pytest.LogCaptureFixture) -> None:
     port = free_port()
     settings = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.5, retry_min_s=0.05)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
@@ -39,21 +39,21 @@ def test_rtp_jpeg_is_received_and_its_sender_may_stop_and_return(caplog: pytest.
                 assert source.statistics.reopened >= 1
 
 
-def test_a_udp_port_where_nothing_comes_says_what_was_expected(capfd: pytest.CaptureFixture[str]) -> None:
+def test_silent_udp_port_names_the_expected_stream(capfd: pytest.CaptureFixture[str]) -> None:
     port = free_port()
     settings = SourceSettings(open_timeout_s=0.5)
-    with pytest.raises(SourceError, match=f"no MPEG-TS came on UDP port {port}; is the sender sending"):
+    with pytest.raises(SourceError, match=f"no MPEG-TS .*{port}; is the sender sending"):
         open_source(f"udp://127.0.0.1:{port}", settings)
-    with pytest.raises(SourceError, match=f"no RTP H264 came on UDP port {port}"):
+    with pytest.raises(SourceError, match=f"no RTP H264 .*{port}"):
         open_source(f"udp://127.0.0.1:{port}?format=rtp-h264", settings)
     assert capfd.readouterr().err == ""
 
 
-def test_a_udp_port_in_use_says_so() -> None:
+def test_udp_port_in_use_is_reported() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("0.0.0.0", 0))
         port = other.getsockname()[1]
-        with pytest.raises(SourceError, match=f"UDP port {port} is taken by another program"):
+        with pytest.raises(SourceError, match=f"UDP port {port} is in use"):
             open_source(f"udp://127.0.0.1:{port}", SourceSettings(open_timeout_s=0.5))
 
 
@@ -72,13 +72,13 @@ def test_a_udp_port_in_use_says_so() -> None:
         ("udp://[::1]:7000?format=rtp-jpeg", ["o=- 0 0 IN IP6 ::1", "c=IN IP6 ::1"]),
     ],
 )
-def test_the_session_description_says_what_the_address_says(uri: str, lines: list[str]) -> None:
+def test_session_description_matches_the_address(uri: str, lines: list[str]) -> None:
     text = UdpStream(uri, SourceSettings()).session_description().split("\r\n")
     assert set(lines) <= set(text)
 
 
 def test_a_payload_type_out_of_range_is_refused() -> None:
-    with pytest.raises(SourceError, match="payload must be an RTP payload type from 0 to 127, got '200'"):
+    with pytest.raises(SourceError, match=r"payload .*'200'"):
         UdpStream("udp://:5600?format=rtp-h264&payload=200", SourceSettings())
 
 
@@ -106,10 +106,10 @@ def test_an_encoded_stream_over_udp_is_received(container: str, codec: str, addr
             image = np.full((96, 128, 3), (200, 90, 20), np.uint8)
             index = 0
             while not stop.wait(1 / 30):
-                picture = av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
-                picture.pts = index
+                video_frame = av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
+                video_frame.pts = index
                 index += 1
-                out.mux(stream.encode(picture))
+                out.mux(stream.encode(video_frame))
 
     sender = threading.Thread(target=send, daemon=True)
     sender.start()

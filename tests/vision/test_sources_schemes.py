@@ -61,7 +61,7 @@ def test_unknown_scheme_lists_the_known_ones(grey: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["shm", "Grey", "1grey", "grey://", ""])
-def test_scheme_that_is_taken_or_malformed_is_refused(scheme: str) -> None:
+def test_duplicate_or_malformed_scheme_is_rejected(scheme: str) -> None:
     before = SOURCES.known()
 
     def open_other(uri: str, settings: SourceSettings) -> Source:

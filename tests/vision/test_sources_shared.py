@@ -22,7 +22,7 @@ def frame(sequence: int, value: int) -> Frame:
     return Frame(np.full((4, 6, 3), value, np.uint8), time.monotonic_ns(), sequence, depth_m)
 
 
-def test_shared_frames_come_with_depth_and_their_own_stamp_and_gaps_are_drops() -> None:
+def test_shared_frames_have_depth_stamps_and_counted_gaps() -> None:
     name = f"test-{secrets.token_hex(6)}"
     with SharedFrameWriter(name, 6, 4, depth=True) as writer:
         written = frame(7, 50)
@@ -42,7 +42,7 @@ def test_shared_frames_come_with_depth_and_their_own_stamp_and_gaps_are_drops() 
             assert source.statistics.dropped == 4
 
 
-def test_a_writer_that_goes_and_returns_is_lost_and_back(caplog: pytest.LogCaptureFixture) -> None:
+def test_writer_restart_is_logged_as_loss_and_recovery(caplog: pytest.LogCaptureFixture) -> None:
     name = f"test-{secrets.token_hex(6)}"
     first = SharedFrameWriter(name, 6, 4, depth=False)
     first.write(Frame(np.full((4, 6, 3), 10, np.uint8), time.monotonic_ns(), 100))
@@ -64,7 +64,7 @@ def test_a_writer_that_goes_and_returns_is_lost_and_back(caplog: pytest.LogCaptu
             assert source.statistics.reopened == 1
 
 
-def test_what_a_dead_writer_left_is_no_frame() -> None:
+def test_frame_of_a_dead_writer_is_ignored() -> None:
     name = f"test-{secrets.token_hex(6)}"
     with SharedFrameWriter(name, 6, 4, depth=False) as writer:
         old = Frame(np.zeros((4, 6, 3), np.uint8), time.monotonic_ns() - 60_000_000_000, 3)
@@ -73,14 +73,14 @@ def test_what_a_dead_writer_left_is_no_frame() -> None:
             open_source(f"shm://{name}", SourceSettings(open_timeout_s=0.3, retry_min_s=0.1))
 
 
-def test_nobody_writing_is_one_clear_line() -> None:
+def test_missing_writer_is_a_one_line_error() -> None:
     with pytest.raises(
         SourceError, match=r"no frames in the shared memory 'test-none'.*is its writer running"
     ):
         open_source("shm://test-none", SourceSettings(open_timeout_s=0.3, retry_min_s=0.1))
 
 
-def test_a_source_brings_its_camera_and_ends_when_it_changes() -> None:
+def test_source_provides_calibration_and_ends_on_change() -> None:
     name = f"test-{secrets.token_hex(6)}"
     lens = CameraCalibration(CameraModel.from_horizontal_fov(6, 4, 1.2), CameraMount(pitch_rad=-0.35))
     other = CameraCalibration(CameraModel.from_horizontal_fov(6, 4, 1.4), CameraMount(pitch_rad=-0.35))

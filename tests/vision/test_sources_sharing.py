@@ -25,11 +25,11 @@ def name() -> Iterator[str]:
     assert not Path("/dev/shm", name).exists(), "the shared memory was left behind"
 
 
-def pictures(folder: Path, *sizes: tuple[int, int]) -> Path:
+def write_images(folder: Path, *sizes: tuple[int, int]) -> Path:
     rng = np.random.default_rng(1)
     for index, (width, height) in enumerate(sizes):
-        picture = rng.integers(0, 255, (height, width, 3), dtype=np.uint8)
-        assert cv2.imwrite(str(folder / f"{index}.png"), picture)
+        image = rng.integers(0, 255, (height, width, 3), dtype=np.uint8)
+        assert cv2.imwrite(str(folder / f"{index}.png"), image)
     return folder
 
 
@@ -42,8 +42,8 @@ def shared(folder: Path, name: str, **settings: Any) -> Iterator[Source]:
         yield source
 
 
-def test_what_is_read_is_there_for_others_with_its_stamp(name: str, tmp_path: Path) -> None:
-    folder = pictures(tmp_path, (32, 24), (32, 24))
+def test_frames_are_shared_with_their_stamps(name: str, tmp_path: Path) -> None:
+    folder = write_images(tmp_path, (32, 24), (32, 24))
     with shared(folder, name) as source:
         for _ in range(2):
             frame = source.read()
@@ -55,8 +55,8 @@ def test_what_is_read_is_there_for_others_with_its_stamp(name: str, tmp_path: Pa
             assert np.array_equal(other.image, frame.image)
 
 
-def test_a_frame_that_comes_after_the_end_is_shown_to_nobody(name: str, tmp_path: Path) -> None:
-    folder = pictures(tmp_path, (32, 24), (32, 24))
+def test_frame_after_close_is_not_shared(name: str, tmp_path: Path) -> None:
+    folder = write_images(tmp_path, (32, 24), (32, 24))
     with FrameSharing(name) as sharing, open_source(str(folder)) as source:
         frame = source.read()
         assert frame is not None
@@ -66,8 +66,8 @@ def test_a_frame_that_comes_after_the_end_is_shown_to_nobody(name: str, tmp_path
         SharedFrameReader(name)
 
 
-def test_a_stream_that_changes_its_size_goes_on(name: str, tmp_path: Path) -> None:
-    folder = pictures(tmp_path, (32, 24), (48, 16))
+def test_sharing_continues_after_a_size_change(name: str, tmp_path: Path) -> None:
+    folder = write_images(tmp_path, (32, 24), (48, 16))
     with shared(folder, name) as source:
         source.read()
         with SharedFrameReader(name) as reader:
@@ -78,8 +78,8 @@ def test_a_stream_that_changes_its_size_goes_on(name: str, tmp_path: Path) -> No
             assert (other.width, other.height) == (48, 16)
 
 
-def test_a_name_that_another_writes_is_one_clear_line(name: str, tmp_path: Path) -> None:
-    folder = pictures(tmp_path, (32, 24))
+def test_name_in_use_is_a_one_line_error(name: str, tmp_path: Path) -> None:
+    folder = write_images(tmp_path, (32, 24))
     with (
         SharedFrameWriter(name, 8, 8, False),
         shared(folder, name) as source,
@@ -88,8 +88,8 @@ def test_a_name_that_another_writes_is_one_clear_line(name: str, tmp_path: Path)
         source.read()
 
 
-def test_others_see_what_a_slow_reader_leaves_out(name: str, tmp_path: Path) -> None:
-    folder = pictures(tmp_path, (32, 24), (32, 24))
+def test_sharing_includes_frames_a_slow_reader_misses(name: str, tmp_path: Path) -> None:
+    folder = write_images(tmp_path, (32, 24), (32, 24))
     with shared(folder, name, realtime=True, loop=True, rate_hz=200.0), SharedFrameReader(name) as reader:
         # Nobody reads the source itself.
         seen: set[int] = set()
@@ -102,8 +102,8 @@ def test_others_see_what_a_slow_reader_leaves_out(name: str, tmp_path: Path) -> 
             time.sleep(0.001)
 
 
-def test_a_live_source_whose_frames_cannot_be_shared_does_not_open(name: str, tmp_path: Path) -> None:
-    folder = pictures(tmp_path, (32, 24))
+def test_source_fails_to_open_if_sharing_fails(name: str, tmp_path: Path) -> None:
+    folder = write_images(tmp_path, (32, 24))
     with (
         SharedFrameWriter(name, 8, 8, False),
         pytest.raises(SourceError, match=f"shm://{name}: .*another process"),

@@ -1,6 +1,6 @@
-"""Where frames come from: files, folders, cameras, pipes, networks, shared memory — one `open_source`.
+"""Frame sources: files, folders, cameras, pipes, network streams, shared memory, opened by `open_source`.
 
-A source of one's own is a `Capture`, and a function with the decorator `vision.sources.registry.source`.
+A custom source is a `Capture`, and a function with the decorator `vision.sources.registry.source`.
 """
 
 from vision.sources.capture import Capture, CaptureError, RawFrame

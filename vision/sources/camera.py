@@ -1,11 +1,10 @@
 """A camera of Video4Linux, `/dev/video0` or `0`.
 
-A name under `/dev/v4l/by-id/` stays the same camera after it was unplugged and plugged in again; a number
-may not.
+A name under `/dev/v4l/by-id/` stays the same when a camera is unplugged and plugged in again; a number may
+not.
 
-No camera was at hand when this was written: it follows OpenCV's V4L2 back end as documented, and is tested
-    with a
-stand-in for `cv2.VideoCapture`, the lowest layer there is.
+Not tested with a real camera: it follows OpenCV's V4L2 back end as documented, and is tested with a fake
+`cv2.VideoCapture`, the lowest layer available.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSetting
 
 logger = logging.getLogger(__name__)
 
-_OLDEST_STAMP_NS = 1_000_000_000  # a driver's stamp further back than this is of another clock
+_OLDEST_STAMP_NS = 1_000_000_000  # an older driver stamp is from another clock
 
 
 def camera_device(uri: str) -> Path | None:
-    """The device an address means: an index, or a character device under /dev; None if neither."""
+    """The device of an address: an index, or a character device under /dev; None if neither."""
     if uri.isascii() and uri.isdecimal():
         return Path(f"/dev/video{int(uri)}")
     path = Path(uri)
@@ -43,20 +42,20 @@ def camera_device(uri: str) -> Path | None:
 
 
 def check_camera(device: Path, settings: SourceSettings) -> None:
-    """Find what would keep a camera from opening, in words.
+    """Check that a camera can be opened.
 
     Raises:
         SourceError: no such device, no permission, or a pixel format that no camera has.
     """
     if settings.pixel_format in PIPE_PIXEL_FORMATS:
         raise SourceError(
-            f"{device}: pixel_format {settings.pixel_format!r} is for pipes; a camera's is four letters, "
+            f"{device}: pixel_format {settings.pixel_format!r} is for pipes; a camera's is a FOURCC, "
             f"such as MJPG or YUYV"
         )
     if not device.exists():
         others = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
         raise SourceError(
-            f"{device}: no such camera; {f'there are {others}' if others else 'no camera is connected'}"
+            f"{device}: no such camera; {f'found {others}' if others else 'no camera is connected'}"
         )
     if not os.access(device, os.R_OK | os.W_OK):
         raise SourceError(
@@ -66,31 +65,31 @@ def check_camera(device: Path, settings: SourceSettings) -> None:
 
 
 class CameraCapture(Capture):
-    """Frames of a V4L2 camera, stamped by its driver where it stamps with the monotonic clock.
+    """Frames of a V4L2 camera, with the driver's stamp if it uses the monotonic clock.
 
     Raises:
-        SourceError: it cannot be opened, for a reason found.
-        CaptureError: it did not open; another program may have it.
+        SourceError: it cannot be opened, for a known reason.
+        CaptureError: it did not open; another program may be using it.
     """
 
     def __init__(self, device: Path, settings: SourceSettings) -> None:
         check_camera(device, settings)
         quiet_opencv()
         self._device = device
-        # OpenCV waits this long, in whole seconds, for a frame; it reads the variable when it first needs it.
+        # OpenCV's timeout for a frame, in whole seconds; it reads the variable at its first use.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(settings.read_timeout_s)))
         self._capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2)
         if not self._capture.isOpened():
             self._capture.release()
             raise CaptureError(
-                "it does not open as a camera; another program may be using it, or it is a camera's second "
-                "device (metadata)"
+                "it does not open as a camera; another program may be using it, or it is a camera's metadata "
+                "device"
             )
-        self._ask_for(settings)
+        self._configure(settings)
 
-    def _ask_for(self, settings: SourceSettings) -> None:
+    def _configure(self, settings: SourceSettings) -> None:
         capture = self._capture
-        # The pixel format first: it decides which sizes and rates the driver offers.
+        # The pixel format first: the sizes and rates that the driver offers depend on it.
         if settings.pixel_format is not None:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.pixel_format))
         if settings.width is not None:
@@ -104,27 +103,27 @@ class CameraCapture(Capture):
         rate_hz = capture.get(cv2.CAP_PROP_FPS)
         pixel_format = fourcc_text(int(capture.get(cv2.CAP_PROP_FOURCC)))
         refused = [
-            f"{name} {asked}"
-            for name, asked, given in (
+            f"{name} {requested}"
+            for name, requested, actual in (
                 ("width", settings.width, width),
                 ("height", settings.height, height),
                 ("pixel_format", settings.pixel_format, pixel_format),
             )
-            if asked is not None and asked != given
+            if requested is not None and requested != actual
         ]
         if settings.rate_hz is not None and abs(settings.rate_hz - rate_hz) > 0.5:
             refused.append(f"rate_hz {settings.rate_hz:g}")
-        given_text = f"{width}x{height} {pixel_format} at {rate_hz:g} Hz"
+        actual_text = f"{width}x{height} {pixel_format} at {rate_hz:g} Hz"
         if refused:
-            logger.warning("%s: gives %s; asked for %s", self._device, given_text, ", ".join(refused))
+            logger.warning("%s: set to %s; not accepted: %s", self._device, actual_text, ", ".join(refused))
         else:
-            logger.info("%s: gives %s", self._device, given_text)
+            logger.info("%s: set to %s", self._device, actual_text)
 
     def read(self, timeout_s: float) -> RawFrame | None:
         image, now_ns, decode_ms = read_capture(self._capture)
         if image is None:
             gone = "" if self._device.exists() else "; it was unplugged"
-            raise CaptureError(f"the camera gave no frame{gone}")
+            raise CaptureError(f"the camera delivered no frame{gone}")
         driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         captured_ns = driver_ns if 0 <= now_ns - driver_ns < _OLDEST_STAMP_NS else now_ns
         return RawFrame(image, captured_ns, decode_ms=decode_ms)
@@ -134,6 +133,6 @@ class CameraCapture(Capture):
 
 
 def fourcc_text(code: int) -> str:
-    """The four letters of a FOURCC; a number in hexadecimal where they cannot be printed."""
+    """The four letters of a FOURCC; in hexadecimal if they are not printable."""
     letters = code.to_bytes(4, "little", signed=code < 0)
     return letters.decode("ascii") if all(32 <= letter < 127 for letter in letters) else f"0x{code:08x}"

@@ -1,4 +1,4 @@
-"""The lowest layer of a source: one opened thing that gives pictures until it ends or is lost."""
+"""The lowest layer of a source: an open device, file or stream that delivers frames until it ends."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from vision.sources.source import EndOfStream
 
 
 class CaptureError(Exception):
-    """The feed stopped or could not be opened this time; another attempt may succeed."""
+    """The capture stopped or could not be opened; another attempt may succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawFrame:
-    """One decoded picture of a feed.
+    """One decoded frame of a capture.
 
     Attributes:
         image: (height, width, 3) uint8, BGR.
         captured_ns: CLOCK_MONOTONIC nanoseconds; None for a file, whose frames are captured when read.
         depth_m: (height, width) float32 metres along the optical axis, or None.
         media_s: seconds since the start of the recording, for pacing; None where there is no such time.
-        skipped: pictures that the writer overwrote since the one before.
-        decode_ms: how long making a picture of its bytes took, milliseconds, as far as the library that does
-            it lets us see.
+        skipped: frames that the writer overwrote since the previous one.
+        decode_ms: decoding time, milliseconds, as far as the library exposes it.
     """
 
     image: NDArray[np.uint8]
@@ -40,14 +39,14 @@ class RawFrame:
 
 
 class Capture(ABC):
-    """An opened thing that gives pictures in order. It is never reopened: its opener makes a new one.
+    """An open device, file or stream that delivers frames in order. Reopening creates a new one.
 
     Attributes:
-        total_frames: how many pictures there are, if known.
-        unreadable: pictures that could not be decoded so far.
-        silence_is_loss: whether opening it again may help when nothing comes for a while.
-        interval_s: between two pictures of a recording, where there are no two to tell.
-        calibration: the camera's lens and mount, where it brings them.
+        total_frames: number of frames, if known.
+        unreadable: frames that could not be decoded so far.
+        silence_is_loss: whether reopening may help when no data arrives for a while.
+        interval_s: frame interval of a recording, used where stamps do not give one.
+        calibration: the camera's lens and mount, if it provides them.
     """
 
     total_frames: int | None = None
@@ -58,64 +57,64 @@ class Capture(ABC):
 
     @abstractmethod
     def read(self, timeout_s: float) -> RawFrame | None:
-        """The next picture, or None if none came within about `timeout_s`.
+        """The next frame, or None if none arrived within about `timeout_s`.
 
         Raises:
-            EndOfStream: there are no more, and that is in order.
-            CaptureError: the connection, device or data broke.
+            EndOfStream: regular end.
+            CaptureError: the connection, device or data failed.
         """
 
     @abstractmethod
     def close(self) -> None:
         """Release it. Called once, by the thread that reads."""
 
-    def interrupt(self) -> None:  # noqa: B027 - most feeds return soon enough by themselves
+    def interrupt(self) -> None:  # noqa: B027 - most captures return soon enough without it
         """Make a blocked `read` return early; called from another thread."""
 
 
-OpenFeed = Callable[[], Capture]
-"""Opens a feed. Raises CaptureError where trying again may help, SourceError where it cannot."""
+OpenCapture = Callable[[], Capture]
+"""Opens a capture. Raises CaptureError if another attempt may help, SourceError if not."""
 
 
 class LoopingCapture(Capture):
-    """A file that starts over at its end, its media time running on."""
+    """A file that restarts at its end; its media time continues."""
 
-    def __init__(self, open_capture: OpenFeed) -> None:
-        self._open_feed = open_capture
+    def __init__(self, open_capture: OpenCapture) -> None:
+        self._open_capture = open_capture
         self._capture = open_capture()
         self._unreadable_before = 0
-        self._pictures = 0
+        self._frames = 0
         self._offset_s = 0.0
         self._last_s = 0.0
         self._interval_s = 0.0
 
     def read(self, timeout_s: float) -> RawFrame | None:
         try:
-            picture = self._capture.read(timeout_s)
+            raw = self._capture.read(timeout_s)
         except EndOfStream:
-            if self._pictures == 0:
+            if self._frames == 0:
                 raise
-            self._start_over()
-            picture = self._capture.read(timeout_s)
+            self._restart()
+            raw = self._capture.read(timeout_s)
         self.unreadable = self._unreadable_before + self._capture.unreadable
-        if picture is None:
+        if raw is None:
             return None
-        self._pictures += 1
-        if picture.media_s is None:
-            return picture
-        if self._pictures > 1:
-            self._interval_s = max(picture.media_s - self._last_s, 0.0)
-        self._last_s = picture.media_s
-        return replace(picture, media_s=picture.media_s + self._offset_s)
+        self._frames += 1
+        if raw.media_s is None:
+            return raw
+        if self._frames > 1:
+            self._interval_s = max(raw.media_s - self._last_s, 0.0)
+        self._last_s = raw.media_s
+        return replace(raw, media_s=raw.media_s + self._offset_s)
 
-    def _start_over(self) -> None:
+    def _restart(self) -> None:
         self._capture.close()
         self._unreadable_before += self._capture.unreadable
-        # A single picture stands as long as any other: else it would be read as fast as the processor can.
+        # A single image gets the default interval: otherwise it would be read in a busy loop.
         self._offset_s += self._last_s + (self._interval_s or self._capture.interval_s)
-        self._capture = self._open_feed()
+        self._capture = self._open_capture()
         self._last_s = self._interval_s = 0.0
-        self._pictures = 0
+        self._frames = 0
 
     def close(self) -> None:
         self._capture.close()

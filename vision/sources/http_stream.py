@@ -1,7 +1,7 @@
-"""Motion JPEG by HTTP, as web cameras send it (`multipart/x-mixed-replace`).
+"""Motion JPEG over HTTP, as web cameras send it (`multipart/x-mixed-replace`).
 
-The images are found by their own markers, not by the parts' headers: the boundary and Content-Length that
-cameras send are wrong often enough. A stream of any other type is left to FFmpeg.
+Images are found by JPEG markers, not by the parts' headers: boundary and Content-Length of cameras are often
+wrong. A stream of any other type is opened by FFmpeg.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from vision.sources.source import SourceError, SourceSettings
 
 _JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
 _REFUSALS = {
-    401: "asks for a user and password",
-    403: "forbids it",
-    404: "has nothing there",
-    410: "has no more",
+    401: "requires a user and password",
+    403: "denies access",
+    404: "has no such resource",
+    410: "no longer has this resource",
 }
 
 
 def open_http(uri: str, settings: SourceSettings) -> Capture:
-    """Ask the server for the stream.
+    """Request the stream.
 
     Raises:
-        SourceError: it says no (401, 403, 404, 410).
-        CaptureError: it does not answer, or with an error that may pass.
+        SourceError: refused (401, 403, 404, 410).
+        CaptureError: no response, or an error that may be temporary.
     """
     parts = urlsplit(uri)
     bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
@@ -49,7 +49,7 @@ def open_http(uri: str, settings: SourceSettings) -> Capture:
         with error:
             text = f"the server {_REFUSALS.get(error.code, 'refuses')} (HTTP {error.code} {error.reason})"
         if error.code == 401:
-            text += f"; put the right ones into the address: {parts.scheme}://USER:PASSWORD@{parts.hostname}…"
+            text += f"; put them into the address: {parts.scheme}://USER:PASSWORD@{parts.hostname}…"
         if error.code in _REFUSALS:
             raise SourceError(text) from error
         raise CaptureError(text) from error
@@ -57,12 +57,12 @@ def open_http(uri: str, settings: SourceSettings) -> Capture:
         cause = error.reason if isinstance(error.reason, OSError) else OSError(str(error.reason))
         raise CaptureError(f"{parts.hostname}:{parts.port or parts.scheme} {network_error(cause)}") from error
     except (OSError, http.client.HTTPException) as error:
-        raise CaptureError(f"no answer in HTTP: {error!r}") from error
+        raise CaptureError(f"no HTTP response: {error!r}") from error
     if response.headers.get_content_type() in _JPEG_TYPES:
         return HttpMjpegCapture(response)
     kind = response.headers.get_content_type()
     response.close()
-    return StreamCapture(uri, settings, {}, f"the server sends {kind}, and no video that FFmpeg can read")
+    return StreamCapture(uri, settings, {}, f"the server sends {kind}, which FFmpeg cannot read as video")
 
 
 def _opener(uri: str) -> urllib.request.OpenerDirector:
@@ -78,13 +78,13 @@ def _opener(uri: str) -> urllib.request.OpenerDirector:
 
 
 class HttpMjpegCapture(Capture):
-    """The images of an HTTP response that does not end."""
+    """The images of an endless HTTP response."""
 
     def __init__(self, response: http.client.HTTPResponse) -> None:
         self._response = response
         self._parser = MjpegParser()
         self._ready: deque[tuple[NDArray[np.uint8], int, float]] = deque()
-        # A second handle on the same connection, to end a read from another thread.
+        # A second descriptor of the same connection, to end a read from another thread.
         self._socket = socket.socket(fileno=os.dup(response.fileno()))
 
     def read(self, timeout_s: float) -> RawFrame | None:
@@ -92,9 +92,9 @@ class HttpMjpegCapture(Capture):
             try:
                 data = self._response.read1(1 << 16)
             except TimeoutError as error:
-                raise CaptureError("nothing came any more") from error
+                raise CaptureError("no more data arrived") from error
             except (OSError, http.client.HTTPException) as error:
-                raise CaptureError(f"the connection broke: {error}") from error
+                raise CaptureError(f"the connection failed: {error}") from error
             if not data:
                 raise CaptureError("the server closed the connection")
             captured_ns = time.monotonic_ns()
@@ -106,7 +106,7 @@ class HttpMjpegCapture(Capture):
         return RawFrame(image, captured_ns, decode_ms=decode_ms)
 
     def interrupt(self) -> None:
-        with contextlib.suppress(OSError):  # it is closed already
+        with contextlib.suppress(OSError):  # already closed
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:

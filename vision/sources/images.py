@@ -23,12 +23,12 @@ IMAGE_SUFFIXES = frozenset(
 
 
 def is_image(path: Path) -> bool:
-    """Whether the name is an image's."""
+    """Whether the file name has an image suffix."""
     return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
-    """Sorts as people count: image2 before image10."""
+    """Sort key of natural order: image2 before image10."""
     parts = re.split(r"(\d+)", path.name.casefold())
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part)
 
@@ -49,18 +49,18 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8] | None:
-    """(height, width, 3) BGR of an encoded image, upright as its EXIF says; None if unreadable."""
+    """(height, width, 3) BGR of an encoded image, rotated by its EXIF orientation; None if unreadable."""
     if not data:
         return None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # a size beyond OpenCV's limits is an unreadable image, too
+    except cv2.error:  # a size beyond OpenCV's limits
         return None
     return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
 
 
 class ImagesCapture(Capture):
-    """Images one after another. One that cannot be read is named in a warning, counted and passed over."""
+    """Images in order. An unreadable one is logged, counted and skipped."""
 
     def __init__(self, paths: list[Path], rate_hz: float) -> None:
         quiet_opencv()
@@ -77,17 +77,17 @@ class ImagesCapture(Capture):
             started_ns = time.monotonic_ns()
             try:
                 image = decode_image(path.read_bytes())
-                reason = "not an image that OpenCV can read; is it cut short or damaged?"
+                reason = "not an image that OpenCV can read; it may be truncated or damaged"
             except OSError as error:
                 image, reason = None, error.strerror or str(error)
             if image is not None:
                 decode_ms = (time.monotonic_ns() - started_ns) / 1e6
                 return RawFrame(image, media_s=index * self.interval_s, decode_ms=decode_ms)
             self.unreadable += 1
-            logger.warning("%s: passed over: %s", path, reason)
+            logger.warning("%s: skipped: %s", path, reason)
         if self.unreadable == len(self._paths):
             raise SourceError(f"{self._paths[0]}: none of the {len(self._paths)} images could be read")
         raise EndOfStream
 
     def close(self) -> None:
-        """Nothing is kept open."""
+        """Nothing stays open."""

@@ -1,6 +1,7 @@
-"""The newest frame wins: a thread reads the source and keeps only its latest frame for whoever asks.
+"""A live source: a thread reads the capture and keeps only the newest frame for the reader.
 
-A source that stops is opened again, with a pause that doubles up to a cap, and says so once each way.
+A capture that stops is reopened, with a pause that doubles up to a limit; loss and recovery are logged once
+each.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from vision.frame import Frame
-from vision.sources.capture import Capture, CaptureError, OpenFeed, RawFrame
+from vision.sources.capture import Capture, CaptureError, OpenCapture, RawFrame
 from vision.sources.source import (
     CameraChangedError,
     EndOfStream,
@@ -24,21 +25,21 @@ from vision.sources.source import (
 
 logger = logging.getLogger(__name__)
 
-_POLL_S = 0.2  # how soon the reading thread notices `close` while nothing arrives
-_OPENING_GRACE_S = 1.0  # beyond the deadline, for a driver that is still inside a call
+_POLL_S = 0.2  # how soon the reading thread notices `close` while no data arrives
+_OPENING_GRACE_S = 1.0  # beyond the deadline, for a driver that is still in a call
 
 
 class LatestSource(Source):
-    """A live source. Returns from its making once the first frame is there.
+    """A live source. The constructor returns once the first frame has arrived.
 
     Args:
-        uri: the name in messages, without passwords.
-        open_capture: opens the feed, again and again.
-        settings: the time-outs and pauses.
-        reopen: whether a feed that ended or broke is opened again; if not, that ends the source.
-        paced: hold every picture back until its `media_s` has passed: a recording that stands for a camera.
-        advice: the end of the line that says it never opened: what the reader of the line can do.
-        on_close: called when the source is closed, after the last feed.
+        uri: name in messages, without passwords.
+        open_capture: opens the capture; called for every attempt.
+        settings: timeouts and pauses.
+        reopen: whether a capture that ended or failed is reopened; if not, it ends the source.
+        paced: delay every frame until its `media_s` has passed: a recording used as a camera.
+        advice: what to do if no frame arrives; appended to the error.
+        on_close: called when the source is closed, after the last capture.
     """
 
     live = True
@@ -46,7 +47,7 @@ class LatestSource(Source):
     def __init__(
         self,
         uri: str,
-        open_capture: OpenFeed,
+        open_capture: OpenCapture,
         settings: SourceSettings,
         *,
         reopen: bool = True,
@@ -55,7 +56,7 @@ class LatestSource(Source):
         on_close: Callable[[], None] | None = None,
     ) -> None:
         self.uri = uri
-        self._open_feed = open_capture
+        self._open_capture = open_capture
         self._settings = settings
         self._reopen = reopen
         self._paced = paced
@@ -100,7 +101,7 @@ class LatestSource(Source):
             f"{self.uri}: no frame within {self._settings.open_timeout_s:g} s: {self._last_reason}{advice}"
         )
 
-    # --- the reader's side
+    # --- called by the reader
 
     def read(self, timeout_s: float = 1.0) -> Frame | None:
         with self._changed:
@@ -131,10 +132,10 @@ class LatestSource(Source):
             self._changed.notify_all()
         if capture is not None:
             capture.interrupt()
-        # A decoder inside a network call returns at its own time-out, and must not outlive the interpreter.
+        # A decoder in a network call returns at its own timeout, and must not outlive the interpreter.
         self._thread.join(max(self._settings.open_timeout_s, self._settings.read_timeout_s) + 1.0)
         if self._thread.is_alive():
-            logger.warning("%s: its reading thread is still busy in the driver after close", self.uri)
+            logger.warning("%s: the reading thread is still blocked in the driver after close", self.uri)
         if self._on_close is not None:
             self._on_close()
 
@@ -147,7 +148,7 @@ class LatestSource(Source):
             reopened=now.reopened + reopened,
         )
 
-    # --- the thread's side
+    # --- called by the thread
 
     def _run(self) -> None:
         try:
@@ -156,9 +157,7 @@ class LatestSource(Source):
             if str(end) and self._opened:
                 logger.warning("%s: ended after %d frames: %s", self.uri, self._sequence, end)
             self._finish(end)
-        except (
-            Exception
-        ) as error:  # whatever it is, it belongs to the reader, not to a thread's standard error
+        except Exception as error:  # re-raised in `read`, not on the thread's standard error
             self._finish(error)
 
     def _finish(self, end: Exception) -> None:
@@ -169,22 +168,22 @@ class LatestSource(Source):
     def _read_forever(self) -> None:
         pause_s = self._settings.retry_min_s
         while not self._stop.is_set():
-            came_back = False
+            was_running = False
             try:
-                self._read_one_feed()
+                self._read_capture()
             except CaptureError as lost:
-                came_back = self._lost_since_s is None and self._opened
+                was_running = self._lost_since_s is None and self._opened
                 self._log_lost(str(lost))
             except EndOfStream as end:
                 if not self._reopen:
                     raise
-                came_back = self._lost_since_s is None and self._opened
+                was_running = self._lost_since_s is None and self._opened
                 self._log_lost(str(end) or "it ended")
             except SourceError as error:
                 if not self._opened or isinstance(error, CameraChangedError):
                     raise
                 self._log_lost(str(error))
-            if came_back:
+            if was_running:
                 pause_s = self._settings.retry_min_s
             left_s = self._open_deadline_s - time.monotonic()
             if not self._opened and left_s <= 0.0:
@@ -201,19 +200,19 @@ class LatestSource(Source):
             self._last_reason = reason
         if self._opened and self._lost_since_s is None:
             self._lost_since_s = time.monotonic()
-            logger.warning("%s: lost: %s; opening it again", self.uri, reason)
+            logger.warning("%s: lost: %s; reopening", self.uri, reason)
         else:
-            logger.debug("%s: not yet: %s", self.uri, reason)
+            logger.debug("%s: reopening failed: %s", self.uri, reason)
 
-    def _read_one_feed(self) -> None:
-        capture = self._open_feed()
+    def _read_capture(self) -> None:
+        capture = self._open_capture()
         self._pace_origin_s = None
         with self._changed:
             self._capture = capture
         try:
             if self._opened and capture.calibration != self.calibration:
                 raise CameraChangedError(
-                    f"{self.uri}: the camera came back with another lens or mount; open the source again"
+                    f"{self.uri}: the camera returned with another lens or mount; open the source again"
                 )
             self.calibration = capture.calibration
             self._pump(capture)
@@ -225,63 +224,63 @@ class LatestSource(Source):
 
     def _pump(self, capture: Capture) -> None:
         settings = self._settings
-        heard_s = time.monotonic()
-        said_silent = False
+        received_s = time.monotonic()
+        warned_silent = False
         while not self._stop.is_set():
-            picture = capture.read(_POLL_S)
-            silent_s = time.monotonic() - heard_s
-            if picture is not None:
-                if said_silent:
-                    logger.info("%s: back after %.1f s", self.uri, silent_s)
-                said_silent = False
-                self._hold_back(picture)
-                self._publish(picture, capture)
-                heard_s = time.monotonic()
+            raw = capture.read(_POLL_S)
+            silent_s = time.monotonic() - received_s
+            if raw is not None:
+                if warned_silent:
+                    logger.info("%s: recovered after %.1f s", self.uri, silent_s)
+                warned_silent = False
+                self._pace(raw)
+                self._publish(raw, capture)
+                received_s = time.monotonic()
             elif not self._opened and time.monotonic() > self._open_deadline_s:
                 raise self._never_opened()
             elif silent_s > settings.read_timeout_s:
                 if capture.silence_is_loss:
-                    raise CaptureError(f"nothing came for {silent_s:.1f} s")
-                if self._opened and self._lost_since_s is None and not said_silent:
-                    logger.warning("%s: nothing came for %.1f s; waiting", self.uri, silent_s)
-                    said_silent = True
+                    raise CaptureError(f"no data for {silent_s:.1f} s")
+                if self._opened and self._lost_since_s is None and not warned_silent:
+                    logger.warning("%s: no data for %.1f s; waiting", self.uri, silent_s)
+                    warned_silent = True
 
-    def _hold_back(self, picture: RawFrame) -> None:
-        if not self._paced or picture.media_s is None:
+    def _pace(self, raw: RawFrame) -> None:
+        if not self._paced or raw.media_s is None:
             return
         if self._pace_origin_s is None:
-            self._pace_origin_s = time.monotonic() - picture.media_s
-        self._stop.wait(max(self._pace_origin_s + picture.media_s - time.monotonic(), 0.0))
+            self._pace_origin_s = time.monotonic() - raw.media_s
+        self._stop.wait(max(self._pace_origin_s + raw.media_s - time.monotonic(), 0.0))
 
-    def _publish(self, picture: RawFrame, capture: Capture) -> None:
+    def _publish(self, raw: RawFrame, capture: Capture) -> None:
         ready_ns = time.monotonic_ns()
-        captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
+        captured_ns = ready_ns if raw.captured_ns is None else raw.captured_ns
         unreadable = self._unreadable_before + capture.unreadable
-        self._sequence += picture.skipped + unreadable - self._statistics.unreadable
+        self._sequence += raw.skipped + unreadable - self._statistics.unreadable
         frame = Frame(
-            picture.image,
+            raw.image,
             captured_ns,
             self._sequence,
-            picture.depth_m,
+            raw.depth_m,
             ready_ns,
-            picture.decode_ms,
-            picture.media_s,
+            raw.decode_ms,
+            raw.media_s,
         )
         self._sequence += 1
         if self._settings.on_frame is not None:
             self._settings.on_frame(frame)
-        came_back_after_s = None
+        recovered_after_s = None
         with self._changed:
             if not self._opened:
                 self._opened = True
                 self.total_frames = capture.total_frames
             elif self._lost_since_s is not None:
-                came_back_after_s = time.monotonic() - self._lost_since_s
+                recovered_after_s = time.monotonic() - self._lost_since_s
                 self._lost_since_s = None
                 self._count(reopened=1)
-            self._count(dropped=picture.skipped + (self._slot is not None))
+            self._count(dropped=raw.skipped + (self._slot is not None))
             self._statistics = replace(self._statistics, unreadable=unreadable)
             self._slot = frame
             self._changed.notify_all()
-        if came_back_after_s is not None:
-            logger.warning("%s: back after %.1f s", self.uri, came_back_after_s)
+        if recovered_after_s is not None:
+            logger.warning("%s: recovered after %.1f s", self.uri, recovered_after_s)

@@ -1,7 +1,7 @@
-"""Motion JPEG: JPEG images one after another, with or without other bytes between them.
+"""Motion JPEG: consecutive JPEG images, with or without other bytes between them.
 
-Images are found by walking their segments (ITU-T T.81, annex B): one with a length is stepped over, so
-a thumbnail's markers inside APPn mean nothing, and in the entropy-coded data only a true marker (not FF00,
+Images are found by walking their segments (ITU-T T.81, annex B): segments with a length are skipped, so
+markers of a thumbnail inside APPn are ignored, and in the entropy-coded data only a true marker (not FF00,
 not a restart) counts.
 """
 
@@ -24,21 +24,21 @@ _LARGEST_IMAGE = 64 << 20  # bytes; more without an end is not a JPEG
 
 
 class MjpegSplitter:
-    """Cuts a stream, coming in pieces of any size, into whole JPEG images.
+    """Splits a stream, received in pieces of any size, into complete JPEG images.
 
     Attributes:
-        damaged: images that began and were broken off.
+        damaged: images that started and were not completed.
     """
 
     def __init__(self) -> None:
         self.damaged = 0
         self._buffer = bytearray()
-        self._inside = False  # an image begins at the buffer's first byte
+        self._inside = False  # an image starts at the buffer's first byte
         self._position = 0
         self._in_scan = False
 
     def push(self, data: bytes) -> list[bytes]:
-        """Take more bytes; the images they complete."""
+        """Add bytes; returns the images they complete."""
         self._buffer += data
         images: list[bytes] = []
         while self._find_start():
@@ -46,7 +46,7 @@ class MjpegSplitter:
             if length is None:
                 if len(self._buffer) <= _LARGEST_IMAGE:
                     break
-                self._break_off(len(self._buffer))
+                self._discard(len(self._buffer))
             elif length > 0:
                 images.append(bytes(self._buffer[:length]))
                 del self._buffer[:length]
@@ -55,7 +55,7 @@ class MjpegSplitter:
 
     @property
     def pending(self) -> int:
-        """Bytes of an image that has begun and not ended."""
+        """Bytes of the incomplete image."""
         return len(self._buffer) if self._inside else 0
 
     def _find_start(self) -> bool:
@@ -69,14 +69,14 @@ class MjpegSplitter:
         self._inside, self._in_scan, self._position = True, False, 2
         return True
 
-    def _break_off(self, at: int) -> None:
-        """Give up the image in hand and look for the next from byte `at`."""
+    def _discard(self, at: int) -> None:
+        """Discard the current image and search for the next from byte `at`."""
         self.damaged += 1
         del self._buffer[:at]
         self._inside = False
 
     def _walk(self) -> int | None:
-        """Step over segments: the image's length, None if bytes are missing, 0 if it was broken off."""
+        """Walk the segments: the image's length, None if bytes are missing, 0 if it was discarded."""
         buffer = self._buffer
         while True:
             if self._in_scan:
@@ -90,7 +90,7 @@ class MjpegSplitter:
             if at + 2 > len(buffer):
                 return None
             if buffer[at] != 0xFF:
-                self._break_off(at)
+                self._discard(at)
                 return 0
             code = buffer[at + 1]
             if code == 0xFF:  # fill byte
@@ -98,7 +98,7 @@ class MjpegSplitter:
             elif code == _EOI:
                 return at + 2
             elif code == _SOI or code == 0x00:
-                self._break_off(at)
+                self._discard(at)
                 return 0
             elif code == _TEM or 0xD0 <= code <= 0xD7:  # markers without a length
                 self._position = at + 2
@@ -107,7 +107,7 @@ class MjpegSplitter:
                     return None
                 length = int.from_bytes(buffer[at + 2 : at + 4], "big")
                 if length < 2:
-                    self._break_off(at + 2)
+                    self._discard(at + 2)
                     return 0
                 if at + 2 + length > len(buffer):
                     return None
@@ -116,31 +116,31 @@ class MjpegSplitter:
 
 
 class MjpegParser:
-    """Pictures out of Motion JPEG. An image that cannot be decoded is counted and passed over."""
+    """Decodes Motion JPEG. An image that cannot be decoded is counted and skipped."""
 
     rate_hz: float | None = None
 
     def __init__(self) -> None:
         self._splitter = MjpegSplitter()
         self._undecodable = 0
-        self._said_at = 1
+        self._next_warning = 1
 
     @property
     def unreadable(self) -> int:
         return self._undecodable + self._splitter.damaged
 
     def push(self, data: bytes) -> list[NDArray[np.uint8]]:
-        pictures = []
+        decoded = []
         for jpeg in self._splitter.push(data):
-            picture = decode_image(jpeg)
-            if picture is None:
+            image = decode_image(jpeg)
+            if image is None:
                 self._undecodable += 1
             else:
-                pictures.append(picture)
-        if self.unreadable >= self._said_at:
-            logger.warning("MJPEG: %d damaged images passed over so far", self.unreadable)
-            self._said_at = self.unreadable * 10  # a bad cable must not fill the log
-        return pictures
+                decoded.append(image)
+        if self.unreadable >= self._next_warning:
+            logger.warning("MJPEG: %d damaged images skipped so far", self.unreadable)
+            self._next_warning = self.unreadable * 10  # a bad cable must not fill the log
+        return decoded
 
     def leftover(self) -> str:
         pending = self._splitter.pending

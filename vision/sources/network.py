@@ -1,4 +1,4 @@
-"""Streams from the network that FFmpeg reads: RTSP, MPEG-TS and RTP over UDP, and some that come by HTTP."""
+"""Network streams read by FFmpeg: RTSP, MPEG-TS and RTP over UDP, and some HTTP streams."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import open_ffmpeg, read_capture
 from vision.sources.source import SourceError, SourceSettings
 
-# Show frames when they come: no reordering buffer before the decoder, and none of its frame threads.
+# No reordering buffer before the decoder, and no frame threads in it.
 _LOW_LATENCY = {"fflags": "nobuffer", "flags": "low_delay"}
 
 # RFC 3551 (JPEG is the static type 26), RFC 6184 (H.264), RFC 7798 (H.265).
 _RTP_FORMATS = {"rtp-h264": "H264/90000", "rtp-h265": "H265/90000", "rtp-jpeg": "JPEG/90000"}
 _JPEG_PAYLOAD, _FIRST_DYNAMIC_PAYLOAD = 26, 96
-_LONGEST_STEP_S = 1.0  # a larger step in a stream's own time is a break in it, not a pause
+_LONGEST_STEP_S = 1.0  # a larger step of the stream's time is a discontinuity, not a pause
 
 
 def without_password(uri: str) -> str:
-    """The address as it may be shown: a user's password replaced by stars."""
+    """The address for display: the password replaced by stars."""
     parts = urlsplit(uri)
     if parts.password is None:
         return uri
@@ -39,12 +39,12 @@ class StreamCapture(Capture):
 
     Args:
         location: an address, or a file that describes one.
-        settings: the time-outs.
-        options: FFmpeg's.
-        reason: says why nothing came, once opening has failed.
+        settings: timeouts.
+        options: of FFmpeg.
+        reason: error text if opening fails.
 
     Raises:
-        CaptureError: it did not open in `open_timeout_s`.
+        CaptureError: it did not open within `open_timeout_s`.
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class StreamCapture(Capture):
         )
         self._media_s = 0.0
         self._stamp_s: float | None = None
-        # RTP's description alone lets FFmpeg open it; without a size nothing has come.
+        # FFmpeg opens RTP by its description alone; without a size no data has arrived.
         if not (self._capture.isOpened() and self._capture.get(cv2.CAP_PROP_FRAME_WIDTH) > 0):
             self._capture.release()
-            raise CaptureError(reason or "no video stream came")
+            raise CaptureError(reason or "no video stream received")
 
     def read(self, timeout_s: float) -> RawFrame | None:
         image, captured_ns, decode_ms = read_capture(self._capture)
         if image is None:
-            # OpenCV does not tell an end from a silence of `read_timeout_s`.
+            # OpenCV does not distinguish the end of a stream from a timeout of `read_timeout_s`.
             raise CaptureError("the stream stopped")
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
         step_s = 0.0 if self._stamp_s is None else stamp_s - self._stamp_s
@@ -80,20 +80,20 @@ class StreamCapture(Capture):
 
 
 def open_rtsp(uri: str, settings: SourceSettings) -> StreamCapture:
-    """RTSP (RFC 2326), its media inside the TCP connection; OPENCV_FFMPEG_CAPTURE_OPTIONS can say otherwise.
+    """RTSP (RFC 2326) over TCP; OPENCV_FFMPEG_CAPTURE_OPTIONS can override the transport.
 
     Raises:
-        CaptureError: nobody answers, or not with video.
+        CaptureError: no response, or no video in it.
     """
     options = {"rtsp_transport": "tcp", **_LOW_LATENCY}
     try:
         return StreamCapture(uri, settings, options)
     except CaptureError as lost:
-        raise CaptureError(_why_no_rtsp(uri, min(settings.open_timeout_s, 2.0))) from lost
+        raise CaptureError(_rtsp_problem(uri, min(settings.open_timeout_s, 2.0))) from lost
 
 
-def _why_no_rtsp(uri: str, timeout_s: float) -> str:
-    """Ask the server ourselves, since OpenCV tells nobody why FFmpeg failed."""
+def _rtsp_problem(uri: str, timeout_s: float) -> str:
+    """Query the server directly, since OpenCV does not report why FFmpeg failed."""
     parts = urlsplit(uri)
     host, port = parts.hostname or "", parts.port or (322 if parts.scheme == "rtsps" else 554)
     if parts.scheme == "rtsps":
@@ -104,38 +104,38 @@ def _why_no_rtsp(uri: str, timeout_s: float) -> str:
     try:
         with socket.create_connection((host, port), timeout_s) as connection:
             if not request:
-                return f"{host}:{port} answers, but not with video"
+                return f"{host}:{port} responds, but without video"
             connection.sendall(request)
             answer = connection.recv(4096).split(b"\r\n")[0].decode("ascii", "replace")
     except OSError as error:
         return f"{host}:{port} {network_error(error)}"
     if " 401 " in answer:
         return (
-            f"{host}:{port} asks for a user and password ({answer}); put the right ones into the address: "
+            f"{host}:{port} requires a user and password ({answer}); put them into the address: "
             f"rtsp://USER:PASSWORD@{host}…"
         )
     if answer.startswith("RTSP/") and " 200 " not in f"{answer} ":
-        return f"{host}:{port} answers {answer!r}; is the path right?"
-    return f"{host}:{port} answers, but no video that FFmpeg can read came"
+        return f"{host}:{port} responds {answer!r}; check the path"
+    return f"{host}:{port} responds, but sent no video that FFmpeg can read"
 
 
 def network_error(error: OSError) -> str:
     if isinstance(error, socket.gaierror):
-        return "is not a name that the network knows"
+        return "cannot be resolved"
     if isinstance(error, TimeoutError):
-        return "does not answer"
+        return "does not respond"
     return f"cannot be reached: {(error.strerror or str(error)).lower()}"
 
 
 class UdpStream:
-    """A UDP port that MPEG-TS or RTP is sent to: `udp://HOST:PORT[?format=…]`.
+    """A UDP port that receives MPEG-TS or RTP: `udp://HOST:PORT[?format=…]`.
 
     `format` is `mpegts` (the default), `rtp-h264`, `rtp-h265` or `rtp-jpeg`; `payload` the RTP payload type
-    where it is not the usual one. An empty host means every interface; a multicast group is joined. Other
-    parameters go to FFmpeg.
+    if not the usual one. An empty host means every interface; a multicast group is joined. Other parameters
+    go to FFmpeg.
 
     Raises:
-        SourceError: the address makes no sense.
+        SourceError: the address is invalid.
     """
 
     def __init__(self, uri: str, settings: SourceSettings) -> None:
@@ -156,7 +156,7 @@ class UdpStream:
         self._query = query
 
     def open_capture(self) -> StreamCapture:
-        """Open the port and wait for video on it."""
+        """Open the port and wait for video."""
         if self._format == "mpegts":
             host = f"[{self._host}]" if ":" in self._host else self._host
             query = {"overrun_nonfatal": "1", "fifo_size": "50000", **self._query}
@@ -172,10 +172,10 @@ class UdpStream:
         try:
             return StreamCapture(location, self._settings, options)
         except CaptureError as lost:
-            raise CaptureError(self._why_nothing()) from lost
+            raise CaptureError(self._problem()) from lost
 
     def session_description(self) -> str:
-        """What the sender sends, in SDP (RFC 4566): FFmpeg cannot tell from RTP packets alone."""
+        """The stream's description in SDP (RFC 4566): FFmpeg cannot derive it from RTP packets."""
         family = "IP6" if ":" in self._host else "IP4"
         group = "/16" if family == "IP4" and ipaddress.ip_address(self._host).is_multicast else ""
         lines = [
@@ -189,17 +189,17 @@ class UdpStream:
         ]
         return "\r\n".join(lines) + "\r\n"
 
-    def _why_nothing(self) -> str:
+    def _problem(self) -> str:
         family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
         try:
             with socket.socket(family, socket.SOCK_DGRAM) as probe:
                 probe.bind(("", self._port))
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
-                return f"UDP port {self._port} is taken by another program"
+                return f"UDP port {self._port} is in use by another program"
             return f"UDP port {self._port} cannot be opened: {os.strerror(error.errno or 0).lower()}"
         what = "MPEG-TS" if self._format == "mpegts" else f"RTP {_RTP_FORMATS[self._format].split('/')[0]}"
-        return f"no {what} came on UDP port {self._port}"
+        return f"no {what} received on UDP port {self._port}"
 
 
 def _udp_address(uri: str, parts: SplitResult) -> tuple[str, int]:
@@ -217,4 +217,4 @@ def _udp_address(uri: str, parts: SplitResult) -> tuple[str, int]:
     try:
         return str(socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0]), port
     except OSError as error:
-        raise SourceError(f"{uri}: {host!r} is not an address or name of this network") from error
+        raise SourceError(f"{uri}: {host!r} is not an address and cannot be resolved") from error

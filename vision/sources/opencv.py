@@ -1,7 +1,7 @@
-"""OpenCV and FFmpeg as sources use them: quiet, and with options that FFmpeg takes from the environment.
+"""OpenCV and FFmpeg as used by sources: without their log output, and with FFmpeg options per capture.
 
-Both print to standard error what this package says itself in one line. Their voices come back with
-`OPENCV_LOG_LEVEL=INFO` and `OPENCV_FFMPEG_LOGLEVEL=32`.
+Both print to standard error what this package logs in one line. `OPENCV_LOG_LEVEL=INFO` and
+`OPENCV_FFMPEG_LOGLEVEL=32` enable their output.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ _environment_lock = threading.Lock()
 
 
 def quiet_opencv() -> None:
-    """Silence OpenCV's and FFmpeg's own messages, unless the environment asks for them."""
+    """Silence the messages of OpenCV and FFmpeg, unless the environment enables them."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _AV_LOG_QUIET)
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-quiet_opencv()  # on import too: FFmpeg's level is looked at once, when anybody first uses it through OpenCV
+quiet_opencv()  # on import too: FFmpeg's level is read once, at its first use through OpenCV
 
 
 @contextmanager
 def environment(name: str, value: str) -> Iterator[None]:
-    """Set one environment variable for a while, one thread at a time."""
+    """Set one environment variable temporarily, one thread at a time."""
     with _environment_lock:
         before = os.environ.get(name)
         os.environ[name] = value
@@ -46,9 +46,9 @@ def environment(name: str, value: str) -> Iterator[None]:
 
 
 def read_capture(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, int, float]:
-    """The next picture of a capture, when it had come, and how long decoding it took.
+    """Read the next image of a capture, with its arrival time and decoding time.
 
-    Waiting for it and decoding it are two calls of OpenCV; FFmpeg's decoders already work in the first.
+    OpenCV waits and decodes in two calls; FFmpeg's decoders already work in the first.
 
     Returns:
         (height, width, 3) uint8 BGR or None; CLOCK_MONOTONIC nanoseconds of the first call's end;
@@ -56,12 +56,12 @@ def read_capture(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, i
     """
     if not capture.grab():
         return None, time.monotonic_ns(), 0.0
-    came_ns = time.monotonic_ns()
+    arrived_ns = time.monotonic_ns()
     ok, image = capture.retrieve()
-    decode_ms = (time.monotonic_ns() - came_ns) / 1e6
+    decode_ms = (time.monotonic_ns() - arrived_ns) / 1e6
     if not ok or image is None:
-        return None, came_ns, decode_ms
-    return np.ascontiguousarray(image, dtype=np.uint8), came_ns, decode_ms
+        return None, arrived_ns, decode_ms
+    return np.ascontiguousarray(image, dtype=np.uint8), arrived_ns, decode_ms
 
 
 def open_ffmpeg(
@@ -71,12 +71,12 @@ def open_ffmpeg(
     read_timeout_s: float | None = None,
     options: Mapping[str, str] | None = None,
 ) -> cv2.VideoCapture:
-    """A capture by FFmpeg; ask `isOpened`.
+    """Open a capture by FFmpeg; check `isOpened`.
 
     Args:
-        location: a file name or an address as FFmpeg takes it.
-        open_timeout_s, read_timeout_s: after these FFmpeg gives up; None leaves its own (30 s).
-        options: FFmpeg's format and codec options; those in OPENCV_FFMPEG_CAPTURE_OPTIONS go before them.
+        location: a file name or an address, as FFmpeg accepts it.
+        open_timeout_s, read_timeout_s: FFmpeg's timeouts; None: its default (30 s).
+        options: FFmpeg's format and codec options; OPENCV_FFMPEG_CAPTURE_OPTIONS overrides them.
     """
     quiet_opencv()
     parameters: list[int] = []

@@ -1,4 +1,4 @@
-"""From an address to an open source."""
+"""Opens a source by its address."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
 from vision.sources.video_file import VideoFileCapture
 
-_IMAGE_RATE_HZ = 10.0  # of images standing for a camera when no rate is asked
+_IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 
 
 def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source:  # noqa: B008 - frozen
-    """Open where frames come from, and wait for the first one.
+    """Open a source of frames and wait for the first frame.
 
     | address | source | frames |
     |---|---|---|
     | `street.mp4`, `file:///data/street.mp4` | a video file | every one |
     | `photos/` | a folder of images, in natural order | every one |
     | `photo.jpg` | one image | one |
-    | `-` | standard input: raw, YUV4MPEG2 or MJPEG | the newest; every one if it is a file or asked for |
-    | `/run/camera.fifo` | a FIFO with the same | the newest; every one if asked for |
+    | `-` | standard input: raw, YUV4MPEG2 or MJPEG | the newest; every one from a file or with `every_frame`
+    | | `/run/camera.fifo` | a FIFO with the same | the newest; every one with `every_frame` |
     | `/dev/video0`, `0`, `/dev/v4l/by-id/…` | a camera | the newest |
     | `rtsp://camera/stream` | RTSP | the newest |
-    | `http://camera/video.mjpg` | Motion JPEG by HTTP, or what FFmpeg reads | the newest |
+    | `http://camera/video.mjpg` | Motion JPEG over HTTP, or what FFmpeg reads | the newest |
     | `udp://:5600`, `udp://239.1.2.3:5600` | MPEG-TS | the newest |
     | `udp://:5600?format=rtp-h264` | RTP: `rtp-h264`, `rtp-h265` or `rtp-jpeg` | the newest |
     | `shm://NAME` | shared memory of this host (`vision.shared_frame`), with depth | the newest |
 
-    Other schemes are those that plug-ins have registered with `vision.sources.registry.source`.
+    Plug-ins register other schemes with `vision.sources.registry.source`.
 
     Args:
         uri: the address.
         settings: see `SourceSettings`.
 
     Raises:
-        SourceError: it cannot be opened, or gave no frame within `open_timeout_s`; one line that says why.
+        SourceError: it cannot be opened, or delivered no frame within `open_timeout_s`; one line with the
+            reason.
     """
     quiet_opencv()
     if uri == "-":
@@ -62,8 +63,8 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         return _open_path(Path(uri).expanduser(), settings)
     if (opener := SOURCES.get(scheme)) is None:
         raise SourceError(
-            f"{without_password(uri)}: sources have no {scheme}://; known: {SOURCES.known()}, cameras "
-            "(/dev/video0), files, folders, FIFOs and - for standard input. The scheme of a plug-in is known "
+            f"{without_password(uri)}: unknown scheme {scheme}://; known: {SOURCES.known()}, cameras "
+            "(/dev/video0), files, folders, FIFOs and - for standard input. Schemes of a plug-in are known "
             "once its module is loaded (plugins.modules, --plugins-modules)"
         )
     return opener(uri, settings)
@@ -84,7 +85,7 @@ def _open_rtsp(uri: str, settings: SourceSettings) -> Source:
 @source("http", "Motion JPEG, or what FFmpeg reads")
 @source("https", "the same over TLS")
 def _open_http(uri: str, settings: SourceSettings) -> Source:
-    # What FFmpeg reads by HTTP may come faster than it is to be shown: a recording, or HLS's first pieces.
+    # FFmpeg may read faster than real time over HTTP: a recording, or the first segments of HLS.
     return LatestSource(
         without_password(uri),
         lambda: open_http(uri, settings),
@@ -111,7 +112,7 @@ def _open_shared(uri: str, settings: SourceSettings) -> Source:
 
 
 def _rest(uri: str) -> str:
-    """What stands behind `scheme://`."""
+    """The part after `scheme://`."""
     return uri.partition("://")[2]
 
 
@@ -154,7 +155,7 @@ def _open_standard_input(settings: SourceSettings) -> Source:
     name = "standard input"
     check_pipe_settings(name, settings)
     if os.isatty(0):
-        raise SourceError("standard input is a terminal; pipe frames into it, or name a source")
+        raise SourceError("standard input is a terminal; pipe frames into it, or give a source")
 
     def open_capture() -> Capture:
         return PipeCapture(os.dup(0), settings)
@@ -190,10 +191,10 @@ def _image_rate_hz(settings: SourceSettings) -> float:
 
 
 def _nearest(path: Path) -> str:
-    """A hint: the names in the same folder that look alike."""
+    """A hint: similar names in the same folder."""
     folder = path.parent
     if not folder.is_dir():
-        return f" (the folder {folder} does not exist either)"
+        return f" (the folder {folder} does not exist)"
     try:
         names = os.listdir(folder)
     except OSError:

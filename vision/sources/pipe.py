@@ -1,4 +1,4 @@
-"""A pipe of bytes: standard input or a FIFO, carrying raw pixels, YUV4MPEG2 or MJPEG."""
+"""A byte stream from standard input or a FIFO: raw pixels, YUV4MPEG2 or MJPEG."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from vision.sources.y4m import MAGIC, Y4mParser
 
 logger = logging.getLogger(__name__)
 
-_PIPE_BYTES = 1 << 20  # a frame of 640x480 in one go; the kernel's own default is 64 KiB
+_PIPE_BYTES = 1 << 20  # one frame of 640x480 in one read; the kernel's default is 64 KiB
 
 
 class PipeCapture(Capture):
-    """Pictures out of a file descriptor, which it owns.
+    """Frames from a file descriptor, which it owns.
 
     Args:
         descriptor: open for reading; a pipe, FIFO, socket or regular file.
         settings: pixel_format, width, height, rate_hz.
-        end_is_loss: whether the writer's going away is a loss (a FIFO of a live source) or the end.
+        end_is_loss: whether the writer's exit is a loss (a FIFO of a live source) or the end.
     """
 
-    silence_is_loss = False  # closing a FIFO under a writer that is only slow would kill the writer
+    silence_is_loss = False  # closing a FIFO would kill a writer that is only slow
 
     def __init__(self, descriptor: int, settings: SourceSettings, *, end_is_loss: bool = False) -> None:
         self._descriptor = descriptor
@@ -44,12 +44,14 @@ class PipeCapture(Capture):
         self._is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
-        self._parser: StreamParser | None = _parser_of(settings)
+        self._parser: StreamParser | None = _parser_from_settings(settings)
         self._head = b""
         self._ready: deque[tuple[NDArray[np.uint8], int, float]] = deque()
         self._delivered = 0
-        self._heard = False
-        with contextlib.suppress(OSError):  # not a pipe, or above the user's limit: the default size does
+        self._received = False
+        with contextlib.suppress(
+            OSError
+        ):  # not a pipe, or above the user's limit: the default size is enough
             fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
     def read(self, timeout_s: float) -> RawFrame | None:
@@ -61,7 +63,7 @@ class PipeCapture(Capture):
             data = os.read(self._descriptor, _PIPE_BYTES)
             if not data:
                 self._end()
-            self._take(data)
+            self._parse(data)
         image, captured_ns, decode_ms = self._ready.popleft()
         rate_hz = self._settings.rate_hz or (self._parser.rate_hz if self._parser else None) or 30.0
         self.interval_s = 1 / rate_hz
@@ -71,17 +73,17 @@ class PipeCapture(Capture):
         return RawFrame(image, stamp_ns, media_s=media_s, decode_ms=decode_ms)
 
     def _check_clean_end(self) -> None:
-        # A writer of a FIFO that had gone before we opened raises no POLLHUP; a read tells that it has gone.
-        if self._heard and not os.get_blocking(self._descriptor):
+        # A FIFO's writer that exited before the pipe was opened raises no POLLHUP; a read detects it.
+        if self._received and not os.get_blocking(self._descriptor):
             with contextlib.suppress(BlockingIOError):
                 data = os.read(self._descriptor, _PIPE_BYTES)
                 if not data:
                     self._end()
-                self._take(data)
+                self._parse(data)
 
-    def _take(self, data: bytes) -> None:
+    def _parse(self, data: bytes) -> None:
         captured_ns = time.monotonic_ns()
-        self._heard = True
+        self._received = True
         if self._parser is None:
             self._head += data
             if len(self._head) < len(MAGIC):
@@ -89,7 +91,7 @@ class PipeCapture(Capture):
             data = self._head
         try:
             if self._parser is None:
-                self._parser = _parser_for(data)
+                self._parser = _parser_from_magic(data)
             images = self._parser.push(data)
         except StreamError as error:
             raise CaptureError(str(error)) from error
@@ -101,12 +103,12 @@ class PipeCapture(Capture):
         leftover = (
             self._parser.leftover()
             if self._parser
-            else f"{len(self._head)} bytes, too few to know the format"
+            else f"{len(self._head)} bytes, too few to detect the format"
         )
         if self._parser is None and not self._head:
-            leftover = "no bytes at all"
+            leftover = "no data received"
         if self._end_is_loss:
-            raise CaptureError(f"its writer has gone{f', {leftover}' if leftover else ''}")
+            raise CaptureError(f"the writer has closed it{f', {leftover}' if leftover else ''}")
         raise EndOfStream(leftover)
 
     def close(self) -> None:
@@ -114,13 +116,13 @@ class PipeCapture(Capture):
 
 
 class Fifo:
-    """A named pipe that stays open between its writers, so that no writer dies in the moment of reopening."""
+    """A named pipe that stays open between writers, so that a writer is not killed during reopening."""
 
     def __init__(self, path: Path, settings: SourceSettings) -> None:
         self._path = path
         self._settings = settings
         check_pipe_settings(str(path), settings)
-        self._supervisor = _open_fifo(path)
+        self._held_descriptor = _open_fifo(path)
         self._closed = False
 
     def open_capture(self) -> PipeCapture:
@@ -131,19 +133,19 @@ class Fifo:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            os.close(self._supervisor)
+            os.close(self._held_descriptor)
 
 
 def _open_fifo(path: Path) -> int:
-    # Without O_NONBLOCK the call itself would wait for a writer, for ever.
+    # Without O_NONBLOCK the call would block until there is a writer.
     try:
         return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
-        raise SourceError(f"{path}: cannot open this pipe: {error.strerror}") from error
+        raise SourceError(f"{path}: cannot open the pipe: {error.strerror}") from error
 
 
 def check_pipe_settings(name: str, settings: SourceSettings) -> None:
-    """Refuse settings that no pipe can be read with.
+    """Check that a pipe can be read with these settings.
 
     Raises:
         SourceError: a camera's pixel format, or raw pixels without their size.
@@ -154,10 +156,10 @@ def check_pipe_settings(name: str, settings: SourceSettings) -> None:
             f"{name}: a pipe carries bgr24, rgb24, gray8, y4m or mjpeg, but pixel_format is {pixel_format!r}"
         )
     if pixel_format in RAW_PIXEL_FORMATS and (settings.width is None or settings.height is None):
-        raise SourceError(f"{name}: {pixel_format} has no size of its own; give width and height")
+        raise SourceError(f"{name}: {pixel_format} needs width and height")
 
 
-def _parser_of(settings: SourceSettings) -> StreamParser | None:
+def _parser_from_settings(settings: SourceSettings) -> StreamParser | None:
     if settings.pixel_format in RAW_PIXEL_FORMATS:
         assert settings.width is not None
         assert settings.height is not None
@@ -169,12 +171,12 @@ def _parser_of(settings: SourceSettings) -> StreamParser | None:
     return None
 
 
-def _parser_for(head: bytes) -> StreamParser:
+def _parser_from_magic(head: bytes) -> StreamParser:
     if head.startswith(MAGIC):
         return Y4mParser()
     if head.startswith(b"\xff\xd8\xff"):
         return MjpegParser()
     raise StreamError(
-        f"neither YUV4MPEG2 nor JPEG (it begins with {head[:8].hex(' ')}); for raw pixels give pixel_format "
+        f"neither YUV4MPEG2 nor JPEG (it starts with {head[:8].hex(' ')}); for raw pixels give pixel_format "
         f"bgr24, rgb24 or gray8 with width and height"
     )

@@ -1,4 +1,4 @@
-"""Raw frames in a byte stream: nothing but pixels, of a size that both ends know."""
+"""Raw frames in a byte stream: only pixels, of a size known to both ends."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from vision.sources.source import RAW_PIXEL_FORMATS
 
 
 class StreamError(Exception):
-    """The bytes are not what they should be."""
+    """The bytes do not follow the format."""
 
 
 class StreamParser(Protocol):
-    """Turns bytes, in pieces of any size, into pictures."""
+    """Decodes bytes, received in pieces of any size, into images."""
 
     @property
     def unreadable(self) -> int:
-        """Pictures found that could not be decoded."""
+        """Images that could not be decoded."""
         ...
 
     @property
     def rate_hz(self) -> float | None:
-        """The rate the stream itself claims, if it does."""
+        """The frame rate in the stream's header, if it has one."""
         ...
 
     def push(self, data: bytes) -> list[NDArray[np.uint8]]:
-        """Take more bytes; the pictures they complete, (height, width, 3) BGR.
+        """Add bytes; returns the images they complete, (height, width, 3) BGR.
 
         Raises:
-            StreamError: the bytes break the format; the stream cannot go on.
+            StreamError: the bytes break the format; the stream cannot continue.
         """
         ...
 
     def leftover(self) -> str:
-        """At the end of the stream: what is incomplete, in words; empty if nothing is."""
+        """At the end of the stream: what is incomplete, in words; empty if nothing."""
         ...
 
 
 class RawParser:
-    """Frames of `width` × `height` pixels in `bgr24`, `rgb24` or `gray8`, one after another."""
+    """Consecutive frames of `width` × `height` pixels in `bgr24`, `rgb24` or `gray8`."""
 
     unreadable = 0
     rate_hz: float | None = None
@@ -59,15 +59,15 @@ class RawParser:
         self._buffer += data
         size = self._frame_bytes
         count = len(self._buffer) // size
-        pictures = [self._picture(self._buffer[i * size : (i + 1) * size]) for i in range(count)]
+        images = [self._decode(self._buffer[i * size : (i + 1) * size]) for i in range(count)]
         if count:
             del self._buffer[: count * size]
-        return pictures
+        return images
 
-    def _picture(self, data: bytearray) -> NDArray[np.uint8]:
+    def _decode(self, data: bytearray) -> NDArray[np.uint8]:
         pixels = np.frombuffer(data, np.uint8).reshape(self._height, self._width, self._channels)
         if self._format == "bgr24":
-            return pixels  # the slice was a copy, the reader's own to write on
+            return pixels  # the slice is a copy, so it is writable
         code = cv2.COLOR_RGB2BGR if self._format == "rgb24" else cv2.COLOR_GRAY2BGR
         return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
 
@@ -76,5 +76,5 @@ class RawParser:
             return ""
         return (
             f"the last frame is incomplete: {len(self._buffer)} of {self._frame_bytes} bytes "
-            f"({self._width}x{self._height} {self._format}); is the size right?"
+            f"({self._width}x{self._height} {self._format}); check width and height"
         )

@@ -1,4 +1,4 @@
-"""Every frame, in order: files, and pipes whose writer waits."""
+"""Every frame, in order: files, and pipes whose writer waits for the reader."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import time
 from collections.abc import Callable
 
 from vision.frame import Frame
-from vision.sources.capture import CaptureError, OpenFeed, RawFrame
+from vision.sources.capture import CaptureError, OpenCapture, RawFrame
 from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
 
 logger = logging.getLogger(__name__)
 
 
 class SequentialSource(Source):
-    """Reads a feed in the caller's own thread. The first frame is read when it is made, to know it can be."""
+    """Reads a capture in the caller's thread. The constructor reads the first frame as a check."""
 
     live = False
 
     def __init__(
         self,
         uri: str,
-        open_capture: OpenFeed,
+        open_capture: OpenCapture,
         settings: SourceSettings,
         *,
         on_close: Callable[[], None] | None = None,
@@ -41,55 +41,55 @@ class SequentialSource(Source):
         self._ended = False
         self.total_frames = self._capture.total_frames
         try:
-            self._first: RawFrame | None = self._first_picture(settings.open_timeout_s)
+            self._first: RawFrame | None = self._read_first(settings.open_timeout_s)
         except BaseException:
             self.close()
             raise
 
-    def _first_picture(self, timeout_s: float) -> RawFrame:
+    def _read_first(self, timeout_s: float) -> RawFrame:
         deadline_s = time.monotonic() + timeout_s
         try:
-            picture = self._capture.read(timeout_s)
-            while picture is None and time.monotonic() < deadline_s:
-                picture = self._capture.read(max(deadline_s - time.monotonic(), 0.0))
+            raw = self._capture.read(timeout_s)
+            while raw is None and time.monotonic() < deadline_s:
+                raw = self._capture.read(max(deadline_s - time.monotonic(), 0.0))
         except EndOfStream as end:
             raise SourceError(f"{self.uri}: ended before its first frame{_detail(end)}") from end
         except CaptureError as lost:
             raise SourceError(f"{self.uri}: {lost}") from lost
-        if picture is None:
-            raise SourceError(f"{self.uri}: no frame within {timeout_s:g} s; is its writer running?")
-        return picture
+        if raw is None:
+            raise SourceError(f"{self.uri}: no frame within {timeout_s:g} s; start its writer")
+        return raw
 
     def read(self, timeout_s: float = 1.0) -> Frame | None:
         if self._closed or self._ended:
             raise EndOfStream
-        picture = self._first
+        raw = self._first
         self._first = None
-        if picture is None:
+        if raw is None:
             try:
-                picture = self._capture.read(timeout_s)
+                raw = self._capture.read(timeout_s)
             except EndOfStream as end:
                 self._ended = True
-                self._log_missing_files(end)
+                self._log_early_end(end)
                 raise
             except CaptureError as lost:
                 self._ended = True
                 raise SourceError(f"{self.uri}: {lost}") from lost
-        if picture is None:
+        if raw is None:
             return None
-        self._sequence += picture.skipped + self._capture.unreadable - self._unreadable_seen
+        self._sequence += raw.skipped + self._capture.unreadable - self._unreadable_seen
         self._unreadable_seen = self._capture.unreadable
-        self._dropped += picture.skipped
+        self._dropped += raw.skipped
         ready_ns = time.monotonic_ns()
-        captured_ns = ready_ns if picture.captured_ns is None else picture.captured_ns
+        captured_ns = ready_ns if raw.captured_ns is None else raw.captured_ns
         frame = Frame(
-            picture.image,
+            raw.image,
             captured_ns,
             self._sequence,
-            picture.depth_m,
+            raw.depth_m,
             ready_ns,
-            picture.decode_ms,
-            picture.media_s,
+            raw.decode_ms,
+            raw.media_s,
         )
         self._sequence += 1
         self._delivered += 1
@@ -97,7 +97,7 @@ class SequentialSource(Source):
             self._on_frame(frame)
         return frame
 
-    def _log_missing_files(self, end: EndOfStream) -> None:
+    def _log_early_end(self, end: EndOfStream) -> None:
         if detail := _detail(end):
             logger.warning("%s: ended after %d frames%s", self.uri, self._delivered, detail)
 

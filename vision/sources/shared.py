@@ -1,4 +1,4 @@
-"""Frames that another process puts into shared memory: `shm://NAME`, with depth where it gives depth."""
+"""Frames that another process writes to shared memory: `shm://NAME`, with depth if the writer provides it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from vision.shared_frame import SharedFrameReader, segment_path
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.source import SourceError, SourceSettings
 
-_LOOK_EVERY_S = 0.001  # shared memory wakes nobody; a look costs some microseconds
+_POLL_S = 0.001  # shared memory does not notify; a poll takes some microseconds
 
 
 def check_name(name: str) -> None:
-    """Raises SourceError for a name that no shared memory can have."""
+    """Raises SourceError for an invalid name of a shared memory."""
     try:
         segment_path(name)
     except (OSError, ValueError) as error:
@@ -24,7 +24,7 @@ class SharedFrameCapture(Capture):
     """The newest frame of a shared memory, each once.
 
     Raises:
-        CaptureError: nobody has made it (yet), or something else is there.
+        CaptureError: it does not exist (yet), or is something else.
     """
 
     def __init__(self, name: str, settings: SourceSettings) -> None:
@@ -39,25 +39,25 @@ class SharedFrameCapture(Capture):
     def read(self, timeout_s: float) -> RawFrame | None:
         deadline_s = time.monotonic() + timeout_s
         while True:
-            looked_ns = time.monotonic_ns()
+            polled_ns = time.monotonic_ns()
             try:
                 frame = self._reader.latest(self._after)
-            except ValueError as error:  # a new writer of another release
+            except ValueError as error:  # a new writer from another release
                 raise CaptureError(str(error)) from error
             if self._reader.calibration != self.calibration:
-                raise CaptureError("another camera writes there now")
+                raise CaptureError("the shared memory has a new writer with another camera")
             if frame is not None and self._after is None and self._is_stale(frame):
-                # What a dead writer left behind is no sign of life.
+                # A dead writer's last frame is not a new frame.
                 self._after = frame.sequence
                 frame = None
             if frame is not None:
                 break
             if time.monotonic() >= deadline_s:
                 return None
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(_POLL_S)
         before, self._after = self._after, frame.sequence
         skipped = 0 if before is None else max(frame.sequence - before - 1, 0)
-        copy_ms = (time.monotonic_ns() - looked_ns) / 1e6
+        copy_ms = (time.monotonic_ns() - polled_ns) / 1e6
         return RawFrame(frame.image, frame.captured_ns, frame.depth_m, skipped=skipped, decode_ms=copy_ms)
 
     def _is_stale(self, frame: Frame) -> bool:

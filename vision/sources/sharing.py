@@ -1,4 +1,4 @@
-"""Offering a source's frames to other programs of this host while they arrive: `shm://NAME`."""
+"""Publishes a source's frames to other programs on this host as they arrive: `shm://NAME`."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from vision.sources.source import SourceError
 
 
 class FrameSharing:
-    """Frames of any size into shared memory, for as long as this is open.
+    """Writes frames of any size to shared memory until closed.
 
-    A camera can be opened once; this lets several models look through it. Given to a source as
-    `SourceSettings.on_frame`, it writes every frame as it arrives, whoever takes it and how slowly. The copy
-    costs one memory copy a frame, whoever reads the shared memory nothing.
+    A camera can be opened only once; this lets several models use it. As `SourceSettings.on_frame` of a
+    source it writes every frame as it arrives, independent of the readers. The cost is one memory copy per
+    frame, and none for readers.
 
     Args:
-        name: of the shared memory. Nothing is there before the first frame, whose size it has.
+        name: of the shared memory. It is created at the first frame, with that frame's size.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._writer: SharedFrameWriter | None = None
-        # A camera's driver that hangs may still be giving a frame when all is being closed.
+        # A blocked camera driver may still deliver a frame while everything is being closed.
         self._lock = Lock()
         self._closed = False
 
     def write(self, frame: Frame) -> None:
-        """Show a frame to the others. After `close` it does nothing.
+        """Publish a frame. Does nothing after `close`.
 
         Raises:
-            SourceError: another program writes under that name, or the memory cannot be had.
+            SourceError: another program writes under that name, or the memory cannot be allocated.
         """
         with self._lock:
             if not self._closed:
                 self._writer_for(frame).write(frame)
 
     def _writer_for(self, frame: Frame) -> SharedFrameWriter:
-        """The writer of frames of this size: a stream may change its own in the middle."""
+        """The writer for frames of this size: a stream may change its size."""
         size = (frame.width, frame.height, frame.depth_m is not None)
         writer = self._writer
         if writer is not None and (writer.width, writer.height, writer.depth) == size:
             return writer
-        self._take_away()
+        self._remove()
         try:
             self._writer = SharedFrameWriter(self._name, *size)
         except (OSError, ValueError) as error:
@@ -52,12 +52,12 @@ class FrameSharing:
         return self._writer
 
     def close(self) -> None:
-        """Take the shared memory away."""
+        """Remove the shared memory."""
         with self._lock:
             self._closed = True
-            self._take_away()
+            self._remove()
 
-    def _take_away(self) -> None:
+    def _remove(self) -> None:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()

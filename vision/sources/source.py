@@ -1,4 +1,4 @@
-"""What a source of frames is: its settings, its figures, its errors, and the contract of `read`."""
+"""The source interface: settings, statistics, errors, and `read`."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 
 RAW_PIXEL_FORMATS = {"bgr24": 3, "rgb24": 3, "gray8": 1}
-"""Raw pixel formats of a pipe → bytes a pixel."""
+"""Raw pixel formats of a pipe → bytes per pixel."""
 
 PIPE_PIXEL_FORMATS = (*RAW_PIXEL_FORMATS, "y4m", "mjpeg")
 
 
 class SourceError(Exception):
-    """A source that cannot be opened, or cannot go on. The text is one line that says what to do."""
+    """A source cannot be opened, or cannot continue. The text is one line that says what to do."""
 
 
 class CameraChangedError(SourceError):
-    """The source goes on with another lens or mount than it began with; open it again to use that."""
+    """The source returned with another lens or mount; open it again to use that."""
 
 
 class EndOfStream(Exception):  # noqa: N818 - an end, not an error
-    """The source has given its last frame."""
+    """The source has delivered its last frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceSettings:
-    """How to open and read a source. A kind of source ignores what it has no use for.
+    """How to open and read a source. A kind of source ignores what does not apply to it.
 
     Attributes:
-        width, height: pixels. Asked of a camera; required for a raw pipe; nothing else uses them.
-        rate_hz: frames a second. Asked of a camera; the pace of images and raw files when `realtime`.
-        pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or what a pipe carries: `bgr24`, `rgb24`, `gray8`
-            (these need width and height), `y4m`, `mjpeg`. None: the driver's choice, or y4m/mjpeg recognised
-            by the pipe's first bytes.
-        loop: start a file over at its end.
-        realtime: pace a file by its own timestamps, newest frame wins: a file standing for a camera. A pipe
-            has its writer's pace.
+        width, height: pixels. Requested from a camera; required for a raw pipe; unused otherwise.
+        rate_hz: frames per second. Requested from a camera; the rate of images and raw files with `realtime`.
+        pixel_format: a camera's FOURCC (`MJPG`, `YUYV`), or the format of a pipe: `bgr24`, `rgb24`, `gray8`
+            (these need width and height), `y4m`, `mjpeg`. None: the driver's default, or y4m/mjpeg detected
+            from the pipe's first bytes.
+        loop: restart a file at its end.
+        realtime: read a file at its own frame rate, newest frame wins: a file used as a camera. A pipe has
+            its writer's rate.
         every_frame: pipes only. True: every frame in order, the writer waits for the reader, and the writer's
-            end is the end. False: newest frame wins. None: newest wins, but a regular file redirected into
-            standard input is read whole. Files give every frame unless `realtime`; cameras, networks and
-            shared memory cannot wait, so there the newest always wins.
-        open_timeout_s: how long to wait for the very first frame.
-        read_timeout_s: a live source silent for this long is lost, and is opened again.
+            exit is the end. False: newest frame wins. None: newest wins, but a regular file redirected to
+            standard input is read completely. Files deliver every frame unless `realtime`; cameras, networks
+            and shared memory cannot wait, so the newest always wins.
+        open_timeout_s: timeout for the first frame.
+        read_timeout_s: a live source without data for this long is lost, and is reopened.
         retry_min_s, retry_max_s: the pause between attempts starts at the first and doubles up to the second.
-        on_frame: called with every frame as it arrives, before it is given to the reader, and also with those
-            that the reader is too slow for. A live source calls it in its own thread. If it raises a
-            `SourceError`, that is as if the source had failed.
+        on_frame: called with every frame as it arrives, before the reader gets it, including frames that the
+            reader is too slow for. A live source calls it in its own thread. A `SourceError` raised here ends
+            the source.
     """
 
     width: int | None = None
@@ -85,7 +85,7 @@ class SourceSettings:
             self.pixel_format in PIPE_PIXEL_FORMATS or len(self.pixel_format) == 4
         ):
             raise ValueError(
-                f"pixel_format must be a camera's four letters (MJPG, YUYV) or one of "
+                f"pixel_format must be a camera's FOURCC (MJPG, YUYV) or one of "
                 f"{', '.join(PIPE_PIXEL_FORMATS)}, got {self.pixel_format!r}"
             )
 
@@ -96,9 +96,9 @@ class SourceStatistics:
 
     Attributes:
         delivered: frames that `read` returned.
-        dropped: frames that a newer one replaced before anybody read them.
-        unreadable: pictures that arrived and could not be decoded.
-        reopened: how often a lost source came back.
+        dropped: frames replaced by a newer one before they were read.
+        unreadable: frames that could not be decoded.
+        reopened: number of recoveries of a lost source.
     """
 
     delivered: int = 0
@@ -111,12 +111,11 @@ class Source(ABC):
     """An open source of frames. Use it as a context manager, or iterate it to its end.
 
     Attributes:
-        uri: where the frames come from, without passwords.
-        live: True where the newest frame wins; False where every frame is given.
-        total_frames: how many frames there will be, None where nobody knows. A video file's own claim may be
-            a little off.
-        calibration: lens and mount, where the camera brings them (shared memory can); it never changes while
-            the source is open.
+        uri: address of the source, without passwords.
+        live: True: the newest frame wins; False: every frame is delivered.
+        total_frames: number of frames, None if unknown. A video file's header may be slightly wrong.
+        calibration: lens and mount, if the source provides them (shared memory can); constant while the
+            source is open.
     """
 
     uri: str
@@ -128,14 +127,13 @@ class Source(ABC):
     def read(self, timeout_s: float = 1.0) -> Frame | None:
         """The next frame.
 
-        A live source gives its newest frame, each at most once, waiting up to `timeout_s` for one; None says
-        that none came in that time (also while a lost source is being opened again: keep reading). A source
-        of every frame gives the next in order; a file never returns None, a pipe does when its writer is
-        late.
+        A live source returns its newest frame, each at most once, waiting up to `timeout_s`; None if none
+        arrived (also while a lost source is being reopened: keep reading). Other sources return every frame
+        in order; a file never returns None, a pipe does if its writer is late.
 
         Raises:
             EndOfStream: after the last frame, and after `close`.
-            SourceError: the source failed and will not come back.
+            SourceError: the source failed permanently.
         """
 
     @property
@@ -145,7 +143,7 @@ class Source(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Give back the device, file or socket. A second call does nothing."""
+        """Release the device, file or socket. A second call does nothing."""
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""A video file, read by the FFmpeg that OpenCV carries."""
+"""A video file, read by OpenCV's FFmpeg."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vision.sources.source import EndOfStream, SourceError
 
 
 class VideoFileCapture(Capture):
-    """Every frame of a video file in order, with its time in the film.
+    """Every frame of a video file in order, with its media time.
 
     Raises:
-        SourceError: no video in it that FFmpeg can read.
+        SourceError: no video that FFmpeg can read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -27,8 +27,8 @@ class VideoFileCapture(Capture):
         self._capture = open_ffmpeg(str(path))
         if not self._capture.isOpened():
             raise SourceError(
-                f"{path}: no video that FFmpeg can read ({path.stat().st_size} bytes); is it damaged, "
-                f"or another kind of file?"
+                f"{path}: no video that FFmpeg can read ({path.stat().st_size} bytes); it may be damaged or "
+                f"another kind of file"
             )
         claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.total_frames = int(claimed) if 0 < claimed < 1e9 else None
@@ -40,12 +40,12 @@ class VideoFileCapture(Capture):
     def read(self, timeout_s: float) -> RawFrame | None:
         started_ns = time.monotonic_ns()
         ok, image = self._capture.read()
-        decode_ms = (time.monotonic_ns() - started_ns) / 1e6  # a file has no waiting in it
+        decode_ms = (time.monotonic_ns() - started_ns) / 1e6  # a file read does not wait
         if not ok:
-            # OpenCV says "no frame" for an end and for damage alike; the file's own count tells them apart.
+            # OpenCV does not distinguish an end from damage; the frame count in the file does.
             missing = (self.total_frames or 0) - self._delivered
             if missing > max(2, 0.02 * (self.total_frames or 0)):
-                raise EndOfStream(f"the file promises {self.total_frames}; it is cut short or damaged")
+                raise EndOfStream(f"the file should have {self.total_frames}; it is truncated or damaged")
             raise EndOfStream
         self._delivered += 1
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0

@@ -1,8 +1,8 @@
-"""YUV4MPEG2, the uncompressed video stream of mjpegtools (`yuv4mpeg(5)`), as ffmpeg and GStreamer write it.
+"""YUV4MPEG2, the uncompressed video stream of mjpegtools (`yuv4mpeg(5)`), as written by ffmpeg and GStreamer.
 
 A line `YUV4MPEG2 W640 H480 F30:1 C420jpeg …`, then for every frame a line `FRAME …` and its planes: luma,
 then the two chroma planes. Colours are BT.601; the range is the broadcast one (16..235) unless
-`XCOLORRANGE=FULL` says otherwise.
+`XCOLORRANGE=FULL`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from vision.sources.raw import StreamError
 logger = logging.getLogger(__name__)
 
 MAGIC = b"YUV4MPEG2"
-_LINE_LIMIT = 4096  # bytes; the specification names none, a line this long is not a header
+_LINE_LIMIT = 4096  # bytes; the specification has no limit, a line this long is not a header
 
-# Horizontal and vertical chroma subsampling, and whether an alpha plane follows. None: no chroma at all.
+# Horizontal and vertical chroma subsampling, and whether an alpha plane follows. None: no chroma.
 _COLOUR_SPACES: dict[str, tuple[tuple[int, int] | None, bool]] = {
     "420": ((2, 2), False),
     "420jpeg": ((2, 2), False),
@@ -67,10 +67,10 @@ class Y4mHeader:
 
 
 def parse_y4m_header(line: bytes) -> Y4mHeader:
-    """The header out of the stream's first line, without its line feed.
+    """Parse the stream's first line, without its line feed.
 
     Raises:
-        StreamError: not a header, no valid size, or a colour space this reader does not know.
+        StreamError: not a header, no valid size, or an unsupported colour space.
     """
     words = line.decode("ascii", "replace").split(" ")
     if words[0] != MAGIC.decode():
@@ -85,7 +85,7 @@ def parse_y4m_header(line: bytes) -> Y4mHeader:
     name = values.get("C", "420")
     if name not in _COLOUR_SPACES:
         raise StreamError(
-            f"colour space C{name} is not read here, only 8-bit {', '.join(_COLOUR_SPACES)}; "
+            f"colour space C{name} is not supported, only 8-bit {', '.join(_COLOUR_SPACES)}; "
             f"convert it, for example with ffmpeg -pix_fmt yuv420p"
         )
     subsampling, alpha = _COLOUR_SPACES[name]
@@ -103,7 +103,7 @@ def parse_y4m_header(line: bytes) -> Y4mHeader:
 def _size(values: dict[str, str], letter: str, name: str) -> int:
     text = values.get(letter, "")
     if not (text.isascii() and text.isdecimal() and 1 <= int(text) <= 32768):
-        raise StreamError(f"its header gives no {name} from 1 to 32768: {letter}{text}")
+        raise StreamError(f"the header has no {name} from 1 to 32768: {letter}{text}")
     return int(text)
 
 
@@ -115,7 +115,7 @@ def _rate(text: str) -> float | None:
 
 
 def bgr_from_planes(data: bytes, header: Y4mHeader) -> NDArray[np.uint8]:
-    """(height, width, 3) BGR of one frame's planes, which lie in `data` one after another."""
+    """(height, width, 3) BGR of one frame's planes, which are consecutive in `data`."""
     width, height = header.width, header.height
     planes = np.frombuffer(data, np.uint8)
     luma = planes[: width * height].reshape(height, width)
@@ -145,7 +145,7 @@ def bgr_from_planes(data: bytes, header: Y4mHeader) -> NDArray[np.uint8]:
 
 
 class Y4mParser:
-    """Pictures out of a YUV4MPEG2 stream that comes in pieces of any size."""
+    """Decodes a YUV4MPEG2 stream received in pieces of any size."""
 
     unreadable = 0
     rate_hz: float | None = None
@@ -157,14 +157,14 @@ class Y4mParser:
 
     def push(self, data: bytes) -> list[NDArray[np.uint8]]:
         self._buffer += data
-        pictures = []
+        images = []
         position = 0
         while True:
             if self._in_frame and self._header is not None:
                 end = position + self._header.frame_bytes
                 if end > len(self._buffer):
                     break
-                pictures.append(bgr_from_planes(bytes(self._buffer[position:end]), self._header))
+                images.append(bgr_from_planes(bytes(self._buffer[position:end]), self._header))
                 self._in_frame = False
                 position = end
                 continue
@@ -172,22 +172,22 @@ class Y4mParser:
             if end < 0:
                 if len(self._buffer) - position >= _LINE_LIMIT:
                     raise StreamError(
-                        f"no line of YUV4MPEG2 within {_LINE_LIMIT} bytes; is it another format?"
+                        f"no line of YUV4MPEG2 within {_LINE_LIMIT} bytes; it may be another format"
                     )
                 break
-            self._take_line(bytes(self._buffer[position:end]))
+            self._parse_line(bytes(self._buffer[position:end]))
             position = end + 1
         del self._buffer[:position]
-        return pictures
+        return images
 
-    def _take_line(self, line: bytes) -> None:
+    def _parse_line(self, line: bytes) -> None:
         if self._header is not None and (line == b"FRAME" or line.startswith(b"FRAME ")):
             self._in_frame = True
         elif line.startswith(MAGIC):  # also between frames: a new writer on the same pipe
             self._header = parse_y4m_header(line)
             self.rate_hz = self._header.rate_hz
             if self._header.interlaced:
-                logger.warning("the YUV4MPEG2 stream is interlaced; its fields are shown as they come")
+                logger.warning("the YUV4MPEG2 stream is interlaced; its fields are not deinterlaced")
         else:
             expected = "FRAME" if self._header else MAGIC.decode()
             raise StreamError(f"expected a line {expected!r} of YUV4MPEG2, got {line[:40]!r}")
