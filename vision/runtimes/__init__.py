@@ -1,1 +1,1 @@
-"""What computes the network: torch, ONNX Runtime, OpenVINO or TensorRT behind one small contract."""
+"""Inference runtimes: torch, ONNX Runtime, OpenVINO or TensorRT behind one interface."""

@@ -1,4 +1,4 @@
-"""The one contract of all runtimes: a letterboxed picture in, raw maps out."""
+"""The runtime interface: a letterboxed image in, raw head outputs out."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ PRECISIONS: tuple[Precision, ...] = ("auto", "float32", "bfloat16", "float16")
 
 
 class RuntimeUnusableError(ValueError):
-    """A runtime cannot do what it was asked: the file, the precision or the machine does not allow it."""
+    """A runtime cannot do what was requested: the file, the precision or the machine does not allow it."""
 
 
 class RuntimeMissingError(RuntimeUnusableError):
-    """A runtime was asked for by name and is not installed. The message names the extra that brings it."""
+    """A runtime was requested by name and is not installed. The message names the extra to install."""
 
 
 class Runtime(Protocol):
-    """A network made ready. Not to be shared between threads.
+    """A network ready for inference. Not thread-safe.
 
-    The picture's colours and range are the runtime's affair: it takes the pixels as they are.
+    Colour order and scaling are part of the network: it takes the pixels as they are.
 
     Attributes:
         name: of the runtime.
-        precision: what the network computes in, `float32`, `bfloat16` or `float16`.
+        precision: of the network, `float32`, `bfloat16` or `float16`.
         precision_reason: why, in words.
-        threads: processor threads that it computes with.
-        head: how its maps are read.
+        threads: processor threads it uses.
+        head: layout of its outputs.
     """
 
     @property
@@ -54,35 +54,35 @@ class Runtime(Protocol):
 
     @property
     def product(self) -> Product:
-        """Of two float32 matrices, with the runtime's own threads where it has such a thing."""
+        """Matrix product of two float32 matrices, on the runtime's own threads if it has any."""
 
     def prepare(self, height: int, width: int) -> None:
-        """Make ready for inputs of one size, so that the first `infer` is as fast as the rest."""
+        """Prepare for inputs of one size, so that the first `infer` is not slower than the rest."""
 
     def infer(self, image_bgr: NDArray[np.uint8]) -> Sequence[LevelOutput]:
-        """(H, W, 3) uint8 BGR, C-contiguous, sides multiples of the largest stride → one level's maps each.
+        """(H, W, 3) uint8 BGR, C-contiguous, sides multiples of the largest stride → each level's outputs.
 
-        The maps may lie in the runtime's own memory: they hold until the next `infer`.
+        The outputs may be the runtime's own memory: they are valid until the next `infer`.
         """
 
 
 def installed(runtime: RuntimeName) -> bool:
-    """Whether the runtime's package can be imported. Nothing is imported."""
+    """Whether the runtime's package can be imported, without importing it."""
     return importlib.util.find_spec(runtime) is not None
 
 
 def version(runtime: RuntimeName) -> str:
-    """The installed runtime's version; `unknown` of one that was put there without a package."""
+    """The installed runtime's version; `unknown` if it does not belong to a package."""
     try:
         return importlib.metadata.version(runtime)
     except importlib.metadata.PackageNotFoundError:
-        # Another package may bring it, such as onnxruntime-gpu.
+        # Another package may provide it, such as onnxruntime-gpu.
         packages = importlib.metadata.packages_distributions().get(runtime, [])
         return importlib.metadata.version(packages[0]) if packages else "unknown"
 
 
 def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
-    """The runtime's module. Raises `RuntimeMissingError`, which names the extra to install."""
+    """Import the runtime's module. Raises `RuntimeMissingError`, which names the extra to install."""
     for package in filter(None, (runtime, also)):
         try:
             if importlib.util.find_spec(package) is None:
@@ -90,7 +90,7 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
                     f"the runtime {runtime} is not installed ({package} is missing): "
                     f"pip install 'mavlink-companion[{runtime}]'"
                 )
-        except ModuleNotFoundError:  # of a dotted name, when even the first part is missing
+        except ModuleNotFoundError:  # of a dotted name, when its first part is missing
             raise RuntimeMissingError(
                 f"the runtime {runtime} is not installed ({package} is missing): "
                 f"pip install 'mavlink-companion[{runtime}]'"
@@ -100,12 +100,12 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
     except ImportError as error:
         raise RuntimeMissingError(
             f"the runtime {runtime} is installed but cannot be loaded: {error}; "
-            f"install it again: pip install --force-reinstall 'mavlink-companion[{runtime}]'"
+            f"reinstall it: pip install --force-reinstall 'mavlink-companion[{runtime}]'"
         ) from error
 
 
 def bfloat16_instructions() -> str:
-    """The processor's own bfloat16 arithmetic, as Linux names it; empty where it has none."""
+    """Names of the processor's bfloat16 instructions, as Linux reports them; empty if it has none."""
     try:
         lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     except OSError:

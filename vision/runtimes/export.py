@@ -1,4 +1,4 @@
-"""A checkpoint written as what another runtime reads, with its facts inside, checked before it is kept."""
+"""Exports a checkpoint for another runtime, with its metadata, and verifies the file before keeping it."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from vision.yolo.checkpoint_pair import weights_sha256
 
 logger = logging.getLogger(__name__)
 
-# The lowest with everything that these networks need, for the oldest readers.
+# The lowest opset that supports these networks, for the oldest readers.
 _OPSET = 17
-# Maps of the exported file may differ from torch's by this much, in logits; accumulated rounding is far less.
+# Largest difference of the exported file's outputs from torch's, in logits; rounding is far less.
 _TOLERANCE = 0.02
-# Trained networks' logits stay within this; where a network's are larger, so is their rounding.
+# Logits of trained networks stay within this; the tolerance scales with larger ones.
 _USUAL_LARGEST = 20.0
 _READER: dict[ExportKind, RuntimeName] = {
     "onnx": "onnxruntime",
@@ -45,20 +45,20 @@ def export(
     *,
     model_family: str = "",
 ) -> Path:
-    """Write a checkpoint's network for another runtime.
+    """Export a checkpoint's network for another runtime.
 
-    The file takes (1, H, W, 3) uint8 BGR, H and W any multiples of the largest stride, and gives for each
-    level (stride S) `sides_S` and `classes_S`, see `LevelOutput`. It carries its `ExportedFacts`.
+    The file takes (1, H, W, 3) uint8 BGR, H and W any multiples of the largest stride, and returns for each
+    level (stride S) `sides_S` and `classes_S`, see `LevelOutput`. It contains its `ExportedFacts`.
 
     Args:
-        output: where to; None: beside the checkpoint, with the kind's own ending (`SUFFIXES`).
-        image_size: what it is tuned for and checked at; of a TensorRT plan the largest side.
-        model_family: of the network, to be told on.
+        output: file to write; None: beside the checkpoint, with the kind's suffix (`SUFFIXES`).
+        image_size: size for tuning and verification; for a TensorRT plan the largest side.
+        model_family: of the network, stored in the facts.
 
     Raises:
         CheckpointError: the checkpoint cannot be read.
-        RuntimeMissingError: the runtime that the file is for is not installed.
-        RuntimeUnusableError: the network cannot be exported, or the file's maps are not the network's.
+        RuntimeMissingError: the target runtime is not installed.
+        RuntimeUnusableError: the network cannot be exported, or the file's outputs differ from the network's.
     """
     if to not in SUFFIXES:
         raise RuntimeUnusableError(f"can export to {', '.join(SUFFIXES)}, not to {to!r:.50}")
@@ -84,7 +84,7 @@ def export(
 
 
 def export_network(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -> Path:
-    """Write a network that is ready. The file appears whole or not at all (OpenVINO's `.xml` last)."""
+    """Export a network. The file appears complete or not at all (OpenVINO's `.xml` last)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         partial = Path(folder) / path.name
@@ -97,14 +97,14 @@ def export_network(network: Network, facts: ExportedFacts, to: ExportKind, path:
         else:
             _write_tensorrt(network, facts, partial)
         _check(network, facts, to, partial)
-        for made in sorted(Path(folder).iterdir(), key=lambda made: made.name == path.name):
-            os.replace(made, path.with_name(made.name))
+        for exported in sorted(Path(folder).iterdir(), key=lambda exported: exported.name == path.name):
+            os.replace(exported, path.with_name(exported.name))
     logger.info("%s: written for %s", path, to)
     return path
 
 
 def _example(side: int, *, height: int | None = None, seed: int = 0) -> torch.Tensor:
-    """A smooth random picture: (1, H, W, 3) uint8, so that every layer has something to see."""
+    """A smooth random image: (1, H, W, 3) uint8, so that every layer has varied input."""
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand((1, 3, 8, 8), generator=generator)
     shape = (side if height is None else height, side)
@@ -113,8 +113,8 @@ def _example(side: int, *, height: int | None = None, seed: int = 0) -> torch.Te
 
 
 @contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Exporters warn of what is theirs to know: their deprecations, and sizes seen by the tracer."""
+def _without_warnings() -> Iterator[None]:
+    """Suppress exporters' warnings: deprecations, and sizes fixed by the tracer."""
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -127,7 +127,7 @@ def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
         raise RuntimeMissingError(
             "exporting needs the package onnx: pip install 'mavlink-companion[onnxruntime]', or [tensorrt]"
         ) from error
-    with _quietly():
+    with _without_warnings():
         example = _example(facts.image_size)
         graph: Any = traced(network, example)
         torch.onnx.export(
@@ -139,31 +139,33 @@ def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
             dynamic_axes={INPUT: {1: "height", 2: "width"}}
             | {name: {2: f"{name}_height", 3: f"{name}_width"} for name in network.names},
             opset_version=_OPSET,
-            # The tracing exporter: the other one needs one more package.
+            # The tracing exporter: the other one needs another package.
             dynamo=False,
         )
-    made = onnx.load(str(path))
-    entry = made.metadata_props.add()
+    exported = onnx.load(str(path))
+    entry = exported.metadata_props.add()
     entry.key, entry.value = KEY, facts.to_json()
-    onnx.save(made, str(path))
+    onnx.save(exported, str(path))
 
 
 def _write_openvino(network: Network, facts: ExportedFacts, path: Path) -> None:
     openvino = required("openvino")
-    with _quietly():
+    with _without_warnings():
         any_size = openvino.PartialShape([1, -1, -1, 3])
         example = _example(facts.image_size)
-        # Traced here: OpenVINO would trace the network as a module, twice, in several times the time.
-        made = openvino.convert_model(traced(network, example), example_input=(example,), input=[any_size])
-    made.inputs[0].get_tensor().set_names({INPUT})
-    for output, name in zip(made.outputs, network.names, strict=True):
+        # Traced here: OpenVINO would trace the module twice, which takes several times as long.
+        exported = openvino.convert_model(
+            traced(network, example), example_input=(example,), input=[any_size]
+        )
+    exported.inputs[0].get_tensor().set_names({INPUT})
+    for output, name in zip(exported.outputs, network.names, strict=True):
         output.get_tensor().set_names({name})
-    made.set_rt_info(facts.to_json(), [KEY])
-    openvino.save_model(made, str(path), compress_to_fp16=False)
+    exported.set_rt_info(facts.to_json(), [KEY])
+    openvino.save_model(exported, str(path), compress_to_fp16=False)
 
 
 def _write_torchscript(network: Network, facts: ExportedFacts, path: Path) -> None:
-    with _quietly():
+    with _without_warnings():
         trace: Any = torch.jit.trace
         traced = trace(network, _example(facts.image_size), check_trace=False)
         torch.jit.save(traced, str(path), _extra_files={KEY: facts.to_json()})
@@ -180,7 +182,7 @@ def _write_tensorrt(network: Network, facts: ExportedFacts, path: Path) -> None:
 
 
 def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -> None:
-    """The file's maps against torch's, on a square and on another input: sizes must have stayed open."""
+    """Compare the file's outputs with torch's, for a square and another input: sizes must be dynamic."""
     from vision.runtimes.selection import runtime_of_file
 
     head = network.head
@@ -188,19 +190,19 @@ def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -
     stride = max(facts.strides)
     square = _example(facts.image_size)
     other = _example(facts.image_size, height=max(stride, facts.image_size // 2 // stride * stride), seed=1)
-    for picture in (square, other):
+    for image in (square, other):
         with torch.inference_mode():
-            expected = [level[0].numpy() for level in network(picture)]
+            expected = [level[0].numpy() for level in network(image)]
         found: list[Any] = []
         try:
-            for level in runtime.infer(picture[0].numpy()):
+            for level in runtime.infer(image[0].numpy()):
                 found += [getattr(level, kind) for kind in head.kinds]
         except (RuntimeError, RuntimeUnusableError) as error:
-            raise _unfaithful(to, picture.shape, str(error)) from error
+            raise _mismatch(to, image.shape, str(error)) from error
         worst = _largest_difference(expected, found)
-        # Half precision rounds every layer; whether boxes agree is for `companion models verify`.
+        # Half precision rounds every layer; `companion models verify` compares the boxes.
         if not worst <= (_TOLERANCE if runtime.precision == "float32" else 50 * _TOLERANCE):
-            raise _unfaithful(to, picture.shape, f"they differ by {worst:.3g}")
+            raise _mismatch(to, image.shape, f"largest difference {worst:.3g}")
 
 
 def _largest_difference(expected: Sequence[Any], found: Sequence[Any]) -> float:
@@ -212,8 +214,8 @@ def _largest_difference(expected: Sequence[Any], found: Sequence[Any]) -> float:
     )
 
 
-def _unfaithful(to: str, shape: Sequence[int], why: str) -> RuntimeUnusableError:
+def _mismatch(to: str, shape: Sequence[int], reason: str) -> RuntimeUnusableError:
     return RuntimeUnusableError(
-        f"the network cannot be exported to {to}: for a picture of {shape[2]}x{shape[1]} the file's maps are "
-        f"not the network's ({' '.join(why.split())[:300]})"
+        f"the network cannot be exported to {to}: for an image of {shape[2]}x{shape[1]} the file's outputs "
+        f"differ from the network's ({' '.join(reason.split())[:300]})"
     )

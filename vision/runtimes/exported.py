@@ -1,7 +1,7 @@
-"""What an exported file tells of itself, so that it can be loaded alone.
+"""Metadata of an exported file, so that it can be loaded without its checkpoint.
 
-The facts travel inside the file: ONNX metadata, OpenVINO's `rt_info`, TorchScript's extra files, and before
-a TensorRT plan, which has no room of its own, as `MAGIC`, their length (little-endian uint32) and the facts.
+The facts are stored in the file: ONNX metadata, OpenVINO's `rt_info`, TorchScript's extra files, and before a
+TensorRT plan, which has no metadata, as `MAGIC`, their length (little-endian uint32) and the facts.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ SUFFIXES: dict[ExportKind, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ExportedFacts:
-    """Of one exported network.
+    """Metadata of one exported network.
 
     Attributes:
         class_names: id → name.
-        strides, reg_max, end_to_end: how its maps are read, see `Head`.
-        image_size: pixels that it was made for; it takes others too, unless `fixed_size` names the one.
-        fixed_size: (height, width) of the only input it takes; None: any multiples of the largest stride.
-        model_family: of the network, as the exporter was told; may be empty.
-        source_sha256: of the file that it was made from.
-        metadata: the source's own: licence, origin, score.
+        strides, reg_max, end_to_end: layout of its outputs, see `Head`.
+        image_size: pixels it was exported for; other sizes work too, unless `fixed_size` is set.
+        fixed_size: (height, width) of the only accepted input; None: any multiples of the largest stride.
+        model_family: of the network, from the export; may be empty.
+        source_sha256: of the checkpoint.
+        metadata: of the checkpoint: licence, origin, score.
     """
 
     class_names: tuple[str, ...]
@@ -63,25 +63,28 @@ class ExportedFacts:
 
     @classmethod
     def from_json(cls, text: str, path: Path) -> ExportedFacts:
-        """Raises `RuntimeUnusableError` for anything but what `to_json` writes."""
+        """Parse the output of `to_json`. Raises `RuntimeUnusableError` for anything else."""
         try:
             plain = json.loads(text)
             if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT:
-                raise ValueError(f"its format is not {FORMAT}")
+                raise ValueError(f"the format is not {FORMAT}")
             facts = cls(**plain)
             names, strides = tuple(facts.class_names), tuple(facts.strides)
             fixed = None if facts.fixed_size is None else tuple(facts.fixed_size)
-            whole = (*strides, facts.reg_max, facts.image_size, *(fixed or ()))
+            integers = (*strides, facts.reg_max, facts.image_size, *(fixed or ()))
             if not names or not strides or not all(isinstance(name, str) for name in names):
-                raise ValueError("it names no classes or no strides")
-            if not all(type(number) is int and number > 0 for number in whole) or len(fixed or (1, 1)) != 2:
-                raise ValueError("its strides, bins and sizes must be whole numbers above 0")
+                raise ValueError("no classes or no strides")
+            if (
+                not all(type(number) is int and number > 0 for number in integers)
+                or len(fixed or (1, 1)) != 2
+            ):
+                raise ValueError("strides, bins and sizes must be integers above 0")
             if not isinstance(facts.metadata, dict) or not isinstance(facts.end_to_end, bool):
-                raise ValueError("its metadata is no table")
+                raise ValueError("metadata is not a table")
         except (ValueError, TypeError, RecursionError) as error:
             raise RuntimeUnusableError(
-                f"{path}: its description of itself cannot be used ({error!s:.200}); "
-                "make it again with `companion models export`"
+                f"{path}: its metadata cannot be used ({error!s:.200}); "
+                "export it again with `companion models export`"
             ) from None
         return cls(
             names,
@@ -97,32 +100,31 @@ class ExportedFacts:
 
 
 def not_ours(path: Path) -> RuntimeUnusableError:
-    """For a file that carries no facts."""
+    """The error for a file without facts."""
     return RuntimeUnusableError(
-        f"{path}: does not say what it is (no {KEY} metadata); "
-        "make it from the checkpoint with `companion models export`"
+        f"{path}: has no {KEY} metadata; export it from the checkpoint with `companion models export`"
     )
 
 
 def kind_of(path: Path) -> ExportKind | None:
-    """By the name's ending; None for a checkpoint."""
+    """The kind by the file suffix; None for a checkpoint."""
     return next((kind for kind, suffix in SUFFIXES.items() if path.suffix == suffix), None)
 
 
 def with_facts(facts: ExportedFacts, plan: bytes) -> bytes:
-    """A TensorRT plan with its facts before it."""
+    """A TensorRT plan preceded by its facts."""
     text = facts.to_json().encode()
     return MAGIC + struct.pack("<I", len(text)) + text + plan
 
 
 def split_facts(content: bytes, path: Path) -> tuple[ExportedFacts, memoryview]:
-    """The reverse of `with_facts`; the plan is not copied."""
+    """The inverse of `with_facts`; the plan is not copied."""
     view = memoryview(content)
     start = len(MAGIC) + 4
     if len(content) < start or view[: len(MAGIC)] != MAGIC:
         raise not_ours(path)
     (length,) = struct.unpack("<I", view[len(MAGIC) : start])
     if length > min(_LONGEST_FACTS, len(content) - start):
-        raise RuntimeUnusableError(f"{path}: is cut short; make it again with `companion models export`")
+        raise RuntimeUnusableError(f"{path}: is truncated; export it again with `companion models export`")
     text = bytes(view[start : start + length]).decode(errors="replace")
     return ExportedFacts.from_json(text, path), view[start + length :]

@@ -1,12 +1,12 @@
-"""A trained model made into what is run: pixels as they come, classes that are wanted, maps kept apart.
+"""Converts a trained model for inference: raw pixels as input, selected classes, separate outputs.
 
-Changes, none of which alters the results beyond rounding:
+The changes do not alter the results beyond rounding:
 
-* The first convolution takes the bytes of a BGR picture: the division by 255 and the channels' order are
-  folded into its weights.
-* Of the last convolution of the class branches only the wanted classes' rows are kept.
-* Box sides and class logits stay separate maps, which saves joining and taking them apart again; and with
-  `sparse_boxes` the box branches are left out, as `BoxBranch` computes them where there is something.
+* The first convolution takes the bytes of a BGR image: the division by 255 and the channel order are folded
+  into its weights.
+* In the last convolution of the class branches only the selected classes' rows are kept.
+* Box sides and class logits stay separate, which saves concatenating and splitting them; and with
+  `sparse_boxes` the box branches are left out, as `BoxBranch` computes them only for candidate cells.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ from vision.yolo.postprocess import head_of
 
 
 class Network(nn.Module):
-    """(1, H, W, 3) uint8 BGR → for each level the maps of `Head.kinds`.
+    """(1, H, W, 3) uint8 BGR → for each level the outputs of `Head.kinds`.
 
-    All maps are (1, C, H / stride, W / stride) float32, in one flat tuple. `names` gives each a name.
+    All outputs are (1, C, H / stride, W / stride) float32, in one flat tuple. `names` has their names.
 
     Args:
-        model: is taken over and changed; do not use it afterwards.
+        model: is modified; do not use it afterwards.
         class_ids: sorted; the classes to compute. None: all.
-        sparse_boxes: give the neck's maps, from which the few boxes are computed later, instead of all sides.
+        sparse_boxes: return the neck's features, from which the candidates' boxes are computed later, instead
+            of all sides.
     """
 
     def __init__(
@@ -57,11 +58,11 @@ class Network(nn.Module):
 
     @property
     def names(self) -> list[str]:
-        """Of the maps, in the order of the output."""
+        """Names of the outputs, in their order."""
         return [f"{kind}_{stride}" for stride in self.head.strides for kind in self.head.kinds]
 
     def in_precision(self, dtype: torch.dtype) -> Network:
-        """Compute in `dtype`, but for the last class convolutions, which decide, in place."""
+        """Compute in `dtype`, except for the last class convolutions, which decide the class; in place."""
         self.dtype = dtype
         self.body.to(dtype)
         for branch in _branches(self.body.detect.class_branches):
@@ -69,24 +70,24 @@ class Network(nn.Module):
         return self
 
     def channels_last(self) -> Network:
-        """Lay the weights out as (out, height, width, in), in place: the faster layout on processors."""
+        """Store the weights as (out, height, width, in), in place: the faster layout on processors."""
         for parameter in self.parameters():
             if parameter.dim() == 4:
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         return self
 
     def forward(self, image_bgr: Tensor) -> tuple[Tensor, ...]:
-        # Seen as channels first, it already lies channels last: no copy but the conversion, which comes
-        # first as TensorRT asks of bytes.
+        # The permuted tensor is already channels-last in memory: no copy except the conversion, which comes
+        # first because TensorRT requires it for bytes.
         pixels = image_bgr.to(self.dtype).permute(0, 3, 1, 2)
         if not self._folded:
             pixels = pixels.flip(1) / 255
-        maps: Sequence[Tensor] = self.body(pixels)
-        return tuple(maps)
+        outputs: Sequence[Tensor] = self.body(pixels)
+        return tuple(outputs)
 
 
 class _SplitHead(Detect):
-    """The head's branches with their maps kept apart."""
+    """The head's branches with separate outputs."""
 
     def __init__(self, head: Detect, kinds: tuple[str, ...]) -> None:
         nn.Module.__init__(self)
@@ -94,15 +95,15 @@ class _SplitHead(Detect):
         self._modules = dict(head._modules)
         self.kinds = kinds
 
-    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        found: list[Tensor] = []
+    def forward(self, neck: Sequence[Tensor]) -> list[Tensor]:
+        outputs: list[Tensor] = []
         branches = zip(_branches(self.box_branches), _branches(self.class_branches), strict=True)
-        for x, (boxes, classes) in zip(maps, branches, strict=True):
+        for x, (boxes, classes) in zip(neck, branches, strict=True):
             features = classes[:-1](x).float()
-            found += [(x if "neck" in self.kinds else boxes(x)).float(), classes[-1](features)]
+            outputs += [(x if "neck" in self.kinds else boxes(x)).float(), classes[-1](features)]
             if "features" in self.kinds:
-                found.append(features)
-        return found
+                outputs.append(features)
+        return outputs
 
 
 def _branches(branches: nn.ModuleList) -> list[nn.Sequential]:
@@ -110,7 +111,7 @@ def _branches(branches: nn.ModuleList) -> list[nn.Sequential]:
 
 
 def _sliced(head: Head, detect: Detect, class_ids: Sequence[int] | None) -> Head:
-    """Keep the wanted classes' rows of the last convolutions, and what tells when another class wins."""
+    """Keep the selected classes' rows of the last convolutions, and `rows` to detect other winners."""
     if class_ids is None or len(class_ids) == head.class_count:
         return head
     rows = []
@@ -123,14 +124,14 @@ def _sliced(head: Head, detect: Detect, class_ids: Sequence[int] | None) -> Head
         last.weight.data = weight[index].clone()
         last.bias.data = bias[index].clone()
         last.out_channels = len(index)
-    # In an end-to-end head every class speaks for itself: nobody is asked who else would.
+    # In an end-to-end head the classes do not compete.
     wins = None if head.end_to_end else tuple(rows)
     return replace(head, class_ids=tuple(int(index) for index in class_ids), rows=wins)
 
 
 def _box_branches(detect: Detect, activation: str) -> tuple[BoxBranch, ...] | None:
-    """The box branches' weights, as `BoxBranch` wants them; None for branches of another make."""
-    made = []
+    """The box branches' weights in `BoxBranch`'s layout; None for branches of another structure."""
+    result = []
     for branch in _branches(detect.box_branches):
         layers = [cast(nn.Conv2d, getattr(layer, "conv", layer)) for layer in branch]
         shapes = [(layer.kernel_size, layer.stride, layer.padding, layer.groups) for layer in layers]
@@ -141,14 +142,14 @@ def _box_branches(detect: Detect, activation: str) -> tuple[BoxBranch, ...] | No
             np.ascontiguousarray(weight.reshape(-1, weight.shape[-1]).numpy()) for weight in weights
         )
         biases = tuple(cast(Tensor, layer.bias).detach().float().numpy().copy() for layer in layers)
-        made.append(BoxBranch((first, second, last), (biases[0], biases[1], biases[2]), activation))
-    return tuple(made)
+        result.append(BoxBranch((first, second, last), (biases[0], biases[1], biases[2]), activation))
+    return tuple(result)
 
 
 def _fold_pixels(model: YoloModel) -> bool:
-    """RGB in 0..1 → BGR in 0..255, in the weights of the one convolution that reads the picture.
+    """RGB in 0..1 → BGR in 0..255, in the weights of the one convolution that reads the image.
 
-    False where a description lets something else read it.
+    False if another layer of the description reads it.
     """
     first = getattr(model.model[0], "conv", None)
     readers = [index for index, sources in enumerate(model._sources) if -1 in sources]

@@ -12,19 +12,19 @@ from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, r
 from vision.runtimes.exported import INPUT, KEY, ExportedFacts, not_ours
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
-# As ONNX Runtime names them. A provider that is there is wanted: its package was chosen for it.
+# As ONNX Runtime names them. An available provider is used: its package was chosen for it.
 _PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
 _ERRORS_ONLY = 3
 
 
 class OnnxRuntime:
-    """An ONNX file that `export` made. See `contract.Runtime`.
+    """An ONNX file written by `export`. See `base.Runtime`.
 
     Args:
         path: the file.
-        head: how its maps are read; None: as the file says.
-        precision: `float32`, what the file is in.
-        threads: of the processor; None: as many as ONNX Runtime takes.
+        head: layout of its outputs; None: from the file's metadata.
+        precision: `float32`, the file's precision.
+        threads: of the processor; None: ONNX Runtime's default.
     """
 
     product: Product = staticmethod(np.matmul)
@@ -40,7 +40,7 @@ class OnnxRuntime:
     ) -> None:
         if precision not in ("auto", "float32"):
             raise RuntimeUnusableError(
-                f"onnxruntime computes in float32, what its files are in; not {precision}"
+                f"onnxruntime computes in float32, the precision of its files; not in {precision}"
             )
         onnxruntime = required("onnxruntime")
         options = onnxruntime.SessionOptions()
@@ -54,10 +54,10 @@ class OnnxRuntime:
         if started[:1] != providers[:1]:
             raise RuntimeUnusableError(
                 f"onnxruntime cannot start {providers[0]}, which its package is built for; "
-                f"started {started}. Its GPU libraries are missing, or install the package for processors"
+                f"started {started}. Install its GPU libraries, or the package for processors"
             )
         self.head = head if head is not None else onnx_facts(path, self._session).head()
-        self.precision, self.precision_reason = "float32", f"what the file is in ({started[0]})"
+        self.precision, self.precision_reason = "float32", f"precision of the file ({started[0]})"
         self._threads = threads
 
     @property
@@ -68,17 +68,17 @@ class OnnxRuntime:
         self.infer(np.zeros((height, width, 3), np.uint8))
 
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
-        maps = [level[0] for level in self._session.run(None, {INPUT: image_bgr[None]})]
-        return self.head.levels(maps)
+        outputs = [level[0] for level in self._session.run(None, {INPUT: image_bgr[None]})]
+        return self.head.levels(outputs)
 
 
 def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:
-    """What an ONNX file of ours tells of itself."""
+    """Read the metadata of an exported ONNX file."""
     if session is None:
         onnxruntime = required("onnxruntime")
         options = onnxruntime.SessionOptions()
         options.log_severity_level = _ERRORS_ONLY
-        # Only to be read: nothing is optimised.
+        # Only the metadata is read: no optimisation.
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         session = _session(onnxruntime, path, options, ["CPUExecutionProvider"])
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
@@ -88,7 +88,7 @@ def onnx_facts(path: Path, session: Any = None) -> ExportedFacts:
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """Number of processors available to this process."""
     import os
 
     return len(os.sched_getaffinity(0))
@@ -99,7 +99,7 @@ def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -
         raise RuntimeUnusableError(f"{path}: no such file")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
-    # Its errors have no common class of their own but Exception.
+    # Its errors have no common base class but Exception.
     except Exception as error:
         raise RuntimeUnusableError(
             f"{path}: onnxruntime cannot load it: {' '.join(str(error).split())}"

@@ -1,4 +1,4 @@
-"""OpenVINO, on the processor: Intel's and AMD's, and ARM's."""
+"""OpenVINO, on Intel, AMD and ARM processors."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _MOST_SIZES = 2
 
 
 class OpenVinoRuntime:
-    """An OpenVINO or ONNX file that `export` made. See `contract.Runtime`.
+    """An OpenVINO or ONNX file written by `export`. See `base.Runtime`.
 
-    The network is compiled for each size of input, which makes it faster than leaving the size open.
+    The network is compiled for each input size, which is faster than a dynamic size.
 
     Args:
         path: the `.xml` (its `.bin` beside it) or `.onnx`.
-        head: how its maps are read; None: as the file says.
-        precision: `auto`: bfloat16 where the processor computes in it, else float32.
-        threads: of the processor; None: as many as OpenVINO takes.
+        head: layout of its outputs; None: from the file's metadata.
+        precision: `auto`: bfloat16 if the processor supports it, else float32.
+        threads: of the processor; None: OpenVINO's default.
     """
 
     product: Product = staticmethod(np.matmul)
@@ -55,7 +55,7 @@ class OpenVinoRuntime:
                 else "this processor does not compute in bfloat16"
             )
         else:
-            self.precision, self.precision_reason = precision, "as asked"
+            self.precision, self.precision_reason = precision, "as requested"
         self._settings: dict[str, Any] = {
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_PRECISION_HINT": _HINTS[self.precision],
@@ -67,7 +67,7 @@ class OpenVinoRuntime:
 
     @property
     def threads(self) -> int:
-        """As compiled; before the first inference as asked, 0 for unknown."""
+        """As compiled; before the first inference as requested, 0 for unknown."""
         return self._threads or 0
 
     def prepare(self, height: int, width: int) -> None:
@@ -76,11 +76,11 @@ class OpenVinoRuntime:
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         size = (image_bgr.shape[0], image_bgr.shape[1])
         request = self._requests.get(size) or self._compiled(size)
-        # Both ways without a copy: the tensor is the picture, the maps are the request's own memory.
+        # No copies: the tensor is the image, the outputs are the request's memory.
         request.set_input_tensor(self._openvino.Tensor(image_bgr[None], shared_memory=True))
         request.infer()
-        maps = [request.get_output_tensor(index).data[0] for index in range(len(self._model.outputs))]
-        return self.head.levels(maps)
+        outputs = [request.get_output_tensor(index).data[0] for index in range(len(self._model.outputs))]
+        return self.head.levels(outputs)
 
     def _compiled(self, size: tuple[int, int]) -> Any:
         try:
@@ -109,13 +109,13 @@ class OpenVinoRuntime:
 
 
 def openvino_facts(path: Path, model: Any = None) -> ExportedFacts:
-    """What an OpenVINO or ONNX file of ours tells of itself."""
+    """Read the metadata of an exported OpenVINO or ONNX file."""
     if model is None:
         model = _read(required("openvino").Core(), path)
-    # An ONNX file's metadata is found among the frontend's.
-    for place in ([KEY], ["framework", KEY]):
-        if model.has_rt_info(place):
-            return ExportedFacts.from_json(str(model.get_rt_info(place).value), path)
+    # The metadata of an ONNX file is under its frontend's.
+    for keys in ([KEY], ["framework", KEY]):
+        if model.has_rt_info(keys):
+            return ExportedFacts.from_json(str(model.get_rt_info(keys).value), path)
     raise not_ours(path)
 
 

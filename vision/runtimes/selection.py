@@ -1,4 +1,4 @@
-"""Which runtime runs a model: the one named, or with `auto` the fastest installed one on this board."""
+"""Selects the runtime of a model: by name, or with `auto` the fastest installed one on this board."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 RuntimeChoice = Literal["auto", "torch", "onnxruntime", "openvino", "tensorrt"]
-# What each runtime reads best of what can be exported.
+# The export format of each runtime.
 _EXPORTS: dict[RuntimeName, ExportKind] = {
     "onnxruntime": "onnx",
     "openvino": "openvino",
@@ -42,7 +42,7 @@ _EXPORTS: dict[RuntimeName, ExportKind] = {
 
 @dataclass(frozen=True, slots=True)
 class SelectedRuntime:
-    """A runtime that runs.
+    """A running runtime.
 
     Attributes:
         reason: why this one, in words.
@@ -62,16 +62,16 @@ def start_runtime(
     image_size: int = 640,
     sparse_boxes: bool = False,
 ) -> SelectedRuntime:
-    """Make a model ready on the runtime that was asked for.
+    """Load a model on the requested runtime.
 
     Args:
-        class_ids: sorted; a checkpoint's network computes these alone. Of an exported file's classes they
-            are picked afterwards.
-        sparse_boxes: compute a checkpoint's boxes only where something is; for confidences that few cells
+        class_ids: sorted; a checkpoint's network computes only these. For an exported file the classes are
+            filtered afterwards.
+        sparse_boxes: compute a checkpoint's boxes only at candidate cells; for thresholds that few cells
             reach. An exported file computes all.
 
     Raises:
-        RuntimeMissingError: the named runtime is not installed. Nothing else is taken in its place.
+        RuntimeMissingError: the named runtime is not installed. There is no fallback.
         RuntimeUnusableError: it cannot run this file, or not in this precision.
     """
     if choice != "auto" and choice not in RUNTIMES:
@@ -79,12 +79,12 @@ def start_runtime(
     check_runtime(source, choice)
     if choice != "auto":
         runtime = _start(source, choice, class_ids, precision, threads, image_size, sparse_boxes)
-        return SelectedRuntime(runtime, "as asked")
+        return SelectedRuntime(runtime, "as requested")
     from vision.runtimes.autotune import fastest_runtime
 
     candidates = [name for name in source.runners() if installed(name)]
     if len(candidates) == 1:
-        name, reason = candidates[0], "no other that runs this model is installed"
+        name, reason = candidates[0], "the only installed runtime for this model"
     else:
         name, reason = fastest_runtime(
             source,
@@ -100,10 +100,10 @@ def start_runtime(
 
 
 def check_runtime(source: ModelSource, choice: RuntimeChoice) -> None:
-    """Raises RuntimeUnusableError, RuntimeMissingError as `start_runtime` would; nothing is started."""
+    """Raise the RuntimeUnusableError or RuntimeMissingError of `start_runtime` without starting anything."""
     if choice == "auto":
         if not any(installed(name) for name in source.runners()):
-            required(source.runners()[0])  # says what to install
+            required(source.runners()[0])  # raises with what to install
         return
     if choice not in source.runners():
         raise cannot_run(source, choice)
@@ -119,7 +119,7 @@ def runtime_of_file(
     precision: Precision = "auto",
     threads: int | None = None,
 ) -> Runtime:
-    """A runtime on an exported file. `head` None: as the file itself says."""
+    """Load an exported file. `head` None: from the file's metadata."""
     if name == "torch":
         from vision.runtimes.torchscript_runtime import TorchScriptRuntime
 
@@ -138,7 +138,7 @@ def runtime_of_file(
 
 
 def cache_folder() -> Path:
-    """Where converted networks and measured choices are kept: `$XDG_CACHE_HOME` or `~/.cache`."""
+    """Folder of converted networks and cached choices: below `$XDG_CACHE_HOME` or `~/.cache`."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"
     return root / "mavlink-companion" / "runtimes"
@@ -155,7 +155,7 @@ def _start(
 ) -> Runtime:
     if source.kind is not None:
         return runtime_of_file(name, source.path, precision=precision, threads=threads)
-    # What builds and runs a checkpoint's network is torch; a file for another runtime does without it.
+    # torch builds and runs a checkpoint's network; a file for another runtime does not need it.
     if name == "torch":
         from vision.runtimes.torch_runtime import TorchRuntime
 
@@ -174,7 +174,7 @@ def _start(
 
 
 def _converted(source: ModelSource, network: Network, name: RuntimeName, image_size: int) -> Path:
-    """The checkpoint's network as a file for another runtime, made once and kept."""
+    """The checkpoint's network as a file for another runtime, converted once and cached."""
     import torch
 
     from vision.runtimes.export import export_network
@@ -183,7 +183,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     kind = _EXPORTS[name]
     head = network.head
     digest = weights_sha256(source.path)
-    # A plan is made for a largest side; the others leave the size open.
+    # A plan is built for a largest side; the others have a dynamic size.
     side = image_size if kind == "tensorrt" else 640
     plain = source.description.to_plain()
     made_of = [FORMAT, digest, plain, head.class_ids, head.kinds, side]
@@ -201,11 +201,11 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     )
     try:
         if not path.is_file():
-            logger.info("converting %s for %s, once; kept at %s", source.path.name, name, path)
+            logger.info("converting %s for %s, once; cached at %s", source.path.name, name, path)
             export_network(network, facts, kind, path)
     except OSError as error:
         raise RuntimeUnusableError(
-            f"{path}: the converted network cannot be kept ({error.strerror}); "
-            "set XDG_CACHE_HOME to a folder that can be written"
+            f"{path}: the converted network cannot be cached ({error.strerror}); "
+            "set XDG_CACHE_HOME to a writable folder"
         ) from error
     return path

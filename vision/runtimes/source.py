@@ -1,4 +1,4 @@
-"""A model file, whatever its kind, and what it tells before any runtime is chosen."""
+"""A model file of any kind, and its data before a runtime is selected."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Who runs what. A checkpoint everybody does, by way of an export.
+# Runtimes of each kind of file. All of them run a checkpoint, by an export.
 _RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {
     "onnx": ("onnxruntime", "openvino"),
     "openvino": ("openvino",),
@@ -28,16 +28,16 @@ _RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {
 
 @dataclass(slots=True)
 class ModelSource:
-    """What was read of a model file.
+    """Contents of a model file.
 
     Attributes:
         path: the file.
         kind: of an exported file; None for a checkpoint.
         class_names: id → name.
-        metadata: what the file tells about itself: licence, origin, score.
-        strides: one a level, pixels.
-        description: what a checkpoint's network is built from.
-        facts: what an exported file tells.
+        metadata: of the file: licence, origin, score.
+        strides: one per level, pixels.
+        description: architecture of a checkpoint's network.
+        facts: metadata of an exported file.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class ModelSource:
     _model: YoloModel | None = None
 
     def take_model(self) -> YoloModel:
-        """The checkpoint's network, for the caller to change; read again if it was given away before."""
+        """The checkpoint's network, for the caller to modify; later calls read it again."""
         from vision.yolo.checkpoint import load_checkpoint
 
         model, self._model = self._model, None
@@ -66,12 +66,12 @@ def read_source(path: Path) -> ModelSource:
 
     Raises:
         CheckpointError: a checkpoint that cannot be read.
-        RuntimeMissingError: an exported file, and nothing that reads it is installed.
-        RuntimeUnusableError: an exported file that is damaged or does not say what it is.
+        RuntimeMissingError: an exported file, and no runtime that reads it is installed.
+        RuntimeUnusableError: an exported file that is damaged or has no metadata.
     """
     kind = kind_of(path)
     if kind is None:
-        if not path.exists():  # said without waiting for torch
+        if not path.exists():  # checked before torch is imported
             wanted = "a .pt checkpoint, or of NAME.safetensors beside its NAME.yaml"
             raise CheckpointError(f"{path}: no such file; give the path of {wanted}")
         from vision.yolo.checkpoint import load_checkpoint
@@ -112,9 +112,9 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts:
 
 
 def cannot_run(source: ModelSource, runtime: RuntimeName) -> RuntimeUnusableError:
-    """For a runtime that was asked for by name and does not take this kind of file."""
+    """The error for a runtime requested by name that does not run this kind of file."""
     assert source.kind is not None
     return RuntimeUnusableError(
-        f"{source.path}: {runtime} does not run {SUFFIXES[source.kind]} files; "
-        f"ask for the runtime {' or '.join(source.runners())}, or auto, or give the checkpoint"
+        f"{source.path}: {runtime} cannot run {SUFFIXES[source.kind]} files; "
+        f"use the runtime {' or '.join(source.runners())}, or auto, or give the checkpoint"
     )

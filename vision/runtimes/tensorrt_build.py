@@ -10,20 +10,20 @@ from vision.runtimes.exported import INPUT
 
 logger = logging.getLogger(__name__)
 
-# What the builder may try layers with. Tuned for boards that share their memory with the processor.
+# Memory for trying layer implementations. Tuned for boards that share memory with the processor.
 _WORKSPACE_BYTES = 1 << 30
 
 
 def build_plan(onnx_path: Path, *, largest_side: int, stride: int, half: bool = True) -> bytes:
-    """The serialised engine, in float16 where the GPU is fast at it; takes minutes on a small board.
+    """The serialised engine, in float16 where the GPU supports it; takes minutes on a small board.
 
     Args:
-        largest_side: the plan takes inputs up to this, tuned for three quarters of it in height.
+        largest_side: of an input; the plan is tuned for three quarters of it in height.
         half: allow float16.
 
     Raises:
         RuntimeMissingError: TensorRT is not installed.
-        RuntimeUnusableError: it refuses the network; the message is its own.
+        RuntimeUnusableError: it rejects the network, with TensorRT's message.
     """
     tensorrt = required("tensorrt")
     trt_logger = tensorrt.Logger(tensorrt.Logger.ERROR)
@@ -41,10 +41,10 @@ def build_plan(onnx_path: Path, *, largest_side: int, stride: int, half: bool = 
     usual = (1, max(stride, largest_side * 3 // 4 // stride * stride), largest_side, 3)
     profile.set_shape(INPUT, (1, stride, stride, 3), usual, (1, largest_side, largest_side, 3))
     config.add_optimization_profile(profile)
-    logger.info("building a TensorRT plan for %s; this takes minutes, once", onnx_path.name)
+    logger.info("building a TensorRT plan for %s; this takes minutes and is done once", onnx_path.name)
     plan = builder.build_serialized_network(definition, config)
     if plan is None:
         raise RuntimeUnusableError(
-            f"{onnx_path}: TensorRT cannot build a plan; its log on standard error says why"
+            f"{onnx_path}: TensorRT cannot build a plan; see its log on standard error"
         )
     return bytes(plan)

@@ -22,10 +22,10 @@ _CUDA = "cuda.bindings.runtime"
 
 
 class TensorRtRuntime:
-    """An `.engine` that `export` made, on the first GPU. See `contract.Runtime`.
+    """An `.engine` written by `export`, on the first GPU. See `base.Runtime`.
 
-    Plans are bound to the GPU and the TensorRT version that built them. What a plan computes in was decided
-    when it was built.
+    Plans are bound to the GPU and the TensorRT version that built them, and to the precision they were built
+    in.
     """
 
     product: Product = staticmethod(np.matmul)
@@ -45,13 +45,13 @@ class TensorRtRuntime:
         facts, plan = _read(path)
         self.head = facts.head() if head is None else head
         self._cuda = _Cuda()
-        # Kept: the engine refers to it.
+        # Kept alive: the engine refers to it.
         self._runtime = tensorrt.Runtime(tensorrt.Logger(tensorrt.Logger.ERROR))
         engine = self._runtime.deserialize_cuda_engine(plan)
         if engine is None:
             raise RuntimeUnusableError(
                 f"{path}: TensorRT {tensorrt.__version__} cannot load this plan on this GPU; plans are bound "
-                "to both: make it again here with `companion models export`"
+                "to both: export it again here with `companion models export`"
             )
         self._engine = engine
         self._context = engine.create_execution_context()
@@ -62,9 +62,9 @@ class TensorRtRuntime:
             key=lambda name: (int(name.rpartition("_")[2]), kinds[name.rpartition("_")[0]]),
         )
         self._size: tuple[int, int] | None = None
-        self._maps: list[NDArray[np.float32]] = []
+        self._host_outputs: list[NDArray[np.float32]] = []
         self._device: list[tuple[int, int]] = []
-        self.precision, self.precision_reason = "float16", "what plans are built in"
+        self.precision, self.precision_reason = "float16", "precision of the plan"
         # One thread waits for the GPU.
         self.threads = 1
 
@@ -76,34 +76,32 @@ class TensorRtRuntime:
         size = (image_bgr.shape[0], image_bgr.shape[1])
         if size != self._size:
             self._allocate(size)
-        picture, *outputs = self._device
-        self._cuda.to_device(picture[0], image_bgr)
+        device_input, *outputs = self._device
+        self._cuda.to_device(device_input[0], image_bgr)
         if not self._context.execute_async_v3(self._cuda.stream):
-            raise RuntimeUnusableError(
-                "TensorRT could not run the network; its log on standard error says why"
-            )
-        for (pointer, _), found in zip(outputs, self._maps, strict=True):
-            self._cuda.to_host(found, pointer)
+            raise RuntimeUnusableError("TensorRT could not run the network; see its log on standard error")
+        for (pointer, _), host_output in zip(outputs, self._host_outputs, strict=True):
+            self._cuda.to_host(host_output, pointer)
         self._cuda.wait()
-        maps = [level[0] for level in self._maps]
-        return self.head.levels(maps)
+        levels = [level[0] for level in self._host_outputs]
+        return self.head.levels(levels)
 
     def _allocate(self, size: tuple[int, int]) -> None:
-        """Memory on both sides for one size of input."""
+        """Allocate host and device memory for one input size."""
         self._size = None
         for pointer, _ in self._device:
             self._cuda.free(pointer)
-        self._device, self._maps = [], []
+        self._device, self._host_outputs = [], []
         if not self._context.set_input_shape(INPUT, (1, *size, 3)):
             raise RuntimeUnusableError(
-                f"this TensorRT plan does not take {size[1]}x{size[0]}; export it again with a larger size"
+                f"this TensorRT plan does not accept {size[1]}x{size[0]}; export it again with a larger size"
             )
         self._bind(INPUT, size[0] * size[1] * 3)
         for name in self._outputs:
             shape = tuple(self._context.get_tensor_shape(name))
-            found = np.empty(shape, np.float32)
-            self._maps.append(found)
-            self._bind(name, found.nbytes)
+            host_output = np.empty(shape, np.float32)
+            self._host_outputs.append(host_output)
+            self._bind(name, host_output.nbytes)
         self._size = size
 
     def _bind(self, name: str, size_bytes: int) -> None:
@@ -113,7 +111,7 @@ class TensorRtRuntime:
 
 
 class _Cuda:
-    """The few calls of the CUDA runtime that are needed, on one stream; errors raised by name."""
+    """The required calls of the CUDA runtime, on one stream; a failure raises with the error's name."""
 
     def __init__(self) -> None:
         import importlib
@@ -124,27 +122,27 @@ class _Cuda:
             raise RuntimeMissingError(
                 f"{_CUDA} cannot be loaded ({error}): pip install 'mavlink-companion[tensorrt]'"
             ) from error
-        (self.stream,) = self._called(self._api.cudaStreamCreate())
+        (self.stream,) = self._checked(self._api.cudaStreamCreate())
 
     def allocate(self, size_bytes: int) -> int:
-        (pointer,) = self._called(self._api.cudaMalloc(size_bytes))
+        (pointer,) = self._checked(self._api.cudaMalloc(size_bytes))
         return int(pointer)
 
     def free(self, pointer: int) -> None:
-        self._called(self._api.cudaFree(pointer))
+        self._checked(self._api.cudaFree(pointer))
 
     def to_device(self, pointer: int, array: NDArray[Any]) -> None:
         kind = self._api.cudaMemcpyKind.cudaMemcpyHostToDevice
-        self._called(self._api.cudaMemcpyAsync(pointer, array.ctypes.data, array.nbytes, kind, self.stream))
+        self._checked(self._api.cudaMemcpyAsync(pointer, array.ctypes.data, array.nbytes, kind, self.stream))
 
     def to_host(self, array: NDArray[Any], pointer: int) -> None:
         kind = self._api.cudaMemcpyKind.cudaMemcpyDeviceToHost
-        self._called(self._api.cudaMemcpyAsync(array.ctypes.data, pointer, array.nbytes, kind, self.stream))
+        self._checked(self._api.cudaMemcpyAsync(array.ctypes.data, pointer, array.nbytes, kind, self.stream))
 
     def wait(self) -> None:
-        self._called(self._api.cudaStreamSynchronize(self.stream))
+        self._checked(self._api.cudaStreamSynchronize(self.stream))
 
-    def _called(self, answer: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _checked(self, answer: tuple[Any, ...]) -> tuple[Any, ...]:
         error, *rest = answer
         if int(error) != 0:
             raise RuntimeUnusableError(f"CUDA: {error}")
@@ -152,7 +150,7 @@ class _Cuda:
 
 
 def tensorrt_facts(path: Path) -> ExportedFacts:
-    """What a `.engine` of ours tells of itself; needs no TensorRT."""
+    """Read the metadata of an exported `.engine`; needs no TensorRT."""
     return _read(path)[0]
 
 

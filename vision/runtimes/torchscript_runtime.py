@@ -1,6 +1,6 @@
-"""A TorchScript file that `export` made, run by torch on the processor.
+"""A TorchScript file written by `export`, run by torch on the processor.
 
-A TorchScript file is a program, though one of tensor operations alone. Load those you made or trust.
+A TorchScript file is a program, though only of tensor operations. Load only files you trust.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 
 class TorchScriptRuntime:
-    """See `contract.Runtime`. Computes in float32, what the file is in."""
+    """See `base.Runtime`. Computes in float32, the precision of the file."""
 
     product: Product = staticmethod(torch_product)
     name: RuntimeName = "torch"
@@ -42,7 +42,7 @@ class TorchScriptRuntime:
             raise RuntimeUnusableError(f"{path}: no such file")
         try:
             with warnings.catch_warnings():
-                # torch would have files of this kind made otherwise; those that are there want to be read.
+                # torch deprecates this file format; existing files must still be readable.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 load: Any = torch.jit.load
                 self._module: Any = torch.jit.freeze(load(str(path), map_location="cpu").eval())
@@ -50,7 +50,7 @@ class TorchScriptRuntime:
             reason = " ".join(str(error).split())[:300]
             raise RuntimeUnusableError(f"{path}: torch cannot load it: {reason}") from error
         self.head = head if head is not None else torchscript_facts(path).head()
-        self.precision, self.precision_reason = "float32", "what the file is in"
+        self.precision, self.precision_reason = "float32", "precision of the file"
 
     @property
     def threads(self) -> int:
@@ -62,12 +62,12 @@ class TorchScriptRuntime:
 
     def infer(self, image_bgr: NDArray[np.uint8]) -> list[LevelOutput]:
         with torch.inference_mode():
-            maps = [level[0].numpy() for level in self._module(torch.from_numpy(image_bgr).unsqueeze(0))]
-        return self.head.levels(maps)
+            outputs = [level[0].numpy() for level in self._module(torch.from_numpy(image_bgr).unsqueeze(0))]
+        return self.head.levels(outputs)
 
 
 def torchscript_facts(path: Path) -> ExportedFacts:
-    """What a TorchScript file of ours tells of itself; nothing of it is run."""
+    """Read the metadata of an exported TorchScript file; nothing in it is run."""
     try:
         with zipfile.ZipFile(path) as archive:
             name = next((name for name in archive.namelist() if name.endswith(f"/extra/{KEY}")), None)
@@ -75,5 +75,5 @@ def torchscript_facts(path: Path) -> ExportedFacts:
                 raise not_ours(path)
             text = archive.read(name).decode(errors="replace")
     except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise RuntimeUnusableError(f"{path}: is no TorchScript file ({error})") from error
+        raise RuntimeUnusableError(f"{path}: is not a TorchScript file ({error})") from error
     return ExportedFacts.from_json(text, path)

@@ -55,7 +55,7 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     monkeypatch.setenv("XDG_CACHE_HOME", str(base / "cache"))
 
 
-def picture(height: int, width: int, seed: int = 0) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def make_image(height: int, width: int, seed: int = 0) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Smooth blobs of colour, (height, width, 3) uint8."""
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand((1, 3, 6, 8), generator=generator)

@@ -28,7 +28,7 @@ names = st.text(min_size=1, max_size=20)
     fixed_size=st.none() | st.tuples(st.integers(32, 640), st.integers(32, 640)),
     metadata=st.dictionaries(names, st.integers() | names, max_size=3),
 )
-def test_facts_come_back_as_they_were(**values: object) -> None:
+def test_facts_survive_the_round_trip(**values: object) -> None:
     facts = ExportedFacts(image_size=320, source_sha256="00", model_family="YOLO11", **values)  # type: ignore[arg-type]
     assert ExportedFacts.from_json(facts.to_json(), PATH) == facts
 
@@ -55,13 +55,13 @@ def test_anything_else_is_refused_by_name(text: str) -> None:
     ],
     ids=str,
 )
-def test_facts_that_make_no_sense_are_refused(change: dict[str, object]) -> None:
+def test_invalid_facts_are_rejected(change: dict[str, object]) -> None:
     text = json.dumps(json.loads(FACTS.to_json()) | change)
-    with pytest.raises(RuntimeUnusableError, match="make it again with `companion models export`"):
+    with pytest.raises(RuntimeUnusableError, match="companion models export"):
         ExportedFacts.from_json(text, PATH)
 
 
-def test_the_facts_say_how_the_maps_are_read() -> None:
+def test_facts_give_the_output_layout() -> None:
     head = FACTS.head()
     assert (head.strides, head.reg_max, head.end_to_end, head.class_ids) == ((8, 16, 32), 16, False, (0, 1))
     assert head.kinds == ("sides", "classes")
@@ -80,12 +80,12 @@ def test_a_plan_that_is_cut_short_is_refused(cut: int) -> None:
 
 
 @given(content=st.binary() | st.binary().map(lambda tail: MAGIC + tail))
-def test_bytes_that_are_no_plan_of_ours_are_refused(content: bytes) -> None:
+def test_foreign_plan_is_rejected(content: bytes) -> None:
     with pytest.raises(RuntimeUnusableError, match=r"net\.engine"):
         split_facts(content, PATH)
 
 
-def test_kinds_are_told_by_the_ending() -> None:
+def test_kind_follows_from_the_suffix() -> None:
     assert kind_of(Path("a/b.onnx")) == "onnx"
     assert kind_of(Path("b.xml")) == "openvino"
     assert kind_of(Path("b.engine")) == "tensorrt"

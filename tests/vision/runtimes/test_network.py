@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.vision.runtimes.conftest import NAMES, lively_model, picture
+from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.yolo.architecture import build, yolov8_description
@@ -28,8 +28,8 @@ def run(network: Network, image: np.ndarray) -> list[LevelOutput]:
     return network.head.levels([level[0].numpy() for level in maps])
 
 
-def test_bytes_of_a_bgr_picture_give_what_rgb_in_0_to_1_gives() -> None:
-    image = picture(64, 96)
+def test_bgr_bytes_equal_scaled_rgb() -> None:
+    image = make_image(64, 96)
     levels = run(Network(lively_model()), image)
     for expected, level in zip(whole_maps(image), levels, strict=True):
         assert level.sides is not None
@@ -37,8 +37,8 @@ def test_bytes_of_a_bgr_picture_give_what_rgb_in_0_to_1_gives() -> None:
         np.testing.assert_allclose(level.classes, expected[0, 64:], atol=1e-3)
 
 
-def test_a_description_that_reads_the_picture_twice_is_not_folded_and_right() -> None:
-    image = picture(64, 64)
+def test_image_read_twice_is_not_folded_and_correct() -> None:
+    image = make_image(64, 64)
     network = Network(lively_model())
     unfolded = Network(lively_model())
     first = unfolded.body.model[0].get_parameter("conv.weight")
@@ -49,7 +49,7 @@ def test_a_description_that_reads_the_picture_twice_is_not_folded_and_right() ->
 
 
 def test_only_the_rows_of_the_wanted_classes_are_computed() -> None:
-    image = picture(64, 96)
+    image = make_image(64, 96)
     network = Network(lively_model(), [1, 4])
     assert network.head.class_ids == (1, 4)
     assert not network.head.complete
@@ -58,8 +58,8 @@ def test_only_the_rows_of_the_wanted_classes_are_computed() -> None:
         assert level.features is not None
 
 
-def test_the_classes_left_out_still_tell_who_wins() -> None:
-    image = picture(64, 96)
+def test_unselected_classes_still_decide_the_winner() -> None:
+    image = make_image(64, 96)
     network = Network(lively_model(), [1, 4])
     assert network.head.rows is not None
     whole = run(Network(lively_model()), image)
@@ -69,15 +69,15 @@ def test_the_classes_left_out_still_tell_who_wins() -> None:
         np.testing.assert_array_equal(found, expected.classes.reshape(len(NAMES), -1).argmax(axis=0))
 
 
-def test_all_classes_asked_for_are_simply_all() -> None:
+def test_selecting_all_classes_changes_nothing() -> None:
     network = Network(lively_model(), range(len(NAMES)))
     assert network.head.complete
     assert network.head.kinds == ("sides", "classes")
 
 
 @pytest.mark.parametrize("size", [(64, 96), (32, 32), (160, 32)])
-def test_boxes_of_single_cells_are_those_of_the_whole_map_up_to_its_edges(size: tuple[int, int]) -> None:
-    image = picture(*size)
+def test_sparse_boxes_equal_dense_ones_up_to_the_edges(size: tuple[int, int]) -> None:
+    image = make_image(*size)
     whole = run(Network(lively_model()), image)
     network = Network(lively_model(), sparse_boxes=True)
     assert network.head.boxes is not None
@@ -93,9 +93,9 @@ def test_boxes_of_single_cells_are_those_of_the_whole_map_up_to_its_edges(size: 
         assert branch.sides(level.neck, every[:0]).shape == (64, 0)
 
 
-def test_a_frame_with_thousands_of_cells_is_done_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thousands_of_cells_are_processed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     network = Network(lively_model(), sparse_boxes=True)
-    level = run(network, picture(64, 96))[0]
+    level = run(network, make_image(64, 96))[0]
     assert network.head.boxes is not None
     assert level.neck is not None
     every = np.arange(level.classes[0].size)
@@ -104,12 +104,12 @@ def test_a_frame_with_thousands_of_cells_is_done_in_parts(monkeypatch: pytest.Mo
     np.testing.assert_allclose(network.head.boxes[0].sides(level.neck, every), at_once, atol=1e-5)
 
 
-def test_the_maps_have_names() -> None:
+def test_outputs_have_names() -> None:
     network = Network(lively_model(), [0], sparse_boxes=True)
     assert network.names[:4] == ["neck_8", "classes_8", "features_8", "neck_16"]
 
 
-def test_a_model_of_grey_pictures_is_refused() -> None:
+def test_model_of_grey_images_is_rejected() -> None:
     description = yolov8_description((0.1, 0.01, 64), NAMES)
     grey = type(description)(
         **{name: getattr(description, name) for name in description.__slots__} | {"channels": 1}

@@ -35,7 +35,7 @@ def test_building_without_tensorrt_names_the_extra(tmp_path: Path) -> None:
         build_plan(tmp_path / "net.onnx", largest_side=640, stride=32)
 
 
-def test_a_plan_tells_its_classes_without_tensorrt(engine: Path) -> None:
+def test_plan_metadata_is_readable_without_tensorrt(engine: Path) -> None:
     source = read_source(engine)
     assert source.class_names == ("person",)
     assert source.runners() == ("tensorrt",)
@@ -46,6 +46,6 @@ def test_a_precision_that_a_plan_does_not_have_is_refused(engine: Path) -> None:
         TensorRtRuntime(engine, precision="bfloat16")
 
 
-def test_a_missing_plan_is_one_line(tmp_path: Path) -> None:
+def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no such file"):
         read_source(tmp_path / "none.engine")

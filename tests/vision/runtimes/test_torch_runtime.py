@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.vision.runtimes.conftest import lively_model, picture
+from tests.vision.runtimes.conftest import lively_model, make_image
 from vision.runtimes import base
 from vision.runtimes import torch_runtime as torch_runtime_module
 from vision.runtimes.base import RuntimeUnusableError
@@ -31,10 +31,10 @@ def expected(image: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.usefixtures("no_bfloat16")
-def test_one_graph_serves_every_size() -> None:
+def test_one_graph_runs_every_size() -> None:
     runtime = TorchRuntime(lively_model())
     for size in ((64, 96), (96, 64), (32, 32), (64, 96), (256, 320)):
-        image = picture(*size)
+        image = make_image(*size)
         found = [maps for level in runtime.infer(image) for maps in (level.sides, level.classes)]
         for a, b in zip(found, expected(image), strict=True):
             assert a is not None
@@ -43,21 +43,21 @@ def test_one_graph_serves_every_size() -> None:
 
 
 @pytest.mark.usefixtures("no_bfloat16")
-def test_a_network_that_needs_a_graph_for_each_size_gets_one_and_keeps_a_few(
+def test_static_network_keeps_a_few_graphs_by_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(TorchRuntime, "_any_size", lambda self: None)
     monkeypatch.setattr(torch_runtime_module, "_MOST_GRAPHS", 2)
     runtime = TorchRuntime(lively_model())
     for size in ((64, 96), (96, 64), (64, 96), (32, 32)):
-        image = picture(*size)
+        image = make_image(*size)
         classes = runtime.infer(image)[0].classes
         np.testing.assert_allclose(classes, expected(image)[1], atol=1e-3)
     assert set(runtime._graphs) == {(64, 96), (32, 32)}
 
 
-def test_bfloat16_says_nearly_the_same_and_its_maps_are_float32() -> None:
-    image = picture(64, 96)
+def test_bfloat16_is_close_and_returns_float32() -> None:
+    image = make_image(64, 96)
     full = TorchRuntime(lively_model(), precision="float32")
     half = TorchRuntime(lively_model(), precision="bfloat16", sparse_boxes=True)
     assert (full.precision, half.precision) == ("float32", "bfloat16")
@@ -72,14 +72,14 @@ def test_bfloat16_says_nearly_the_same_and_its_maps_are_float32() -> None:
 def test_without_native_bfloat16_auto_is_float32() -> None:
     runtime = TorchRuntime(lively_model())
     assert runtime.precision == "float32"
-    assert "does not compute in bfloat16" in runtime.precision_reason
+    assert "not support bfloat16" in runtime.precision_reason
 
 
 @pytest.mark.usefixtures("with_bfloat16")
 @pytest.mark.parametrize(
     ("half_ms", "chosen"), [(1.0, "bfloat16"), (3.9, "bfloat16"), (4.1, "float32"), (9.0, "float32")]
 )
-def test_with_native_bfloat16_auto_takes_it_where_it_is_much_faster(
+def test_auto_uses_native_bfloat16_if_much_faster(
     monkeypatch: pytest.MonkeyPatch, half_ms: float, chosen: str
 ) -> None:
     times = {torch.float32: 5.0, torch.bfloat16: half_ms}
@@ -101,7 +101,7 @@ def test_a_precision_it_does_not_have_is_refused() -> None:
         TorchRuntime(lively_model(), precision="float16")
 
 
-def test_threads_are_set_and_told() -> None:
+def test_threads_are_set_and_reported() -> None:
     before = torch.get_num_threads()
     try:
         assert TorchRuntime(lively_model(), precision="float32", threads=1).threads == 1
@@ -109,6 +109,6 @@ def test_threads_are_set_and_told() -> None:
         torch.set_num_threads(before)
 
 
-def test_products_are_products() -> None:
+def test_torch_product_matches_numpy() -> None:
     a, b = np.random.default_rng(0).random((2, 5, 5), np.float32)
     np.testing.assert_allclose(torch_product(a, b), a @ b, rtol=1e-5)
