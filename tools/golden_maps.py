@@ -1,4 +1,4 @@
-"""The figures of `test_the_maps_are_those_of_the_reference`, from the reference, for development only.
+"""The figures of `test_outputs_match_the_reference`, from the reference, for development only.
 
 PYTHONPATH=. OTHER_VENV/bin/python tools/golden_maps.py
 """

@@ -100,11 +100,11 @@ def one_storage_for_all(path: Path) -> Path:
 
 
 def pair(
-    path: Path, header: bytes, said: bytes = b"format: mavlink-companion.yolo.v2\narchitecture: {}\n"
+    path: Path, header: bytes, description: bytes = b"format: mavlink-companion.yolo.v2\narchitecture: {}\n"
 ) -> Path:
     path = path.with_suffix(".safetensors")
     path.write_bytes(len(header).to_bytes(8, "little") + header)
-    path.with_suffix(".yaml").write_bytes(said)
+    path.with_suffix(".yaml").write_bytes(description)
     return path
 
 
@@ -169,12 +169,12 @@ BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda p: pair(p, b"{}", b"a: [" + b"[]," * 600_000 + b"]"),
         "more than 100000 values",
     ),
-    "a description that laughs": (
+    "nested aliases (billion laughs)": (
         lambda p: pair(p, b"{}", b"a: &a [x,x]\nb: &b [*a,*a,*a]\nc: [*b,*b,*b]\n"),
         "anchors and aliases",
     ),
-    "a description that runs": (
+    "a description with a tag": (
         lambda p: pair(p, b"{}", b"a: !!python/object/apply:os.system ['id']\n"),
-        "nothing was run",
+        "was not run",
     ),
 }  # fmt: skip

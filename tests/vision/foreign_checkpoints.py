@@ -43,9 +43,9 @@ def trained_model(description: ModelDescription | None = None, seed: int = 0) ->
     return model.eval()
 
 
-def foreign_classes(monkeypatch: pytest.MonkeyPatch, places: dict[str, str]) -> dict[str, type[nn.Module]]:
+def foreign_classes(monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) -> dict[str, type[nn.Module]]:
     classes = {}
-    for name, module_name in places.items():
+    for name, module_name in modules.items():
         parts = module_name.split(".")
         for end in range(1, len(parts) + 1):
             package = ".".join(parts[:end])
@@ -65,9 +65,9 @@ def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attribut
         name = type(module).__name__
         name = FOREIGN_NAMES.get(name, name)
         if name in classes:
-            stranger = nn.Module.__new__(classes[name])
-            stranger.__dict__ = dict(module.__dict__)
-            module = stranger
+            foreign = nn.Module.__new__(classes[name])
+            foreign.__dict__ = dict(module.__dict__)
+            module = foreign
         module.__dict__["_modules"] = {
             key: None if child is None else relabelled(child) for key, child in module._modules.items()
         }

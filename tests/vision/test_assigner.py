@@ -83,7 +83,7 @@ def test_a_contested_cell_goes_to_the_object_its_box_overlaps_most() -> None:
     assert int(found.class_scores[0, middle].argmax()) == 1
 
 
-def test_an_object_smaller_than_a_cell_and_between_centres_is_still_learned() -> None:
+def test_object_between_cell_centres_is_assigned() -> None:
     found = assign([[7, 7, 9, 9]], [0])
     assert found.foreground.any()
 

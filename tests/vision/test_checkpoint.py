@@ -139,9 +139,7 @@ def test_a_foreign_checkpoint_gives_the_network_that_was_trained(
     assert_same_maps(model, loaded.model)
 
 
-def test_a_foreign_checkpoint_is_read_where_the_library_is_not_installed(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_foreign_checkpoint_needs_no_library(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
     path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign))
     before = {name: module for name, module in sys.modules.items() if name.startswith("ultralytics")}
     for name in before:
@@ -161,7 +159,7 @@ def test_the_averaged_weights_are_preferred(tmp_path: Path, foreign: dict[str, t
     assert_same_maps(averaged, load_checkpoint(path).model)
 
 
-def test_what_a_training_run_leaves_in_the_file_does_no_harm(
+def test_training_leftovers_in_the_file_are_ignored(
     tmp_path: Path, foreign: dict[str, type[nn.Module]]
 ) -> None:
     path = save_foreign(
@@ -211,7 +209,7 @@ def test_names_may_be_a_list(tmp_path: Path, foreign: dict[str, type[nn.Module]]
     [
         pytest.param({"names": {0: "car", 2: "dog"}}, "not numbered from 0", id="a gap in the names"),
         pytest.param({"names": None}, "no class names", id="no names"),
-        pytest.param({"names": ["car"]}, "names 1 classes, its network has 2", id="too few names"),
+        pytest.param({"names": ["car"]}, "1 classes, .* 2", id="too few names"),
         pytest.param({"yaml": None}, "has no yaml", id="no description"),
         pytest.param({"yaml": {"nc": 2}}, "needs 1..128 rows", id="no rows"),
     ],
@@ -235,7 +233,7 @@ def test_a_layer_that_is_not_known_is_named_with_its_row(
 
 def test_a_model_of_another_task_is_refused(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
     path = save_foreign(tmp_path / "f.pt", foreign["SegmentationModel"]())
-    with pytest.raises(CheckpointError, match="holds a SegmentationModel; only detection models"):
+    with pytest.raises(CheckpointError, match="SegmentationModel"):
         load_checkpoint(path)
 
 
@@ -285,7 +283,7 @@ def terse(whole: Any) -> None:
         ("YOLO26", "x"),
     ],
 )
-def test_every_generation_is_built_from_what_the_pickled_layers_show(
+def test_every_family_is_built_from_its_pickled_layers(
     tmp_path: Path, foreign: dict[str, type[nn.Module]], model_family: str, scale: str
 ) -> None:
     model = trained_model(shrunk(model_family, scale))
@@ -316,9 +314,7 @@ def test_a_checkpoint_of_the_first_releases_is_read(
     assert_same_maps(model, loaded.model)
 
 
-def test_a_head_of_two_is_end_to_end_whichever_answered_last(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_dual_head_is_end_to_end_in_any_state(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
     whole = as_foreign(trained_model(shrunk("YOLO26", "n")), foreign)
     whole.model[-1]._end2end = False
     assert load_checkpoint(save_foreign(tmp_path / "f.pt", whole)).model.end_to_end
@@ -345,7 +341,7 @@ def test_a_checkpoint_saved_folded_is_read(
 
 
 @pytest.mark.parametrize("unscaled", [True, False])
-def test_as_many_channels_as_classes_are_scaled_or_not_as_they_were_trained(
+def test_channels_equal_to_classes_are_scaled_as_trained(
     tmp_path: Path, foreign: dict[str, type[nn.Module]], unscaled: bool
 ) -> None:
     names = tuple(f"class {index}" for index in range(64))

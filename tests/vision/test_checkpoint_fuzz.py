@@ -84,11 +84,11 @@ def mutated(data: bytes, dice: random.Random) -> bytes:
     return bytes(changed)
 
 
-def assert_harmless(path: Path, said: dict[str, Any]) -> None:
-    assert said["outcome"].startswith(("loaded ", "CheckpointError: ", "UnsafeCheckpointError: ")), said
-    assert said["outcome"].isprintable()
+def assert_harmless(path: Path, report: dict[str, Any]) -> None:
+    assert report["outcome"].startswith(("loaded ", "CheckpointError: ", "UnsafeCheckpointError: ")), report
+    assert report["outcome"].isprintable()
     limit = 3 * sum(each.stat().st_size for each in path.parent.glob(f"{path.stem}.*")) + FIXED_BYTES
-    assert said["bytes"] <= limit, (path.name, said)
+    assert report["bytes"] <= limit, (path.name, report)
 
 
 def test_mutations_are_read_or_refused_by_name(tmp_path: Path) -> None:
@@ -98,18 +98,18 @@ def test_mutations_are_read_or_refused_by_name(tmp_path: Path) -> None:
         *mutated_bytes(ours.read_bytes(), tmp_path, 24),
         *mutated_pairs(ours, tmp_path, 24),
     ]
-    for path, said in zip(paths, read_apart(*paths), strict=True):
-        assert_harmless(path, said)
+    for path, report in zip(paths, read_apart(*paths), strict=True):
+        assert_harmless(path, report)
 
 
 @pytest.mark.skipif(not REAL.is_file(), reason=f"{REAL} is not here; set COMPANION_TEST_DATA")
-def test_a_real_checkpoint_and_mutations_of_it_take_less_than_three_times_its_size(tmp_path: Path) -> None:
+def test_memory_stays_below_three_times_the_file_size(tmp_path: Path) -> None:
     paths = [REAL, *mutated_pickles(REAL, tmp_path, 8)]
     real, *mutations = read_apart(*paths)
     assert real["outcome"] == "loaded 80 classes"
     assert real["bytes"] < 3 * REAL.stat().st_size
-    for path, said in zip(paths[1:], mutations, strict=True):
-        assert_harmless(path, said)
+    for path, report in zip(paths[1:], mutations, strict=True):
+        assert_harmless(path, report)
 
 
 def mutated_pickles(source: Path, folder: Path, count: int) -> list[Path]:
@@ -138,14 +138,14 @@ def mutated_pairs(source: Path, folder: Path, count: int) -> list[Path]:
     weights = (folder / "o.safetensors").read_bytes()
     table = yaml.safe_load((folder / "o.yaml").read_bytes())
     del table["weights"]  # Without the checksum, so that a damaged header is read at all.
-    said = yaml.safe_dump(table).encode()
+    report = yaml.safe_dump(table).encode()
     length = int.from_bytes(weights[:8], "little") + 8
     paths = []
     for seed in range(count):
         dice, path = random.Random(seed), folder / f"p{seed}.safetensors"
         head = mutated(weights[:length], dice) if seed % 2 else weights[:length]
         path.write_bytes(head + weights[length:])
-        path.with_suffix(".yaml").write_bytes(said if seed % 2 else mutated(said, dice))
+        path.with_suffix(".yaml").write_bytes(report if seed % 2 else mutated(report, dice))
         paths.append(path)
     return paths
 
@@ -172,9 +172,7 @@ OPCODES = st.sampled_from(
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(OPCODES, max_size=40))
-def test_any_program_of_the_pickle_machine_ends_in_a_model_or_a_named_error(
-    tmp_path: Path, program: list[bytes]
-) -> None:
+def test_any_pickle_program_gives_a_model_or_an_error(tmp_path: Path, program: list[bytes]) -> None:
     pickled = b"\x80\x02" + b"".join(program) + b"."
     path = archive(tmp_path / "a.pt", {"m/data.pkl": pickled, "m/data/0": bytes(16)})
     with pytest.raises(CheckpointError) as caught:
@@ -187,6 +185,6 @@ def test_every_bomb_is_refused_by_name_without_growing(tmp_path: Path) -> None:
     for index, (make, _) in enumerate(BOMBS.values()):
         (folder := tmp_path / f"{index}").mkdir()
         paths.append(make(folder / "bomb.pt"))
-    for (name, (_, says)), path, said in zip(BOMBS.items(), paths, read_apart(*paths), strict=True):
-        assert_harmless(path, said)
-        assert re.search(says, said["outcome"]), (name, said)
+    for (name, (_, expected)), path, report in zip(BOMBS.items(), paths, read_apart(*paths), strict=True):
+        assert_harmless(path, report)
+        assert re.search(expected, report["outcome"]), (name, report)

@@ -63,7 +63,7 @@ def hostile(marker: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", list(hostile(Path())))
-def test_a_pickle_that_calls_something_is_refused_by_name_and_not_run(tmp_path: Path, name: str) -> None:
+def test_pickle_with_a_call_is_rejected_and_not_run(tmp_path: Path, name: str) -> None:
     marker = tmp_path / "it-ran"
     pickled = dumped({"model": None, "innocent": hostile(marker)[name]})
     path = archive(tmp_path / "evil.pt", pickled)
@@ -74,9 +74,7 @@ def test_a_pickle_that_calls_something_is_refused_by_name_and_not_run(tmp_path: 
     assert not marker.exists()
 
 
-def test_a_real_checkpoint_with_a_call_hidden_in_it_is_refused_and_not_run(
-    tmp_path: Path, foreign: dict[str, type[nn.Module]]
-) -> None:
+def test_hidden_call_in_a_checkpoint_is_not_run(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
     import os
 
     marker = tmp_path / "it-ran"
@@ -114,7 +112,7 @@ def test_a_real_checkpoint_with_a_call_hidden_in_it_is_refused_and_not_run(
         ),
     ],
 )
-def test_tricks_with_admitted_names_are_refused(tmp_path: Path, program: bytes) -> None:
+def test_misuse_of_allowed_names_is_rejected(tmp_path: Path, program: bytes) -> None:
     with pytest.raises(UnsafeCheckpointError, match="nothing was run"):
         load_checkpoint(archive(tmp_path / "evil.pt", program))
 
@@ -159,7 +157,7 @@ def test_a_tensor_outside_its_storage_is_refused(
         load_checkpoint(path)
 
 
-def test_numbers_repeated_without_end_are_refused(tmp_path: Path) -> None:
+def test_endlessly_repeated_numbers_are_rejected(tmp_path: Path) -> None:
     function, call = tensor_call(storage(count=1000), 0, (1000,), (1,))
     one = dumped((function, call))[2:-1]
     program = b"\x80\x02](" + (one[:-3] + b"R") * 2000 + b"e."
@@ -180,7 +178,7 @@ def test_a_network_larger_than_its_file_costs_no_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("depth", [5, 14, 60, 50_000])
-def test_a_maze_of_references_is_refused_at_once(tmp_path: Path, depth: int) -> None:
+def test_nested_references_are_rejected_at_once(tmp_path: Path, depth: int) -> None:
     """Each tuple holds the one before twice: a few bytes whose copy or text would never be finished."""
     program = dumped({"format": FORMAT})[:-1] + b"(" + dumped("description")[2:-1]
     program += b"]q\x09" + b"h\x09h\x09\x86q\x09" * depth + b"u."
@@ -189,13 +187,13 @@ def test_a_maze_of_references_is_refused_at_once(tmp_path: Path, depth: int) -> 
 
 
 @pytest.mark.parametrize("name", ["", "\x1b[2Jcar", "a\nb"])
-def test_a_class_name_that_could_steer_a_terminal_is_refused(tmp_path: Path, name: str) -> None:
+def test_unprintable_class_name_is_rejected(tmp_path: Path, name: str) -> None:
     save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
     content = torch.load(tmp_path / "m.pt", weights_only=True)
     content["description"]["names"] = [name, "dog"]
     content["state_dict"]["\x1b\n"] = torch.zeros(1)
     torch.save(content, tmp_path / "m.pt")
-    with pytest.raises(CheckpointError, match="class name must be printable") as caught:
+    with pytest.raises(CheckpointError, match="printable") as caught:
         load_checkpoint(tmp_path / "m.pt")
     assert str(caught.value).isprintable()
     content["description"]["names"] = ["car", "dog"]
@@ -229,7 +227,7 @@ def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path: Path, content: 
 
 
 def test_a_missing_file_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"no such file; give the path of a \.pt"):
+    with pytest.raises(CheckpointError, match=r"no such file.*\.pt"):
         load_checkpoint(tmp_path / "none.pt")
     with pytest.raises(CheckpointError, match="is a folder"):
         load_checkpoint(tmp_path)
@@ -340,8 +338,8 @@ def test_a_file_with_changed_bytes_loads_or_is_refused(
     for where, value in edits:
         # Headers and directory lie at the two ends; the numbers between are many and uninteresting.
         half = 30_000
-        place = int(where * 2 * half)
-        changed[place if place < half else len(changed) - 2 * half + place] = value
+        position = int(where * 2 * half)
+        changed[position if position < half else len(changed) - 2 * half + position] = value
     (tmp_path / "changed.pt").write_bytes(changed)
     loads_or_names_the_reason(tmp_path / "changed.pt")
 
@@ -402,7 +400,7 @@ def test_plain_values_are_read_as_python_reads_them(value: Any) -> None:
         (b"\x80\x02NQ.", "something else than a tuple"),
     ],
 )
-def test_a_senseless_program_is_refused(program: bytes, expected: str) -> None:
+def test_invalid_pickle_program_is_rejected(program: bytes, expected: str) -> None:
     with pytest.raises(CheckpointError, match=expected):
         unpickle(program, {}, refuse)
 

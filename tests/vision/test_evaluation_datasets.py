@@ -14,7 +14,7 @@ from vision.evaluation.dataset import open_dataset
 from vision.evaluation.samples import Dataset, DatasetError
 
 
-def picture(path: Path, width: int = 200, height: int = 100) -> Path:
+def make_image(path: Path, width: int = 200, height: int = 100) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.full((height, width, 3), 90, np.uint8))
     return path
@@ -30,7 +30,7 @@ def text(path: Path, content: str) -> Path:
 def yolo(tmp_path: Path) -> Path:
     """Two labelled images and one that shows nothing."""
     for name in ("a", "b", "c"):
-        picture(tmp_path / "images" / "val" / f"{name}.jpg")
+        make_image(tmp_path / "images" / "val" / f"{name}.jpg")
     text(tmp_path / "labels" / "val" / "a.txt", "0 0.5 0.5 0.2 0.4\n\n1 0.25 0.25 0.5 0.5\n")
     text(tmp_path / "labels" / "val" / "b.txt", "1 0.1 0.1 0.3 0.1 0.3 0.5 0.1 0.5\n")
     return tmp_path
@@ -41,7 +41,7 @@ def pixels(dataset: Dataset, index: int) -> list[list[int]]:
     return boxes
 
 
-def test_images_and_labels_in_folders_of_their_own(yolo: Path) -> None:
+def test_images_and_labels_in_separate_folders(yolo: Path) -> None:
     dataset = open_dataset(yolo)
     assert (dataset.kind, dataset.class_names) == ("YOLO", None)
     assert [sample.image.name for sample in dataset.samples] == ["a.jpg", "b.jpg", "c.jpg"]
@@ -51,8 +51,8 @@ def test_images_and_labels_in_folders_of_their_own(yolo: Path) -> None:
     assert len(dataset.samples[2].boxes) == 0
 
 
-def test_images_with_their_texts_beside_them(tmp_path: Path) -> None:
-    picture(tmp_path / "x.png")
+def test_images_with_labels_beside_them(tmp_path: Path) -> None:
+    make_image(tmp_path / "x.png")
     text(tmp_path / "x.txt", "0 0.5 0.5 1 1")
     assert pixels(open_dataset(tmp_path), 0) == [[0, 0, 200, 100]]
 
@@ -67,54 +67,54 @@ def test_a_data_yaml_gives_names_and_splits(yolo: Path, names: str) -> None:
         dataset = open_dataset(path)
         assert dataset.class_names == ("car", "no")
         assert len(dataset.samples) == 3
-    with pytest.raises(DatasetError, match=r"`train` names .*images/train, which is not there"):
+    with pytest.raises(DatasetError, match=r"`train` .*images/train"):
         open_dataset(yolo, split="train")
-    with pytest.raises(DatasetError, match="has no split 'test'; it has val, train"):
+    with pytest.raises(DatasetError, match=r"'test'.* val, train"):
         open_dataset(yolo, split="test")
 
 
 def test_a_split_may_be_a_list_of_files(yolo: Path) -> None:
     text(yolo / "val.txt", "./images/val/b.jpg\n\nimages/val/gone.jpg\n")
     text(yolo / "data.yaml", "val: val.txt\nnames: [car, dog]\n")
-    with pytest.raises(DatasetError, match=r"val\.txt, line 3: .*gone\.jpg is not there"):
+    with pytest.raises(DatasetError, match=r"val\.txt, line 3: .*gone\.jpg"):
         open_dataset(yolo)
     text(yolo / "val.txt", "./images/val/b.jpg\n")
     assert [sample.image.name for sample in open_dataset(yolo).samples] == ["b.jpg"]
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "expected"),
     [
         ("0 0.5 0.5 0.2", "got 4 numbers"),
         ("0 0.5 0.5 0.2 0.2 0.9", "got 6 numbers"),
         ("car 0.5 0.5 0.2 0.2", "expected numbers"),
-        ("0.5 0.5 0.5 0.2 0.2", "the class must be a whole number"),
-        ("-1 0.5 0.5 0.2 0.2", "the class must be a whole number"),
+        ("0.5 0.5 0.5 0.2 0.2", "whole number"),
+        ("-1 0.5 0.5 0.2 0.2", "whole number"),
         ("2 0.5 0.5 0.2 0.2", r"whole number, 0\.\.1, got 2"),
-        ("0 0.5 0.5 0 0.2", "width and height must be above 0"),
-        ("0 120 50 20 20", r"fractions of the image, 0\.\.1, got 20 to 120"),
+        ("0 0.5 0.5 0 0.2", "width and height"),
+        ("0 120 50 20 20", r"got 20 to 120"),
         ("0 nan 0.5 0.2 0.2", "not finite"),
     ],
 )
-def test_a_wrong_label_is_named_with_file_and_line(yolo: Path, line: str, says: str) -> None:
+def test_a_wrong_label_is_named_with_file_and_line(yolo: Path, line: str, expected: str) -> None:
     text(yolo / "data.yaml", "val: images/val\nnames: [car, dog]\n")
     text(yolo / "labels" / "val" / "b.txt", f"0 0.5 0.5 0.1 0.1\n{line}\n")
-    with pytest.raises(DatasetError, match=rf"b\.txt, line 2: .*{says}"):
+    with pytest.raises(DatasetError, match=rf"b\.txt, line 2: .*{expected}"):
         open_dataset(yolo)
 
 
-def test_a_folder_that_is_no_data_set_says_what_was_expected(tmp_path: Path) -> None:
+def test_folder_without_data_set_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no such file or folder"):
         open_dataset(tmp_path / "none")
     with pytest.raises(DatasetError, match="has no images"):
         open_dataset(tmp_path)
-    picture(tmp_path / "images" / "a.jpg")
-    with pytest.raises(DatasetError, match=r"none of its 1 images has labels; .*labels/a\.txt was expected"):
+    make_image(tmp_path / "images" / "a.jpg")
+    with pytest.raises(DatasetError, match=r"labels/a\.txt"):
         open_dataset(tmp_path)
 
 
 def coco(tmp_path: Path, **changes: Any) -> Path:
-    picture(tmp_path / "val2017" / "a.jpg")
+    make_image(tmp_path / "val2017" / "a.jpg")
     content = {
         "images": [{"id": 7, "file_name": "a.jpg", "width": 200, "height": 100}],
         "categories": [{"id": 3, "name": "car"}, {"id": 90, "name": "dog"}],
@@ -143,23 +143,25 @@ def annotated(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
         (annotated(category_id=1), "annotation 0: its category_id 1"),
         (annotated(bbox=[0, 0, -1, 1]), "annotation 0: its bbox must"),
-        (annotated(image_id=8), "annotations of the image 8"),
+        (annotated(image_id=8), "image 8"),
         ({"annotations": {}}, "`annotations` must be a list"),
         ({"categories": []}, "has no categories"),
         ({"categories": [{"id": 1}]}, "category 0: expected"),
         ({"images": [{"id": 7, "file_name": "gone.jpg"}]}, "image 0: gone.jpg is in none of .*--images"),
     ],
 )  # fmt: skip
-def test_a_wrong_entry_of_a_coco_file_is_named(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
-    with pytest.raises(DatasetError, match=says):
+def test_a_wrong_entry_of_a_coco_file_is_named(
+    tmp_path: Path, changes: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(DatasetError, match=expected):
         open_dataset(coco(tmp_path, **changes))
 
 
-def test_what_is_no_json_and_what_is_two_files_is_told(tmp_path: Path) -> None:
+def test_invalid_json_and_ambiguous_files_are_rejected(tmp_path: Path) -> None:
     path = coco(tmp_path)
     text(path.with_name("instances_train2017.json"), "{}")
     with pytest.raises(DatasetError, match="several annotation files"):

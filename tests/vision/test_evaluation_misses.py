@@ -26,14 +26,14 @@ def add(
     misses.add(Path("a.jpg"), IMAGE, detections, table[:, :4], table[:, 4].astype(np.int64), ignored)
 
 
-def test_what_is_found_right_is_no_mistake() -> None:
+def test_correct_detections_are_no_errors() -> None:
     misses = WorstMisses()
     add(misses, found((0, 0, 50, 50, 0.9, 0)), (2, 2, 50, 50, 0))
     assert misses.counts == {"missed": 0, "imagined": 0}
     assert misses.sheet() is None
 
 
-def test_another_class_another_place_and_a_weak_one_are_mistakes() -> None:
+def test_wrong_class_position_or_confidence_is_an_error() -> None:
     misses = WorstMisses()
     add(
         misses,
@@ -51,7 +51,7 @@ def test_a_crowd_is_not_missed() -> None:
     assert misses.counts["missed"] == 0
 
 
-def test_the_largest_missed_and_the_surest_imagined_are_kept() -> None:
+def test_worst_errors_of_each_kind_are_kept() -> None:
     misses = WorstMisses(keep=2)
     for size in (10, 40, 20, 30):
         add(misses, found((100, 50, 120, 70, size / 100 + 0.3, 0)), (0, 0, size, size, 0))

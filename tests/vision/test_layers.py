@@ -55,11 +55,11 @@ def with_lively_statistics(module: Layer, seed: int = 0) -> Layer:
         pytest.param(Bottleneck(8, 8, True), (2, 8, 16, 20), id="a bottleneck keeps the size"),
     ],
 )
-def test_a_layer_gives_the_shape_that_it_promises(layer: nn.Module, expected: tuple[int, ...]) -> None:
+def test_layer_output_shapes(layer: nn.Module, expected: tuple[int, ...]) -> None:
     assert layer(torch.rand(2, 8, 16, 20)).shape == expected
 
 
-def test_a_bottleneck_adds_its_input_only_where_asked_and_possible() -> None:
+def test_bottleneck_shortcut_is_optional() -> None:
     x = torch.rand(1, 8, 4, 4)
     for wanted, outputs in ((True, 8), (False, 8), (True, 12)):
         bottleneck = Bottleneck(8, outputs, wanted).eval()
@@ -127,7 +127,7 @@ def test_two_depthwise_convolutions_fold_into_one() -> None:
     torch.testing.assert_close(layer(x), before, rtol=1e-4, atol=1e-5)
 
 
-def test_a_cell_sees_its_own_area_and_no_other() -> None:
+def test_area_attention_stays_within_its_area() -> None:
     layer = with_lively_statistics(AreaAttention(64, 2, areas=4))
     x = torch.rand(1, 64, 32, 4)
     changed = x.clone()
@@ -139,7 +139,7 @@ def test_a_cell_sees_its_own_area_and_no_other() -> None:
     assert bool((difference[24:] < 1e-6).all())
 
 
-def test_an_sppf_without_its_first_activation_lets_negative_values_through() -> None:
+def test_sppf_without_activation_keeps_negatives() -> None:
     x = torch.rand(1, 8, 6, 6) - 0.5
     for activated in (True, False):
         layer = with_lively_statistics(SPPF(8, 8, 5, 3, True, activated))

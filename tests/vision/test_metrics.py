@@ -76,7 +76,7 @@ def test_a_box_of_iou_0_72_counts_at_the_five_lower_thresholds() -> None:
     assert score.map50_95 == pytest.approx(0.5)
 
 
-def test_classes_do_not_find_each_other_and_absent_classes_do_not_count() -> None:
+def test_classes_are_separate_and_absent_ones_ignored() -> None:
     score = score_detections([result([(SQUARE, 0.9, 1)], [(SQUARE, 0)])], NAMES)
     assert score.map50 == 0
     assert math.isnan(score.per_class["boat"].ap50)
@@ -96,7 +96,7 @@ def test_no_images_give_no_score() -> None:
     assert math.isnan(score_detections([], NAMES).map50)
 
 
-def test_a_class_id_the_model_does_not_know_is_refused() -> None:
+def test_unknown_class_id_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"class ids must be 0\.\.1, got 0\.\.7"):
         score_detections([result([(SQUARE, 0.5, 7)], [(SQUARE, 0)])], NAMES)
 
@@ -152,7 +152,7 @@ def test_an_ignored_region_makes_nothing_right_or_wrong() -> None:
     assert score.map50 == pytest.approx(1)
 
 
-def test_the_score_is_that_of_cocos_own_program() -> None:
+def test_score_matches_pycocotools() -> None:
     """Random scenes with crowds, second boxes and false alarms, against pycocotools."""
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
     cocoeval = pytest.importorskip("pycocotools.cocoeval")
@@ -214,7 +214,7 @@ def test_precision_and_recall_count_what_is_confident_enough() -> None:
     assert points["boat"].recall == 0.0
 
 
-def test_an_ignored_object_may_be_found_but_not_called_by_another_class() -> None:
+def test_ignored_object_is_neutral_only_for_its_class() -> None:
     seen = result([(SQUARE, 0.9, 0), (SQUARE, 0.8, 1)], [(SQUARE, 0)])
     ignoring = ImageResult(
         seen.boxes, seen.confidences, seen.class_ids, seen.true_boxes, seen.true_class_ids, np.array([True])

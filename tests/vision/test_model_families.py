@@ -77,7 +77,7 @@ def fill(state: dict[str, Tensor], seed: int = 7) -> None:
             tensor.copy_(0.4 * random - 0.2)
 
 
-def picture() -> Tensor:
+def make_image() -> Tensor:
     """(1, 3, 64, 96): waves, a different one for each colour."""
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     waves = [torch.sin(x / (3 + colour) + y / (7 - colour)) for colour in range(3)]
@@ -116,11 +116,11 @@ def test_every_published_network_is_counted() -> None:
 
 
 @pytest.mark.parametrize(("model_family", "scale"), GOLDEN)
-def test_the_maps_are_those_of_the_reference(model_family: str, scale: str) -> None:
+def test_outputs_match_the_reference(model_family: str, scale: str) -> None:
     model = filled(small(model_family, scale))
     with torch.inference_mode():
-        maps = model(picture())
-        folded = model.fuse()(picture())
+        maps = model(make_image())
+        folded = model.fuse()(make_image())
     expected = GOLDEN[model_family, scale]
     assert facts(maps) == pytest.approx(expected, rel=0, abs=1e-4 * expected[1])
     assert facts(folded) == pytest.approx(expected, rel=0, abs=1e-3 * expected[1])
@@ -149,7 +149,7 @@ def test_the_maps_are_those_of_the_reference(model_family: str, scale: str) -> N
         ("YOLO26", "n", ("model.23.one2one_cv2.0.2.bias", "model.23.one2one_cv3.2.1.0.conv.weight")),
     ],
 )
-def test_the_parameters_bear_the_names_of_checkpoints_in_circulation(
+def test_parameter_names_match_published_checkpoints(
     model_family: str, scale: str, names: tuple[str, ...]
 ) -> None:
     state = build_shapes(published_description(model_family, scale, COCO_SIZED)).state_dict()
@@ -163,7 +163,7 @@ def test_a_head_without_distributions_has_no_bins() -> None:
 
 
 @pytest.mark.parametrize("model_family", SCALES)
-def test_a_published_description_survives_being_written_and_read(model_family: str) -> None:
+def test_published_description_survives_the_round_trip(model_family: str) -> None:
     for scale in SCALES[model_family]:
         description = published_description(model_family, scale, FEW)
         assert ModelDescription.from_plain(description.to_plain()) == description
@@ -172,8 +172,8 @@ def test_a_published_description_survives_being_written_and_read(model_family: s
 @pytest.mark.parametrize(
     ("model_family", "scale", "expected"),
     [
-        ("YOLO13", "n", "unknown model family 'YOLO13'; known are YOLOv5u, YOLOv8"),
-        ("YOLO11", "b", "YOLO11 has no scale 'b'; known are n, s, m, l, x"),
+        ("YOLO13", "n", "'YOLO13'.*YOLOv5u, YOLOv8"),
+        ("YOLO11", "b", "YOLO11 .*'b'.*n, s, m, l, x"),
     ],
 )
 def test_an_unpublished_network_is_refused_with_the_known_ones(
@@ -187,18 +187,18 @@ def test_an_unpublished_network_is_refused_with_the_known_ones(
 
 
 @pytest.mark.parametrize("model_family", SCALES)
-def test_generation_scale_and_work_are_recognised(model_family: str) -> None:
+def test_family_scale_and_gflops_are_recognised(model_family: str) -> None:
     for scale in ("n", "x"):
         model = build_shapes(published_description(model_family, scale, COCO_SIZED))
-        told = describe(model, 640 if scale == "n" else 64)
-        assert (told.model_family, told.scale) == (model_family, scale)
-        assert told.parameters == PARAMETERS[model_family][scale]
-        assert told.end_to_end == (model_family in ("YOLOv10", "YOLO26"))
+        facts = describe(model, 640 if scale == "n" else 64)
+        assert (facts.model_family, facts.scale) == (model_family, scale)
+        assert facts.parameters == PARAMETERS[model_family][scale]
+        assert facts.end_to_end == (model_family in ("YOLOv10", "YOLO26"))
         if scale == "n":
-            assert told.gflops == pytest.approx(GFLOPS[model_family], abs=0.1)
+            assert facts.gflops == pytest.approx(GFLOPS[model_family], abs=0.1)
 
 
-def test_the_work_grows_with_the_picture_and_not_with_folding() -> None:
+def test_gflops_grow_with_image_size_not_with_folding() -> None:
     model = build_shapes(published_description("YOLOv8", "n", COCO_SIZED))
     whole, quarter = describe(model, 640), describe(model, 320)
     assert whole.gflops == pytest.approx(4 * quarter.gflops)
@@ -212,8 +212,8 @@ def test_the_work_grows_with_the_picture_and_not_with_folding() -> None:
 def test_folding_drops_the_branches_that_only_train() -> None:
     model = lively()
     with torch.inference_mode():
-        before = model(picture())
-        after = model.fuse()(picture())
+        before = model(make_image())
+        after = model.fuse()(make_image())
     for a, b in zip(before, after, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
     assert not any(".cv3." in name and "model.23." in name for name in model.state_dict())
@@ -222,7 +222,7 @@ def test_folding_drops_the_branches_that_only_train() -> None:
     assert sum(parameter.numel() for parameter in published.parameters()) == 2_408_932
 
 
-def test_networks_of_ones_own_are_told_apart_from_the_published() -> None:
+def test_custom_networks_differ_from_published_ones() -> None:
     assert describe(lively("YOLO11"), 64).scale is None
     down = [[-1, 1, "Conv", [16, 3, 2]] for _ in range(6)]
     head = [-1, 1, "Detect", ["nc"]]
@@ -258,7 +258,7 @@ def reference_boxes(
 def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
     model = lively()
     with torch.inference_mode():
-        maps = model(picture())
+        maps = model(make_image())
         decoded = model.decode(maps)[0]
     confidence = decoded[:, 4:].max(dim=1).values.median().item()
     boxes = select_boxes(model, maps, confidence=confidence, most=most)
@@ -273,7 +273,7 @@ def test_the_best_pairs_of_cell_and_class_are_selected(most: int) -> None:
 def test_overlapping_boxes_of_an_end_to_end_head_are_all_kept() -> None:
     model = lively()
     with torch.inference_mode():
-        maps = model(picture())
+        maps = model(make_image())
     many = select_boxes(model, maps, confidence=0.0, iou=0.0, most=1000)
     assert len(many) == sum(level.shape[2] * level.shape[3] for level in maps) * len(FEW)
 
@@ -281,7 +281,7 @@ def test_overlapping_boxes_of_an_end_to_end_head_are_all_kept() -> None:
 def test_a_class_filter_gives_what_filtering_afterwards_gives() -> None:
     model = lively()
     with torch.inference_mode():
-        maps = model(picture())
+        maps = model(make_image())
     every = select_boxes(model, maps, confidence=0.3, most=1000)
     only = select_boxes(model, maps, confidence=0.3, most=1000, class_ids=(0, 2))
     kept = every.class_id != 1
@@ -293,14 +293,14 @@ def test_a_class_filter_gives_what_filtering_afterwards_gives() -> None:
 def test_no_box_above_the_confidence_is_an_empty_list() -> None:
     model = lively()
     with torch.inference_mode():
-        boxes = select_boxes(model, model(picture()), confidence=1.0)
+        boxes = select_boxes(model, model(make_image()), confidence=1.0)
     assert (len(boxes), boxes.xyxy.shape) == (0, (0, 4))
     assert (boxes.confidence.dtype, boxes.class_id.dtype) == (np.dtype(np.float32), np.dtype(np.int64))
 
 
-def test_an_end_to_end_head_learns_with_one_branch_and_answers_with_the_other() -> None:
+def test_end_to_end_head_trains_and_predicts_separately() -> None:
     model = lively()
-    x = picture()
+    x = make_image()
     with torch.inference_mode():
         answered = model(x)
         model.detect.training = True  # Normalisation stays as it is, so that only the branches differ.

@@ -43,7 +43,7 @@ def put(maps: list[Tensor], level: int, x: int, y: int, bins: tuple[int, ...], *
         cell[64 + NAMES.index(name)] = logit
 
 
-def test_nothing_seen_gives_no_boxes(model: YoloModel) -> None:
+def test_no_activation_gives_no_boxes(model: YoloModel) -> None:
     boxes = select_boxes(model, empty_maps())
     assert len(boxes) == 0
     assert boxes.xyxy.shape == (0, 4)
@@ -95,7 +95,7 @@ def test_classes_are_filtered_before_the_limit_on_boxes(model: YoloModel) -> Non
     assert select_boxes(model, maps, most=3).class_id.tolist() == [0, 0, 0]
 
 
-def test_a_cell_speaks_for_its_most_probable_class_only(model: YoloModel) -> None:
+def test_cell_predicts_only_its_most_probable_class(model: YoloModel) -> None:
     maps = empty_maps()
     put(maps, 0, 4, 3, (2, 2, 2, 2), car=3.0, dog=2.0)
     assert len(select_boxes(model, maps, class_ids=[1])) == 0
@@ -109,7 +109,7 @@ def test_a_box_must_be_above_the_confidence(model: YoloModel) -> None:
     assert len(select_boxes(model, maps, confidence=0.5)) == 0
 
 
-def test_a_one_to_one_head_speaks_for_every_class_and_suppresses_nothing() -> None:
+def test_one_to_one_head_predicts_every_class_without_nms() -> None:
     head = Head((8,), 1, True, 3, (0, 1, 2))
     classes = np.full((3, 4, 4), -9.0, np.float32)
     classes[0, 1, 1], classes[2, 1, 1], classes[0, 1, 2] = 3.0, 1.0, 2.0
@@ -129,7 +129,7 @@ def test_a_one_to_one_head_speaks_for_every_class_and_suppresses_nothing() -> No
     wanted=st.sets(st.integers(0, 6), min_size=1),
     confidence=st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]),
 )
-def test_computing_only_the_wanted_classes_is_the_same_as_filtering_afterwards(
+def test_computing_some_classes_equals_filtering_afterwards(
     seed: int, classes: int, wanted: set[int], confidence: float
 ) -> None:
     """Whole numbers, so that logits are exact and ties between classes are many."""
@@ -153,7 +153,7 @@ def test_computing_only_the_wanted_classes_is_the_same_as_filtering_afterwards(
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_the_memory_order_of_the_maps_does_not_matter(order: Literal["C", "F"]) -> None:
+def test_memory_order_of_the_outputs_does_not_matter(order: Literal["C", "F"]) -> None:
     random = np.random.default_rng(0)
     classes, sides = random.normal(size=(5, 6, 7)), random.normal(size=(64, 6, 7))
     head = Head((8,), 16, False, 5, tuple(range(5)))
@@ -167,9 +167,9 @@ def test_the_memory_order_of_the_maps_does_not_matter(order: Literal["C", "F"]) 
     assert again.class_id.tolist() == plain.class_id.tolist()
 
 
-def test_maps_without_sides_and_without_what_gives_them_are_refused() -> None:
+def test_outputs_without_sides_and_neck_are_rejected() -> None:
     head = Head((8,), 16, False, 1, (0,))
-    with pytest.raises(ValueError, match="need the neck's maps"):
+    with pytest.raises(ValueError, match="the neck"):
         boxes_of(head, [LevelOutput(classes=np.ones((1, 2, 2), np.float32))])
 
 
@@ -195,7 +195,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("paired", [512, 0], ids=["all pairs at once", "one by one"])
 @given(boxes=BOXES, iou=st.sampled_from([0.0, 0.3, 0.5, 0.7, 1.0]), most=st.integers(1, 50))
-def test_suppression_is_what_the_definition_says(
+def test_suppression_matches_its_definition(
     paired: int, boxes: list[tuple[int, ...]], iou: float, most: int
 ) -> None:
     table = np.array(boxes, np.float64).reshape(-1, 6)

@@ -36,7 +36,7 @@ def test_each_scale_has_the_published_number_of_parameters(scale: str, count: in
     assert sum(parameter.numel() for parameter in model.parameters()) == count
 
 
-def test_the_parameters_bear_the_names_of_checkpoints_in_circulation() -> None:
+def test_parameter_names_match_published_checkpoints() -> None:
     with torch.device("meta"):
         names = set(build(yolov8_description("n", COCO_SIZED)).state_dict())
     assert {
@@ -51,7 +51,7 @@ def test_the_parameters_bear_the_names_of_checkpoints_in_circulation() -> None:
     } <= names
 
 
-def test_the_maps_have_one_size_per_stride() -> None:
+def test_outputs_have_one_size_per_stride() -> None:
     model = build(yolov8_description(SMALL, ("car", "dog", "boat"))).eval()
     with torch.inference_mode():
         maps = model(torch.rand(2, 3, 96, 160))
@@ -68,7 +68,7 @@ def test_training_reaches_every_parameter_but_the_bins() -> None:
     assert without == ["model.22.dfl.conv.weight"]
 
 
-def test_a_whole_network_with_folded_normalisation_gives_the_same_maps() -> None:
+def test_folded_network_gives_the_same_outputs() -> None:
     torch.manual_seed(2)
     model = build(yolov8_description(SMALL, ("car", "dog")))
     for _ in range(3):
@@ -103,7 +103,7 @@ def test_distances_from_a_cell_become_a_box_in_pixels() -> None:
     assert box.tolist() == [[4.5 * 8, 4.5 * 8, 8.5 * 8, 10.5 * 8]]
 
 
-def test_a_description_survives_being_written_and_read() -> None:
+def test_description_survives_the_round_trip() -> None:
     description = dataclasses.replace(
         yolov8_description("m", ("a", "b")), activation="ReLU", reg_max=8, unscaled_channels=(64,)
     )
@@ -130,7 +130,7 @@ def test_a_channel_count_that_is_declared_unscaled_stays() -> None:
 @pytest.mark.parametrize(
     ("position", "row", "expected"),
     [
-        pytest.param(3, [-1, 1, "Quantum", [64]], r"row 3: unknown layer 'Quantum'; known are", id="layer"),
+        pytest.param(3, [-1, 1, "Quantum", [64]], r"row 3: .*'Quantum'", id="layer"),
         pytest.param(2, [-1, 1, "C2f", ["wide"]], r"row 2 \(C2f\): channels .* got 'wide'", id="channels"),
         pytest.param(2, [-1, 1, "C2f", [64, 3]], r"row 2 \(C2f\): the shortcut", id="shortcut"),
         pytest.param(2, [-1, 64, "C2f", [64]], r"", id="many repeats are cut by the depth multiple"),
@@ -139,18 +139,14 @@ def test_a_channel_count_that_is_declared_unscaled_stays() -> None:
         pytest.param(1, ["x", 1, "Conv", [64]], r"row 1: 'from' must be", id="from"),
         pytest.param(1, [-1, 1, "Conv"], r"row 1 must be", id="short row"),
         pytest.param(1, [-1, 1, "Conv", [64, 2, 2]], r"row 1 \(Conv\): the kernel must be odd", id="even"),
-        pytest.param(
-            10, [-1, 1, "C2f", [64]], r"row 11 \(Concat\) joins maps of different sizes", id="not enlarged"
-        ),
-        pytest.param(
-            21, [[18, 15, 12], 1, "Detect", ["nc"]], r"row 21: Detect must read maps each smaller", id="order"
-        ),
+        pytest.param(10, [-1, 1, "C2f", [64]], r"row 11 \(Concat\)", id="not enlarged"),
+        pytest.param(21, [[18, 15, 12], 1, "Detect", ["nc"]], r"row 21: Detect", id="order"),
         pytest.param(1, [-1, 1, "Conv", [64, 3, 2, 3]], r"does not divide by its stride", id="padding"),
         pytest.param(1, [-1, 1, "C3k2", [64, 1]], r"row 1 \(C3k2\): the choice of C3k", id="C3k"),
         pytest.param(1, [-1, 1, "C3k2", [64, False, 0]], r"expansion must be a number in 0..1", id="ratio"),
-        pytest.param(1, [-1, 1, "C3k2", [64, False, 0.5, False, 2]], r"knows no groups", id="groups"),
+        pytest.param(1, [-1, 1, "C3k2", [64, False, 0.5, False, 2]], r"groups", id="groups"),
         pytest.param(1, [-1, 1, "A2C2f", [8]], r"multiples of 32 channels, got 4", id="area heads"),
-        pytest.param(12, [-1, 1, "C2PSA", [64]], r"as many channels as it reads, 16, got 8", id="attended"),
+        pytest.param(12, [-1, 1, "C2PSA", [64]], r"16, got 8", id="attended"),
         pytest.param(2, [-1, 1, "PSA", [64, 1]], r"takes at most 1", id="PSA"),
         pytest.param(1, [-1, 1, "Detect", ["nc"]], r"row 1 is 'Detect': the last row", id="early head"),
         pytest.param(
@@ -199,13 +195,13 @@ def test_a_row_that_cannot_be_built_is_named(position: int, row: list[Any], expe
     ],
     ids=str,
 )
-def test_a_senseless_table_is_refused_by_name(changes: dict[str, Any]) -> None:
+def test_invalid_table_is_rejected_by_name(changes: dict[str, Any]) -> None:
     with torch.device("meta"), pytest.raises(ArchitectureError):
         build(ModelDescription.from_plain(small_table(**changes)))
 
 
 def test_an_unknown_scale_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ArchitectureError, match="unknown scale 'q'; known are n, s, m, l, x"):
+    with pytest.raises(ArchitectureError, match=r"'q'.*n, s, m, l, x"):
         yolov8_description("q", ("a",))
 
 

@@ -1,1 +1,1 @@
-"""Judging a detector on labelled photographs: data sets read, misses shown."""
+"""Evaluation of a detector on labelled images: data set readers and the sheet of worst errors."""

@@ -16,7 +16,7 @@ from vision.evaluation.samples import Dataset, DatasetError, Sample
 
 
 def find_annotations(folder: Path) -> Path | None:
-    """The annotation file of a folder: the one JSON with `images` and `annotations`; None if there is
+    """Find the annotation file of a folder: the only JSON with `images` and `annotations`; None if there is
     none.
     """
     if not folder.is_dir():
@@ -26,12 +26,12 @@ def find_annotations(folder: Path) -> Path | None:
     candidates = fitting or [path for path in found if _looks_like_coco(path)]
     if len(candidates) > 1:
         names = ", ".join(str(path.relative_to(folder)) for path in candidates)
-        raise DatasetError(f"{folder}: has several annotation files, name one: {names}")
+        raise DatasetError(f"{folder}: has several annotation files, give one: {names}")
     return candidates[0] if candidates else None
 
 
 def _looks_like_coco(path: Path) -> bool:
-    """By the keys in its beginning and its end: a file of annotations can be large."""
+    """Check the keys at the beginning and end of the file: annotation files can be large."""
     with path.open("rb") as file:
         seen = file.read(1 << 16)
         file.seek(max(0, path.stat().st_size - (1 << 16)))
@@ -40,7 +40,7 @@ def _looks_like_coco(path: Path) -> bool:
 
 
 def read_coco(path: Path, images: Path | None = None) -> Dataset:
-    """The data set of one annotation file; raises `DatasetError` naming the entry."""
+    """Read the data set of one annotation file; raises `DatasetError` naming the entry."""
     try:
         content = json.loads(path.read_bytes())
     except OSError as error:
@@ -72,7 +72,7 @@ def read_coco(path: Path, images: Path | None = None) -> Dataset:
         )
     if annotations:
         raise DatasetError(
-            f"{path}: has annotations of the image {next(iter(annotations))!r}, which it does not list"
+            f"{path}: has annotations of the image {next(iter(annotations))!r}, which is not listed"
         )
     if not samples:
         raise DatasetError(f"{path}: lists no images")
@@ -87,12 +87,12 @@ def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, An
 
 
 def _categories(entries: list[dict[str, Any]], path: Path) -> tuple[tuple[str, ...], dict[Any, int]]:
-    """Names in the order of the file, and the file's ids → their place in it."""
+    """Names in the order of the file, and the file's ids → their index in it."""
     ids: dict[Any, int] = {}
     names = []
     for index, entry in enumerate(entries):
         if type(entry.get("id")) is not int or not isinstance(entry.get("name"), str) or entry["id"] in ids:
-            raise DatasetError(f"{path}, category {index}: expected an `id` of its own and a `name`")
+            raise DatasetError(f"{path}, category {index}: expected a unique `id` and a `name`")
         ids[entry["id"]] = index
         names.append(entry["name"])
     if not names:
@@ -125,8 +125,8 @@ def _annotation(entry: dict[str, Any], ids: dict[Any, int], where: str) -> tuple
 
 
 class _ImageFinder:
-    """Where the images of an annotation file are: beside it, in `images/`, in a folder of the split's
-    name.
+    """Finds the images of an annotation file: beside it, in `images/`, or in a folder named after the
+    split.
     """
 
     def __init__(self, annotations: Path, images: Path | None) -> None:
@@ -135,13 +135,13 @@ class _ImageFinder:
         root = annotations.parent
         split = annotations.stem.removeprefix("instances_")
         above = root.parent if root.name == "annotations" else root
-        self._places = (
+        self._folders = (
             [images] if images else [root, above / split, above / "images" / split, above / "images", above]
         )
 
     def find(self, file_name: str, where: str) -> Path:
-        for place in self._places:
-            if (place / file_name).is_file():
-                return place / file_name
-        looked = ", ".join(str(place) for place in self._places)
-        raise DatasetError(f"{where}: {file_name} is in none of {looked}; name the folder with --images")
+        for folder in self._folders:
+            if (folder / file_name).is_file():
+                return folder / file_name
+        searched = ", ".join(str(folder) for folder in self._folders)
+        raise DatasetError(f"{where}: {file_name} is in none of {searched}; give the folder with --images")

@@ -1,4 +1,4 @@
-"""Opens a labelled data set, whichever format it comes in."""
+"""Opens a labelled data set of any supported format."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from vision.evaluation.yolo_dataset import read_yolo
 
 
 def open_dataset(path: Path, *, split: str | None = None, images: Path | None = None) -> Dataset:
-    """Find out what is at `path` and read its labels.
+    """Detect the format of the data set at `path` and read its labels.
 
     Args:
         path: a folder with `images/` and `labels/`, or with both side by side; one with a `data.yaml`, or
             that file; a COCO annotation file (JSON), or a folder with one.
-        split: `train`, `val` or `test` of a `data.yaml`; None: `val`, or what else it has if that is all.
-        images: where the images of a COCO file are; None: looked for around it.
+        split: `train`, `val` or `test` of a `data.yaml`; None: `val`, or the first other one.
+        images: folder of a COCO file's images; None: searched near the file.
 
     Raises:
-        DatasetError: nothing of the kind is there, or a label is wrong.
+        DatasetError: no data set found, or an invalid label.
     """
     if not path.exists():
         raise DatasetError(

@@ -1,7 +1,8 @@
-"""The worst mistakes of a detector, kept while it is judged, and shown on one sheet.
+"""The worst errors of a detector, collected during evaluation and shown on one sheet.
 
-Missed: true objects that no detection of their class covers, the largest first, as the largest are the least
-excusable. Imagined: detections where no such object is, the most confident first.
+Missed: ground truth objects without a detection of their class, largest first. Imagined: detections without
+    an
+object, most confident first.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ Kind = Literal["missed", "imagined"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Miss:
-    """One mistake: where, of what, how bad, and what it looks like.
+    """One error with its position, class, severity and image crop.
 
     Attributes:
-        severity: missed: share of the image; imagined: confidence. Only compared within a kind.
+        severity: missed: share of the image area; imagined: confidence. Comparable only within a kind.
         box: xyxy in pixels of `image`.
-        crop: (168, 168, 3) uint8 BGR, the box drawn in.
+        crop: (168, 168, 3) uint8 BGR, with the box drawn.
     """
 
     kind: Kind
@@ -46,18 +47,18 @@ class Miss:
 
 
 class WorstMisses:
-    """Keeps the worst of each kind; memory does not grow with the data set.
+    """Keeps the worst errors of each kind; memory does not grow with the data set.
 
     Attributes:
-        counts: how many there were of each kind.
+        counts: total number of each kind.
     """
 
     def __init__(self, keep: int = 18, *, confidence: float = 0.25, iou: float = 0.5) -> None:
         """
         Args:
-            keep: of each kind.
-            confidence: detections below it are not counted as said.
-            iou: overlap from which a detection covers an object.
+            keep: number to keep of each kind.
+            confidence: detections below it are ignored.
+            iou: overlap from which a detection matches an object.
         """
         self._keep = keep
         self._confidence = confidence
@@ -74,34 +75,34 @@ class WorstMisses:
         true_class_ids: NDArray[np.int64],
         ignored: NDArray[np.bool_],
     ) -> None:
-        """Compare what was found in one image with what is there; class ids of both are
-        `found.class_names`'.
+        """Compare the detections of one image with its ground truth; class ids of both are those of
+        `found.class_names`.
         """
-        said = found[found.confidence >= self._confidence]
-        covers = (box_iou(said.xyxy, true_boxes) >= self._iou) & (
-            said.class_id[:, None] == true_class_ids[None, :]
+        detected = found[found.confidence >= self._confidence]
+        matches = (box_iou(detected.xyxy, true_boxes) >= self._iou) & (
+            detected.class_id[:, None] == true_class_ids[None, :]
         )
         height, width = image.shape[:2]
-        for index in np.flatnonzero(~covers.any(axis=0) & ~ignored):
+        for index in np.flatnonzero(~matches.any(axis=0) & ~ignored):
             left, top, right, bottom = map(float, true_boxes[index])
             share = (right - left) * (bottom - top) / (width * height)
-            self._note(
+            self._add(
                 "missed", share, path, image, found.class_names[true_class_ids[index]], true_boxes[index]
             )
-        for index in np.flatnonzero(~covers.any(axis=1)):
-            name = found.class_names[said.class_id[index]]
-            self._note("imagined", float(said.confidence[index]), path, image, name, said.xyxy[index])
+        for index in np.flatnonzero(~matches.any(axis=1)):
+            name = found.class_names[detected.class_id[index]]
+            self._add("imagined", float(detected.confidence[index]), path, image, name, detected.xyxy[index])
 
     def worst(self, kind: Kind) -> list[Miss]:
-        """The kept ones, the worst first."""
+        """The kept errors, worst first."""
         return [miss for _, _, miss in sorted(self._heaps[kind], reverse=True)]
 
     def sheet(self) -> NDArray[np.uint8] | None:
-        """Both kinds on one picture, (H, W, 3) uint8 BGR; None if there is no mistake to show."""
+        """Both kinds in one image, (H, W, 3) uint8 BGR; None if there is no error."""
         rows: list[NDArray[np.uint8]] = []
         for kind, title in (
             ("missed", "missed, the largest first"),
-            ("imagined", "imagined, the surest first"),
+            ("imagined", "imagined, the most confident first"),
         ):
             shown = self.worst(kind)  # type: ignore[arg-type]
             if shown:
@@ -109,7 +110,7 @@ class WorstMisses:
                 rows += [_row(shown[start : start + _COLUMNS]) for start in range(0, len(shown), _COLUMNS)]
         return np.concatenate(rows) if rows else None
 
-    def _note(
+    def _add(
         self,
         kind: Kind,
         severity: float,
@@ -135,15 +136,15 @@ class WorstMisses:
 def _crop(
     image: NDArray[np.uint8], box: NDArray[np.float32], colour: tuple[int, int, int]
 ) -> NDArray[np.uint8]:
-    """A square around the box with half its size of surroundings, as large as a tile."""
+    """A square crop around the box with a margin of 30 % on each side, scaled to a tile."""
     left, top, right, bottom = map(float, box)
     side = max(right - left, bottom - top, 16.0) * 1.6
     scale = _TILE / side
     x0, y0 = (left + right - side) / 2, (top + bottom - side) / 2
-    place = np.array([[scale, 0, -x0 * scale], [0, scale, -y0 * scale]])
+    matrix = np.array([[scale, 0, -x0 * scale], [0, scale, -y0 * scale]])
     shrink = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     tile = cv2.warpAffine(
-        image, place, (_TILE, _TILE), flags=shrink, borderMode=cv2.BORDER_CONSTANT, borderValue=_BACKGROUND
+        image, matrix, (_TILE, _TILE), flags=shrink, borderMode=cv2.BORDER_CONSTANT, borderValue=_BACKGROUND
     )
     corners = [round((left - x0) * scale), round((top - y0) * scale)]
     opposite = [round((right - x0) * scale), round((bottom - y0) * scale)]
@@ -168,7 +169,7 @@ def _title(text: str) -> NDArray[np.uint8]:
     return row
 
 
-def _write(picture: NDArray[np.uint8], text: str, x: int, y: int, size: float = 0.38) -> None:
-    # The built-in font has no other characters than these.
+def _write(canvas: NDArray[np.uint8], text: str, x: int, y: int, size: float = 0.38) -> None:
+    # The built-in font has only ASCII characters.
     plain = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, plain, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
+    cv2.putText(canvas, plain, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""What a labelled data set is to the judge: images, and what is in them."""
+"""Data types of labelled data sets: images and their ground truth."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 
 
 class DatasetError(ValueError):
-    """A data set that cannot be used; the message names the file, the line or entry, and what is wrong."""
+    """A data set that cannot be used; the message names the file, the line or entry, and the problem."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """One image and what is in it.
+    """One image and its ground truth.
 
     Attributes:
         image: the file.
-        boxes: (N, 4) float32 xyxy: pixels, or fractions of the image where `in_fractions`.
+        boxes: (N, 4) float32 xyxy: pixels, or fractions of the image if `in_fractions`.
         class_ids: (N,) int64.
-        in_fractions: as YOLO labels have them.
-        ignored: (N,) bool: a region that may or may not be found (COCO's `iscrowd`).
+        in_fractions: as in YOLO labels.
+        ignored: (N,) bool: regions that need not be detected (COCO's `iscrowd`).
     """
 
     image: Path
@@ -52,10 +52,10 @@ class Dataset:
     """Samples in the order of their files.
 
     Attributes:
-        root: what was opened.
+        root: path that was opened.
         kind: "YOLO" or "COCO".
-        class_names: id → name; None where the data set says nothing of names.
-        samples: with an image each; one without labels shows nothing of any class.
+        class_names: id → name; None if the data set has no names.
+        samples: one per image; one without labels is a negative.
     """
 
     root: Path
@@ -76,8 +76,8 @@ def _images_below(folder: Path) -> Iterator[Path]:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 BGR, turned upright as its EXIF says; raises `DatasetError`."""
+    """(height, width, 3) uint8 BGR, rotated by its EXIF orientation; raises `DatasetError`."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise DatasetError(f"{path}: cannot be read as an image; is it whole?")
+        raise DatasetError(f"{path}: cannot be read as an image; it may be truncated")
     return image.astype(np.uint8, copy=False)

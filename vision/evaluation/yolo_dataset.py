@@ -1,7 +1,7 @@
-"""YOLO-format data sets: an image, and beside it or under `labels/` a text of `class cx cy w h` lines.
+"""YOLO-format data sets: images, with label files of `class cx cy w h` lines beside them or under `labels/`.
 
-Coordinates are fractions of the image. A line with more numbers is a polygon, as segmentation labels have
-it; its box is taken. An image without a text, or with an empty one, shows nothing: a negative.
+Coordinates are fractions of the image. A line with more numbers is a polygon (segmentation label); its
+bounding box is used. An image without a label file, or with an empty one, is a negative.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from vision.plain_yaml import PlainYamlError, load_plain_yaml
 
 _TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
 _SPLITS = ("val", "test", "train")
-# Labels are written with six digits, so that a box at the edge may stand out by as much.
+# Labels are written with six digits, so a box at the edge may exceed it by this much.
 _ROUNDING = 1e-4
 _LARGEST_LABELS_BYTES = 16 << 20
 
 
 def read_yolo(path: Path, split: str | None = None) -> Dataset:
-    """The data set at `path`: a `data.yaml`, a folder with one, or a folder of images. Raises
+    """Read the data set at `path`: a `data.yaml`, a folder with one, or a folder of images. Raises
     `DatasetError`.
     """
     table_path = (
@@ -37,7 +37,7 @@ def read_yolo(path: Path, split: str | None = None) -> Dataset:
         names, images = _names(table, table_path), _images_of(table, table_path, split)
     if not images:
         raise DatasetError(
-            f"{path}: has no images; expected images/ and labels/, or images with texts beside"
+            f"{path}: has no images; expected images/ and labels/, or images with label files beside them"
         )
     samples = tuple(_sample(image, path, names) for image in images)
     if not any(_labels_path(image, path).is_file() for image in images):
@@ -72,20 +72,20 @@ def _names(table: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
 
 
 def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Path]:
-    there = [name for name in _SPLITS if table.get(name)]
-    chosen = split or (there[0] if there else None)
+    available = [name for name in _SPLITS if table.get(name)]
+    chosen = split or (available[0] if available else None)
     if chosen is None and split is None:
         root = path.parent
         return image_files(root / "images" if (root / "images").is_dir() else root)
-    if chosen not in there:
-        raise DatasetError(f"{path}: has no split {chosen!r}; it has {', '.join(there) or 'none'}")
+    if chosen not in available:
+        raise DatasetError(f"{path}: has no split {chosen!r}; it has {', '.join(available) or 'none'}")
     base = path.parent / str(table["path"]) if table.get("path") else path.parent
     if not base.is_dir():
-        base = path.parent  # `path` is often where the author had the data set.
-    places = table[chosen] if isinstance(table[chosen], list) else [table[chosen]]
+        base = path.parent  # `path` is often the author's local path.
+    entries = table[chosen] if isinstance(table[chosen], list) else [table[chosen]]
     found: list[Path] = []
-    for place in places:
-        where = base / str(place)
+    for entry in entries:
+        where = base / str(entry)
         if where.is_dir():
             found += image_files(where)
         elif where.is_file() and where.suffix == ".txt":
@@ -96,19 +96,19 @@ def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Pat
                 if line.strip()
             ]
         else:
-            raise DatasetError(f"{path}: `{chosen}` names {where}, which is not there")
+            raise DatasetError(f"{path}: `{chosen}` names {where}, which does not exist")
     return found
 
 
 def _listed(line: str, base: Path, source: Path, number: int) -> Path:
     image = base / line
     if not image.is_file():
-        raise DatasetError(f"{source}, line {number}: {image} is not there")
+        raise DatasetError(f"{source}, line {number}: {image} does not exist")
     return image
 
 
 def _labels_path(image: Path, root: Path) -> Path:
-    """`…/images/x/1.jpg` → `…/labels/x/1.txt`, the last `images`; elsewhere the text beside the image."""
+    """`…/images/x/1.jpg` → `…/labels/x/1.txt`, for the last `images`; else the file beside the image."""
     parts = list(image.parts)
     below = len((root if root.is_dir() else root.parent).parts)
     for index in range(len(parts) - 2, -1, -1):
@@ -124,7 +124,7 @@ def _sample(image: Path, root: Path, names: tuple[str, ...] | None) -> Sample:
     if not path.is_file():
         return Sample(image, np.zeros((0, 4), np.float32), np.zeros(0, np.int64), in_fractions=True)
     if path.stat().st_size > _LARGEST_LABELS_BYTES:
-        raise DatasetError(f"{path}: has {path.stat().st_size} bytes; that is no text of labels")
+        raise DatasetError(f"{path}: has {path.stat().st_size} bytes, too many for a label file")
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:

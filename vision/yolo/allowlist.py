@@ -1,7 +1,7 @@
-"""What a detection checkpoint may name: the layers and plain values that stand in one.
+"""Names that a detection checkpoint may contain: layers and plain values.
 
-Each becomes an inert record. That a name stands here lets the file be read, so that the builder can name the
-layer it does not know; it does not let anything run.
+Each is read as a stub. A name in this list makes the file readable, so that the builder can report an unknown
+layer; it does not allow any code to run.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _MODELS = (
     "SegmentationModel",
     "YOLOv10DetectionModel",
 )
-# A model saved in the middle of its training carries its loss along; it is not looked at.
+# A model saved during training contains its loss; it is ignored.
 _LOSSES = (
     "ultralytics.utils.loss.BboxLoss",
     "ultralytics.utils.loss.DFLoss",
@@ -74,7 +74,7 @@ _LOSSES = (
     "ultralytics.yolo.v8.detect.train.Loss",
 )
 
-# Until 8.0.6 the settings of the training were omegaconf's, and the model kept them.
+# Until 8.0.6 the training settings were omegaconf objects, stored with the model.
 _OLD_SETTINGS = (
     "__builtin__.dict",
     "omegaconf.base.ContainerMetadata",
@@ -85,12 +85,12 @@ _OLD_SETTINGS = (
     "typing.Any",
 )
 
-INERT: tuple[str, ...] = (
+STUB_NAMES: tuple[str, ...] = (
     *(f"torch.nn.modules.{name}" for name in _TORCH_MODULES),
     *(f"ultralytics.nn.modules.block.{name}" for name in _BLOCKS),
     *(f"ultralytics.nn.modules.conv.{name}" for name in _CONVOLUTIONS),
     *(f"ultralytics.nn.modules.head.{name}" for name in _HEADS),
-    # Until 8.0.90 all layers lay in one file.
+    # Until 8.0.90 all layers were in one file.
     *(f"ultralytics.nn.modules.{name}" for name in (*_BLOCKS, *_CONVOLUTIONS, *_HEADS)),
     *(f"ultralytics.nn.tasks.{name}" for name in _MODELS),
     *_LOSSES,

@@ -1,6 +1,6 @@
 """The network, built row by row from its description.
 
-`build` makes it with fresh weights; the description comes from a checkpoint or from `yolov8_description`.
+`build` creates it with random weights; the description comes from a checkpoint or from `yolov8_description`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription, yolov8_description
-from vision.yolo.layer_config import HEADS, LAYERS, make
+from vision.yolo.layer_config import HEADS, LAYERS, build_layer
 from vision.yolo.layers import Concat, Conv, Detect, LargeKernelDWConv
 
 __all__ = [
@@ -27,8 +27,8 @@ __all__ = [
 ]
 
 _IMAGE = -1
-# The deepest published network repeats 48 blocks; a description of far more is not a network.
-_MOST_REPEATS_ALTOGETHER = 256
+# The deepest published network repeats 48 blocks; far more is not a valid description.
+_MAX_TOTAL_REPEATS = 256
 _LARGEST_STRIDE = 128
 
 
@@ -63,15 +63,15 @@ class YoloModel(nn.Module):
 
     @property
     def end_to_end(self) -> bool:
-        """Whether the head speaks once an object: its boxes are to be selected, not suppressed (NMS)."""
+        """Whether the head predicts each object once: its boxes need no NMS."""
         return self.detect.end_to_end
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """(B, channels, H, W) RGB in 0..1, H and W multiples of the largest stride → raw maps, one a stride.
+        """(B, channels, H, W) RGB in 0..1, H and W multiples of the largest stride → one output per stride.
 
         Each is (B, 4 · reg_max + classes, H / stride, W / stride): first the four box sides (left, top,
-        right, bottom), logits of their distributions or, with `reg_max` 1, distances in cells; then the
-        class logits. An end-to-end head gives its one-to-one maps in evaluation, the others in training.
+        right, bottom), as logits of their distributions or, with `reg_max` 1, distances in cells; then the
+        class logits. An end-to-end head returns its one-to-one outputs in evaluation, the others in training.
         """
         outputs: dict[int, Tensor] = {_IMAGE: x}
         for index, (layer, sources) in enumerate(zip(self.model, self._sources, strict=True)):
@@ -80,14 +80,14 @@ class YoloModel(nn.Module):
                 if self._last_use[source] == index:
                     del outputs[source]
             outputs[index] = layer(inputs if isinstance(layer, Concat | Detect) else inputs[0])
-        maps: list[Tensor] = list(outputs[len(self.model) - 1])
-        return maps
+        levels: list[Tensor] = list(outputs[len(self.model) - 1])
+        return levels
 
-    def decode(self, maps: Sequence[Tensor]) -> Tensor:
-        """Raw maps → (B, N, 4 + classes): xyxy in pixels of the network's input, then scores in 0..1."""
-        flat = torch.cat([level.flatten(2) for level in maps], dim=2).transpose(1, 2)
+    def decode(self, outputs: Sequence[Tensor]) -> Tensor:
+        """Raw outputs → (B, N, 4 + classes): xyxy in pixels of the network's input, then scores in 0..1."""
+        flat = torch.cat([level.flatten(2) for level in outputs], dim=2).transpose(1, 2)
         sides, logits = torch.split(flat, [4 * self.reg_max, len(self.class_names)], dim=2)
-        centres, strides = anchor_points(maps, self.strides)
+        centres, strides = anchor_points(outputs, self.strides)
         boxes = decode_boxes(self.detect.dfl(sides), centres, strides)
         return torch.cat((boxes, logits.sigmoid()), dim=2)
 
@@ -104,23 +104,23 @@ class YoloModel(nn.Module):
 
 
 def build(description: ModelDescription) -> YoloModel:
-    """A network with fresh weights. Raises `ArchitectureError` naming the row that cannot be built."""
+    """Build a network with random weights. Raises `ArchitectureError` naming the row that cannot be built."""
     return YoloModel(description)
 
 
 def build_shapes(description: ModelDescription) -> YoloModel:
-    """The network on the meta device: shapes alone, however large, cost no memory. Raises as `build` does."""
+    """Build the network on the meta device, which needs no memory for weights. Raises as `build` does."""
     with torch.device("meta"):
         return YoloModel(description)
 
 
-def anchor_points(maps: Sequence[Tensor], strides: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """The middle of every cell, level by level and row by row.
+def anchor_points(outputs: Sequence[Tensor], strides: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """The centre of every cell, level by level and row by row.
 
-    Returns (N, 2) x, y in cells of the point's own level, and (N, 1) the level's stride in pixels.
+    Returns (N, 2) x, y in cells of the point's level, and (N, 1) the level's stride in pixels.
     """
     centres, steps = [], []
-    for level, stride in zip(maps, strides, strict=True):
+    for level, stride in zip(outputs, strides, strict=True):
         height, width = level.shape[-2:]
         y, x = torch.meshgrid(
             torch.arange(height, dtype=torch.float32, device=level.device) + 0.5,
@@ -133,23 +133,23 @@ def anchor_points(maps: Sequence[Tensor], strides: Sequence[int]) -> tuple[Tenso
 
 
 def decode_boxes(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
-    """Distances from a cell's middle (…, N, 4: left, top, right, bottom, in cells) → xyxy in pixels."""
+    """Distances from a cell's centre (…, N, 4: left, top, right, bottom, in cells) → xyxy in pixels."""
     return torch.cat((centres - distances[..., :2], centres + distances[..., 2:]), dim=-1) * strides
 
 
 def _build_layers(
     description: ModelDescription,
 ) -> tuple[list[nn.Module], list[tuple[int, ...]], tuple[int, ...]]:
-    """One module per row; for each row the numbers of the rows it reads (-1: the image); the strides."""
+    """One module per row; for each row the indices of the rows it reads (-1: the image); the strides."""
     layers: list[nn.Module] = []
     sources: list[tuple[int, ...]] = []
     channels = {_IMAGE: description.channels}
     reduction = {_IMAGE: 1}
     last = len(description.rows) - 1
     if sum(row.repeats for row in description.rows if row.repeats > 1) * description.depth_multiple > (
-        _MOST_REPEATS_ALTOGETHER
+        _MAX_TOTAL_REPEATS
     ):
-        raise ArchitectureError(f"repeats more than {_MOST_REPEATS_ALTOGETHER} blocks altogether")
+        raise ArchitectureError(f"repeats more than {_MAX_TOTAL_REPEATS} blocks in total")
     for index, row in enumerate(description.rows):
         reads = tuple(index + source if source < 0 else source for source in row.source)
         if not all(source in channels for source in reads):
@@ -159,22 +159,22 @@ def _build_layers(
                 f"row {index} is {row.layer!r:.100}: the last row, and no other, must be 'Detect'"
             )
         if len({reduction[source] for source in reads}) > 1 and row.layer not in HEADS:
-            raise ArchitectureError(f"row {index} ({row.layer}) joins maps of different sizes")
+            raise ArchitectureError(f"row {index} ({row.layer}) joins inputs of different sizes")
         if row.layer not in LAYERS:
             raise ArchitectureError(
-                f"row {index}: unknown layer {row.layer!r:.100}; known are {', '.join(LAYERS)}"
+                f"row {index}: unknown layer {row.layer!r:.100}; known: {', '.join(LAYERS)}"
             )
         try:
-            made = make(row, [channels[source] for source in reads], description)
+            built = build_layer(row, [channels[source] for source in reads], description)
         except ArchitectureError as error:
             raise ArchitectureError(f"row {index} ({row.layer}): {error}") from None
-        layers.append(made.module)
+        layers.append(built.module)
         sources.append(reads)
-        channels[index] = made.channels
-        reduction[index] = reduction[reads[0]] * made.reduction // made.enlargement
+        channels[index] = built.channels
+        reduction[index] = reduction[reads[0]] * built.reduction // built.enlargement
     strides = tuple(reduction[source] for source in sources[-1])
     if strides[0] < 2 or strides[-1] > _LARGEST_STRIDE or list(strides) != sorted(set(strides)):
         raise ArchitectureError(
-            f"row {last}: Detect must read maps each smaller than the one before, got strides {strides}"
+            f"row {last}: Detect must read inputs each smaller than the one before, got strides {strides}"
         )
     return layers, sources, strides

@@ -1,4 +1,4 @@
-"""Task-aligned assignment: which grid cell learns which object, and how strongly.
+"""Task-aligned assignment of grid cells to objects, with the strength of each target.
 
 After TOOD (Feng et al., ICCV 2021, "Task-aligned One-stage Object Detection"): a cell's alignment with an
 object is t = s^α · u^β, with s its score for the object's class and u the IoU of its box with the object's.
@@ -19,11 +19,11 @@ TOP_K = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """What each of A cells of B images should say.
+    """Training targets of each of A cells of B images.
 
     Attributes:
-        foreground: (B, A) bool, the cells that have an object.
-        boxes: (B, A, 4) float, pixels xyxy: the object of the cell; zeros for background.
+        foreground: (B, A) bool, the cells with an object.
+        boxes: (B, A, 4) float, pixels xyxy: the cell's object; zeros for background.
         class_scores: (B, A, classes) float in 0..1: the soft classification target, the alignment
             normalised so that an object's best cell gets the object's best IoU.
     """
@@ -67,15 +67,15 @@ def assign_task_aligned(
         true_boxes: (B, M, 4) pixels xyxy, padded.
         true_classes: (B, M) int64, padded with any valid id.
         present: (B, M) bool, false for the padding.
-        smallest_cell: the finest stride in pixels. An object thinner than that counts as that thick
-            when asking which centres lie inside it, so that no object falls between the cells.
+        smallest_cell: the finest stride in pixels. A thinner object is extended to this width when testing
+            which centres lie inside it, so that it contains at least one.
         top_k: cells per object.
         alpha: exponent of the class score.
         beta: exponent of the IoU.
 
     Returns:
-        An `Assignment` for the A cells of each image. A cell claimed by several objects goes to the one its
-        box overlaps most.
+        An `Assignment` for the A cells of each image. A cell claimed by several objects goes to the one with
+        the largest overlap.
     """
     batch, cells, _ = scores.shape
     most = true_boxes.shape[1]
@@ -86,10 +86,10 @@ def assign_task_aligned(
             torch.zeros_like(scores),
         )
 
-    middle = (true_boxes[..., :2] + true_boxes[..., 2:]) / 2
+    centre = (true_boxes[..., :2] + true_boxes[..., 2:]) / 2
     reach = ((true_boxes[..., 2:] - true_boxes[..., :2]) / 2).clamp(min=smallest_cell / 2)
-    offset = (centres[None, None] - middle[:, :, None]).abs()
-    # ≤: an object exactly between two cells belongs to both, not to none.
+    offset = (centres[None, None] - centre[:, :, None]).abs()
+    # ≤: an object exactly between two cells belongs to both.
     candidate = (offset <= reach[:, :, None]).all(-1) & present[..., None]
 
     overlap = pairwise_iou(true_boxes, boxes) * candidate
@@ -97,7 +97,7 @@ def assign_task_aligned(
     class_score = scores.transpose(1, 2).gather(1, of_class)
     alignment = class_score.pow(alpha) * overlap.pow(beta)
 
-    # Cells outside an object rank below every cell inside it, also while all alignments are still zero.
+    # Cells outside an object rank below every cell inside it, even while all alignments are zero.
     ranked = torch.where(candidate, alignment, torch.full_like(alignment, -1.0))
     best = ranked.topk(min(top_k, cells), dim=-1).indices
     claimed = torch.zeros_like(candidate).scatter_(-1, best, True) & candidate

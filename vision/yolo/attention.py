@@ -1,8 +1,8 @@
-"""Attention over the cells of a map: YOLOv10's and YOLO11's, and YOLO12's over areas.
+"""Attention over the cells of a feature map: YOLOv10's and YOLO11's, and YOLO12's over areas.
 
 References: attention (Vaswani et al., 2017); partial self-attention (YOLOv10, Wang et al., 2024); area
-attention (YOLOv12, Tian et al., 2025). In both a convolution of the values adds what attention alone does
-not see: where a cell lies.
+attention (YOLOv12, Tian et al., 2025). In both, a convolution of the values adds the cell's position, which
+attention alone ignores.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ CHANNELS_PER_AREA_HEAD = 32
 def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
     """Scaled dot-product attention, channels before cells: (…, K, N), (…, K, N), (…, V, N) → (…, V, N)."""
     weights = ((query * query.shape[-2] ** -0.5).transpose(-2, -1) @ key).softmax(dim=-1)
-    seen: Tensor = value @ weights.transpose(-2, -1)
-    return seen
+    attended: Tensor = value @ weights.transpose(-2, -1)
+    return attended
 
 
 class Attention(nn.Module):
-    """Every cell looks at every other. Keys are half as wide as values."""
+    """Attention of every cell to every other. Keys are half as wide as values."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
@@ -39,15 +39,16 @@ class Attention(nn.Module):
         batch, channels, height, width = x.shape
         mixed = self.qkv(x).reshape(batch, self.heads, -1, height * width)
         query, key, value = mixed.split([self.key_width, self.key_width, self.value_width], dim=2)
-        seen = attend(query, key, value).reshape(batch, channels, height, width)
-        y: Tensor = self.proj(seen + self.pe(value.reshape(batch, channels, height, width)))
+        attended = attend(query, key, value).reshape(batch, channels, height, width)
+        y: Tensor = self.proj(attended + self.pe(value.reshape(batch, channels, height, width)))
         return y
 
 
 class AreaAttention(nn.Module):
-    """Every cell looks at the cells of its area: the rows of the map, cut into `areas` equal runs.
+    """Attention of every cell to the cells of its area: the map's rows, divided into `areas` equal runs.
 
-    The number of cells must be a multiple of `areas`; 4 areas at stride 16 are, for sides in multiples of 32.
+    The number of cells must be a multiple of `areas`; with 4 areas at stride 16 it is, for sides in multiples
+    of 32.
     """
 
     def __init__(self, channels: int, heads: int, areas: int) -> None:
@@ -62,9 +63,9 @@ class AreaAttention(nn.Module):
         batch, channels, height, width = x.shape
         mixed = self.qkv(x).reshape(batch, self.heads, 3 * channels // self.heads, self.areas, -1)
         query, key, value = mixed.chunk(3, dim=2)
-        seen = attend(query.transpose(2, 3), key.transpose(2, 3), value.transpose(2, 3)).transpose(2, 3)
-        seen = seen.reshape(batch, channels, height, width)
-        y: Tensor = self.proj(seen + self.pe(value.reshape(batch, channels, height, width)))
+        attended = attend(query.transpose(2, 3), key.transpose(2, 3), value.transpose(2, 3)).transpose(2, 3)
+        attended = attended.reshape(batch, channels, height, width)
+        y: Tensor = self.proj(attended + self.pe(value.reshape(batch, channels, height, width)))
         return y
 
 
@@ -90,7 +91,7 @@ class PSABlock(nn.Module):
 
 
 class PSA(PSABlock):
-    """YOLOv10's: half of the channels pass one attention block, the other half goes around it."""
+    """YOLOv10's: half of the channels pass one attention block, the other half bypasses it."""
 
     def __init__(self, channels: int, *, activation: str = "SiLU") -> None:
         hidden = channels // 2
@@ -99,13 +100,13 @@ class PSA(PSABlock):
         self.cv2 = Conv(2 * hidden, channels, activation=activation)
 
     def forward(self, x: Tensor) -> Tensor:
-        around, through = self.cv1(x).chunk(2, dim=1)
-        y: Tensor = self.cv2(torch.cat((around, super().forward(through)), dim=1))
+        bypass, through = self.cv1(x).chunk(2, dim=1)
+        y: Tensor = self.cv2(torch.cat((bypass, super().forward(through)), dim=1))
         return y
 
 
 class C2PSA(nn.Module):
-    """YOLO11's: the same with `repeats` attention blocks."""
+    """YOLO11's: as `PSA`, with `repeats` attention blocks."""
 
     def __init__(self, channels: int, repeats: int = 1, *, activation: str = "SiLU") -> None:
         super().__init__()
@@ -115,13 +116,13 @@ class C2PSA(nn.Module):
         self.m = nn.Sequential(*(PSABlock(hidden, activation=activation) for _ in range(repeats)))
 
     def forward(self, x: Tensor) -> Tensor:
-        around, through = self.cv1(x).chunk(2, dim=1)
-        y: Tensor = self.cv2(torch.cat((around, self.m(through)), dim=1))
+        bypass, through = self.cv1(x).chunk(2, dim=1)
+        y: Tensor = self.cv2(torch.cat((bypass, self.m(through)), dim=1))
         return y
 
 
 class ABlock(nn.Module):
-    """Area attention, then a feed-forward network `mlp_ratio` as wide, each added to its input."""
+    """Area attention, then a feed-forward network `mlp_ratio` times as wide, each added to its input."""
 
     def __init__(
         self, channels: int, areas: int = 1, mlp_ratio: float = 2.0, *, activation: str = "SiLU"

@@ -1,4 +1,4 @@
-"""Changing a training picture without changing what it shows: mirror, zoom and shift, colour."""
+"""Augmentation of labelled training images: mirror, zoom and shift, colour."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 PADDING_GREY = 114
-"""The grey a letterbox pads with, so that training has seen such borders."""
+"""Padding value of the letterbox, so that training includes such borders."""
 
 LabelledImage = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]
 """Image (height, width, 3) uint8 BGR; boxes (N, 4) float32 pixels xyxy; class ids (N,) int64.
 
-An id ~class (negative) marks an object that is neither to be found nor to be taken for background."""
+An id ~class (negative) marks an object that is neither to be detected nor background."""
 
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
-    """How far a picture may be changed. Fractions are of the original value.
+    """Limits of the changes. Fractions are of the original value.
 
     Attributes:
         mirror: probability of a left–right mirror.
-        zoom_probability: probability of a zoom with a shift; otherwise the geometry stays.
-        zoom_min: smallest zoom; below 1 the picture gets grey borders.
+        zoom_probability: probability of a zoom with a shift.
+        zoom_min: smallest zoom; below 1 the image gets grey borders.
         zoom_max: largest zoom.
         hue: largest shift of the hue, as a fraction of the colour circle.
         saturation: largest relative change of the saturation.
         brightness: largest relative change of the brightness.
-        visible_fraction: an object of which less than this stays in the picture is no longer labelled.
-        min_side_px: nor is one whose box gets a smaller side than this.
-        min_area_px: nor one whose box gets a smaller area.
+        visible_fraction: an object with less than this share inside the image is no longer labelled.
+        min_side_px: nor is one whose box has a smaller side than this.
+        min_area_px: nor one whose box has a smaller area.
     """
 
     mirror: float = 0.5
@@ -55,10 +55,10 @@ def augment(
     limits: Augmentation,
     size: tuple[int, int] | None = None,
 ) -> LabelledImage:
-    """A changed copy. The same `rng` state gives the same change.
+    """An augmented copy. The same `rng` state gives the same change.
 
-    `size` (width, height) of the copy; None: the scene's own. In a smaller one the scene is shown whole, as a
-    letterbox shows it, or a part of it, zoomed up to `zoom_max` times the scene's own pixels.
+    `size` (width, height) of the copy; None: the scene's. A smaller copy shows the whole scene, letterboxed,
+    or a part of it, zoomed up to `zoom_max` times the scene's pixels.
     """
     image, boxes, class_ids = scene
     if rng.random() < limits.mirror:
@@ -75,11 +75,11 @@ def augment(
 def mirrored(
     image: NDArray[np.uint8], boxes: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Left and right exchanged. Box edges are continuous coordinates: 0 is the left edge, width the right."""
+    """Mirror left and right. Box edges are continuous coordinates: 0 is the left edge, width the right."""
     width = image.shape[1]
-    turned = boxes.copy()
-    turned[:, 0], turned[:, 2] = width - boxes[:, 2], width - boxes[:, 0]
-    return image[:, ::-1], turned
+    mirrored_boxes = boxes.copy()
+    mirrored_boxes[:, 0], mirrored_boxes[:, 2] = width - boxes[:, 2], width - boxes[:, 0]
+    return image[:, ::-1], mirrored_boxes
 
 
 def _zoomed(
@@ -96,16 +96,16 @@ def _zoomed(
     shift = (window - zoom * whole) / 2
     if zoomed:
         zoom = float(np.exp(rng.uniform(np.log(zoom * limits.zoom_min), np.log(limits.zoom_max))))
-        # Zoomed in, the window lies anywhere in the picture; zoomed out, the picture anywhere in the window.
+        # Zoomed in, the window is anywhere in the image; zoomed out, the image anywhere in the window.
         shift = rng.random(2) * (window - zoom * whole)
         if len(boxes) and (window < whole).any() and rng.random() < 0.7:
-            # Most of a large scene is empty: look where an object is.
-            middle = boxes[int(rng.integers(len(boxes)))].reshape(2, 2).mean(axis=0) * zoom
+            # Most of a large scene is empty: prefer a window with an object.
+            centre = boxes[int(rng.integers(len(boxes)))].reshape(2, 2).mean(axis=0) * zoom
             room = window - zoom * whole
             shift = np.clip(
-                rng.uniform(0.1, 0.9, 2) * window - middle, np.minimum(room, 0), np.maximum(room, 0)
+                rng.uniform(0.1, 0.9, 2) * window - centre, np.minimum(room, 0), np.maximum(room, 0)
             )
-    # warpAffine counts from pixel centres, boxes from pixel edges: half a pixel each way.
+    # warpAffine counts from pixel centres, boxes from pixel edges: half a pixel each.
     centre_shift = shift + 0.5 * zoom - 0.5
     matrix = np.array([[zoom, 0, centre_shift[0]], [0, zoom, centre_shift[1]]])
     warped = cv2.warpAffine(
@@ -120,11 +120,11 @@ def _zoomed(
     clipped = np.clip(moved, 0, np.tile(window, 2)).astype(np.float32)
     area = (moved[:, 2:] - moved[:, :2]).prod(1)
     sides = clipped[:, 2:] - clipped[:, :2]
-    left = sides.prod(1)
-    cut = left < limits.visible_fraction * np.maximum(area, 1e-9)
-    small = (sides.min(1, initial=np.inf) < limits.min_side_px) | (left < limits.min_area_px)
+    visible_area = sides.prod(1)
+    cut = visible_area < limits.visible_fraction * np.maximum(area, 1e-9)
+    small = (sides.min(1, initial=np.inf) < limits.min_side_px) | (visible_area < limits.min_area_px)
     ids = np.where((cut | small) & (class_ids >= 0), ~class_ids, class_ids)
-    shown = left > 0
+    shown = visible_area > 0
     return warped.astype(np.uint8, copy=False), clipped[shown], ids[shown]
 
 

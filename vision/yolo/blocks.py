@@ -1,6 +1,6 @@
-"""The blocks between input and head: cross-stage partial blocks of every model family, pooling, joining.
+"""Blocks between input and head: cross-stage partial blocks of every model family, pooling, concatenation.
 
-Attribute names (`cv1`, `m`, `gamma` …) are those that checkpoints in circulation use.
+Attribute names (`cv1`, `m`, `gamma` …) are those of published checkpoints.
 
 References: CSPNet (Wang et al., 2019); SPP (He et al., 2014); the published model tables of YOLOv5u, YOLOv8,
 YOLO11, YOLO12 and YOLO26; YOLOv12 (Tian et al., 2025).
@@ -18,7 +18,7 @@ from vision.yolo.convolution import Conv, same_padding
 
 
 class Bottleneck(nn.Module):
-    """Two convolutions, with a shortcut around them where the channel counts allow and it is asked.
+    """Two convolutions, with a shortcut around them if requested and the channel counts allow it.
 
     `expansion` is the width between the two, as a share of `outputs`.
     """
@@ -45,9 +45,9 @@ class Bottleneck(nn.Module):
 
 
 class GrowingBlock(nn.Module):
-    """Cross-stage partial block that keeps every stage: `hidden` channels pass `repeats` stages in a row.
+    """Cross-stage partial block that keeps every stage: `hidden` channels pass `repeats` stages in sequence.
 
-    With `parts` 2 as many go around them, with 1 none do.
+    With `parts` 2 the same number of channels bypasses them, with 1 none.
     """
 
     def __init__(
@@ -69,10 +69,10 @@ class GrowingBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         first = self.cv1(x)
-        kept = [first] if self.parts == 1 else list(first.chunk(self.parts, dim=1))
+        outputs = [first] if self.parts == 1 else list(first.chunk(self.parts, dim=1))
         for stage in self.m:
-            kept.append(stage(kept[-1]))
-        y: Tensor = self.cv2(torch.cat(kept, dim=1))
+            outputs.append(stage(outputs[-1]))
+        y: Tensor = self.cv2(torch.cat(outputs, dim=1))
         return y
 
 
@@ -98,7 +98,7 @@ class C2f(GrowingBlock):
 
 
 class C2(nn.Module):
-    """Half of the channels pass `repeats` bottlenecks, the other half goes around them (YOLOv8-P6)."""
+    """Half of the channels pass `repeats` bottlenecks, the other half bypasses them (YOLOv8-P6)."""
 
     def __init__(
         self,
@@ -119,8 +119,8 @@ class C2(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        through, around = self.cv1(x).chunk(2, dim=1)
-        y: Tensor = self.cv2(torch.cat((self.m(through), around), dim=1))
+        through, bypass = self.cv1(x).chunk(2, dim=1)
+        y: Tensor = self.cv2(torch.cat((self.m(through), bypass), dim=1))
         return y
 
 
@@ -217,7 +217,7 @@ class C3k2(GrowingBlock):
 class A2C2f(GrowingBlock):
     """YOLO12's (R-ELAN): stages of two area-attention blocks each, or of one C3k each.
 
-    With `residual` the whole is added to its input, scaled by the learnt `gamma`.
+    With `residual` the result, scaled by the learnt `gamma`, is added to the input.
     """
 
     def __init__(
@@ -251,9 +251,9 @@ class A2C2f(GrowingBlock):
 
 
 class SPPF(nn.Module):
-    """Spatial pyramid pooling: one pooling window applied `pools` times sees as many window sizes.
+    """Spatial pyramid pooling: one pooling window applied `pools` times gives as many window sizes.
 
-    YOLO26's adds the input where the channel counts allow (`shortcut`) and leaves out the first activation.
+    YOLO26's adds the input where the channel counts allow (`shortcut`) and omits the first activation.
     """
 
     def __init__(
@@ -284,7 +284,7 @@ class SPPF(nn.Module):
 
 
 class Concat(nn.Module):
-    """Joins several maps along one axis."""
+    """Concatenates several inputs along one axis."""
 
     def __init__(self, dimension: int = 1) -> None:
         super().__init__()

@@ -1,9 +1,9 @@
-"""Checkpoints: our own pair of files, and the ordinary Ultralytics `.pt`, both read without running them.
+"""Checkpoints: our own pair of files, and Ultralytics' `.pt`, both read without running code from them.
 
-Our own is `NAME.safetensors` with `NAME.yaml` (`checkpoint_pair`). The first version's was a dictionary that
-`torch.load(weights_only=True)` reads too, `{"format", "description", "state_dict" (float16), "metadata"}`.
+Our own is `NAME.safetensors` with `NAME.yaml` (`checkpoint_pair`). The first version was a dictionary that
+`torch.load(weights_only=True)` also reads, `{"format", "description", "state_dict" (float16), "metadata"}`.
 An Ultralytics checkpoint is a pickled `DetectionModel`; its description, class names and tensors are taken
-from the inert records that `torch_archive` makes of it.
+from the stubs that `torch_archive` creates.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ _MOST_NODES = 100_000
 _MOST_MODULES = 20_000
 _LONGEST_NAME = 500
 _LONGEST_TEXT = 100_000
-# Of all layers together: the largest published networks have some eighty.
+# Of all layers together: the largest published networks have about eighty.
 _MOST_REPEATS = 256
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedModel:
-    """A checkpoint that was read.
+    """A loaded checkpoint.
 
     Attributes:
         model: float32, on the CPU, in evaluation mode, batch normalisation not folded.
         class_names: id → name.
-        description: what it was built from.
-        metadata: plain values: licence, origin, score, whatever the file tells.
+        description: the architecture it was built from.
+        metadata: plain values of the file: licence, origin, score and others.
     """
 
     model: YoloModel
@@ -64,11 +64,11 @@ class LoadedModel:
 
 
 def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str, Any]) -> None:
-    """Write `model` at `path`, weights as float16 (those beyond its range as float32), in one step.
+    """Write `model` to `path` atomically, weights as float16 (those beyond its range as float32).
 
     Args:
         path: `NAME.safetensors` (its description goes to `NAME.yaml` beside it), or `.pt`.
-        metadata: plain values only (dicts, lists, texts, numbers, booleans, None), else `TypeError`.
+        metadata: plain values only (dicts, lists, strings, numbers, booleans, None), else `TypeError`.
     """
     path = Path(path)
     try:
@@ -86,7 +86,7 @@ def save_checkpoint(path: str | Path, model: YoloModel, *, metadata: Mapping[str
         "state_dict": weights,
         "metadata": plain_metadata,
     }
-    # A reader, or the next start after a power cut, sees the old file or the new one.
+    # A reader, or a start after a power failure, sees either the old or the new file.
     partial = path.with_name(f"{path.name}.partial")
     torch.save(content, partial)
     os.replace(partial, path)
@@ -98,13 +98,13 @@ def load_checkpoint(path: str | Path) -> LoadedModel:
     Of Ultralytics': YOLOv5u, v8, v10, 11, 12, 26.
 
     Raises:
-        UnsafeCheckpointError: the file asks for code to be run, named in the message.
+        UnsafeCheckpointError: the file requests a function call, named in the message.
         CheckpointError: missing, damaged, of another kind, or weights that do not fit the description.
     """
     pair = is_pair(Path(path))
     content = read_pair(Path(path)) if pair else read_archive(path)
     try:
-        return _described(content) if pair else _interpret(content)
+        return _from_description(content) if pair else _interpret(content)
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
         raise kind(one_line(f"{path}: {error}")) from None
@@ -117,7 +117,7 @@ def _interpret(content: Any) -> LoadedModel:
         raise CheckpointError("not a detection checkpoint: expected a dictionary with a model in it")
     if "format" in content:
         return _interpret_own(content)
-    # The averaged weights, where training kept them, are the better ones.
+    # The averaged weights, if training kept them, are the better ones.
     record = content["model"] if content.get("ema") is None and "model" in content else content.get("ema")
     if not isinstance(record, Stub):
         raise CheckpointError(
@@ -129,11 +129,11 @@ def _interpret(content: Any) -> LoadedModel:
 def _interpret_own(content: dict[Any, Any]) -> LoadedModel:
     if content["format"] != FORMAT:
         raise CheckpointError(f"has format {shown(content['format'])}, this version reads {FORMAT!r}")
-    return _described(content)
+    return _from_description(content)
 
 
-def _described(content: dict[Any, Any]) -> LoadedModel:
-    """A network from `description`, `state_dict` and `metadata`."""
+def _from_description(content: dict[Any, Any]) -> LoadedModel:
+    """Build a network from `description`, `state_dict` and `metadata`."""
     description = ModelDescription.from_plain(_plain_dictionary(content, "description"))
     weights = content.get("state_dict")
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
@@ -151,7 +151,7 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
     description = as_trained(description, modules)
     model = _with_weights(description, dict(_weights(modules)))
     stride = modules[f"model.{len(description.rows) - 1}"].state.get("stride")
-    # The first few: as a list of numbers a large tensor would be many times as large.
+    # Only the first few: a large tensor as a list of numbers would be many times as large.
     if isinstance(stride, Tensor) and (found := stride.flatten()[:9].tolist()) != list(model.strides):
         raise CheckpointError(f"its head has strides {found!r:.100}, not {model.strides}")
     for name, module in model.named_modules():
@@ -161,14 +161,14 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
             if type(epsilon) is not float or not 0 < epsilon < 1:
                 raise CheckpointError(f"{name} has the epsilon {shown(epsilon)}, expected a small number")
             module.eps = epsilon
-    metadata = {"origin": f"Ultralytics {_note(content, 'version')}".strip()}
+    metadata = {"origin": f"Ultralytics {_text(content, 'version')}".strip()}
     for key, source in (("licence", "license"), ("date", "date")):
-        if _note(content, source):
-            metadata[key] = _note(content, source)
+        if _text(content, source):
+            metadata[key] = _text(content, source)
     return LoadedModel(model, description.class_names, description, metadata)
 
 
-def _note(content: dict[Any, Any], key: str) -> str:
+def _text(content: dict[Any, Any], key: str) -> str:
     value = content.get(key)
     return value[:200] if isinstance(value, str) else ""
 
@@ -209,16 +209,16 @@ def _modules(record: Stub) -> Iterator[tuple[str, Stub]]:
 
 
 def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, Tensor]]:
-    """Each tensor with its dotted name, taken out of its module: who gets it holds it alone."""
+    """Each tensor with its dotted name, removed from its module so that there is no second reference."""
     for name, module in modules.items():
-        passing = module.state.get("_non_persistent_buffers_set", frozenset())
+        non_persistent = module.state.get("_non_persistent_buffers_set", frozenset())
         for kind in ("_parameters", "_buffers"):
             tensors = module.state.get(kind, {})
             if not isinstance(tensors, dict):
                 raise CheckpointError(f"{name}'s {kind} are not a dictionary")
             for key in list(tensors):
                 tensor = tensors.pop(key)
-                if tensor is None or (isinstance(passing, frozenset) and key in passing):
+                if tensor is None or (isinstance(non_persistent, frozenset) and key in non_persistent):
                     continue
                 if not isinstance(tensor, Tensor):
                     raise CheckpointError(f"{name}.{key} is not a tensor")
@@ -226,12 +226,12 @@ def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, Tensor]]:
 
 
 def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
-    """The described network with exactly these weights; every name of either side accounted for.
+    """Build the described network with exactly these weights; missing and unknown names are errors.
 
-    Empties `weights`, so that a number is not held twice for longer than its layer needs.
+    Empties `weights`, so that no tensor is held twice for longer than its layer needs.
     """
     _check_sizes(description, weights)
-    # Shapes only: a description that promises more than the file holds must not cost memory.
+    # Shapes only: a description larger than the file must not cost memory.
     model = build_shapes(description)
     if not any(name.endswith(".bn.weight") for name in weights):
         model.fuse()
@@ -252,17 +252,17 @@ def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> 
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise CheckpointError(f"{name} has numbers that are not finite")
     converted = {}
-    for name, meant in expected.items():
-        converted[name] = weights.pop(name).to(meant.dtype, copy=True).contiguous()
+    for name, target in expected.items():
+        converted[name] = weights.pop(name).to(target.dtype, copy=True).contiguous()
     model.load_state_dict(converted, strict=True, assign=True)
     return model.eval()
 
 
 def _check_sizes(description: ModelDescription, weights: dict[str, Tensor]) -> None:
-    """What a file makes large: layers repeated, and the same numbers used for many weights."""
+    """Reject what makes a small file large: repeated layers, and tensors that share storage."""
     repeats = sum(max(1, round(row.repeats * description.depth_multiple)) for row in description.rows)
     if repeats > _MOST_REPEATS:
-        raise CheckpointError(f"describes {repeats} layers, at most {_MOST_REPEATS} make sense")
+        raise CheckpointError(f"describes {repeats} layers, the limit is {_MOST_REPEATS}")
     storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage() for tensor in weights.values()}
     if sum(tensor.nbytes for tensor in weights.values()) > sum(map(len, storages.values())):
         raise CheckpointError("uses the same numbers for several weights; it is not a checkpoint")
@@ -284,13 +284,13 @@ def _plain_dictionary(content: Mapping[Any, Any], key: str) -> dict[Any, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A bounded copy of containers and scalars, so that nothing later is led around a maze of references."""
-    left = _MOST_NODES
+    """A bounded copy of containers and scalars, so that later code never follows shared references."""
+    nodes_left = _MOST_NODES
 
     def copy(value: Any, depth: int) -> Any:
-        nonlocal left
-        left -= 1
-        if depth > _DEEPEST or left < 0:
+        nonlocal nodes_left
+        nodes_left -= 1
+        if depth > _DEEPEST or nodes_left < 0:
             raise CheckpointError("its description is too deep or too long")
         if isinstance(value, str) and len(value) > _LONGEST_TEXT:
             raise CheckpointError(f"has a text of {len(value)} characters in its description")

@@ -1,8 +1,7 @@
-"""A checkpoint as two plain files: `NAME.safetensors`, the numbers, and `NAME.yaml`, what they are.
+"""A checkpoint as two plain files: `NAME.safetensors`, the weights, and `NAME.yaml`, their description.
 
-The YAML file says `format`, `weights` (file name, size, SHA-256 of the other), `architecture` (class
-names, the rows of the network) and whatever else there is to tell: licence, training, score. Neither can
-hold a program.
+The YAML file contains `format`, `weights` (file name, size, SHA-256 of the other), `architecture` (class
+names, the rows of the network) and further metadata: licence, training, score. Neither file can contain code.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def is_pair(path: Path) -> bool:
 
 
 def pair_paths(path: Path) -> tuple[Path, Path]:
-    """Either file of a pair → (weights, description). Of `.yaml` and `.yml` the one that is there."""
+    """Either file of a pair → (weights, description). Of `.yaml` and `.yml` the existing one."""
     if path.suffix.lower() in DESCRIPTION_SUFFIXES:
         return path.with_suffix(WEIGHTS_SUFFIX), path
     candidates = [path.with_suffix(suffix) for suffix in DESCRIPTION_SUFFIXES]
@@ -41,18 +40,18 @@ def pair_paths(path: Path) -> tuple[Path, Path]:
 
 
 def read_pair(path: Path) -> dict[str, Any]:
-    """Both files → `description`, `state_dict`, `metadata`, as the other reader gives them.
+    """Read both files → `description`, `state_dict`, `metadata`.
 
     Raises:
-        CheckpointError: a file is missing or damaged, or the two do not belong together. One line.
+        CheckpointError: a file is missing or damaged, or the two do not match. One line.
     """
     from vision.yolo.safetensors_file import read_safetensors
 
     weights_path, description_path = pair_paths(path)
     table = _read_description(description_path, weights_path)
-    said = table.pop("weights", {})
+    declared = table.pop("weights", {})
     try:
-        _check_belongs(weights_path, said, description_path)
+        _check_belongs(weights_path, declared, description_path)
         content = read_safetensors(weights_path)
     except CheckpointError as error:
         raise CheckpointError(one_line(f"{weights_path}: {error}")) from None
@@ -74,17 +73,17 @@ def read_pair(path: Path) -> dict[str, Any]:
 def write_pair(
     path: Path, description: Mapping[str, Any], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
 ) -> None:
-    """Write `path` (`NAME.safetensors`) and `NAME.yaml`; a reader never sees a half-written file.
+    """Write `path` (`NAME.safetensors`) and `NAME.yaml`; a reader never sees a partly written file.
 
     Args:
-        description: a network's own, `ModelDescription.to_plain()`.
-        metadata: plain values; the keys `format`, `weights` and `architecture` are taken.
+        description: of the network, `ModelDescription.to_plain()`.
+        metadata: plain values; the keys `format`, `weights` and `architecture` are reserved.
     """
     from vision.yolo.safetensors_file import write_safetensors
 
-    taken = metadata.keys() & {"format", "weights", "architecture"}
-    if taken:
-        raise ValueError(f"the metadata must not have the key {sorted(taken)[0]!r}")
+    reserved = metadata.keys() & {"format", "weights", "architecture"}
+    if reserved:
+        raise ValueError(f"the metadata must not have the key {sorted(reserved)[0]!r}")
     description_path = path.with_suffix(DESCRIPTION_SUFFIXES[0])
     weights_partial = path.with_name(f"{path.name}.partial")
     description_partial = description_path.with_name(f"{description_path.name}.partial")
@@ -97,16 +96,16 @@ def write_pair(
             "sha256": file_sha256(weights_partial),
         },
         **metadata,
-        "architecture": _shown(description),
+        "architecture": _one_line_rows(description),
     }
     with description_partial.open("w", encoding="utf-8") as file:
         file.write("# What is in the file of the same name that ends in .safetensors.\n")
-        # The emitter takes this one character for a line break where it does not escape.
+        # The emitter treats this one character as a line break if it is not escaped.
         readable = "\\x85" not in repr(table)
         yaml.dump(table, file, Dumper=_Dumper, sort_keys=False, allow_unicode=readable, width=110)
         file.flush()
         os.fsync(file.fileno())
-    # Should the power fail between the two, the checksum tells that they do not belong together.
+    # After a power failure between the two, the checksum shows that they do not match.
     os.replace(weights_partial, path)
     os.replace(description_partial, description_path)
 
@@ -118,7 +117,7 @@ def file_sha256(path: Path) -> str:
 
 
 def weights_sha256(path: Path) -> str:
-    """What tells one model from another: the SHA-256 of the checkpoint, of a pair that of its weights."""
+    """Identifies a model: the SHA-256 of the checkpoint, or of a pair's weights."""
     return file_sha256(pair_paths(path)[0] if is_pair(path) else path)
 
 
@@ -126,13 +125,11 @@ def _read_description(path: Path, weights_path: Path) -> dict[str, Any]:
     try:
         size = path.stat().st_size
         if size > _LARGEST_DESCRIPTION_BYTES:
-            raise CheckpointError(
-                f"{path}: has {size} bytes, at most {_LARGEST_DESCRIPTION_BYTES} make sense"
-            )
+            raise CheckpointError(f"{path}: has {size} bytes, the limit is {_LARGEST_DESCRIPTION_BYTES}")
         table = load_plain_yaml(path.read_bytes().decode("utf-8"))
     except FileNotFoundError:
         raise CheckpointError(
-            f"{path}: no such file; {weights_path.name} needs it beside it, it says what the weights are"
+            f"{path}: no such file; {weights_path.name} needs it beside it, as the description of the weights"
         ) from None
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
@@ -150,23 +147,23 @@ def _read_description(path: Path, weights_path: Path) -> dict[str, Any]:
     return table
 
 
-def _check_belongs(weights_path: Path, said: Any, description_path: Path) -> None:
-    """What the description says of the weights, where it says anything; by hand one may leave it out."""
-    if not isinstance(said, dict):
+def _check_belongs(weights_path: Path, declared: Any, description_path: Path) -> None:
+    """Compare the weights with their checksum in the description, if it has one."""
+    if not isinstance(declared, dict):
         raise CheckpointError(f"`weights` in {description_path.name} must be a table, or left out")
-    expected = said.get("sha256")
+    expected = declared.get("sha256")
     if expected is None:
         return
     try:
         found = file_sha256(weights_path)
     except FileNotFoundError:
-        return  # The reader says it better.
+        return  # The reader reports it.
     except OSError as error:
         raise CheckpointError(f"cannot be read ({error.strerror or error})") from None
     if found != expected:
         raise CheckpointError(
             f"has the SHA-256 {found}, {description_path.name} was written for {expected!s:.100}; "
-            "the two do not belong together, copy both again"
+            "the two do not match, copy both again"
         )
 
 
@@ -191,8 +188,8 @@ _Dumper.add_representer(
 )
 
 
-def _shown(description: Mapping[str, Any]) -> dict[str, Any]:
-    """The description with one line a row of the network."""
+def _one_line_rows(description: Mapping[str, Any]) -> dict[str, Any]:
+    """The description with one line per row of the network."""
     return {
         key: [_Row(row) if isinstance(row, list) else row for row in value]
         if key in ("backbone", "head")

@@ -1,4 +1,4 @@
-"""YOLOv10's blocks, which spend less where channels repeat one another (Wang et al., 2024)."""
+"""YOLOv10's blocks, which reduce computation on redundant channels (Wang et al., 2024)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from vision.yolo.convolution import Conv, DWConv
 
 
 class LargeKernelDWConv(nn.Module):
-    """Two depthwise convolutions side by side, 7×7 and 3×3, added and activated (RepVGG, Ding et al., 2021).
+    """Two parallel depthwise convolutions, 7×7 and 3×3, added and activated (RepVGG, Ding et al., 2021).
 
-    `fuse` makes one 7×7 convolution of them.
+    `fuse` merges them into one 7×7 convolution.
     """
 
     def __init__(self, channels: int) -> None:
@@ -85,7 +85,7 @@ class C2fCIB(GrowingBlock):
 
 
 class SCDown(nn.Module):
-    """YOLOv10's halving: channels by a 1×1 convolution, size by a depthwise one."""
+    """YOLOv10's downsampling: channels by a 1×1 convolution, size by a depthwise one."""
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int = 3, stride: int = 2, *, activation: str = "SiLU"

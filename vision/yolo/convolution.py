@@ -1,7 +1,6 @@
-"""The convolution that every network here is made of, and its depthwise form.
+"""The basic convolution of all networks, and its depthwise form.
 
-Attribute names (`conv`, `bn`, `act`) are those that checkpoints in circulation use, so that weights load by
-name.
+Attribute names (`conv`, `bn`, `act`) are those of published checkpoints, so that weights load by name.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ def same_padding(kernel: int) -> int:
 class Conv(nn.Module):
     """Convolution without bias → batch normalisation → activation.
 
-    (B, `inputs`, H, W) → (B, `outputs`, H / stride, W / stride). `activation` None leaves the last step out;
+    (B, `inputs`, H, W) → (B, `outputs`, H / stride, W / stride). `activation` None omits the last step;
     `padding` None keeps the size at stride 1.
     """
 
@@ -60,7 +59,7 @@ class Conv(nn.Module):
         if norm.running_mean is None or norm.running_var is None:
             raise ValueError("a batch normalisation without running statistics cannot be folded")
         self.bn = nn.Identity()
-        if conv.weight.is_meta:  # Shapes alone: nothing to compute, and torch would import much to do so.
+        if conv.weight.is_meta:  # Shapes only: nothing to compute, and torch would import much to do so.
             conv.bias = nn.Parameter(norm.bias.detach().clone())
             return
         with torch.no_grad():
@@ -72,7 +71,7 @@ class Conv(nn.Module):
 
 
 class DWConv(Conv):
-    """The same with as many groups as both channel counts allow: one filter per channel where they agree."""
+    """A `Conv` with as many groups as both channel counts allow: one filter per channel if they are equal."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
-"""What a network is made of: rows of (from, repeats, layer, arguments) and three multipliers.
+"""The description of a network: rows of (from, repeats, layer, arguments) and three multipliers.
 
-A checkpoint carries this description of itself; `yolov8_description` and `published_description` write the
-published ones.
+A checkpoint contains its description; `yolov8_description` and `published_description` return the published
+ones.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vision.yolo.convolution import ACTIVATIONS
-from vision.yolo.layer_spec import ArchitectureError, LayerSpec, settle_pooling, settle_scale
+from vision.yolo.layer_spec import ArchitectureError, LayerSpec, apply_pooling_form, apply_scale
 
 __all__ = ["YOLOV8_SCALES", "ArchitectureError", "LayerSpec", "ModelDescription", "yolov8_description"]
 
@@ -25,28 +25,28 @@ YOLOV8_SCALES: dict[str, tuple[float, float, int]] = {
 }
 _LARGEST_ROWS = 128
 _LARGEST_CLASS_WIDTH = 1 << 14
-# Since these layers the class branches of the head are light.
-_LIGHT_SINCE = frozenset({"C3k2", "A2C2f", "C2fCIB", "v10Detect"})
+# Families with these layers have depthwise class branches in the head.
+_LIGHT_CLASS_LAYERS = frozenset({"C3k2", "A2C2f", "C2fCIB", "v10Detect"})
 
 
 @dataclass(frozen=True, slots=True)
 class ModelDescription:
-    """Everything needed to build a network but its weights.
+    """Everything needed to build a network except its weights.
 
     Attributes:
         class_names: id → name.
-        backbone, head: the rows, numbered on from backbone to head.
+        backbone, head: the rows, numbered consecutively from backbone to head.
         depth_multiple: multiplies the repeats of every row that has more than one.
         width_multiple: multiplies channel counts, rounded up to a multiple of 8.
-        max_channels: channel counts are limited to this before the width multiple; None for no limit.
+        max_channels: limit of channel counts before the width multiple; None for no limit.
         channels: of the input image.
-        reg_max: bins of the distribution over each box side; 1 for none, the sides themselves.
+        reg_max: bins of the distribution over each box side; 1: the sides are predicted directly.
         activation: `SiLU` or `ReLU`.
-        unscaled_channels: channel counts that the width multiple leaves alone. (Ultralytics' networks do not
-            scale a row whose channel count equals the number of classes.)
+        unscaled_channels: channel counts that the width multiple does not apply to. (Ultralytics' networks do
+            not scale a row whose channel count equals the number of classes.)
         light_classes: the head's class branches are depthwise (YOLOv10, YOLO11 and later).
-        class_width: channels within the head's class branches; None for the usual.
-        end_to_end: the head speaks once an object, and needs no NMS.
+        class_width: channels within the head's class branches; None for the default.
+        end_to_end: the head predicts each object once and needs no NMS.
     """
 
     class_names: tuple[str, ...]
@@ -89,18 +89,18 @@ class ModelDescription:
                 raise ArchitectureError(f"{name} must be true or false, got {getattr(self, name)!r:.200}")
         if not isinstance(self.activation, str) or self.activation not in ACTIVATIONS:
             raise ArchitectureError(
-                f"unknown activation {self.activation!r:.200}; known are {', '.join(ACTIVATIONS)}"
+                f"unknown activation {self.activation!r:.200}; known: {', '.join(ACTIVATIONS)}"
             )
         if not 1 <= len(self.rows) <= _LARGEST_ROWS:
             raise ArchitectureError(f"a network needs 1..{_LARGEST_ROWS} rows, got {len(self.rows)}")
 
     @property
     def rows(self) -> tuple[LayerSpec, ...]:
-        """The rows of backbone and head, in the order in which the network runs them."""
+        """The rows of backbone and head, in execution order."""
         return self.backbone + self.head
 
     def to_plain(self) -> dict[str, Any]:
-        """The description as plain dicts, lists, strings and numbers; `from_plain` reads it back."""
+        """The description as plain dicts, lists, strings and numbers; the inverse of `from_plain`."""
         return {
             "nc": len(self.class_names),
             "names": list(self.class_names),
@@ -124,8 +124,8 @@ class ModelDescription:
     ) -> ModelDescription:
         """Read a model table: our own (`to_plain`) or one with a `scales` table and a `scale` letter in it.
 
-        What such a table leaves unsaid, because its scale or its layers imply it, the description says.
-        `class_names` overrides the table's `names`. Raises `ArchitectureError`.
+        Values that such a table implies by its scale or its layers are made explicit. `class_names` overrides
+        the table's `names`. Raises `ArchitectureError`.
         """
         names = plain.get("names") if class_names is None else class_names
         if isinstance(names, str) or not isinstance(names, Sequence):
@@ -133,7 +133,7 @@ class ModelDescription:
         depth, width, max_channels = _multiples(plain)
         plain_rows = [*_list(plain, "backbone"), *_list(plain, "head")]
         rows = tuple(
-            settle_scale(settle_pooling(LayerSpec.from_plain(row, index)), _scale(plain))
+            apply_scale(apply_pooling_form(LayerSpec.from_plain(row, index)), _scale(plain))
             for index, row in enumerate(plain_rows)
         )
         layers = {row.layer for row in rows}
@@ -149,7 +149,7 @@ class ModelDescription:
             reg_max=_first(plain, ("reg_max",), 16),
             activation=_activation_name(_first(plain, ("activation",), "SiLU")),
             unscaled_channels=tuple(_list(plain, "unscaled_channels")),
-            light_classes=_first(plain, ("light_classes",), not _LIGHT_SINCE.isdisjoint(layers)),
+            light_classes=_first(plain, ("light_classes",), not _LIGHT_CLASS_LAYERS.isdisjoint(layers)),
             class_width=plain.get("class_width"),
             end_to_end=_first(plain, ("end2end",), "v10Detect" in layers),
         )
@@ -164,40 +164,40 @@ def yolov8_description(scale: str | tuple[float, float, int], class_names: Seque
     """
     if isinstance(scale, str):
         if scale not in YOLOV8_SCALES:
-            raise ArchitectureError(f"unknown scale {scale!r}; known are {', '.join(YOLOV8_SCALES)}")
+            raise ArchitectureError(f"unknown scale {scale!r}; known: {', '.join(YOLOV8_SCALES)}")
         scale = YOLOV8_SCALES[scale]
     depth, width, max_channels = scale
-    before = (-1,)
+    previous = (-1,)
 
     def down(channels: int) -> LayerSpec:
-        return LayerSpec(before, 1, "Conv", (channels, 3, 2))
+        return LayerSpec(previous, 1, "Conv", (channels, 3, 2))
 
-    upsample = LayerSpec(before, 1, "nn.Upsample", (None, 2, "nearest"))
+    upsample = LayerSpec(previous, 1, "nn.Upsample", (None, 2, "nearest"))
     backbone = (
         down(64),
         down(128),
-        LayerSpec(before, 3, "C2f", (128, True)),
+        LayerSpec(previous, 3, "C2f", (128, True)),
         down(256),
-        LayerSpec(before, 6, "C2f", (256, True)),
+        LayerSpec(previous, 6, "C2f", (256, True)),
         down(512),
-        LayerSpec(before, 6, "C2f", (512, True)),
+        LayerSpec(previous, 6, "C2f", (512, True)),
         down(1024),
-        LayerSpec(before, 3, "C2f", (1024, True)),
-        LayerSpec(before, 1, "SPPF", (1024, 5)),
+        LayerSpec(previous, 3, "C2f", (1024, True)),
+        LayerSpec(previous, 1, "SPPF", (1024, 5)),
     )
     head = (
         upsample,
         LayerSpec((-1, 6), 1, "Concat", (1,)),
-        LayerSpec(before, 3, "C2f", (512,)),
+        LayerSpec(previous, 3, "C2f", (512,)),
         upsample,
         LayerSpec((-1, 4), 1, "Concat", (1,)),
-        LayerSpec(before, 3, "C2f", (256,)),
+        LayerSpec(previous, 3, "C2f", (256,)),
         down(256),
         LayerSpec((-1, 12), 1, "Concat", (1,)),
-        LayerSpec(before, 3, "C2f", (512,)),
+        LayerSpec(previous, 3, "C2f", (512,)),
         down(512),
         LayerSpec((-1, 9), 1, "Concat", (1,)),
-        LayerSpec(before, 3, "C2f", (1024,)),
+        LayerSpec(previous, 3, "C2f", (1024,)),
         LayerSpec((15, 18, 21), 1, "Detect", ("nc",)),
     )
     return ModelDescription(tuple(class_names), backbone, head, depth, width, max_channels)
@@ -246,7 +246,7 @@ def _multiples(plain: Mapping[Any, Any]) -> tuple[float, float, int | None]:
 
 
 def _scale(plain: Mapping[Any, Any]) -> str:
-    """The letter of the scale; empty where the table has none. Bad ones are refused by `_multiples`."""
+    """The letter of the scale; empty if the table has none. `_multiples` rejects invalid ones."""
     scales = plain.get("scales")
     first = next(iter(scales)) if isinstance(scales, Mapping) and scales else ""
     scale = plain.get("scale") or first

@@ -1,4 +1,4 @@
-"""Judging a model on drawn scenes that training has not seen."""
+"""Evaluation of a model on rendered scenes that training has not seen."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def evaluate(
     """Mean average precision over `count` scenes of `width` × `height` pixels (multiples of 32).
 
     Args:
-        model: in evaluation mode, or it is put into it.
+        model: is put into evaluation mode.
         scenes: draws the scenes.
         seed: of the held-out set; far from every training seed.
-        confidence: detections below it are not counted; low, so that the whole recall range is judged.
-        iou: of the suppression of overlapping boxes.
+        confidence: detections below it are ignored; low, so that the whole recall range is covered.
+        iou: NMS IoU threshold.
 
     Raises:
-        ValueError: the size is no multiple of 32, or the source gives something that is no scene.
+        ValueError: the size is not a multiple of 32, or the source returns an invalid scene.
     """
     if width % 32 or height % 32:
-        raise ValueError(f"scenes to judge must be multiples of 32 pixels, got {width}x{height}")
+        raise ValueError(f"evaluation scenes must be multiples of 32 pixels, got {width}x{height}")
     model.eval()
     results = []
     for index in range(count):

@@ -1,6 +1,6 @@
 """The anchor-free heads: with and without distributions over the box sides, with and without NMS.
 
-Attribute names (`cv2`, `cv3`, `one2one_cv2`, `dfl` …) are those that checkpoints in circulation use.
+Attribute names (`cv2`, `cv3`, `one2one_cv2`, `dfl` …) are those of published checkpoints.
 
 References: generalised focal loss, for the box sides as distributions (Li et al., 2020); consistent dual
 assignments, for the end-to-end head (YOLOv10, Wang et al., 2024); focal loss, for the prior (Lin et al.,
@@ -26,7 +26,7 @@ class DFL(nn.Module):
         super().__init__()
         self.bins = bins
         self.conv = nn.Conv2d(bins, 1, 1, bias=False).requires_grad_(False)
-        # On the processor, whatever the default: counting on the meta device makes torch import sympy.
+        # On the CPU, whatever the default device: arange on the meta device makes torch import sympy.
         distances = torch.arange(bins, dtype=torch.float32, device="cpu")
         self.conv.weight.data.copy_(distances.view(1, bins, 1, 1))
 
@@ -38,18 +38,18 @@ class DFL(nn.Module):
 
 
 class Detect(nn.Module):
-    """The head: for each level one map of box sides and class logits.
+    """The head: for each level box sides and class logits.
 
     A list of (B, C_i, H_i, W_i) → a list of (B, 4 · reg_max + classes, H_i, W_i). With `reg_max` 1 the first
-    four channels are the distances themselves, in cells; else `dfl` makes distances of them.
+    four channels are the distances themselves, in cells; otherwise `dfl` converts them to distances.
 
-    An end-to-end head has every branch twice. The one-to-many branches learn from many cells an object and
-    need NMS; they answer in training. The one-to-one branches learnt to speak once an object; they answer in
-    evaluation, and `fuse` drops the others.
+    An end-to-end head has every branch twice. The one-to-many branches learn from many cells per object, need
+    NMS, and are used in training. The one-to-one branches predict each object once and are used in
+    evaluation; `fuse` drops the others.
 
     Args:
         light: class branches of depthwise and 1×1 convolutions (YOLOv10, YOLO11 and later).
-        class_width: channels within the class branches; None for the usual.
+        class_width: channels within the class branches; None for the default.
     """
 
     def __init__(
@@ -82,12 +82,12 @@ class Detect(nn.Module):
 
     @property
     def box_branches(self) -> nn.ModuleList:
-        """Of the branches that answer in evaluation, those of the box sides, one a level."""
+        """The box branches used in evaluation, one per level."""
         return self.one2one_cv2 if self.end_to_end else self.cv2
 
     @property
     def class_branches(self) -> nn.ModuleList:
-        """Of the branches that answer in evaluation, those of the class logits, one a level."""
+        """The class branches used in evaluation, one per level."""
         return self.one2one_cv3 if self.end_to_end else self.cv3
 
     def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
@@ -100,15 +100,15 @@ class Detect(nn.Module):
         ]
 
     def fuse(self) -> None:
-        """Drop the branches that never answer in evaluation."""
+        """Drop the branches that are not used in evaluation."""
         if self.end_to_end and not self._fused:
             del self.cv2, self.cv3
         self._fused = True
 
     def initialise_biases(self, strides: Sequence[int], image_size: int = 640) -> None:
-        """Start with each class as rare as 5 objects in an `image_size` picture (after Lin et al., 2017).
+        """Set the prior of each class to 5 objects per image of side `image_size` (after Lin et al., 2017).
 
-        Without this prior the thousands of background cells drown the first epochs.
+        Without it the loss of thousands of background cells dominates the first epochs.
         """
         pairs = [(self.box_branches, self.class_branches)]
         if self.end_to_end and not self._fused:

@@ -1,4 +1,4 @@
-"""The arguments of a description's row, each checked when it is asked for."""
+"""The arguments of a description's row, checked on access."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MOST_REPEATS = 64
 
 @dataclass(frozen=True, slots=True)
 class LayerArguments:
-    """A row while it is being made. Every method raises `ArchitectureError` for an argument out of place.
+    """A row being built. Every method raises `ArchitectureError` for an invalid argument.
 
     Attributes:
         inputs: channels of the rows it reads.
@@ -68,7 +68,7 @@ class LayerArguments:
 
     def ungrouped(self, position: int) -> None:
         if self._argument(position, 1) != 1:
-            raise ArchitectureError(f"knows no groups, got {self._argument(position, 1)!r:.100}")
+            raise ArchitectureError(f"does not support groups, got {self._argument(position, 1)!r:.100}")
 
     def _argument(self, position: int, default: object) -> object:
         return self.row.arguments[position] if position < len(self.row.arguments) else default
@@ -87,5 +87,5 @@ class LayerArguments:
             return 1
         repeats = max(1, round(self.row.repeats * self.description.depth_multiple))
         if repeats > _MOST_REPEATS:
-            raise ArchitectureError(f"would repeat {repeats} times, at most {_MOST_REPEATS} make sense")
+            raise ArchitectureError(f"would repeat {repeats} times, the limit is {_MOST_REPEATS}")
         return repeats

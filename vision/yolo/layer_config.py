@@ -1,4 +1,4 @@
-"""From a row of the description to its module: arguments checked, channels and repeats scaled."""
+"""Builds the module of a description's row: checks its arguments, scales channels and repeats."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ HEADS = ("Detect", "v10Detect")
 
 @dataclass(frozen=True, slots=True)
 class BuiltLayer:
-    """A row's module, the channels it gives, and by how much it makes the map smaller and larger."""
+    """A row's module, its output channels, and the factors by which it reduces and enlarges the size."""
 
     module: nn.Module
     channels: int
@@ -41,12 +41,12 @@ class BuiltLayer:
     enlargement: int = 1
 
 
-def make(row: LayerSpec, inputs: Sequence[int], description: ModelDescription) -> BuiltLayer:
-    """The module of `row`, one of `LAYERS`, which reads maps of `inputs` channels.
+def build_layer(row: LayerSpec, inputs: Sequence[int], description: ModelDescription) -> BuiltLayer:
+    """Build the module of `row`, one of `LAYERS`, for inputs with `inputs` channels.
 
     Raises `ArchitectureError`.
     """
-    return _MAKERS[row.layer](LayerArguments(row, tuple(inputs), description))
+    return _BUILDERS[row.layer](LayerArguments(row, tuple(inputs), description))
 
 
 def _conv(row: LayerArguments) -> BuiltLayer:
@@ -58,7 +58,7 @@ def _conv(row: LayerArguments) -> BuiltLayer:
     padding = row.number(3, "padding", LARGEST_KERNEL, None) if len(row.row.arguments) > 3 else None
     if padding is None and kernel % 2 == 0:
         raise ArchitectureError(f"the kernel must be odd where no padding is given, got {kernel}")
-    # What keeps every size a whole number of cells: size / stride, neither more nor less.
+    # Keeps every size a whole number of cells: exactly size / stride.
     if (2 * (same_padding(kernel) if padding is None else padding) - kernel) // stride != -1:
         raise ArchitectureError(f"a kernel of {kernel} with padding {padding} does not divide by its stride")
     module = Conv(row.single(), channels, kernel, stride, padding=padding, activation=row.activation)
@@ -84,9 +84,9 @@ def _scdown(row: LayerArguments) -> BuiltLayer:
 
 
 def _partial(block: type[C2 | C2f | C3], shortcut: bool) -> Callable[[LayerArguments], BuiltLayer]:
-    """The older cross-stage partial blocks, which differ in whether they have shortcuts unless told."""
+    """The older cross-stage partial blocks, which differ in their default of `shortcut`."""
 
-    def maker(row: LayerArguments) -> BuiltLayer:
+    def builder(row: LayerArguments) -> BuiltLayer:
         row.takes(4)
         row.ungrouped(2)
         channels = row.channels()
@@ -100,7 +100,7 @@ def _partial(block: type[C2 | C2f | C3], shortcut: bool) -> Callable[[LayerArgum
         )
         return BuiltLayer(module, channels)
 
-    return maker
+    return builder
 
 
 def _c3k2(row: LayerArguments) -> BuiltLayer:
@@ -128,7 +128,7 @@ def _a2c2f(row: LayerArguments) -> BuiltLayer:
     row.ungrouped(6)
     channels, expansion = row.channels(), row.ratio(5, "expansion", 0.5)
     area_attention = row.flag(1, "area attention", True)
-    # Without area attention the number of areas means nothing; the published tables write -1.
+    # Without area attention the number of areas is unused; the published tables write -1.
     areas = row.number(2, "number of areas", 64, 1) if area_attention else 1
     residual = row.flag(3, "residual", False)
     if int(channels * expansion) % CHANNELS_PER_AREA_HEAD:
@@ -174,10 +174,10 @@ def _c2psa(row: LayerArguments) -> BuiltLayer:
 
 
 def _attended(row: LayerArguments) -> int:
-    """The channels of a block whose half passes attention: as many as it reads."""
+    """The channels of a block in which half pass attention: output channels equal input channels."""
     channels = row.channels()
     if row.single() != channels:
-        raise ArchitectureError(f"gives as many channels as it reads, {row.single()}, got {channels}")
+        raise ArchitectureError(f"needs as many output channels as inputs, {row.single()}, got {channels}")
     _divides_into_heads(channels // 2)
     return channels
 
@@ -207,14 +207,16 @@ def _upsample(row: LayerArguments) -> BuiltLayer:
     row.once()
     size, factor, mode = (*row.row.arguments, None, None, None)[:3]
     if size not in (None, "None") or type(factor) is not int or factor != 2 or mode != "nearest":
-        raise ArchitectureError(f"only [None, 2, 'nearest'] is known, got {list(row.row.arguments)!r:.200}")
+        raise ArchitectureError(
+            f"only [None, 2, 'nearest'] is supported, got {list(row.row.arguments)!r:.200}"
+        )
     return BuiltLayer(nn.Upsample(scale_factor=2, mode="nearest"), row.single(), enlargement=2)
 
 
 def _concat(row: LayerArguments) -> BuiltLayer:
     row.once()
     if tuple(row.row.arguments) not in ((), (1,)):
-        raise ArchitectureError(f"joins channels (axis 1), got {list(row.row.arguments)!r:.200}")
+        raise ArchitectureError(f"concatenates channels (axis 1), got {list(row.row.arguments)!r:.200}")
     return BuiltLayer(Concat(1), sum(row.inputs))
 
 
@@ -238,7 +240,7 @@ def _detect(row: LayerArguments) -> BuiltLayer:
     return BuiltLayer(module, 0)
 
 
-_MAKERS: dict[str, Callable[[LayerArguments], BuiltLayer]] = {
+_BUILDERS: dict[str, Callable[[LayerArguments], BuiltLayer]] = {
     "A2C2f": _a2c2f,
     "C2PSA": _c2psa,
     "C2": _partial(C2, shortcut=True),
@@ -257,5 +259,5 @@ _MAKERS: dict[str, Callable[[LayerArguments], BuiltLayer]] = {
     "nn.Upsample": _upsample,
     "v10Detect": _detect,
 }
-LAYERS = tuple(sorted(_MAKERS))
-"""The layers that a row may name."""
+LAYERS = tuple(sorted(_BUILDERS))
+"""The supported layer names."""

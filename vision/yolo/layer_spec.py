@@ -1,4 +1,4 @@
-"""One row of a network's description, and what an older or terser table leaves unsaid about it."""
+"""One row of a network's description, and the values that older or shorter tables imply."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class LayerSpec:
         return [source, self.repeats, self.layer, list(self.arguments)]
 
     def with_argument(self, position: int, value: Any, defaults: Sequence[Any]) -> LayerSpec:
-        """The row with one argument set; those before it that it left out are filled from `defaults`.
+        """The row with one argument set; omitted arguments before it are filled from `defaults`.
 
-        A row that says so already, or leaves it out because `defaults` does, stays as it is.
+        A row that already has the value, explicitly or by `defaults`, stays unchanged.
         """
         if value == (*self.arguments, *defaults[len(self.arguments) :])[position]:
             return self
@@ -57,18 +57,18 @@ class LayerSpec:
         return replace(self, arguments=tuple(arguments[: max(len(self.arguments), position + 1)]))
 
 
-# After the channels: what a row that leaves them out means.
+# Defaults of omitted arguments; the first, the channels, has none.
 C3K2_DEFAULTS = (None, False, 0.5, False, 1, True)
 A2C2F_DEFAULTS = (None, True, 1, False, 2.0, 0.5, 1, True)
 PUBLISHED_MLP_RATIOS = (2.0, 1.2)
 SPPF_DEFAULTS = (None, 5, 3, False, True)
 
 
-def settle_scale(row: LayerSpec, scale: str) -> LayerSpec:
-    """YOLO11, 12 and 26 share one table among their scales, and the larger ones read it differently.
+def apply_scale(row: LayerSpec, scale: str) -> LayerSpec:
+    """Make explicit what a table shared by all scales (YOLO11, 12 and 26) implies for the larger ones.
 
-    From m on every C3k2 is made of C3k blocks; from l on area attention has a residual and a narrower
-    feed-forward network. Here the row says so itself.
+    From m on, every C3k2 consists of C3k blocks; from l on, area attention has a residual and a narrower
+    feed-forward network.
     """
     if row.layer == "C3k2" and scale in ("m", "l", "x"):
         return row.with_argument(1, True, C3K2_DEFAULTS)
@@ -80,7 +80,7 @@ def settle_scale(row: LayerSpec, scale: str) -> LayerSpec:
     return row
 
 
-def settle_pooling(row: LayerSpec) -> LayerSpec:
+def apply_pooling_form(row: LayerSpec) -> LayerSpec:
     """An SPPF row with more than a kernel is YOLO26's form: no activation after its first convolution."""
     if row.layer == "SPPF" and 2 < len(row.arguments) < len(SPPF_DEFAULTS):
         return row.with_argument(4, False, SPPF_DEFAULTS)

@@ -1,4 +1,4 @@
-"""Every layer that a detection network's description may name, in one place."""
+"""All layers of detection networks, re-exported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a network says of one image, before boxes are made of it; the same from every runtime."""
+"""Raw network outputs of one image, before decoding; the same for every runtime."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Cells whose boxes are computed at once: bounds the memory of a frame with thousands.
+# Cells whose boxes are computed at once: limits the memory for a frame with thousands.
 _MOST_CELLS = 512
 
 Product = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
@@ -17,15 +17,15 @@ Product = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelOutput:
-    """One level's raw maps. Any memory order; a reader must not keep them past the next inference.
+    """Raw outputs of one level. Any memory order; valid until the next inference.
 
     Attributes:
         classes: (K, H, W) float32 logits of the head's `class_ids`, in their order.
         sides: (4 · reg_max, H, W) float32: logits of the distributions of left, top, right, bottom; with
-            reg_max 1 the distances themselves, in cells. None where `neck` is there instead.
-        neck: (C, H, W) float32: what the head reads. The few cells that matter get their sides from it.
-        features: (F, H, W) float32: what the last convolution of the class branch reads. There where the
-            head computes some classes alone, as the others' logits follow from it; else None.
+            reg_max 1 the distances themselves, in cells. None if `neck` is given instead.
+        neck: (C, H, W) float32: input of the head, from which the sides of candidate cells are computed.
+        features: (F, H, W) float32: input of the class branch's last convolution. Only if the head computes
+            some of the classes, to derive the others' logits; else None.
     """
 
     classes: NDArray[np.float32]
@@ -36,14 +36,14 @@ class LevelOutput:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClassRows:
-    """One level's last class convolution (1×1), of all classes, for a few cells at a time.
+    """One level's last class convolution (1×1), for all classes, applied to a few cells at a time.
 
-    Classes with the very same weights tie always, and the lowest id wins; so each distinct row is kept once,
-    by its lowest id, and rounding cannot decide between equals.
+    Classes with identical weights always tie, and the lowest id wins; so each distinct row is kept once, by
+    its lowest id, and rounding cannot decide between equals.
 
     Attributes:
         weight: (R, F) float32. bias: (R,) float32.
-        class_id: (R,) int64, rising: the lowest class with this row.
+        class_id: (R,) int64, ascending: the lowest class with this row.
     """
 
     weight: NDArray[np.float32]
@@ -58,7 +58,7 @@ class ClassRows:
         return cls(np.ascontiguousarray(weight[first]), bias[first], first.astype(np.int64))
 
     def best_class(self, features: NDArray[np.float32]) -> NDArray[np.int64]:
-        """(F, N) features of N cells → (N,) their most probable classes, of equals the lowest."""
+        """(F, N) features of N cells → (N,) their most probable classes; the lowest of equals."""
         logits = self.weight @ features + self.bias[:, None]
         best: NDArray[np.int64] = self.class_id[logits.argmax(axis=0)]
         return best
@@ -66,10 +66,10 @@ class ClassRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxBranch:
-    """One level's box branch, for a few cells at a time: 3×3, 3×3 and 1×1 convolutions.
+    """One level's box branch, applied to a few cells at a time: 3×3, 3×3 and 1×1 convolutions.
 
-    A frame has thousands of cells and boxes in dozens; run over the whole map this branch is a sixth of the
-    smallest networks' time. A cell's sides hang on the 5×5 cells around it alone.
+    A frame has thousands of cells and dozens of boxes; over the whole map this branch takes a sixth of the
+    smallest networks' time. A cell's sides depend only on the 5×5 cells around it.
 
     Attributes:
         weights: (9 · C, M), (9 · M, M) and (M, 4 · reg_max) float32, kernels' rows, columns, then channels.
@@ -84,10 +84,10 @@ class BoxBranch:
     def sides(
         self, neck: NDArray[np.float32], cells: NDArray[np.int64], product: Product = np.matmul
     ) -> NDArray[np.float32]:
-        """(C, H, W) map and N cells, row by row → (4 · reg_max, N) as the branch gives at these cells.
+        """(C, H, W) features and N cells, row by row → (4 · reg_max, N) output of the branch at these cells.
 
         Args:
-            product: of two matrices.
+            product: matrix product.
         """
         parts = [
             self._sides(neck, cells[first : first + _MOST_CELLS], product)
@@ -113,11 +113,11 @@ class BoxBranch:
         windows = np.lib.stride_tricks.sliding_window_view(patches, (3, 3), axis=(1, 2))
         flat = windows.transpose(0, 1, 2, 4, 5, 3).reshape(count * 9, -1)
         hidden = self._activated(product(flat, self.weights[0]) + self.biases[0])
-        # Beyond the map's edge the second convolution sees nothing, not what the first would make of nothing.
+        # The second convolution is zero-padded at the map's edge.
         hidden = hidden.reshape(count, 3, 3, -1) * inside[:, 1:4, 1:4]
         hidden = self._activated(product(hidden.reshape(count, -1), self.weights[1]) + self.biases[1])
-        found: NDArray[np.float32] = product(hidden, self.weights[2]) + self.biases[2]
-        return found
+        sides: NDArray[np.float32] = product(hidden, self.weights[2]) + self.biases[2]
+        return sides
 
     def _activated(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         if self.activation == "ReLU":
@@ -129,16 +129,16 @@ class BoxBranch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Head:
-    """How to read the maps.
+    """Layout of the outputs.
 
     Attributes:
-        strides: pixels of the input per cell, one a level.
+        strides: pixels of the input per cell, one per level.
         reg_max: bins of a box side's distribution; 1: the sides are distances.
-        end_to_end: the head speaks once an object; its boxes are selected, not suppressed.
+        end_to_end: the head predicts each object once; its boxes need no NMS.
         class_count: of the model.
-        class_ids: of the maps' class channels; all of the model's, or some.
-        rows: one a level where `class_ids` are not all and the maps bring features; else None.
-        boxes: one a level where the maps bring the neck instead of the sides; else None.
+        class_ids: of the class channels; all of the model's, or some.
+        rows: one per level if `class_ids` are not all and the outputs have features; else None.
+        boxes: one per level if the outputs have the neck instead of the sides; else None.
     """
 
     strides: tuple[int, ...]
@@ -151,19 +151,19 @@ class Head:
 
     @property
     def complete(self) -> bool:
-        """Whether the maps hold every class."""
+        """Whether the outputs contain every class."""
         return len(self.class_ids) == self.class_count
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Of the maps of one level, in the order in which networks give them."""
+        """Kinds of the outputs of one level, in the order of the network's outputs."""
         boxes = ("sides",) if self.boxes is None else ("neck",)
         return (*boxes, "classes") if self.rows is None else (*boxes, "classes", "features")
 
-    def levels(self, maps: Sequence[NDArray[Any]]) -> list[LevelOutput]:
-        """A network's flat list of maps, each (C, H, W), level by level."""
+    def levels(self, outputs: Sequence[NDArray[Any]]) -> list[LevelOutput]:
+        """Group a network's flat list of outputs, each (C, H, W), by level."""
         kinds = self.kinds
         return [
-            LevelOutput(**dict(zip(kinds, maps[first : first + len(kinds)], strict=True)))
-            for first in range(0, len(maps), len(kinds))
+            LevelOutput(**dict(zip(kinds, outputs[first : first + len(kinds)], strict=True)))
+            for first in range(0, len(outputs), len(kinds))
         ]

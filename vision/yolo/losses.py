@@ -18,7 +18,7 @@ from torch import Tensor
 from vision.yolo.assigner import assign_task_aligned
 
 BINS = 16
-"""Distance bins per side of a box; bin k stands for k strides."""
+"""Distance bins per side of a box; bin k is k strides."""
 
 BOX_GAIN = 7.5
 CLASS_GAIN = 0.5
@@ -34,7 +34,7 @@ class DetectionLoss:
         box: scalar, CIoU part, detached.
         classes: scalar, classification part, detached.
         distribution: scalar, distribution focal part, detached.
-        foreground: how many cells were given an object, per image on average.
+        foreground: number of foreground cells per image, on average.
     """
 
     total: Tensor
@@ -46,14 +46,14 @@ class DetectionLoss:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """The objects of B images, padded to the most any of them has.
+    """Ground truth of B images, padded to the largest number of objects.
 
     Attributes:
         boxes: (B, M, 4) float32, pixels xyxy of the network's input.
         classes: (B, M) int64.
         present: (B, M) bool, false for padding.
-        ignored: (B, M) bool: objects too small or too much hidden to be learned. Where one is, its class is
-            neither asked for nor held against the network; other classes are. None: there is none.
+        ignored: (B, M) bool: objects too small or too occluded to be learned. Inside one, its class does not
+            contribute to the loss; other classes do. None: there is none.
     """
 
     boxes: Tensor
@@ -78,22 +78,22 @@ def ciou(first: Tensor, second: Tensor) -> Tensor:
 
     outer = torch.maximum(first[..., 2:], second[..., 2:]) - torch.minimum(first[..., :2], second[..., :2])
     diagonal = outer.square().sum(-1) + tiny
-    apart = (first[..., :2] + first[..., 2:] - second[..., :2] - second[..., 2:]).square().sum(-1) / 4
+    distance = (first[..., :2] + first[..., 2:] - second[..., :2] - second[..., 2:]).square().sum(-1) / 4
 
     angle_first = torch.atan2(size_first[..., 0], size_first[..., 1] + tiny)
     angle_second = torch.atan2(size_second[..., 0], size_second[..., 1] + tiny)
     aspect = (4 / math.pi**2) * (angle_first - angle_second).square()
     with torch.no_grad():
         weight = aspect / (1 - iou + aspect + tiny)
-    return iou - apart / diagonal - weight * aspect
+    return iou - distance / diagonal - weight * aspect
 
 
 def distribution_focal_loss(logits: Tensor, distances: Tensor) -> Tensor:
-    """Cross-entropy against the two bins around each true distance, in proportion to their nearness.
+    """Cross-entropy against the two bins around each true distance, weighted by proximity.
 
     Args:
         logits: (N, 4, BINS) raw bins of each side.
-        distances: (N, 4) true distances in strides; clipped into the bins' range.
+        distances: (N, 4) true distances in strides; clipped to the bins' range.
 
     Returns:
         (N,) the mean over the four sides.
@@ -123,23 +123,23 @@ def cell_grid(
     return torch.cat(centres), torch.cat(sizes)
 
 
-def detection_loss(maps: Sequence[Tensor], strides: Sequence[float], truth: Truth) -> DetectionLoss:
+def detection_loss(outputs: Sequence[Tensor], strides: Sequence[float], truth: Truth) -> DetectionLoss:
     """The loss of one batch.
 
     Args:
-        maps: raw head outputs, one per stride, (B, 4 · BINS + classes, H, W): first the bins of left, top,
+        outputs: raw head outputs, one per stride, (B, 4 · BINS + classes, H, W): first the bins of left, top,
             right and bottom, then the class logits.
-        strides: pixels per cell of each map.
+        strides: pixels per cell of each output.
         truth: the objects of the B images.
 
     Raises:
-        ValueError: a map has no room for class logits.
+        ValueError: an output has no class logits.
     """
-    channels = maps[0].shape[1]
+    channels = outputs[0].shape[1]
     if channels <= 4 * BINS:
-        raise ValueError(f"head maps must have {4 * BINS} + classes channels, got {channels}")
-    centres, cell_sizes = cell_grid([(m.shape[2], m.shape[3]) for m in maps], strides, maps[0].device)
-    flat = torch.cat([m.flatten(2) for m in maps], 2).transpose(1, 2)
+        raise ValueError(f"head outputs must have {4 * BINS} + classes channels, got {channels}")
+    centres, cell_sizes = cell_grid([(m.shape[2], m.shape[3]) for m in outputs], strides, outputs[0].device)
+    flat = torch.cat([m.flatten(2) for m in outputs], 2).transpose(1, 2)
     bin_logits = flat[..., : 4 * BINS].reshape(*flat.shape[:2], 4, BINS)
     class_logits = flat[..., 4 * BINS :]
 
@@ -154,18 +154,18 @@ def detection_loss(maps: Sequence[Tensor], strides: Sequence[float], truth: Trut
             truth.present,
             smallest_cell=float(min(strides)),
         )
-    # The soft targets' sum is the batch's amount of evidence; below one object it must not blow losses up.
+    # The sum of the soft targets normalises the loss; with less than one object it must not inflate it.
     evidence = target.class_scores.sum().clamp(min=1.0)
     entropy = F.binary_cross_entropy_with_logits(class_logits, target.class_scores, reduction="none")
-    classes = (entropy * _judged(truth, centres, cell_sizes, target.class_scores)).sum() / evidence
+    classes = (entropy * _class_mask(truth, centres, cell_sizes, target.class_scores)).sum() / evidence
 
     image, cell = target.foreground.nonzero(as_tuple=True)
     weight = target.class_scores[image, cell].sum(-1)
     chosen = bin_logits[image, cell]
-    middle, size = centres[cell], cell_sizes[cell][:, None]
+    centre, size = centres[cell], cell_sizes[cell][:, None]
     true_boxes = target.boxes[image, cell]
-    box = ((1 - ciou(_boxes_from_bins(chosen, middle, size), true_boxes)) * weight).sum() / evidence
-    distances = torch.cat([middle - true_boxes[:, :2], true_boxes[:, 2:] - middle], -1) / size
+    box = ((1 - ciou(_boxes_from_bins(chosen, centre, size), true_boxes)) * weight).sum() / evidence
+    distances = torch.cat([centre - true_boxes[:, :2], true_boxes[:, 2:] - centre], -1) / size
     distribution = (distribution_focal_loss(chosen, distances) * weight).sum() / evidence
 
     box, classes, distribution = BOX_GAIN * box, CLASS_GAIN * classes, DISTRIBUTION_GAIN * distribution
@@ -178,17 +178,17 @@ def detection_loss(maps: Sequence[Tensor], strides: Sequence[float], truth: Trut
     )
 
 
-def _judged(truth: Truth, centres: Tensor, cell_sizes: Tensor, class_scores: Tensor) -> Tensor:
-    """(B, A, classes) 1, and 0 where an ignored object of the class is and nothing is to be learned."""
-    judged = torch.ones_like(class_scores)
+def _class_mask(truth: Truth, centres: Tensor, cell_sizes: Tensor, class_scores: Tensor) -> Tensor:
+    """(B, A, classes) weights: 0 inside an ignored object of the class, 1 elsewhere."""
+    mask = torch.ones_like(class_scores)
     if truth.ignored is None:
-        return judged
+        return mask
     for image, item in truth.ignored.nonzero().tolist():
         left, top, right, bottom = truth.boxes[image, item].tolist()
         x, y, reach = centres[:, 0], centres[:, 1], cell_sizes / 2
         inside = (x > left - reach) & (x < right + reach) & (y > top - reach) & (y < bottom + reach)
-        judged[image, inside, int(truth.classes[image, item])] = 0.0
-    return torch.where(class_scores > 0, 1.0, judged)
+        mask[image, inside, int(truth.classes[image, item])] = 0.0
+    return torch.where(class_scores > 0, 1.0, mask)
 
 
 def _boxes_from_bins(bin_logits: Tensor, centres: Tensor, cell_sizes: Tensor) -> Tensor:

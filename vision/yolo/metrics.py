@@ -1,7 +1,7 @@
-"""How good a detector is: average precision after COCO's rules (101 recall points, IoU 0.50 to 0.95).
+"""Average precision by COCO's rules (101 recall points, IoU 0.50 to 0.95).
 
-Ours, as it is a hundred lines of numpy and training needs it everywhere; the tests hold it to `pycocotools`,
-COCO's own program, where that is installed.
+Implemented here because it is a hundred lines of numpy that training always needs; the tests compare it with
+`pycocotools`, COCO's reference, where that is installed.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 IOU_THRESHOLDS: NDArray[np.float64] = np.linspace(0.5, 0.95, 10)
-# k / 100 rounds as a recall of found / objects does; multiples of a step would not, and miss by one bit.
+# k / 100 rounds like a recall of found / objects; multiples of a step would differ in the last bit.
 RECALL_POINTS = np.arange(101) / 100
 DETECTIONS_PER_IMAGE = 100
 WRONG, RIGHT, NEITHER = 0, 1, 2
-"""What a detection is: it finds no object, it finds one, or it lies on one that may or may not be found."""
+"""Verdict on a detection: matches no object, matches one, or lies in an ignored region."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageResult:
-    """What was found in one image and what is there. Boxes (N, 4) pixels xyxy, other arrays (N,).
+    """Detections and ground truth of one image. Boxes (N, 4) pixels xyxy, other arrays (N,).
 
-    `ignored` marks true boxes that may or may not be found (COCO's crowds); empty: none.
+    `ignored` marks ground truth that need not be detected (COCO's crowds); empty: none.
     """
 
     boxes: NDArray[np.float32]
@@ -41,9 +41,9 @@ class ImageResult:
 
 @dataclass(frozen=True, slots=True)
 class ClassScore:
-    """Average precision of one class: at IoU 0.50, the mean over 0.50:0.95, and the number of true objects.
+    """Average precision of one class: at IoU 0.50, the mean over 0.50:0.95, and the number of objects.
 
-    Both are NaN when there is no true object of the class.
+    Both are NaN if there is no object of the class.
     """
 
     ap50: float
@@ -53,7 +53,7 @@ class ClassScore:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Means over the classes that occur, each class's own score by name, and how many images were judged."""
+    """Means over the classes that occur, each class's score by name, and the number of images."""
 
     map50: float
     map50_95: float
@@ -63,9 +63,9 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """One class at one confidence and IoU 0.50: detections that are right and wrong, and the true objects.
+    """One class at one confidence and IoU 0.50: true positives, false positives and objects.
 
-    `precision` and `recall` are NaN where there is no detection, no object.
+    `precision` is NaN without detections, `recall` without objects.
     """
 
     right: int
@@ -94,10 +94,10 @@ def box_iou(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[
 def score_detections(results: Sequence[ImageResult], class_names: Sequence[str]) -> Score:
     """Mean average precision over images.
 
-    Within a class, detections are taken in falling confidence over all images; each takes the true box of its
-    image that it overlaps most among those not taken yet, and is right if that IoU reaches the threshold. At
-    most 100 detections of a class count in an image. A detection that takes none but lies in an ignored
-    region is neither right nor wrong.
+    Within a class, detections are processed by descending confidence over all images; each is matched with
+    the unmatched object of its image that it overlaps most, and is right if that IoU reaches the threshold.
+    At most 100 detections of a class count per image. An unmatched detection in an ignored region is neither
+    right nor wrong.
 
     Raises:
         ValueError: a class id is outside `class_names`.
@@ -117,25 +117,27 @@ def score_detections(results: Sequence[ImageResult], class_names: Sequence[str])
 
 
 def judge(result: ImageResult, confidence: float) -> NDArray[np.int8]:
-    """(N,) what each detection of an image is at IoU 0.50; NEITHER for those below `confidence`."""
+    """(N,) verdict on each detection of an image at IoU 0.50; NEITHER below `confidence`."""
     verdict = np.full(len(result.class_ids), NEITHER, np.int8)
     for class_id in np.unique(result.class_ids).tolist():
-        mine = np.flatnonzero((result.class_ids == class_id) & (result.confidences >= confidence))
-        mine = mine[np.argsort(-result.confidences[mine], kind="stable")]
+        selected = np.flatnonzero((result.class_ids == class_id) & (result.confidences >= confidence))
+        selected = selected[np.argsort(-result.confidences[selected], kind="stable")]
         true = result.true_class_ids == class_id
-        verdict[mine] = _verdicts(result.boxes[mine], result.true_boxes[true], result.ignored[true])[0]
+        verdict[selected] = _verdicts(result.boxes[selected], result.true_boxes[true], result.ignored[true])[
+            0
+        ]
     return verdict
 
 
 def operating_points(
     results: Sequence[ImageResult], class_names: Sequence[str], confidence: float
 ) -> dict[str, OperatingPoint]:
-    """Class name → what all detections of at least this confidence come to."""
+    """Class name → operating point of the detections of at least this confidence."""
     verdicts = [judge(result, confidence) for result in results]
     points = {}
     for class_id, name in enumerate(class_names):
-        said = [v[r.class_ids == class_id] for v, r in zip(verdicts, results, strict=True)]
-        right, wrong = (sum(int((v == kind).sum()) for v in said) for kind in (RIGHT, WRONG))
+        of_class = [v[r.class_ids == class_id] for v, r in zip(verdicts, results, strict=True)]
+        right, wrong = (sum(int((v == kind).sum()) for v in of_class) for kind in (RIGHT, WRONG))
         objects = sum(int(((r.true_class_ids == class_id) & ~r.ignored).sum()) for r in results)
         points[name] = OperatingPoint(right, wrong, objects)
     return points
@@ -146,11 +148,11 @@ def average_precision(confidences: NDArray[np.float32], right: NDArray[np.bool_]
 
     Args:
         confidences: (N,) of all detections of the class.
-        right: (N,) which of them found a true object.
-        objects: how many true objects there are, at least 1.
+        right: (N,) whether each matches an object.
+        objects: number of objects, at least 1.
 
     Raises:
-        ValueError: there are no true objects; the precision is not defined then.
+        ValueError: there are no objects, so the precision is undefined.
     """
     if objects < 1:
         raise ValueError(f"average precision needs at least one true object, got {objects}")
@@ -160,7 +162,7 @@ def average_precision(confidences: NDArray[np.float32], right: NDArray[np.bool_]
     found = np.cumsum(right[order])
     recall = found / objects
     precision = found / np.arange(1, len(found) + 1)
-    # The best precision still to be had at this recall or beyond.
+    # The best precision at this recall or beyond.
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     at = np.searchsorted(recall, RECALL_POINTS, side="left")
     reached = at < len(envelope)
@@ -172,11 +174,11 @@ def _score_class(results: Sequence[ImageResult], class_id: int) -> ClassScore:
     verdicts: list[NDArray[np.int8]] = []
     objects = 0
     for result in results:
-        mine, true = result.class_ids == class_id, result.true_class_ids == class_id
+        selected, true = result.class_ids == class_id, result.true_class_ids == class_id
         objects += int((true & ~result.ignored).sum())
-        if not mine.any():
+        if not selected.any():
             continue
-        boxes, confidence = result.boxes[mine], result.confidences[mine]
+        boxes, confidence = result.boxes[selected], result.confidences[selected]
         counted = np.argsort(-confidence, kind="stable")[:DETECTIONS_PER_IMAGE]
         confidences.append(confidence[counted])
         verdicts.append(_verdicts(boxes[counted], result.true_boxes[true], result.ignored[true]))
@@ -195,9 +197,9 @@ def _score_class(results: Sequence[ImageResult], class_id: int) -> ClassScore:
 def _verdicts(
     boxes: NDArray[np.float32], true_boxes: NDArray[np.float32], ignored: NDArray[np.bool_]
 ) -> NDArray[np.int8]:
-    """(thresholds, N): what one image's detections of a class are at each IoU threshold.
+    """(thresholds, N): the verdicts on one image's detections of a class at each IoU threshold.
 
-    `boxes` come in falling confidence.
+    `boxes` are sorted by descending confidence.
     """
     verdict = np.full((len(IOU_THRESHOLDS), len(boxes)), WRONG, np.int8)
     if not len(true_boxes):
@@ -217,7 +219,7 @@ def _verdicts(
 
 
 def _share_inside(boxes: NDArray[np.float32], regions: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, 4) and (M, 4) → (N, M): how much of each box lies in each region."""
+    """(N, 4) and (M, 4) → (N, M): share of each box inside each region."""
     a, b = boxes.astype(np.float64)[:, None], regions.astype(np.float64)[None]
     inner = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     area = (a[..., 2:] - a[..., :2]).prod(-1)

@@ -1,4 +1,4 @@
-"""What a network is: its model family and scale, recognised from its layers, its size and its work."""
+"""Model facts: family and scale, recognised from the layers, and number of parameters and operations."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _USUAL_STRIDES = (8, 16, 32)
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """What `describe` tells.
+    """Result of `describe`.
 
     Attributes:
-        model_family: as `YOLOv8`, `YOLO11`; with `-P2` or `-P6` where the head reads a finer or a coarser map
-            too; `unknown` for a network of one's own.
-        scale: the letter, where the multipliers are the published ones of that family; else None.
-        parameters: numbers in the network as given. Folding batch normalisation leaves fewer, and so does
-            dropping the branches of an end-to-end head that only train.
-        gflops: 10⁹ floating-point operations for one picture, a multiplication and an addition being two,
-            of convolutions and attention, as the network runs after `fuse`.
+        model_family: as `YOLOv8`, `YOLO11`; with `-P2` or `-P6` if the head also reads a finer or a coarser
+            level; `unknown` for a custom network.
+        scale: the letter, if the multipliers are the published ones of that family; else None.
+        parameters: of the network as given. Folding batch normalisation reduces them, and so does dropping
+            the training-only branches of an end-to-end head.
+        gflops: 10⁹ floating-point operations per image (a multiplication and an addition are two) of
+            convolutions and attention, after `fuse`.
         end_to_end: whether it needs no NMS.
     """
 
@@ -37,13 +37,13 @@ class ModelFacts:
 
 
 def describe(model: YoloModel, image_size: int = 640) -> ModelFacts:
-    """The facts of a network.
+    """Determine the facts of a network.
 
     Args:
-        image_size: side of the square picture that `gflops` is for, pixels, a multiple of the largest stride.
+        image_size: side of the square image for `gflops`, pixels, a multiple of the largest stride.
 
     Raises:
-        ValueError: `image_size` is no such multiple.
+        ValueError: `image_size` is not a multiple.
     """
     largest = max(model.strides)
     if image_size < largest or image_size % largest:
@@ -59,7 +59,7 @@ def describe(model: YoloModel, image_size: int = 640) -> ModelFacts:
 
 
 def model_family_of(model: YoloModel) -> str:
-    """`ModelFacts.model_family` alone, which costs nothing."""
+    """Determine only `ModelFacts.model_family`, which is fast."""
     description, strides = model.description, model.strides
     layers = {row.layer for row in description.rows}
     if layers & {"v10Detect", "SCDown", "C2fCIB"}:
@@ -82,7 +82,7 @@ def model_family_of(model: YoloModel) -> str:
 
 def _scale(description: ModelDescription, model_family: str) -> str | None:
     for letter, (depth, width, most) in SCALES.get(model_family.partition("-")[0], {}).items():
-        # The first releases wrote a table per scale, its channels limited in the rows themselves.
+        # The first releases had a table per scale, with channels limited in the rows.
         if (description.depth_multiple, description.width_multiple) == (depth, width) and (
             description.max_channels in (None, most)
         ):
@@ -91,11 +91,11 @@ def _scale(description: ModelDescription, model_family: str) -> str | None:
 
 
 def _gflops(description: ModelDescription, image_size: int) -> float:
-    # Shapes alone tell the work; nothing is computed, and the caller's network is left as it is.
+    # On the meta device: nothing is computed, and the caller's network is unchanged.
     model = build_shapes(description).fuse()
     with torch.device("meta"):
-        picture = torch.empty(1, description.channels, image_size, image_size)
+        image = torch.empty(1, description.channels, image_size, image_size)
     counter = FlopCounterMode(display=False)
     with torch.inference_mode(), counter:
-        model(picture)
+        model(image)
     return counter.get_total_flops() / 1e9

@@ -1,8 +1,8 @@
-"""What the pickled layers of a checkpoint know and its model table does not say.
+"""Corrections of a checkpoint's model table by its pickled layers.
 
-A table is read by the release that builds the network, and releases differ: 8.3.0 gave YOLOv8 the light class
-branches of YOLO11, 8.4.0 left out an activation that came back, a channel count that equals the number of
-classes was scaled or not. The layers in the file are what was trained, so where the two differ, they decide.
+A table is interpreted by the release that builds the network, and releases differ: 8.3.0 gave YOLOv8 the
+light class branches of YOLO11, 8.4.0 omitted an activation that later returned, a channel count equal to the
+number of classes was scaled or not. The layers in the file were trained, so they take precedence.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from vision.yolo.safe_pickle import CheckpointError, Stub, shown
 Modules = Mapping[str, Stub]
 """Dotted name → module, `model.<row>` for the rows."""
 
-# The last convolution of each layer, by the names it has there: the channels that the layer gives.
+# The last convolution of each layer, by its name: its channels are the layer's output.
 _LAST_CONVOLUTIONS = ("cv3.conv", "cv2.conv", "conv")
 
 
 def as_trained(description: ModelDescription, modules: Modules) -> ModelDescription:
-    """The description with what the layers themselves show. Raises `CheckpointError`, `ArchitectureError`."""
-    rows = tuple(_settle(row, f"model.{index}", modules) for index, row in enumerate(description.rows))
+    """The description corrected by the layers. Raises `CheckpointError`, `ArchitectureError`."""
+    rows = tuple(_corrected(row, f"model.{index}", modules) for index, row in enumerate(description.rows))
     in_backbone = len(description.backbone)
     description = dataclasses.replace(description, backbone=rows[:in_backbone], head=rows[in_backbone:])
     description = _with_head(description, f"model.{len(rows) - 1}", modules)
@@ -43,7 +43,7 @@ def as_trained(description: ModelDescription, modules: Modules) -> ModelDescript
 
 
 def kind(modules: Modules, name: str) -> str:
-    """The class of a module, without its package; empty where there is none of that name."""
+    """The class name of a module, without its package; empty if there is no such module."""
     module = modules.get(name)
     return "" if module is None else module.name.rpartition(".")[2]
 
@@ -55,7 +55,7 @@ def _tensor(modules: Modules, name: str, parameter: str = "weight") -> Tensor | 
     return tensor if isinstance(tensor, Tensor) and tensor.dim() > 0 else None
 
 
-def _settle(row: LayerSpec, name: str, modules: Modules) -> LayerSpec:
+def _corrected(row: LayerSpec, name: str, modules: Modules) -> LayerSpec:
     first = kind(modules, f"{name}.m.0")
     if row.layer == "C3k2" and first:
         if first == "Sequential":
@@ -64,23 +64,23 @@ def _settle(row: LayerSpec, name: str, modules: Modules) -> LayerSpec:
     if row.layer == "A2C2f" and first == "Sequential":
         row = row.with_argument(1, True, A2C2F_DEFAULTS)
         row = row.with_argument(3, _tensor(modules, name, "gamma") is not None, A2C2F_DEFAULTS)
-        wide = _tensor(modules, f"{name}.m.0.0.mlp.0.conv")
-        if wide is not None and wide.dim() == 4:
-            row = row.with_argument(4, _mlp_ratio(row, wide), A2C2F_DEFAULTS)
+        mlp_weight = _tensor(modules, f"{name}.m.0.0.mlp.0.conv")
+        if mlp_weight is not None and mlp_weight.dim() == 4:
+            row = row.with_argument(4, _mlp_ratio(row, mlp_weight), A2C2F_DEFAULTS)
         return row
     if row.layer == "SPPF" and kind(modules, f"{name}.cv1.act"):
         return row.with_argument(4, kind(modules, f"{name}.cv1.act") != "Identity", SPPF_DEFAULTS)
     return row
 
 
-def _mlp_ratio(row: LayerSpec, wide: Tensor) -> Any:
-    """The ratio the row gives, or a published one, where it fits what was trained; else the trained one."""
-    outputs, inputs = wide.shape[:2]
+def _mlp_ratio(row: LayerSpec, mlp_weight: Tensor) -> Any:
+    """The row's ratio, or a published one, if it fits the trained layer; else the trained layer's ratio."""
+    outputs, inputs = mlp_weight.shape[:2]
     given = row.arguments[4] if len(row.arguments) > 4 else A2C2F_DEFAULTS[4]
     for ratio in (given, *PUBLISHED_MLP_RATIOS):
         if type(ratio) in (int, float) and 0 < ratio < 64 and int(inputs * ratio) == outputs:
             return ratio
-    # A whole number of channels back from a ratio: half a channel keeps the rounding down from losing one.
+    # Inverse of rounding down: half a channel more avoids losing one.
     return (outputs + 0.5) / max(inputs, 1)
 
 
@@ -99,7 +99,7 @@ def _with_head(description: ModelDescription, name: str, modules: Modules) -> Mo
         description,
         reg_max=bins,
         light_classes=light,
-        # Late releases also note which head answered last, often the other one, after a validation with NMS.
+        # Late releases also store which head was used last, often the other one, after a validation with NMS.
         end_to_end=bool(kind(modules, f"{name}.one2one_cv3")),
         class_width=width,
     )
@@ -117,7 +117,7 @@ def _activation(modules: Modules) -> str | None:
 
 
 def _unscaled(description: ModelDescription, modules: Modules) -> tuple[int, ...]:
-    """The number of classes, where a row of as many channels was not scaled."""
+    """The number of classes, if a row with that many channels was not scaled."""
     count = len(description.class_names)
     for index, row in enumerate(description.rows):
         if not row.arguments or row.arguments[0] != count or type(row.arguments[0]) is not int:

@@ -1,4 +1,4 @@
-"""From the network's raw maps to a short list of boxes: best class, class filter, threshold, suppression."""
+"""Decoding of raw outputs to boxes: best class, class filter, threshold, suppression."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from vision.yolo.architecture import YoloModel
 
 MOST_BOXES = 300
-# Up to so many boxes all pairs are compared at once; beyond, the table of pairs costs more than it saves.
+# Up to this many boxes all pairs are compared at once; beyond, the table of pairs is slower.
 _MOST_PAIRED = 512
-# Below the threshold by this much a cell is still looked at: rounding must not decide in logit space.
+# Cells below the threshold by this much are still considered: rounding in logit space must not decide.
 _LOGIT_MARGIN = 1e-3
 
 
@@ -44,22 +44,22 @@ class Boxes:
 
 def select_boxes(
     model: YoloModel,
-    maps: Sequence[Tensor],
+    outputs: Sequence[Tensor],
     *,
     confidence: float = 0.25,
     iou: float = 0.7,
     class_ids: Sequence[int] | None = None,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """One image's maps as the model gives them, (1, 4 · reg_max + classes, H, W) a level → its boxes."""
+    """One image's model outputs, (1, 4 · reg_max + classes, H, W) per level → its boxes."""
     sides = 4 * model.reg_max
-    arrays = [level[0].detach().float().cpu().numpy() for level in maps]
+    arrays = [level[0].detach().float().cpu().numpy() for level in outputs]
     levels = [LevelOutput(classes=array[sides:], sides=array[:sides]) for array in arrays]
     return boxes_of(head_of(model), levels, confidence=confidence, iou=iou, class_ids=class_ids, most=most)
 
 
 def head_of(model: YoloModel) -> Head:
-    """How to read the maps of a whole model."""
+    """The output layout of a complete model."""
     classes = len(model.class_names)
     return Head(tuple(model.strides), model.reg_max, model.end_to_end, classes, tuple(range(classes)))
 
@@ -73,7 +73,7 @@ def boxes_of(
     class_ids: Sequence[int] | None = None,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """One image's maps → its boxes: `candidates_of`, `decode_ltrb` and `boxes_from` in a row."""
+    """One image's outputs → its boxes: `candidates_of`, `decode_ltrb` and `boxes_from` in sequence."""
     candidates = candidates_of(head, levels, confidence, class_ids)
     return boxes_from(head, levels, candidates, decode_ltrb(head, levels, candidates), iou, most)
 
@@ -83,7 +83,7 @@ class Candidates:
     """The cells of one level that may become boxes.
 
     Attributes:
-        cell: (N,) int64, counted row by row.
+        cell: (N,) int64, row-major index.
         confidence: (N,) float32 in 0..1.
         class_id: (N,) int64.
     """
@@ -96,13 +96,13 @@ class Candidates:
 def candidates_of(
     head: Head, levels: Sequence[LevelOutput], confidence: float, class_ids: Sequence[int] | None = None
 ) -> list[Candidates]:
-    """The cells of each level that speak for a wanted class, above `confidence`.
+    """The cells of each level that predict a wanted class above `confidence`.
 
-    A cell speaks for its most probable class, of all that the model knows. In a one-to-one head (YOLOv10,
-    Wang et al., 2024; YOLO26), which has learnt to speak once an object, it speaks for every class.
+    A cell predicts its most probable class, among all classes of the model. In a one-to-one head (YOLOv10,
+    Wang et al., 2024; YOLO26), which predicts each object once, it predicts every class above the threshold.
 
     Args:
-        class_ids: None: all. Where the maps hold some classes alone, those must be among them.
+        class_ids: None: all. If the outputs contain only some classes, these must be among them.
     """
     floor = _logit(confidence) - _LOGIT_MARGIN
     ids = np.asarray(head.class_ids, np.int64)
@@ -120,7 +120,7 @@ def candidates_of(
         if wanted is not None:
             kept &= wanted[class_id]
         if head.rows is not None and level.features is not None and len(cells):
-            # A class that nobody asked for may be the better one, and then the cell speaks for that.
+            # Another class may have a higher score; then the cell does not predict a wanted one.
             features = level.features.reshape(len(level.features), -1)[:, cells]
             kept &= np.isin(head.rows[number].best_class(features), ids)
         found.append(Candidates(cells[kept], score[kept], class_id[kept]))
@@ -133,10 +133,10 @@ def decode_ltrb(
     candidates: Sequence[Candidates],
     product: Product = np.matmul,
 ) -> list[NDArray[np.float32]]:
-    """Each level's (4 · reg_max, N) raw box sides at its N candidates, computed where the maps lack them.
+    """Each level's (4 · reg_max, N) raw box sides at its N candidates, computed from the neck if necessary.
 
     Args:
-        product: of two matrices, for where they are computed.
+        product: matrix product for this computation.
     """
     found = []
     for number, (level, some) in enumerate(zip(levels, candidates, strict=True)):
@@ -144,8 +144,8 @@ def decode_ltrb(
             found.append(level.sides.reshape(len(level.sides), -1)[:, some.cell])
             continue
         if head.boxes is None or level.neck is None:
-            raise ValueError("maps without box sides need the neck's maps and the head's box branches")
-        # A cell of a one-to-one head may be there several times, for several classes.
+            raise ValueError("outputs without box sides need the neck and the head's box branches")
+        # A cell of a one-to-one head may occur several times, for several classes.
         cells, back = np.unique(some.cell, return_inverse=True)
         found.append(head.boxes[number].sides(level.neck, cells, product)[:, back])
     return found
@@ -159,9 +159,9 @@ def boxes_from(
     iou: float = 0.7,
     most: int = MOST_BOXES,
 ) -> Boxes:
-    """Decode the candidates; each class then suppresses its own overlaps, and the `most` confident stay.
+    """Decode the candidates, apply NMS per class, and keep the `most` confident.
 
-    In a one-to-one head boxes that overlap are different objects; nothing is suppressed.
+    In a one-to-one head overlapping boxes are different objects; NMS is not applied.
     """
     xyxy = np.concatenate(
         [
@@ -185,7 +185,7 @@ def _logit(probability: float) -> float:
 
 
 def _best_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(K, N) logits → the cells whose largest is above `floor`, and which that is."""
+    """(K, N) logits → the cells whose largest logit is above `floor`, and its index."""
     cells = _cells_above(logits, floor)
     return cells, logits[:, cells].argmax(axis=0)
 
@@ -193,14 +193,14 @@ def _best_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.i
 def _pairs_above(logits: NDArray[np.float32], floor: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(K, N) logits → every cell and channel above `floor`, cell by cell."""
     cells = _cells_above(logits, floor)
-    place, channel = (logits[:, cells].T > floor).nonzero()
-    return cells[place], channel
+    row, channel = (logits[:, cells].T > floor).nonzero()
+    return cells[row], channel
 
 
 def _cells_above(logits: NDArray[np.float32], floor: float) -> NDArray[np.int64]:
-    """(K, N) logits → the cells of which any is above `floor`, rising.
+    """(K, N) logits → the cells with any logit above `floor`, ascending.
 
-    Where few are, it is quickest to look through all in the order in which they lie in memory.
+    If there are few, scanning in memory order is fastest.
     """
     by_cell = logits.T
     if floor == -math.inf or len(logits) == 1 or not by_cell.flags.c_contiguous:
@@ -234,24 +234,24 @@ def suppress(
 ) -> NDArray[np.int64]:
     """Greedy non-maximum suppression within each class.
 
-    A box falls when a more confident one of its class overlaps it by more than `iou`, intersection over
+    A box is dropped if a more confident one of its class overlaps it by more than `iou`, intersection over
     union.
 
     Args:
         xyxy: (N, 4). confidence: (N,). class_id: (N,).
-        most: how many boxes to keep at most.
+        most: largest number of boxes to keep.
 
     Returns:
-        Indices of the kept boxes, the most confident first; of equals, the earlier.
+        Indices of the kept boxes, most confident first; of equals, the earlier first.
     """
     order = np.argsort(-confidence, kind="stable")
     sides = np.asarray(xyxy, np.float64)[order].T
     area = (sides[2] - sides[0]).clip(0) * (sides[3] - sides[1]).clip(0)
-    walk = _kept_by_pairs if len(order) <= _MOST_PAIRED else _kept_one_by_one
-    return order[walk(sides, area, class_id[order], iou, most)]
+    nms = _nms_pairwise if len(order) <= _MOST_PAIRED else _nms_sequential
+    return order[nms(sides, area, class_id[order], iou, most)]
 
 
-def _kept_by_pairs(
+def _nms_pairwise(
     sides: NDArray[np.float64], area: NDArray[np.float64], classes: NDArray[Any], iou: float, most: int
 ) -> NDArray[np.int64]:
     left, top, right, bottom = sides
@@ -261,14 +261,14 @@ def _kept_by_pairs(
     overlaps = common > iou * (area[:, None] + area - common)
     overlaps &= classes[:, None] == classes
     alive = np.ones(len(area), np.bool_)
-    # Only a box that overlaps a later one can change anything.
+    # Only a box that overlaps a later one matters.
     for index in np.flatnonzero(np.triu(overlaps, 1).any(axis=1)):
         if alive[index]:
             alive[index + 1 :] &= ~overlaps[index, index + 1 :]
     return np.flatnonzero(alive)[:most]
 
 
-def _kept_one_by_one(
+def _nms_sequential(
     sides: NDArray[np.float64], area: NDArray[np.float64], classes: NDArray[Any], iou: float, most: int
 ) -> NDArray[np.int64]:
     left, top, right, bottom = sides

@@ -1,7 +1,7 @@
 """The published networks: YOLOv5u, YOLOv8, YOLOv10, YOLO11, YOLO12, YOLO26, every scale.
 
-All have one shape: a backbone that halves the picture five times, a path up that joins what it finds with
-finer maps, a path down again, and a head at strides 8, 16 and 32 (feature pyramid, Lin et al., 2017; path
+All have one structure: a backbone that halves the image five times, a path up that concatenates finer
+features, a path down, and a head at strides 8, 16 and 32 (feature pyramid, Lin et al., 2017; path
 aggregation, Liu et al., 2018). They differ in the blocks.
 """
 
@@ -48,19 +48,19 @@ SCALES: Mapping[str, Mapping[str, Scale]] = {
     "YOLO12": _LATE_SCALES,
     "YOLO26": _LATE_SCALES,
 }
-"""Generation → scale letter → its multipliers, as published."""
+"""Model family → scale letter → its multipliers, as published."""
 
 
 def published_description(model_family: str, scale: str, class_names: Sequence[str]) -> ModelDescription:
-    """The published network of a model family and a scale, as a key of `SCALES` and of its table.
+    """The published network of a model family and a scale, both keys of `SCALES`.
 
     Raises `ArchitectureError` for an unknown one.
     """
     if model_family not in SCALES:
-        raise ArchitectureError(f"unknown model family {model_family!r:.100}; known are {', '.join(SCALES)}")
+        raise ArchitectureError(f"unknown model family {model_family!r:.100}; known: {', '.join(SCALES)}")
     scales = SCALES[model_family]
     if scale not in scales:
-        raise ArchitectureError(f"{model_family} has no scale {scale!r:.100}; known are {', '.join(scales)}")
+        raise ArchitectureError(f"{model_family} has no scale {scale!r:.100}; known: {', '.join(scales)}")
     if model_family == "YOLOv8":
         return yolov8_description(scale, class_names)
     backbone, head = _rows(_blocks(model_family, scale))
@@ -78,16 +78,16 @@ def published_description(model_family: str, scale: str, class_names: Sequence[s
 
 @dataclass(frozen=True, slots=True)
 class _Blocks:
-    """What stands at each place of the common shape.
+    """The blocks at each position of the common structure.
 
     Attributes:
         stages: the blocks at strides 4, 8, 16, 32.
-        deepest: what follows the last of them.
+        deepest: the blocks after the last stage.
         up, down: the blocks at strides 16 and 8 on the path up, at 16 and 32 on the path down.
         stem: arguments of the first convolution after its channels.
-        stage_channels: what the stages give, before scaling.
-        halving: how strides 16 and 32 are reached in the backbone, and 32 on the path down.
-        narrow_first: YOLOv5's: a 1×1 convolution halves the channels before each enlargement.
+        stage_channels: output channels of the stages, before scaling.
+        halving: downsampling layer to strides 16 and 32 in the backbone, and to 32 on the path down.
+        narrow_first: YOLOv5's: a 1×1 convolution halves the channels before each upsampling.
         head: the name of the head's layer.
     """
 
@@ -145,7 +145,7 @@ def _blocks(model_family: str, scale: str) -> _Blocks:
 
 
 def _yolov10(scale: str, sppf: Block) -> _Blocks:
-    """The larger the scale, the more of its blocks are compact inverted ones; n and s have large kernels."""
+    """Larger scales have more compact inverted blocks; n and s have large kernels."""
     usual: Block = (3, "C2f", ())
     compact: Block = (3, "C2fCIB", (True,))
     large: Block = (3, "C2fCIB", (True, True))
@@ -191,7 +191,7 @@ def _rows(blocks: _Blocks) -> tuple[list[Any], list[Any]]:
         add("nn.Upsample", (None, 2, "nearest"))
         add("Concat", (1,), source=[-1, finer])
         finest = block(channels, kind)
-    # The path down joins what the path up started each enlargement from.
+    # The path down concatenates the inputs of the path up's upsamplings.
     levels = [finest]
     coarser = (joined[1], joined[0] if blocks.narrow_first else deepest)
     for channels, halving, other, kind in zip(

@@ -1,4 +1,4 @@
-"""The two courses of training that made the bundled weights, and the scenes they are judged on."""
+"""The two training runs of the bundled weights, and their evaluation scenes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from vision.yolo.augmentation import Augmentation
 from vision.yolo.training import Stage, TrainingSettings
 
 HELD_OUT_SEED = 10_000_000
-"""Seed of the scenes the model is judged on. No training seed comes near it."""
+"""Seed of the evaluation scenes. No training seed comes near it."""
 
 HELD_OUT_SIZE = (640, 480)
 """Width and height of those scenes, pixels: the size of the built-in vehicle's camera."""
@@ -16,9 +16,9 @@ DEFAULT_RECIPE = TrainingSettings(
     depth_multiple=1 / 3,
     width_multiple=0.125,
     max_channels=1024,
-    # Small pictures have the same field of view: as many objects for a quarter of the work, at half the
-    # pixels. Then the frames' own size; and, because small objects were what was missed, both once and
-    # again. Scenes come round, augmented anew.
+    # Small images have the same field of view: as many objects for a quarter of the work, at half the
+    # pixels. Then the frames' full size; and, because small objects were missed, both again. Scenes
+    # repeat with new augmentation.
     stages=(
         Stage(320, 256, 16, 3970, scenes=12_000),
         Stage(640, 480, 8, 3900, scenes=6_000, decay_steps=3900),
@@ -35,15 +35,15 @@ DEFAULT_RECIPE = TrainingSettings(
     threads=1,
     workers=1,
 )
-"""The first course: large objects from anywhere (`random_scene`), from random weights."""
+"""The first run: large objects from anywhere (`random_scene`), from random weights."""
 
 REFINEMENT = TrainingSettings(
     class_names=DEFAULT_RECIPE.class_names,
     depth_multiple=DEFAULT_RECIPE.depth_multiple,
     width_multiple=DEFAULT_RECIPE.width_multiple,
     max_channels=DEFAULT_RECIPE.max_channels,
-    # A scene of the camera's size is expensive to draw and has many pictures in it: whole at half its pixels,
-    # and parts of it at up to 1.3 times its own.
+    # A scene of the camera's size is expensive to draw and gives many images: whole at half its pixels,
+    # and parts of it at up to 1.3 times its pixels.
     stages=(
         Stage(320, 256, 16, 4315, scenes=6_000, decay_steps=4315, drawn=(640, 480)),
         Stage(320, 256, 16, 8147, scenes=4_000, decay_steps=8147, rate=0.75, drawn=(640, 480)),
@@ -58,5 +58,5 @@ REFINEMENT = TrainingSettings(
     bfloat16=True,
     workers=1,
 )
-"""The second, from the first one's weights: what a flight sees, near and far, and much that is no object
+"""The second run, from the first one's weights: views of a flight, near and far, and many distractors
 (`training_scene`)."""

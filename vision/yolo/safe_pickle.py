@@ -1,12 +1,13 @@
-"""A reader of pickles that cannot run anything: the part of the pickle machine that `torch.save` writes.
+"""A reader of pickles that cannot run code: the part of the pickle machine that `torch.save` writes.
 
-Python's own unpickler imports what a file names and calls it. This one knows tokens only: a global is looked
-up in the caller's table of admitted names, "calling" it makes an `Stub` record or asks the table's own
-function, and setting state fills a record's dictionary. No import, no attribute of a real object, no class of
-the file's choosing. The opcodes are those of pickle protocol 2 (PEP 307); any other is refused.
+Python's own unpickler imports what a file names and calls it. This one handles tokens only: a global is
+looked up in the caller's table of allowed names, "calling" it creates a `Stub` record or calls the table's
+function, and setting state fills a record's dictionary. There are no imports, no attribute access on real
+objects and no classes chosen by the file. The opcodes are those of pickle protocol 2 (PEP 307); any other is
+rejected.
 
-What the values would take is counted as they are made, and a pickle that makes much of little is refused: a
-list is one byte in the file and sixty in memory, and a filled dictionary can be copied by five more.
+The memory of the values is counted as they are created, and a pickle that expands too much is rejected: a
+list is one byte in the file and sixty in memory, and a filled dictionary can be copied by five more bytes.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from typing import Any
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be read; one line that says which, why, and what to do."""
+    """A checkpoint that cannot be read; one line with the file, the reason, and what to do."""
 
 
 class UnsafeCheckpointError(CheckpointError):
-    """A checkpoint that asks for code to be run; the message names what it asked for."""
+    """A checkpoint that requests a function call; the message names it."""
 
 
 @dataclass(slots=True, eq=False)
 class Stub:
-    """What stands in for an object of class `name`: its constructor's arguments and its attributes."""
+    """Stand-in for an object of class `name`: its constructor's arguments and its attributes."""
 
     name: str
     arguments: tuple[Any, ...] = ()
@@ -37,9 +38,9 @@ class Stub:
 
 @dataclass(frozen=True, slots=True)
 class AllowedGlobal:
-    """A global that the file may name. `make` answers a call with these arguments.
+    """A global that the file may name. `make` is called with the arguments of a call.
 
-    Without `make` a call, or an instance, is an `Stub` of this name.
+    Without `make` a call, or an instance, is a `Stub` of this name.
     """
 
     name: str
@@ -50,15 +51,15 @@ class AllowedGlobal:
 
 
 def one_line(message: str) -> str:
-    """A message that may quote the file: control characters escaped, so that it cannot steer a terminal."""
+    """Escape control characters in a message that may quote the file, to protect the terminal."""
     return "".join(character if character.isprintable() else repr(character)[1:-1] for character in message)
 
 
 _MARK = object()
 _SCALARS = (str, int, float, bool, type(None))
-# No checkpoint numbers its keys higher; larger ones can be chosen to collide in a dictionary, for ever.
+# No checkpoint has larger integer keys; larger ones can be chosen to collide in a dictionary.
 _LARGEST_KEY = 1 << 20
-# What values take in CPython, bytes, rounded up.
+# Memory of values in CPython, bytes, rounded up.
 _REFERENCE_BYTES = 8
 _OBJECT_BYTES = 64
 _PAIR_BYTES = 128
@@ -68,45 +69,45 @@ _DEFAULT_ALLOWANCE_BYTES = 16 << 20
 
 
 def shown(value: object) -> str:
-    """A value from a file for a message: a scalar as it is, of anything else its type.
+    """A value from a file for a message: a scalar as it is, for anything else its type.
 
-    The text of a container can be longer than any memory: each tuple may hold the one before twice.
+    The text of a container can exceed any memory: each tuple may contain the one before twice.
     """
     return f"{value!r:.100}" if isinstance(value, _SCALARS) else f"a {type(value).__name__}"
 
 
 def unpickle(
     data: bytes,
-    admitted: Mapping[str, AllowedGlobal],
+    allowed: Mapping[str, AllowedGlobal],
     persistent: Callable[[tuple[Any, ...]], Any],
     allowance_bytes: int = _DEFAULT_ALLOWANCE_BYTES,
 ) -> Any:
-    """The value that `data` describes.
+    """Read the value that `data` describes.
 
     Args:
         data: a pickle of protocol 2.
-        admitted: `module.name` → what it stands for.
-        persistent: answers a persistent id (for torch: a storage).
-        allowance_bytes: what the values may take in memory, storages not counted.
+        allowed: `module.name` → its replacement.
+        persistent: resolves a persistent id (for torch: a storage).
+        allowance_bytes: memory limit of the values, without storages.
 
     Raises:
-        UnsafeCheckpointError: a global that is not admitted; the message names it.
+        UnsafeCheckpointError: a global that is not allowed; the message names it.
         CheckpointError: not such a pickle.
     """
-    return _Machine(data, admitted, persistent, allowance_bytes).run()
+    return _Machine(data, allowed, persistent, allowance_bytes).run()
 
 
 class _Machine:
     def __init__(
         self,
         data: bytes,
-        admitted: Mapping[str, AllowedGlobal],
+        allowed: Mapping[str, AllowedGlobal],
         persistent: Callable[[tuple[Any, ...]], Any],
         allowance_bytes: int,
     ) -> None:
         self._data = data
         self._position = 0
-        self._allowed = admitted
+        self._allowed = allowed
         self._persistent = persistent
         self._left_bytes = allowance_bytes
         self._stack: list[Any] = []
@@ -120,7 +121,7 @@ class _Machine:
             handler = _HANDLERS.get(opcode)
             if handler is None:
                 raise CheckpointError(f"its pickle has opcode {opcode!r}, which torch.save does not write")
-            # Its place on the stack; what it makes beyond that, it counts itself.
+            # Its entry on the stack; handlers count what they create beyond that.
             self._left_bytes -= _REFERENCE_BYTES
             handler(self)
             if self._left_bytes < 0:
@@ -131,7 +132,7 @@ class _Machine:
         return value
 
     def _spend(self, count: int) -> None:
-        """Count bytes that are about to be taken; refuse before a large piece is."""
+        """Count bytes before a large allocation; reject if the limit is exceeded."""
         self._left_bytes -= count
         if self._left_bytes < 0:
             raise CheckpointError("its pickle makes more values than a checkpoint needs")
@@ -174,7 +175,7 @@ class _Machine:
         self._stack.append(value)
 
     def _make(self, value: Any) -> None:
-        """Push a value of its own, not one that is shared."""
+        """Push a new value, not a shared one."""
         self._left_bytes -= sys.getsizeof(value)
         self._stack.append(value)
 
@@ -231,7 +232,7 @@ class _Machine:
             raise CheckpointError("its pickle has a dictionary key without a value")
         self._spend(_OBJECT_BYTES + _PAIR_BYTES * (len(values) // 2))
         for key, value in zip(values[::2], values[1::2], strict=True):
-            # Hashing a nested tuple can be made to take for ever; no checkpoint needs one as a key.
+            # Hashing a nested tuple can be made very slow; no checkpoint needs one as a key.
             if not isinstance(key, _SCALARS):
                 raise CheckpointError(f"its pickle has a dictionary key of type {type(key).__name__}")
             if isinstance(key, int | float) and not -_LARGEST_KEY < key < _LARGEST_KEY:
@@ -264,7 +265,7 @@ class _Machine:
         arguments, function = self._pop(), self._pop()
         if not isinstance(function, AllowedGlobal) or not isinstance(arguments, tuple):
             raise UnsafeCheckpointError(f"its pickle calls a {type(function).__name__}; nothing was run")
-        # A set and a size are copies of what they are given.
+        # A set and a size are copies of their arguments.
         copied = arguments[0] if arguments else None
         self._spend(_CALL_BYTES + _PAIR_BYTES * (len(copied) if isinstance(copied, list | tuple) else 0))
         self._push(function.call(arguments))
@@ -287,7 +288,7 @@ class _Machine:
                 f"its pickle sets attributes of a {type(target).__name__}; nothing was run"
             )
         self._spend(_OBJECT_BYTES + _PAIR_BYTES * (len(state) if isinstance(state, dict) else 1))
-        # Some classes (numpy.dtype) have a state of their own kind; it is kept, and means nothing here.
+        # Some classes (numpy.dtype) have a state of another kind; it is kept but not used.
         target.state.update(state if isinstance(state, dict) else {"__setstate__": state})
 
     def persistent_id(self) -> None:

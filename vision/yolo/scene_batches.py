@@ -1,4 +1,4 @@
-"""Scenes drawn on the fly, in batches, the same whatever the number of workers."""
+"""Batches of scenes drawn on the fly; independent of the number of workers."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ SceneSource = Callable[[np.random.Generator, int, int], LabelledImage]
 """`(rng, width, height) → (image (height, width, 3) uint8 BGR, boxes (N, 4) pixels xyxy, class ids (N,))`.
 
 A class id ~class marks an object that is not to be learned (`LabelledImage`). All randomness must come from
-`rng`. With workers it must be picklable: a function of a module, or a
-`functools.partial` of one.
+`rng`. With workers it must be picklable: a module-level function, or a `functools.partial` of one.
 """
 
 KEPT_BYTES = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4
-"""How much of returning scenes each drawing process keeps, a quarter of the memory; others it draws anew."""
+"""Cache of repeated scenes per drawing process, a quarter of the memory; others are drawn again."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneKey:
-    """Names one training picture: scene number `scene` of `seed`, seen with augmentation number `view`.
+    """Identifies one training image: scene number `scene` of `seed`, with augmentation number `view`.
 
-    The scene is drawn `width` by `height` pixels; `size` is the picture's (width, height), None: the same.
-    Its random numbers follow from these alone: never from the process that draws it, nor from what it drew
+    The scene is drawn `width` by `height` pixels; `size` is the image's (width, height), None: the same.
+    Its random numbers depend only on these values, not on the process that draws it or on what it drew
     before.
     """
 
@@ -46,29 +45,31 @@ class SceneKey:
 
 
 def draw_scene(scenes: SceneSource, key: SceneKey, class_count: int) -> LabelledImage:
-    """Draw and check the scene a key names, not augmented.
+    """Draw and check a key's scene, without augmentation.
 
     Raises:
-        ValueError: the source gave an image of another size or type, or labels that do not fit together.
+        ValueError: the source returned an image of another size or type, or inconsistent labels.
     """
     rng = np.random.default_rng([key.seed, key.scene])
     image, boxes, class_ids = scenes(rng, key.width, key.height)
     if image.shape != (key.height, key.width, 3) or image.dtype != np.uint8:
         raise ValueError(
             f"a scene must be ({key.height}, {key.width}, 3) uint8, "
-            f"the source gave {image.shape} {image.dtype}"
+            f"the source returned {image.shape} {image.dtype}"
         )
     boxes = np.asarray(boxes, np.float32).reshape(-1, 4)
     class_ids = np.asarray(class_ids, np.int64).reshape(-1)
     if len(boxes) != len(class_ids):
         raise ValueError(f"a scene has {len(boxes)} boxes but {len(class_ids)} class ids")
     if len(class_ids) and not (-class_count <= class_ids.min() and class_ids.max() < class_count):
-        raise ValueError(f"class ids must be 0..{class_count - 1}, the source gave {np.unique(class_ids)}")
+        raise ValueError(
+            f"class ids must be 0..{class_count - 1}, the source returned {np.unique(class_ids)}"
+        )
     return image, boxes, class_ids
 
 
 def collate(scenes: Sequence[LabelledImage]) -> tuple[Tensor, Truth]:
-    """Images → (B, H, W, 3) uint8 RGB, boxes and classes padded to the fullest image."""
+    """Images → (B, H, W, 3) uint8 RGB, boxes and classes padded to the largest number of objects."""
     images = torch.from_numpy(np.stack([image[:, :, ::-1] for image, _, _ in scenes]))
     most = max(len(class_ids) for _, _, class_ids in scenes)
     boxes = torch.zeros(len(scenes), most, 4)
@@ -97,27 +98,27 @@ class _Scenes(Dataset[LabelledImage]):
         scenes: SceneSource,
         class_count: int,
         augmentation: Augmentation,
-        returning: frozenset[SceneKey],
+        repeated: frozenset[SceneKey],
     ) -> None:
         self.scenes, self.class_count, self.augmentation = scenes, class_count, augmentation
-        self.returning = returning
+        self.repeated = repeated
         self.drawn: dict[SceneKey, LabelledImage] = {}
         self.room = KEPT_BYTES
 
     def __getitem__(self, key: SceneKey) -> LabelledImage:
-        plain = replace(key, view=0)
-        scene = self.drawn.get(plain)
+        scene_key = replace(key, view=0)
+        scene = self.drawn.get(scene_key)
         if scene is None:
-            scene = draw_scene(self.scenes, plain, self.class_count)
-            # No eviction: scenes come round in turn, so the oldest is the one needed next.
-            if plain in self.returning and scene[0].nbytes <= self.room:
-                self.drawn[plain] = scene
+            scene = draw_scene(self.scenes, scene_key, self.class_count)
+            # No eviction: scenes repeat in order, so the oldest is the one needed next.
+            if scene_key in self.repeated and scene[0].nbytes <= self.room:
+                self.drawn[scene_key] = scene
                 self.room -= scene[0].nbytes
         rng = np.random.default_rng([key.seed, key.scene, key.view])
         return augment(rng, scene, self.augmentation, key.size)
 
 
-def _returning(plan: Sequence[Sequence[SceneKey]]) -> frozenset[SceneKey]:
+def _repeated(plan: Sequence[Sequence[SceneKey]]) -> frozenset[SceneKey]:
     """The scenes that are needed more than once."""
     times = Counter(replace(key, view=0) for keys in plan for key in keys)
     return frozenset(scene for scene, count in times.items() if count > 1)
@@ -138,21 +139,21 @@ def scene_batches(
     """The batches of a plan, in its order: (B, H, W, 3) uint8 RGB and their truth.
 
     Args:
-        scenes: draws the pictures.
-        plan: the keys of each batch; within a batch all of one size.
-        class_count: how many classes ids may name.
+        scenes: draws the images.
+        plan: the keys of each batch; all of one size within a batch.
+        class_count: number of classes.
         augmentation: applied after drawing, from the same random numbers.
         workers: processes that draw ahead; 0 draws in this one.
     """
     if not plan:
         return
     loader = DataLoader(
-        _Scenes(scenes, class_count, augmentation, _returning(plan)),
+        _Scenes(scenes, class_count, augmentation, _repeated(plan)),
         batch_sampler=[list(keys) for keys in plan],
         num_workers=workers,
         collate_fn=collate,
         worker_init_fn=_single_threaded,
-        # A forked child of a process with busy native threads may inherit a locked mutex.
+        # A process forked while native threads are busy may inherit a locked mutex.
         multiprocessing_context="spawn" if workers else None,
         prefetch_factor=4 if workers else None,
     )

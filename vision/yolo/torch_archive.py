@@ -1,4 +1,4 @@
-"""The zip archive that `torch.save` writes, read without running anything in it.
+"""Reads the zip archive that `torch.save` writes, without running code from it.
 
 `data.pkl` describes the value; each storage is a member `data/<key>` of raw little-endian numbers.
 """
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from vision.yolo.allowlist import INERT
+from vision.yolo.allowlist import STUB_NAMES
 from vision.yolo.safe_pickle import (
     AllowedGlobal,
     CheckpointError,
@@ -39,25 +39,25 @@ _STORAGES: dict[str, torch.dtype] = {
 }
 
 _LARGEST_PICKLE_BYTES = 16 << 20
-# The table of contents becomes an object a member; the largest checkpoints have some thousands.
+# Every member becomes an object; the largest checkpoints have some thousands.
 _LARGEST_CONTENTS_BYTES = 1 << 20
 _MOST_MEMBERS = 10_000
-# The end record with the longest comment, and the two records of zip64 before it.
+# The end record with the longest comment, and the two zip64 records before it.
 _LONGEST_ENDING_BYTES = 22 + 65535 + 20 + 56
 _MOST_DIMENSIONS = 8
-# Views may share a storage (a state dictionary beside its model), but not without end.
+# Views may share a storage (a state dictionary beside its model), up to this limit.
 _MOST_VIEWS_PER_ELEMENT = 4
-# What the values of the pickle may take in memory, and as much again as the file has.
+# Memory limit of the pickle's values, in addition to the file's size.
 _VALUES_BYTES = 16 << 20
-# A set's numbers can be chosen to collide, and then take for ever.
+# A set's numbers can be chosen to collide, which is slow.
 _LARGEST_SET = 10_000
 
 
 def read_archive(path: str | Path) -> Any:
-    """The value that was saved at `path`: containers, scalars, CPU tensors, `Stub` records for the rest.
+    """Read the value saved at `path`: containers, scalars, CPU tensors, `Stub` records for the rest.
 
     Raises:
-        UnsafeCheckpointError: the file asks for something that is not admitted, by name.
+        UnsafeCheckpointError: the file names something that is not allowed.
         CheckpointError: missing, empty, truncated, not an archive of `torch.save`. One line naming the file.
     """
     path = Path(path)
@@ -87,7 +87,7 @@ def _read(path: Path) -> Any:
             file.seek(0)
             with zipfile.ZipFile(file) as archive:
                 return _Archive(archive, size).value()
-        # What the zip module raises for damaged headers, encryption, unknown compression and bad names.
+        # Raised by the zip module for damaged headers, encryption, unknown compression and bad names.
         except (
             zipfile.BadZipFile,
             zlib.error,
@@ -105,13 +105,15 @@ def _read(path: Path) -> Any:
 
 
 def _check_contents(file: BinaryIO, size: int) -> None:
-    """The size of the table of contents (APPNOTE 4.3.16, 4.3.14), before the zip module reads it."""
+    """Check the size of the table of contents (APPNOTE 4.3.16, 4.3.14) before the zip module reads it."""
     start = max(0, size - _LONGEST_ENDING_BYTES)
     file.seek(start)
     ending = file.read()
     found = ending.rfind(b"PK\x05\x06")
     if found < 0 or len(ending) - found < 22:
-        raise CheckpointError("the archive is truncated or damaged (no end of it); copy or download it again")
+        raise CheckpointError(
+            "the archive is truncated or damaged (no end record); copy or download it again"
+        )
     (contents,) = struct.unpack_from("<L", ending, found + 12)
     large = ending.rfind(b"PK\x06\x06", 0, found)
     if 0 <= large <= found - 56:
@@ -124,7 +126,7 @@ def _check_contents(file: BinaryIO, size: int) -> None:
 
 
 class _Archive:
-    """One open archive; storages are read when the pickle names them."""
+    """One open archive; storages are read when the pickle refers to them."""
 
     def __init__(self, archive: zipfile.ZipFile, size: int) -> None:
         self._archive = archive
@@ -159,9 +161,7 @@ class _Archive:
 
     def _bytes(self, member: zipfile.ZipInfo, largest: int | None = None) -> bytes:
         if largest is not None and member.file_size > largest:
-            raise CheckpointError(
-                f"{member.filename} has {member.file_size} bytes, at most {largest} make sense"
-            )
+            raise CheckpointError(f"{member.filename} has {member.file_size} bytes, the limit is {largest}")
         return self._archive.read(member)
 
     def _allowed(self) -> dict[str, AllowedGlobal]:
@@ -176,16 +176,16 @@ class _Archive:
             "builtins.set": _set,
             "__builtin__.getattr": _folded_forward,
             "builtins.getattr": _folded_forward,
-            # Releases from 8.0.200 to 8.2 wrote with dill where it was installed, which names types this way.
+            # Releases from 8.0.200 to 8.2 used dill where it was installed, which names types this way.
             "dill._dill._load_type": _type_by_name,
         }
         return (
-            {name: AllowedGlobal(name) for name in (*INERT, *_STORAGES)}
+            {name: AllowedGlobal(name) for name in (*STUB_NAMES, *_STORAGES)}
             | {name: AllowedGlobal(name, make) for name, make in calls.items()}
         )  # fmt: skip
 
     def _storage(self, identity: tuple[Any, ...]) -> Tensor:
-        """('storage', type, key, location, number of elements) → those elements, flat."""
+        """('storage', type, key, location, number of elements) → these elements, flat."""
         if len(identity) != 5 or identity[0] != "storage":
             raise CheckpointError("its pickle refers to something else than a storage")
         _, kind, key, _, count = identity
@@ -210,7 +210,7 @@ class _Archive:
         return stored
 
     def _tensor(self, arguments: tuple[Any, ...]) -> Tensor:
-        """(storage, offset, size, stride, …) → that view of the storage, its bounds checked."""
+        """(storage, offset, size, stride, …) → that view of the storage, after a bounds check."""
         if len(arguments) < 4:
             raise CheckpointError("its pickle has a tensor without a shape")
         storage, offset, size, stride = arguments[:4]
@@ -262,7 +262,7 @@ def _dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
 
 
 def _default_dictionary(arguments: tuple[Any, ...]) -> dict[Any, Any]:
-    """What it would make for a missing key is of no use here; its own entries follow one by one."""
+    """The default factory is not needed; the entries follow one by one."""
     if (
         any(not isinstance(argument, AllowedGlobal | None) for argument in arguments[:1])
         or len(arguments) > 1
@@ -283,7 +283,7 @@ def _set(arguments: tuple[Any, ...]) -> frozenset[Any]:
 
 
 def _folded_forward(arguments: tuple[Any, ...]) -> Stub:
-    """A layer saved with its normalisation folded names its own method; it becomes one more inert record."""
+    """A layer saved with folded normalisation names its own method; it becomes a stub."""
     if len(arguments) != 2 or not isinstance(arguments[0], Stub) or arguments[1] != "forward_fuse":
         raise UnsafeCheckpointError("its pickle calls getattr; nothing was run. Do not use this file")
     return Stub("forward_fuse")

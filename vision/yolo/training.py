@@ -1,4 +1,4 @@
-"""Training a YOLOv8 from drawn scenes: the loop, its settings, and its checkpoints for going on later."""
+"""Training of a YOLOv8 network on rendered scenes: loop, settings, and checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A stretch of training at one picture size. Width and height in pixels, multiples of 32.
+    """A part of the training at one image size. Width and height in pixels, multiples of 32.
 
-    `scenes` is how many different scenes are drawn; they come round, shuffled and augmented anew each time.
-    None: every picture is a new scene.
+    `scenes` is the number of different scenes; they repeat, shuffled and with new augmentation each time.
+    None: every image is a new scene.
 
-    Over the last `decay_steps` the learning rate falls; before, it is constant, so that this stretch can be
-    prolonged without changing what went before. `rate` is what it falls from, as a share of the settings'
+    Over the last `decay_steps` the learning rate falls; before, it is constant, so that this part can be
+    extended without changing what went before. `rate` is the value it falls from, as a share of the settings'
     `learning_rate`.
 
-    `drawn` is the (width, height) at which scenes are drawn; a picture then shows one whole, reduced, or a
-    part of it. None: as large as the picture.
+    `drawn` is the (width, height) at which scenes are drawn; an image then shows a whole one, reduced, or a
+    part of it. None: the image's size.
     """
 
     width: int
@@ -53,7 +53,7 @@ class Stage:
     def __post_init__(self) -> None:
         if self.width % 32 or self.height % 32 or self.width <= 0 or self.height <= 0:
             raise ValueError(
-                f"training pictures must be multiples of 32 pixels, got {self.width}x{self.height}"
+                f"training images must be multiples of 32 pixels, got {self.width}x{self.height}"
             )
         if self.batch_size < 1 or self.steps < 1 or (self.scenes is not None and self.scenes < 1):
             raise ValueError(f"a stage needs a batch size, steps and scenes of 1 or more, got {self}")
@@ -70,30 +70,30 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class TrainingSettings:
-    """Everything that decides the weights. Same settings, same scenes, same machine: same weights.
+    """Everything that determines the weights. Same settings, scenes and machine: same weights.
 
     Attributes:
-        class_names: id → name, as the scene source numbers them.
-        stages: run one after the other, each with its own course of the learning rate.
+        class_names: id → name, as numbered by the scene source.
+        stages: run in sequence, each with its own learning rate schedule.
         depth_multiple, width_multiple, max_channels: the network's scale (`yolov8_description`).
         optimiser: AdamW, or SGD with Nesterov momentum.
         learning_rate: the highest, reached after the warm-up.
         weight_decay: of convolution weights; biases and normalisations have none.
         momentum: of SGD.
         warmup_steps: the rate rises linearly over these.
-        decay: the shape of a stage's fall of the rate.
-        final_rate: where it ends, as a share of `learning_rate`.
+        decay: shape of the rate's fall within a stage.
+        final_rate: its end value, as a share of `learning_rate`.
         normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03
             lags behind the weights in a short training.
-        gradient_limit: largest norm of the gradient, longer ones are shortened to it.
-        average_decay: of the running average of the weights, which is what is kept in the end.
-        seed: of the first weights and of every scene.
+        gradient_limit: largest norm of the gradient (clipping).
+        average_decay: of the running average of the weights, which is the result.
+        seed: of the initial weights and of every scene.
         augmentation: of the drawn scenes.
         threads: of torch. The order of summation, and so the last digits of the weights, depends on it.
-        bfloat16: compute the network's forward pass in bfloat16; a third faster where the processor has it.
+        bfloat16: compute the network's forward pass in bfloat16; a third faster if the processor supports it.
         workers: processes that draw scenes; they do not change the result.
-        time_limit_s: stop after so long even if steps are left; None for no limit.
-        checkpoint_every_s: how often to write the checkpoint, if one is wanted.
+        time_limit_s: stop after this time even if steps remain; None for no limit.
+        checkpoint_every_s: checkpoint interval, if there is one.
     """
 
     class_names: tuple[str, ...]
@@ -132,11 +132,11 @@ class TrainingSettings:
 
     @property
     def steps(self) -> int:
-        """The steps of all stages together."""
+        """Number of steps of all stages together."""
         return sum(stage.steps for stage in self.stages)
 
     def with_steps(self, steps: int) -> TrainingSettings:
-        """The same course compressed or stretched to about `steps` steps, at least one a stage."""
+        """The same schedule scaled to about `steps` steps, at least one per stage."""
         ratio = steps / self.steps
         return replace(
             self,
@@ -155,15 +155,15 @@ class TrainingSettings:
             step -= stage.steps
         else:
             step += stage.steps
-        fallen = min(max((step - (stage.steps - stage.decay_steps)) / max(stage.decay_steps, 1), 0.0), 1.0)
+        decayed = min(max((step - (stage.steps - stage.decay_steps)) / max(stage.decay_steps, 1), 0.0), 1.0)
         if self.decay == "cosine":
-            fallen = (1 - math.cos(math.pi * fallen)) / 2
-        return self.learning_rate * (stage.rate + fallen * (self.final_rate - stage.rate))
+            decayed = (1 - math.cos(math.pi * decayed)) / 2
+        return self.learning_rate * (stage.rate + decayed * (self.final_rate - stage.rate))
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where training stands after a step (`step` of `steps` are done). Losses are of that step's batch."""
+    """State of the training after a step (`step` of `steps` are done). Losses are of that step's batch."""
 
     step: int
     steps: int
@@ -178,7 +178,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainedModel:
-    """The averaged weights, in evaluation mode, and what made them."""
+    """The averaged weights, in evaluation mode, and how they were trained."""
 
     model: YoloModel
     settings: TrainingSettings
@@ -195,20 +195,20 @@ def train(
     resume: bool = False,
     start: YoloModel | None = None,
 ) -> TrainedModel:
-    """Train from the first weights, or go on from a checkpoint, to the last step or the time limit.
+    """Train from the initial weights, or resume from a checkpoint, to the last step or the time limit.
 
     Args:
-        settings: what to train and how.
-        scenes: draws the pictures; see `SceneSource`.
+        settings: network, schedule and data.
+        scenes: draws the images; see `SceneSource`.
         on_progress: called after every step, in this thread.
-        checkpoint: where to write the state now and then and at the end; None for nowhere.
-        resume: go on from `checkpoint`. The result is that of an uninterrupted run.
-        start: a trained network of the same scale and classes to begin with; None: random weights.
+        checkpoint: file for the state, written periodically and at the end; None for none.
+        resume: resume from `checkpoint`. The result is that of an uninterrupted run.
+        start: a trained network of the same scale and classes to start from; None: random weights.
 
     Raises:
         FileNotFoundError: `resume` without such a file.
-        ValueError: the checkpoint or `start` is of another network, or `scenes` gives what is no scene.
-        FloatingPointError: the loss is no longer a number.
+        ValueError: the checkpoint or `start` is of another network, or `scenes` returns an invalid scene.
+        FloatingPointError: the loss is not finite.
     """
     started = time.monotonic()
     torch.set_num_threads(settings.threads)
@@ -228,9 +228,9 @@ def train(
     first = 0
     if resume:
         if checkpoint is None:
-            raise ValueError("to go on with training, name the checkpoint")
+            raise ValueError("resume needs a checkpoint")
         first = _restore(checkpoint, settings, model, average, optimiser)
-        logger.info("training goes on from %s at step %d of %d", checkpoint, first, settings.steps)
+        logger.info("training resumes from %s at step %d of %d", checkpoint, first, settings.steps)
 
     plan = _plan(settings)[first:]
     batches = scene_batches(
@@ -240,15 +240,15 @@ def train(
         augmentation=settings.augmentation,
         workers=settings.workers,
     )
-    step, saved, shown = first, started, 0
+    step, saved_s, images_done = first, started, 0
     loop_started = time.monotonic()
     for images, truth in batches:
         rate = settings.rate_at(step)
         for group in optimiser.param_groups:
             group["lr"] = rate
         with torch.autocast("cpu", torch.bfloat16, enabled=settings.bfloat16):
-            maps = model(network_input(images))
-        loss = detection_loss([level.float() for level in maps], model.strides, truth)
+            outputs = model(network_input(images))
+        loss = detection_loss([level.float() for level in outputs], model.strides, truth)
         if not torch.isfinite(loss.total):
             raise FloatingPointError(
                 f"the loss of step {step} is {float(loss.total)}; lower the learning rate"
@@ -261,13 +261,15 @@ def train(
         update_average(average, model, average_decay_at(step, settings.average_decay))
 
         now = time.monotonic()
-        shown += len(images)
+        images_done += len(images)
         on_progress(
-            _progress(settings, step, loss, rate, shown, now - started, now - loop_started, step - first)
+            _progress(
+                settings, step, loss, rate, images_done, now - started, now - loop_started, step - first
+            )
         )
-        if checkpoint is not None and now - saved >= settings.checkpoint_every_s:
+        if checkpoint is not None and now - saved_s >= settings.checkpoint_every_s:
             _save(checkpoint, settings, step, model, average, optimiser)
-            saved = now
+            saved_s = now
         if settings.time_limit_s is not None and now - started >= settings.time_limit_s:
             logger.warning("training stops at its time limit after %d of %d steps", step, settings.steps)
             break
@@ -277,7 +279,7 @@ def train(
 
 
 def average_decay_at(step: int, decay: float) -> float:
-    """The averaging decay after `step` steps: short at first, so that the first weights fade soon."""
+    """The averaging decay after `step` steps: small at first, so that the initial weights fade quickly."""
     return min(decay, step / (step + 10))
 
 
@@ -289,7 +291,7 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
 
 
 def load_average(checkpoint: Path, settings: TrainingSettings) -> TrainedModel:
-    """The averaged model of a training checkpoint, for instance while training still runs.
+    """The averaged model of a training checkpoint, for example while training is in progress.
 
     Raises:
         FileNotFoundError: no such file.
@@ -308,16 +310,16 @@ def _floats(module: nn.Module) -> list[Tensor]:
 
 
 def _start_boxes_small(model: YoloModel) -> None:
-    """Let every side's distribution fall off by bin, so that the first boxes are about four cells wide.
+    """Let every side's distribution fall off by bin, so that the initial boxes are about four cells wide.
 
-    A flat distribution begins with boxes of 15 cells; their IoU with a small object is near zero, and with
-    β = 6 its alignment vanishes: a short training would spend its time shrinking boxes.
+    A flat distribution gives boxes of 15 cells; their IoU with a small object is near zero, and with
+    β = 6 the alignment vanishes: a short training would spend its time shrinking boxes.
     """
-    fall = -0.4 * torch.arange(model.reg_max, dtype=torch.float32)
+    slope = -0.4 * torch.arange(model.reg_max, dtype=torch.float32)
     with torch.no_grad():
         for branch in model.detect.cv2:
             last = branch[-1]  # type: ignore[index]
-            last.bias.copy_(fall.repeat(4))
+            last.bias.copy_(slope.repeat(4))
 
 
 def _copy_weights(source: YoloModel, model: YoloModel) -> None:
@@ -326,7 +328,7 @@ def _copy_weights(source: YoloModel, model: YoloModel) -> None:
     if source.class_names != model.class_names or shapes != {
         name: value.shape for name, value in model.state_dict().items()
     }:
-        raise ValueError("the model to start from has another scale or other classes than the recipe")
+        raise ValueError("the model to start from has another scale or other classes than the settings")
     model.load_state_dict({name: value.float() for name, value in weights.items()})
 
 
@@ -342,10 +344,10 @@ def _optimiser(model: nn.Module, settings: TrainingSettings) -> torch.optim.Opti
 
 
 def _plan(settings: TrainingSettings) -> list[list[SceneKey]]:
-    """The pictures of every batch. A stage's beginning does not depend on how long it lasts."""
+    """The images of every batch. The start of a stage does not depend on its length."""
     plan: list[list[SceneKey]] = []
     for number, stage in enumerate(settings.stages):
-        # Each stage numbers its scenes from its own thousand million, so that none repeats another's.
+        # Scenes of each stage are numbered from its own multiple of 10⁹, so that none is repeated.
         first = number * 1_000_000_000
         order = _scene_order(np.random.default_rng([settings.seed, number]), stage)
         for _ in range(stage.steps):
@@ -366,7 +368,7 @@ def _plan(settings: TrainingSettings) -> list[list[SceneKey]]:
 
 
 def _scene_order(rng: np.random.Generator, stage: Stage) -> Iterator[tuple[int, int]]:
-    """(scene, how many times it was shown before), for ever."""
+    """(scene, number of times it was used before), forever."""
     if stage.scenes is None:
         yield from ((scene, 0) for scene in itertools.count())
         return
@@ -400,7 +402,7 @@ def _progress(
 
 
 def _pixels_until(stages: Sequence[Stage], step: int) -> int:
-    """Pixels seen in the first `step` steps: what time goes with, where stages differ in size."""
+    """Pixels processed in the first `step` steps: proportional to the time, if stages differ in size."""
     pixels = 0
     for stage in stages:
         steps = min(step, stage.steps)
@@ -428,7 +430,7 @@ def _save(
     average: nn.Module,
     optimiser: torch.optim.Optimizer,
 ) -> None:
-    """Write beside the file, then rename: whoever reads sees the old state or the new one, never half."""
+    """Write a temporary file, then rename it: a reader sees the old state or the new one, never a part."""
     state = {
         "kind": _CHECKPOINT_KIND,
         "network": _network(settings),
@@ -457,7 +459,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _require_same_network(state: dict[str, Any], settings: TrainingSettings, path: Path) -> None:
     if state["network"] != _network(settings):
         raise ValueError(
-            f"{path} is of the network {state['network']}, the settings ask for {_network(settings)}"
+            f"{path} is of the network {state['network']}, the settings require {_network(settings)}"
         )
 
 
