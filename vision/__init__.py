@@ -7,7 +7,7 @@
 >>> len(detections)
 0
 
-They are imported when they are first used: `import vision` itself costs nothing.
+Names are imported lazily, so `import vision` alone is cheap.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """PEP 562: the public names, and `__version__`."""
+    """Import a public name on first use (PEP 562); also `__version__`."""
     if name == "__version__":
         from importlib.metadata import version
 

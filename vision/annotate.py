@@ -1,4 +1,4 @@
-"""Drawing what was seen onto the picture, for people."""
+"""Draws detections onto an image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Rectangle = tuple[int, int, int, int]  # left, top, right, bottom; the last two 
 
 @dataclass(frozen=True, slots=True)
 class _Sizes:
-    """Every measure of the drawing, in pixels, from the image's size: 1 at 640x480."""
+    """Dimensions of the drawing, in pixels, scaled by the image's size: 1 at 640x480."""
 
     line: int
     font_scale: float
@@ -42,7 +42,7 @@ class _Sizes:
 
 
 def class_colour(class_id: int) -> Colour:
-    """A class's own colour, BGR: hues far apart for neighbouring ids, bright on any ground."""
+    """Colour of a class, BGR: distinct hues for neighbouring ids, visible on any background."""
     hue = (0.33 + class_id * _GOLDEN_RATIO) % 1.0
     saturation = (0.80, 0.60, 0.95)[class_id % 3]
     red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 1.0)
@@ -60,10 +60,10 @@ def annotate(
 
     Args:
         image: (height, width, 3) uint8, BGR. Lines and letters scale with its size.
-        detections: each gets a box of its class's colour and a plate: name, track and range where
-            known, confidence.
+        detections: each gets a box in its class's colour and a label: name, track and range where known,
+            confidence.
         lines: text for a panel at the top left.
-        highlight: index of the detection that matters now: drawn last, tinted, with bracketed corners.
+        highlight: index of the detection to highlight: drawn last, tinted, with bracketed corners.
 
     Returns:
         (height, width, 3) uint8, BGR.
@@ -76,7 +76,7 @@ def annotate(
     drawn = image.copy()
     height, width = drawn.shape[:2]
     sizes = _Sizes.of(width, height)
-    # The surest last, over the doubtful; the one that matters over all.
+    # The most confident last, on top; the highlighted one on top of all.
     order = sorted(range(len(detections)), key=lambda index: float(detections.confidence[index]))
     if highlight is not None:
         order.remove(highlight)
@@ -85,11 +85,11 @@ def annotate(
     for index in order:
         colour = class_colour(int(detections.class_id[index]))
         _draw_box(drawn, boxes[index], colour, sizes, marked=index == highlight)
-    taken: list[Rectangle] = []
+    occupied: list[Rectangle] = []
     if lines:
-        taken.append(_draw_panel(drawn, lines, sizes))
-    for index in reversed(order):  # the surest choose their plate's place first
-        taken.append(_draw_plate(drawn, boxes[index], detections, index, sizes, taken))
+        occupied.append(_draw_panel(drawn, lines, sizes))
+    for index in reversed(order):  # the most confident choose their label's position first
+        occupied.append(_draw_label(drawn, boxes[index], detections, index, sizes, occupied))
     return drawn
 
 
@@ -105,7 +105,7 @@ def _draw_box(
     left, top, right, bottom = box
     if marked:
         _blend(image, box, colour, 0.18)
-    # A dark rim keeps a bright box visible on a bright ground.
+    # A dark outline keeps a bright box visible on a bright background.
     cv2.rectangle(image, (left, top), (right, bottom), _DARK, sizes.line + 2, cv2.LINE_AA)
     cv2.rectangle(image, (left, top), (right, bottom), colour, sizes.line, cv2.LINE_AA)
     if marked:
@@ -127,13 +127,13 @@ def _draw_corners(image: NDArray[np.uint8], box: Rectangle, sizes: _Sizes) -> No
         cv2.polylines(image, [bracket], False, _LIGHT, sizes.line, cv2.LINE_AA)
 
 
-def _draw_plate(
+def _draw_label(
     image: NDArray[np.uint8],
     box: Rectangle,
     detections: Detections,
     index: int,
     sizes: _Sizes,
-    taken: Sequence[Rectangle],
+    occupied: Sequence[Rectangle],
 ) -> Rectangle:
     class_id = int(detections.class_id[index])
     text = f"{detections.class_names[class_id]}{_identity(detections, index)} "
@@ -142,29 +142,34 @@ def _draw_plate(
     if not np.isnan(depth_m):
         text += f"  depth {depth_m:.1f} m"
     (text_width, text_height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
-    plate_width = text_width + 2 * sizes.padding
-    plate_height = text_height + baseline + sizes.padding
-    plate = _free_place(box, plate_width, plate_height, image.shape[1], image.shape[0], taken)
+    label_width = text_width + 2 * sizes.padding
+    label_height = text_height + baseline + sizes.padding
+    label = _label_rectangle(box, label_width, label_height, image.shape[1], image.shape[0], occupied)
     colour = class_colour(class_id)
-    left, top, right, bottom = plate
+    left, top, right, bottom = label
     cv2.rectangle(image, (left, top), (right - 1, bottom - 1), colour, cv2.FILLED)
     at = (left + sizes.padding, top + sizes.padding // 2 + text_height)
     cv2.putText(image, text, at, _FONT, sizes.font_scale, _ink_on(colour), sizes.stroke, cv2.LINE_AA)
-    return plate
+    return label
 
 
 def _identity(detections: Detections, index: int) -> str:
-    """` #7`; ` #7?` while the track does not count as true yet; nothing without a track."""
+    """` #7`; ` #7?` while the track is not confirmed; empty without a track."""
     if detections.track_id is None or detections.track_id[index] == NO_TRACK:
         return ""
-    sure = detections.track_confirmed is not None and bool(detections.track_confirmed[index])
-    return f" #{int(detections.track_id[index])}{'' if sure else '?'}"
+    confirmed = detections.track_confirmed is not None and bool(detections.track_confirmed[index])
+    return f" #{int(detections.track_id[index])}{'' if confirmed else '?'}"
 
 
-def _free_place(
-    box: Rectangle, width: int, height: int, image_width: int, image_height: int, taken: Sequence[Rectangle]
+def _label_rectangle(
+    box: Rectangle,
+    width: int,
+    height: int,
+    image_width: int,
+    image_height: int,
+    occupied: Sequence[Rectangle],
 ) -> Rectangle:
-    """Where the plate goes: above its box, inside, below, or wherever near it is free."""
+    """Rectangle of the label: above its box, inside, below, or nearby, where it overlaps least."""
     box_left, box_top, box_right, box_bottom = box
     left = min(max(box_left - 1, 0), max(image_width - width, 0))
     end = min(max(box_right - width + 1, 0), max(image_width - width, 0))
@@ -176,16 +181,16 @@ def _free_place(
         box_top - 2 * height,
         box_bottom + height,
     )
-    places = [(x, y) for y in tops for x in (left, end) if 0 <= y <= image_height - height]
-    if not places:
-        places = [(left, min(max(box_top - height, 0), max(image_height - height, 0)))]
-    rectangles = [(x, y, x + width, y + height) for x, y in places]
-    # A plate that hides its own small object is nearly as bad as one that hides another plate.
+    positions = [(x, y) for y in tops for x in (left, end) if 0 <= y <= image_height - height]
+    if not positions:
+        positions = [(left, min(max(box_top - height, 0), max(image_height - height, 0)))]
+    rectangles = [(x, y, x + width, y + height) for x, y in positions]
+    # A label that hides its own small object is nearly as bad as one that hides another label.
     small = (box_right - box_left) * (box_bottom - box_top) < 3 * width * height
     return min(
         rectangles,
-        key=lambda plate: (
-            sum(_overlap(plate, other) for other in taken) + (_overlap(plate, box) // 2 if small else 0)
+        key=lambda label: (
+            sum(_overlap(label, other) for other in occupied) + (_overlap(label, box) // 2 if small else 0)
         ),
     )
 
@@ -202,7 +207,7 @@ def _draw_panel(image: NDArray[np.uint8], lines: Sequence[str], sizes: _Sizes) -
     margin, inside = 2 * sizes.padding, 2 * sizes.padding
     widest = max(cv2.getTextSize(line, _FONT, scale, sizes.stroke)[0][0] for line in lines)
     room = width - 2 * margin - 2 * inside
-    if widest > room > 0:  # a long line is set smaller, never cut
+    if widest > room > 0:  # a long line is scaled down, not cut
         scale *= room / widest
         widest = room
     (_, text_height), baseline = cv2.getTextSize("Ag", _FONT, scale, sizes.stroke)

@@ -1,4 +1,4 @@
-"""Attitudes as angles and as quaternions, in plain floats: what flies by them needs no numpy.
+"""Attitudes as Euler angles and quaternions, in plain floats without numpy.
 
 Euler angles are the aerospace sequence yaw, pitch, roll (intrinsic z-y-x). Quaternions are (w, x, y, z).
 The matrices of the same rotations are in `vision.rotation`.
@@ -38,26 +38,26 @@ def euler_from_quaternion(quaternion: Quaternion) -> tuple[float, float, float]:
 
 
 def turned_about_down(yaw_rad: float, quaternion: Quaternion) -> Quaternion:
-    """The (w, x, y, z) attitude, turned by a yaw about the parent frame's own down axis."""
+    """The (w, x, y, z) attitude, rotated by a yaw about the parent frame's down axis."""
     c, s = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
     w, x, y, z = quaternion
     return (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w)
 
 
 def slerp(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """Between two attitudes along the shorter way (Shoemake 1985); a fraction above 1 goes on turning.
+    """Interpolate between two attitudes on the shorter arc (Shoemake 1985); above 1 it extrapolates.
 
     Raises ValueError if one is zero.
     """
     a, b = unit_quaternion(first), unit_quaternion(second)
     cosine = sum(p * q for p, q in zip(a, b, strict=True))
-    way = 1.0 if cosine >= 0.0 else -1.0  # the same attitude has two signs
+    sign = 1.0 if cosine >= 0.0 else -1.0  # q and -q are the same attitude
     if abs(cosine) > 0.9995:
         of_first, of_second = 1.0 - fraction, fraction
     else:
         angle = math.acos(abs(cosine))
         of_first, of_second = math.sin((1.0 - fraction) * angle), math.sin(fraction * angle)
-    w, x, y, z = (of_first * p + way * of_second * q for p, q in zip(a, b, strict=True))
+    w, x, y, z = (of_first * p + sign * of_second * q for p, q in zip(a, b, strict=True))
     return unit_quaternion((w, x, y, z))
 
 
@@ -68,7 +68,7 @@ def wrap_angle(angle_rad: float) -> float:
 
 
 def unit_quaternion(quaternion: Quaternion) -> Quaternion:
-    """The same rotation with length 1. Raises ValueError if it is zero, which is no rotation."""
+    """The same rotation with length 1. Raises ValueError for a zero quaternion."""
     norm = math.sqrt(sum(value * value for value in quaternion))
     if norm == 0.0:
         raise ValueError("a zero quaternion is no rotation")

@@ -41,7 +41,7 @@ class CameraModel:
 
     @classmethod
     def from_horizontal_fov(cls, width: int, height: int, fov_rad: float) -> CameraModel:
-        """Square pixels, centred, no distortion, seeing `fov_rad` from edge to edge of the width."""
+        """Square pixels, centred, no distortion, with a horizontal field of view `fov_rad`."""
         if not 0.0 < fov_rad < math.pi:
             raise ValueError(f"horizontal field of view must be in 0..π rad, got {fov_rad}")
         focal = width / 2 / math.tan(fov_rad / 2)
@@ -53,7 +53,7 @@ class CameraModel:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled(self, width: int, height: int) -> CameraModel:
-        """The same camera read out at another size."""
+        """The same camera at another image size."""
         sx, sy = width / self.width, height / self.height
         return CameraModel(
             width,
@@ -106,15 +106,16 @@ class CameraModel:
 
 @dataclass(frozen=True, slots=True)
 class CameraMount:
-    """Where the camera sits on the body (FRD, metres) and how it is turned from looking forward.
+    """Position of the camera on the body (FRD, metres) and rotation from the forward direction.
 
     A negative pitch looks down. With everything zero the camera looks along the body's forward axis.
 
     Attributes:
-        levelled: a gimbal holds it: roll and pitch count from the horizon, yaw from where the nose points.
-        on_gimbal: a gimbal turns it: roll, pitch and yaw count from the gimbal's own frame (FRD, x along its
-            axis), and where it looks is known for a moment alone, see `held`.
-        ned_from_gimbal: (3, 3) rotation of that moment, gimbal FRD to NED; None: not told.
+        levelled: stabilized by a gimbal: roll and pitch are relative to the horizon, yaw to the vehicle's
+            heading.
+        on_gimbal: pointed by a gimbal: roll, pitch and yaw are relative to the gimbal's frame (FRD, x along
+            its axis), whose attitude is given per frame, see `held`.
+        ned_from_gimbal: (3, 3) gimbal attitude at one moment, gimbal FRD to NED; None: unknown.
     """
 
     forward_m: float = 0.0
@@ -128,7 +129,7 @@ class CameraMount:
     ned_from_gimbal: NDArray[np.float64] | None = field(default=None, compare=False)
 
     def held(self, ned_from_gimbal: NDArray[np.float64]) -> CameraMount:
-        """A camera on a gimbal as it looked at one moment, given the gimbal's (3, 3) attitude then."""
+        """The mount of a camera on a gimbal at one moment, with the gimbal's (3, 3) attitude."""
         return replace(self, ned_from_gimbal=ned_from_gimbal)
 
     @property
@@ -140,27 +141,27 @@ class CameraMount:
     def body_from_optical(self) -> NDArray[np.float64]:
         """(3, 3) rotation from the optical frame to the body frame (FRD), for a levelled one a level body.
 
-        Read-only: all that are mounted alike share it.
+        Read-only: cached and shared between equal mounts.
 
-        Raises ValueError for a camera on a gimbal: it has no fixed one.
+        Raises ValueError for a camera on a gimbal, where it is not constant.
         """
         if self.on_gimbal:
-            raise ValueError("a camera on a gimbal does not look one way of the body: ask ned_from_optical")
+            raise ValueError("a camera on a gimbal has no fixed body_from_optical: use ned_from_optical")
         return self._parent_from_optical
 
     @property
     def _parent_from_optical(self) -> NDArray[np.float64]:
-        """(3, 3) rotation from the optical frame to that of what the camera is screwed to."""
+        """(3, 3) rotation from the optical frame to the frame the camera is mounted on."""
         return _parent_from_optical(self.roll_rad, self.pitch_rad, self.yaw_rad)
 
     def ned_from_optical(self, ned_from_body: NDArray[np.float64]) -> NDArray[np.float64]:
         """(3, 3) rotation from the optical frame to NED, for the body's (3, 3) attitude.
 
-        Raises ValueError for a camera on a gimbal whose attitude was not told (`held`).
+        Raises ValueError for a camera on a gimbal without `ned_from_gimbal` (see `held`).
         """
         if self.on_gimbal:
             if self.ned_from_gimbal is None:
-                raise ValueError("where a camera on a gimbal looks needs the gimbal's attitude: use `held`")
+                raise ValueError("a camera on a gimbal needs the gimbal's attitude: use `held`")
             return self.ned_from_gimbal @ self._parent_from_optical
         if self.levelled:
             heading_rad = math.atan2(float(ned_from_body[1, 0]), float(ned_from_body[0, 0]))
@@ -170,7 +171,7 @@ class CameraMount:
 
 @dataclass(frozen=True, slots=True)
 class CameraCalibration:
-    """What a camera says of itself: its lens, and how it is mounted; None: it does not know that."""
+    """Calibration published by a camera: its lens, and its mount (None: unknown)."""
 
     model: CameraModel
     mount: CameraMount | None = None
@@ -178,7 +179,7 @@ class CameraCalibration:
 
 @lru_cache(maxsize=16)
 def _parent_from_optical(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
-    """Read-only: every camera that is mounted like this has it, several times a frame."""
-    turned: NDArray[np.float64] = matrix_from_euler(roll_rad, pitch_rad, yaw_rad) @ BODY_FROM_OPTICAL
-    turned.flags.writeable = False
-    return turned
+    """Read-only and cached: needed several times per frame."""
+    rotation: NDArray[np.float64] = matrix_from_euler(roll_rad, pitch_rad, yaw_rad) @ BODY_FROM_OPTICAL
+    rotation.flags.writeable = False
+    return rotation

@@ -1,7 +1,7 @@
-"""Where the surface of a detected object is nearest, from a depth image and the object's box.
+"""Nearest surface point of a detected object, from a depth image and the object's box.
 
-The answer is a point in the optical frame, so that it can be turned into NED by the attitude of its capture.
-"Nearest" is over ground: of a car seen from above, the bumper and not the roof.
+The point is in the optical frame, so that the attitude at the capture can rotate it into NED.
+"Nearest" is horizontal: of a car seen from above, the bumper and not the roof.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from numpy.typing import NDArray
 
 from vision.camera_model import CameraModel
 
-# With fewer pixels of known depth than this share, what is known may well be something else.
+# With a smaller share of pixels with known depth, these may belong to something else.
 MIN_KNOWN_FRACTION = 0.1
-# A box larger than this is read with a stride, and averaged into this many cells in each direction at most.
+# A larger box is subsampled, and averaged into at most this many cells in each direction.
 _MAX_PIXELS, _MAX_CELLS = 96, 24
-# Cells average as many pixels as bring their noise down to this, but a box keeps so many in each direction.
+# Cells average enough pixels to reduce their noise to this, but a box keeps this many in each direction.
 _CELL_SIGMA_M, _MIN_CELLS = 0.15, 8
-# Lower than this above the ground is ground: the detector's boxes are a few pixels too large.
+# Points lower than this above the ground count as ground: boxes are a few pixels too large.
 GROUND_GAP_M = 0.12
 # The ground is measured in a strip below the box, this share of its height.
 _STRIP, _STRIP_MIN_PX = 0.15, 3
-# Of the cells that are left, so many may be wrong. Less than a tenth of them, nearer than the others by half
-# a metre, is another object before this one.
+# This share of the remaining cells may be wrong. Less than a tenth of them, nearer than the others by half a
+# metre, is another object in front of this one.
 _NEAR_FRACTION, _OTHER_FRACTION, _OTHER_GAP_M = 0.01, 0.1, 0.5
 
 _Edges = tuple[int, int, int, int]  # left, top, right, bottom
 
-# The numbers above were chosen on 450 rendered frames with a stereo camera's noise, drawn as
-# benchmarks/range_error.py draws them but from other seeds than those of the published figures.
+# The numbers above were tuned on 450 rendered frames with a stereo camera's noise, rendered as in
+# benchmarks/range_error.py but with other seeds than those of the published figures.
 
 
 def nearest_points(
@@ -44,21 +44,21 @@ def nearest_points(
 ) -> NDArray[np.float32]:
     """The point of each object's visible surface that is horizontally nearest to the camera.
 
-    The box is averaged into cells in inverse depth, in which a stereo camera's noise is the same everywhere.
-    Ground and sky are left out, and what is left is sorted by horizontal range.
+    The box is averaged into cells of inverse depth, in which a stereo camera's noise is uniform. Ground and
+    sky are excluded, and the remaining cells are sorted by horizontal range.
 
     Args:
         depth_m: (height, width) float32, metres along the optical axis; NaN, infinite or not above zero where
             unknown.
         xyxy: (N, 4) edges of the boxes in that image's pixels: left, top, right, bottom.
-        camera: of that size.
+        camera: model of the depth image's size.
         down: (3,) unit vector of gravity in the optical frame, `ned_from_optical[2]`.
-        lens_height_m: above the ground, for boxes cut off by the image's lower edge; others measure the
-            ground below themselves. None: not known.
+        lens_height_m: above the ground, for boxes cut off by the image's lower edge; for others the ground is
+            measured below the box. None: unknown.
 
     Returns:
-        (N, 3) float32 metres, optical frame (right, down, forward); NaN where too little of the box has a
-        known depth.
+        (N, 3) float32 metres, optical frame (right, down, forward); NaN where too little of the box has known
+        depth.
     """
     points = [_nearest_point(depth_m, box, camera, down, lens_height_m) for box in np.asarray(xyxy).tolist()]
     return np.array(points, np.float32).reshape(-1, 3)
@@ -96,7 +96,7 @@ def _nearest_point(
         above = drops_m < ground_m - GROUND_GAP_M
         if np.count_nonzero(above) >= MIN_KNOWN_FRACTION * len(above):
             rays, along_m, drop = rays[above], along_m[above], drop[above]
-    # Of a metre along the optical axis, how much is over ground.
+    # Horizontal distance per metre along the optical axis.
     level = np.sqrt(np.maximum((rays * rays).sum(axis=1) - drop * drop, 0.0))
     ranges_m = level * along_m
     order = np.argsort(ranges_m)
@@ -107,7 +107,7 @@ def _nearest_point(
 
 
 def _pixels(first: float, last: float, size: int) -> tuple[int, int]:
-    """The pixels between two edges, at least one where that is inside the image."""
+    """The range of pixels between two edges, at least one where that is inside the image."""
     start, stop = math.floor(min(first, last) + 0.5), math.floor(max(first, last) + 0.5)
     stop = max(stop, start + 1)
     return max(start, 0), max(min(stop, size), 0)
@@ -116,7 +116,7 @@ def _pixels(first: float, last: float, size: int) -> tuple[int, int]:
 def _inverse_depth(
     depth_m: NDArray[np.float32], edges: _Edges
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """1 / depth, 0 where unknown; and 1 where known, else 0. Of large parts every second (third, …) pixel."""
+    """1 / depth, 0 where unknown; and 1 where known, else 0. Large boxes are subsampled."""
     left, top, right, bottom = edges
     if right <= left or bottom <= top:
         return np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32)
@@ -130,10 +130,10 @@ def _inverse_depth(
 
 
 def _cell_side(inverse: NDArray[np.float32]) -> float:
-    """How many pixels wide a cell must be for its noise to be small, at the depth of the box's middle.
+    """Side of a cell in pixels for its noise to be small, at the depth of the box's centre.
 
-    The noise is measured: neighbours on a surface differ by little else. By the median absolute difference,
-    edges do not count.
+    The noise is estimated from neighbouring pixels, which differ by little else on a surface; the median
+    absolute difference ignores edges.
     """
     rows, columns = (max(1, size // 32) for size in inverse.shape)
     high, wide = inverse.shape
@@ -162,7 +162,7 @@ def _averaged(
     edges: _Edges,
     camera: CameraModel,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of the cells with depth: (M, 3) rays whose z is 1, optical frame; (M,) depth, metres."""
+    """Of the cells with depth: (M, 3) rays with z = 1, optical frame; (M,) depth, metres."""
     high, wide = shape
     sums = cv2.resize(inverse, (wide, high), interpolation=cv2.INTER_AREA)
     shares = cv2.resize(known, (wide, high), interpolation=cv2.INTER_AREA)
@@ -181,9 +181,9 @@ def _ground(
     camera: CameraModel,
     down: NDArray[np.float64],
 ) -> float | None:
-    """How far the ground before the object is below the lens, metres; None where it cannot be measured."""
+    """Height of the lens above the ground at the object, metres; None where it cannot be measured."""
     left, top, right, bottom = edges
-    first = bottom + 1  # the row in between is half the object
+    first = bottom + 1  # the row in between belongs partly to the object
     last = min(depth_m.shape[0], first + max(_STRIP_MIN_PX, round(_STRIP * (bottom - top))))
     if last - first < _STRIP_MIN_PX:
         return None
@@ -197,13 +197,13 @@ def _ground(
 
 
 def _quantile(values: NDArray[Any], share: float) -> float:
-    """One of the values, in a fifth of the time that `np.quantile` takes."""
-    place = int(values.size * share)
-    return float(np.partition(values, place)[place])
+    """A quantile without interpolation, in a fifth of the time of `np.quantile`."""
+    index = int(values.size * share)
+    return float(np.partition(values, index)[index])
 
 
 def _first_of_object(sorted_m: NDArray[np.float64]) -> int:
-    """Where the object begins among its box's ranges: behind what is clearly nearer and small."""
+    """Index of the object's first range in its box: after a few cells that are clearly nearer."""
     few = sorted_m[: int(_OTHER_FRACTION * len(sorted_m)) + 2]
     gaps = np.flatnonzero(few[1:] - few[:-1] > _OTHER_GAP_M)
     return int(gaps[-1]) + 1 if len(gaps) else 0

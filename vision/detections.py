@@ -1,4 +1,4 @@
-"""What a detector saw in one frame: parallel arrays, validated when made, sliceable."""
+"""Detections of one frame: parallel arrays, validated on construction, sliceable."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ class _TrackRecord(TypedDict):
 class DetectionRecord(_TrackRecord):
     """One detection as plain values, ready for JSON. `xyxy` and `center` are pixels of the frame.
 
-    `depth_m` and `nearest_camera_m` are as in `Detections`, None where unknown.
-    `track_id` and `track_score` are None for a detection that belongs to no track; `track_state` is then
-    `none`, and None if nobody looked for tracks.
+    `depth_m` and `nearest_camera_m` are as in `Detections`, None where unknown. `track_id` and `track_score`
+    are None for a detection without a track; `track_state` is then `none`, and None without tracking.
     """
 
     class_id: int
@@ -35,9 +34,9 @@ class DetectionRecord(_TrackRecord):
 
 
 TRACK_NONE, TRACK_TENTATIVE, TRACK_CONFIRMED = "none", "tentative", "confirmed"
-"""A record's `track_state`: no track, one that may be a mistake, one that counts as true."""
+"""A record's `track_state`: no track, tentative (possibly a false detection), confirmed."""
 NO_TRACK = -1
-"""In `Detections.track_id`: belongs to no track."""
+"""In `Detections.track_id`: no track."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,13 +47,13 @@ class Detections:
         xyxy: (N, 4) float32, pixels of the frame: left, top, right, bottom.
         confidence: (N,) float32 in 0..1.
         class_id: (N,) int64, index into `class_names`.
-        class_names: the model's own table, id → name.
-        nearest_camera_m: (N, 3) float32, optical frame, metres right, down and forward of the lens: the point
-            of the object's visible surface that is horizontally nearest. NaN where unknown.
-        track_id: (N,) int64, 1 or more, `NO_TRACK` for none. Together with the next two; all None if nobody
-            looked for tracks.
+        class_names: the model's class table, id → name.
+        nearest_camera_m: (N, 3) float32, optical frame, metres right, down and forward of the lens: the
+            horizontally nearest point of the object's visible surface. NaN where unknown.
+        track_id: (N,) int64, 1 or more, `NO_TRACK` for none. Set together with the next two; all None without
+            tracking.
         track_score: (N,) float32, the track's median confidence, NaN without a track.
-        track_confirmed: (N,) bool, whether the track counts as true and its class is not in doubt.
+        track_confirmed: (N,) bool, whether the track is confirmed and its class is not in doubt.
     """
 
     xyxy: NDArray[np.float32]
@@ -93,20 +92,23 @@ class Detections:
 
     @classmethod
     def empty(cls, class_names: tuple[str, ...]) -> Detections:
-        """No detections, of a model with these classes."""
+        """No detections, with the class table of a model."""
         return cls(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int64), class_names)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """As three runs of bytes, which can be written to again: seven arrays took ten times as long."""
-        floats, numbers = [self.xyxy.ravel(), self.confidence, self.nearest_camera_m.ravel()], [self.class_id]
-        tracked, truths = False, bytearray()
+        """Pickle as three writable byte buffers: seven arrays took ten times as long."""
+        floats, integers = (
+            [self.xyxy.ravel(), self.confidence, self.nearest_camera_m.ravel()],
+            [self.class_id],
+        )
+        tracked, bool_bytes = False, bytearray()
         if self.track_id is not None and self.track_score is not None and self.track_confirmed is not None:
             floats.append(self.track_score)
-            numbers.append(self.track_id)
-            tracked, truths = True, bytearray(self.track_confirmed)
-        of_floats = bytearray(np.concatenate(floats, dtype=np.float32))
-        of_numbers = bytearray(np.concatenate(numbers, dtype=np.int64))
-        return _unpickled, (self.class_names, len(self), of_floats, of_numbers, truths, tracked)
+            integers.append(self.track_id)
+            tracked, bool_bytes = True, bytearray(self.track_confirmed)
+        float_bytes = bytearray(np.concatenate(floats, dtype=np.float32))
+        int_bytes = bytearray(np.concatenate(integers, dtype=np.int64))
+        return _unpickled, (self.class_names, len(self), float_bytes, int_bytes, bool_bytes, tracked)
 
     def __len__(self) -> int:
         return len(self.xyxy)
@@ -134,7 +136,7 @@ class Detections:
 
     @property
     def center(self) -> NDArray[np.float32]:
-        """(N, 2) float32, pixels: x, y of each box's middle."""
+        """(N, 2) float32, pixels: x, y of each box's centre."""
         return ((self.xyxy[:, :2] + self.xyxy[:, 2:]) / 2).astype(np.float32)
 
     @property
@@ -143,11 +145,11 @@ class Detections:
         return [self.class_names[index] for index in self.class_id]
 
     def of_class(self, class_name: str) -> Detections:
-        """Those of one class; none if the model does not know the class."""
+        """The detections of one class; empty if the model does not have the class."""
         return self[np.array([name == class_name for name in self.names], dtype=np.bool_)]
 
     def records(self) -> list[DetectionRecord]:
-        """Plain values, rounded to what they mean (0.01 px, 0.0001, 1 mm)."""
+        """Plain values, rounded to their precision (0.01 px, 0.0001, 1 mm)."""
         values = zip(
             self.class_id.tolist(),
             self.confidence.tolist(),
@@ -185,19 +187,19 @@ class Detections:
 def _unpickled(
     class_names: tuple[str, ...],
     count: int,
-    of_floats: bytearray,
-    of_numbers: bytearray,
-    of_truths: bytearray,
+    float_bytes: bytearray,
+    int_bytes: bytearray,
+    bool_bytes: bytearray,
     tracked: bool,
 ) -> Detections:
-    floats, numbers = np.frombuffer(of_floats, np.float32), np.frombuffer(of_numbers, np.int64)
+    floats, integers = np.frombuffer(float_bytes, np.float32), np.frombuffer(int_bytes, np.int64)
     return Detections(
         floats[: 4 * count].reshape(count, 4),
         floats[4 * count : 5 * count],
-        numbers[:count],
+        integers[:count],
         class_names,
         floats[5 * count : 8 * count].reshape(count, 3),
-        numbers[count:] if tracked else None,
+        integers[count:] if tracked else None,
         floats[8 * count :] if tracked else None,
-        np.frombuffer(of_truths, np.bool_) if tracked else None,
+        np.frombuffer(bool_bytes, np.bool_) if tracked else None,
     )

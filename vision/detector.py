@@ -1,6 +1,6 @@
-"""Frames in, detections out: letterbox → runtime → class filter → suppression → the frame's own pixels.
+"""YOLO detector: letterbox → runtime → class filter → suppression → boxes in the frame's pixels.
 
-Torch is loaded for what it computes alone: an ONNX or OpenVINO file does without its seconds and its memory.
+Torch is loaded only where it is needed: an ONNX or OpenVINO file saves its import time and memory.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 DEFAULT_MODEL = "default"
-# From this confidence on so few cells are left that their boxes cost less one by one than as whole maps.
+# From this confidence on, decoding the few remaining cells one by one is faster than decoding all cells.
 _SPARSE_FROM = 0.05
 
 
 class Detector(ObjectDetector):
-    """A YOLO network with its thresholds. Not to be shared between threads.
+    """A YOLO network with its thresholds. Not thread-safe.
 
     Attributes:
-        class_names: id → name, the model's own table.
-        class_ids: those it reports, sorted; None for all.
-        runtime: what computes the network: `torch`, `onnxruntime`, `openvino` or `tensorrt`.
-        runtime_reason: why that one, in words.
-        precision: what the network computes in, `float32`, `bfloat16` or `float16`.
-        precision_reason: why, in words.
-        model_name: what `model` was given as.
-        description: what the network was built from; None of an exported file.
-        metadata: what the file tells about itself (licence, origin, score).
+        class_names: id → name, the model's class table.
+        class_ids: ids to report, sorted; None for all.
+        runtime: `torch`, `onnxruntime`, `openvino` or `tensorrt`.
+        runtime_reason: why this runtime, in words.
+        precision: of the network, `float32`, `bfloat16` or `float16`.
+        precision_reason: why this precision, in words.
+        model_name: the value of `model`.
+        description: what the network was built from; None for an exported file.
+        metadata: of the file (licence, origin, score).
         last_timing: of the latest `detect`; None before the first.
     """
 
@@ -64,25 +64,26 @@ class Detector(ObjectDetector):
         square: bool = False,
         runtime: RuntimeChoice = "torch",
     ) -> None:
-        """Load the model and make it ready.
+        """Load the model.
 
         Args:
             model: `default`, the bundled one, or the path of a checkpoint (our own, or an Ultralytics `.pt`),
-                or of a file that `vision.runtimes.export` made of one.
+                or of a file exported by `vision.runtimes.export`.
             classes: names or ids to report; None for all. The network does not compute the others.
             confidence: boxes not above this are dropped, 0..1.
-            iou: of two boxes of one class overlapping more than this the less confident is dropped, 0..1.
+            iou: NMS IoU threshold, 0..1: of two boxes of one class overlapping more, the less confident is
+                dropped.
             image_size: longer side of the network's input, pixels, a multiple of its largest stride (32).
-            precision: `auto` takes bfloat16 only where the processor computes in it, in a fifth less time.
-            threads: processor threads of the runtime (torch: of the whole process); None: its own choice.
+            precision: `auto` selects bfloat16 only where the processor supports it (a fifth less time).
+            threads: processor threads of the runtime (torch: of the whole process); None: its default.
             square: pad the input to a square rather than to the next multiple of the stride.
-            runtime: by name, or `auto` for the fastest installed one (measured once, remembered).
+            runtime: by name, or `auto` for the fastest installed one (measured once, cached).
 
         Raises:
             CheckpointError: the model cannot be read.
             RuntimeMissingError: the named runtime is not installed; the message names its extra.
             RuntimeUnusableError: the runtime cannot run this model, or not in this precision.
-            ValueError: an unknown class (the message names the nearest), or a number out of its range.
+            ValueError: an unknown class (the message names the nearest), or a number out of range.
         """
         for name, value in (("confidence", confidence), ("iou", iou)):
             if not 0.0 <= value <= 1.0:
@@ -91,7 +92,7 @@ class Detector(ObjectDetector):
             raise ValueError(f"precision must be {', '.join(PRECISIONS)}; got {precision!r}")
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
-        fit(image_size, image_size, image_size)  # Refuses a bad size now, not at the first frame.
+        fit(image_size, image_size, image_size)  # Rejects a bad size now, not at the first frame.
         path = _model_path(model)
         source = read_source(path)
         self._stride = max(source.strides)
@@ -134,22 +135,22 @@ class Detector(ObjectDetector):
 
     @property
     def threads(self) -> int:
-        """Processor threads of the runtime; 0 where it does not tell before the first frame."""
+        """Processor threads of the runtime; 0 if unknown before the first frame."""
         return self._runtime.threads
 
     def prepare(self, width: int, height: int) -> None:
-        """Make ready for frames of one size, so that the first is looked at as fast as the rest."""
+        """Prepare for frames of one size, so that the first frame is not slower than the rest."""
         box = self._fit(width, height)
         self._runtime.prepare(box.height, box.width)
 
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
-        """What is in one frame.
+        """Detect objects in one frame.
 
         Args:
             image_bgr: (height, width, 3) uint8, BGR.
 
         Returns:
-            The boxes in the frame's pixels, clipped to it, the most confident first; at most 300.
+            Boxes in the frame's pixels, clipped to it, most confident first; at most 300.
         """
         if image_bgr.ndim != 3 or image_bgr.shape[2] != 3 or image_bgr.dtype != np.uint8:
             raise ValueError(
@@ -157,22 +158,22 @@ class Detector(ObjectDetector):
             )
         started = time.perf_counter()
         box = self._fit(image_bgr.shape[1], image_bgr.shape[0])
-        picture = box.apply(image_bgr, self._boxed)
-        if not (picture.flags.c_contiguous and picture.flags.writeable):
-            # Runtimes look at the memory itself, in this order, and some insist that it were theirs.
-            picture = picture.copy(order="C")
+        boxed = box.apply(image_bgr, self._boxed)
+        if not (boxed.flags.c_contiguous and boxed.flags.writeable):
+            # Runtimes read the memory directly in this order, and some require it to be writable.
+            boxed = boxed.copy(order="C")
         prepared = time.perf_counter()
-        head, maps = self._runtime.head, self._runtime.infer(picture)
-        mapped = time.perf_counter()
-        candidates = candidates_of(head, maps, self.confidence, self.class_ids)
+        head, outputs = self._runtime.head, self._runtime.infer(boxed)
+        computed = time.perf_counter()
+        candidates = candidates_of(head, outputs, self.confidence, self.class_ids)
         selected = time.perf_counter()
-        # The network's last part, where only the cells that matter are computed.
-        sides = decode_ltrb(head, maps, candidates, self._runtime.product)
+        # The box branch, computed only for the candidate cells.
+        sides = decode_ltrb(head, outputs, candidates, self._runtime.product)
         inferred = time.perf_counter()
-        boxes = boxes_from(head, maps, candidates, sides, self.iou)
+        boxes = boxes_from(head, outputs, candidates, sides, self.iou)
         detections = Detections(box.to_frame(boxes.xyxy), boxes.confidence, boxes.class_id, self.class_names)
         done = time.perf_counter()
-        network_s = (mapped - prepared) + (inferred - selected)
+        network_s = (computed - prepared) + (inferred - selected)
         self.last_timing = Timing(
             preprocess_ms=(prepared - started) * 1e3,
             inference_ms=network_s * 1e3,
@@ -189,11 +190,11 @@ class Detector(ObjectDetector):
 
 
 def class_names_of(model: str | Path = DEFAULT_MODEL, runtime: RuntimeChoice = "torch") -> tuple[str, ...]:
-    """What a model knows, id → name, without making it ready.
+    """Class names of a model, id → name, without loading it into a runtime.
 
     Raises:
         CheckpointError: the model cannot be read.
-        RuntimeMissingError, RuntimeUnusableError: the runtime is not installed, or does not run such a file.
+        RuntimeMissingError, RuntimeUnusableError: the runtime is not installed, or cannot run such a file.
     """
     source = read_source(_model_path(model))
     check_runtime(source, runtime)
@@ -206,6 +207,6 @@ def _model_path(model: str | Path) -> Path:
     if not DEFAULT_WEIGHTS.is_file():
         raise CheckpointError(
             f"{DEFAULT_WEIGHTS}: the bundled model is missing from this installation; "
-            "install the package again, make one with `companion train`, or give the path of another"
+            "reinstall the package, train one with `companion train`, or give the path of another"
         )
     return DEFAULT_WEIGHTS

@@ -1,4 +1,4 @@
-"""One picture as it came from a source."""
+"""One frame from a source."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Frame:
 
     Attributes:
         image: (height, width, 3) uint8, BGR, C-contiguous.
-        captured_ns: CLOCK_MONOTONIC nanoseconds (`time.monotonic_ns`) when the frame was captured, or,
-            where the source cannot tell, when its bytes arrived.
+        captured_ns: CLOCK_MONOTONIC nanoseconds (`time.monotonic_ns`) of the capture, or of the arrival of
+            its bytes if the source does not know the capture time.
         sequence: counts every frame the source delivered, from 0. A gap means dropped frames.
-        depth_m: (height, width) float32, metres along the optical axis, NaN where unknown; None if there is
-            no depth.
-        ready_ns: CLOCK_MONOTONIC nanoseconds when the source had the picture decoded; 0 if it does not tell.
-        decode_ms: how long making a picture of its bytes took, milliseconds.
-        media_s: where it is in the recording that it comes from, seconds; None where it is none.
+        depth_m: (height, width) float32, metres along the optical axis, NaN where unknown; None without
+            depth.
+        ready_ns: CLOCK_MONOTONIC nanoseconds when the image was decoded; 0 if unknown.
+        decode_ms: decoding time, milliseconds.
+        media_s: position in the recording, seconds; None for a live source.
     """
 
     image: NDArray[np.uint8]

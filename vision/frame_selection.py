@@ -1,4 +1,4 @@
-"""Which frames are looked at: every N-th, so many a second, none that is too old. Each other is counted."""
+"""Selection of the frames to process: every Nth, up to a rate, up to an age. Skipped frames are counted."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from vision.frame import Frame
 
 EVERY, RATE, TOO_OLD = "every", "rate", "too_old"
-"""Why a frame was not looked at: not its turn, sooner than asked for, captured too long ago."""
+"""Why a frame was skipped: not an Nth frame, above the rate, captured too long ago."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What is asked for.
+    """Which frames to process.
 
     Attributes:
-        every: look at every N-th frame that was read.
-        rate_hz: look at no more than so many a second, by their capture stamps; None: as they come.
-        max_age_s: do not look at what was captured longer ago; None: look at everything.
+        every: process every Nth frame read.
+        rate_hz: process at most this many per second, by capture stamp; None: no limit.
+        max_age_s: skip frames captured longer ago; None: no limit.
     """
 
     every: int = 1
@@ -34,7 +34,7 @@ class Selection:
 
 
 class FrameSelector:
-    """Says frame by frame whether to look at it, and counts what is left out.
+    """Decides for each frame whether to process it, and counts the skipped ones.
 
     Attributes:
         frames_skipped: reason → frames so far.
@@ -46,27 +46,27 @@ class FrameSelector:
         self._due_ns = 0
         self.frames_skipped = {EVERY: 0, RATE: 0, TOO_OLD: 0}
 
-    def look_at(self, frame: Frame, now_ns: int) -> bool:
-        """Whether to look at this frame, picked up at `now_ns` of CLOCK_MONOTONIC."""
-        reason = self._reason_against(frame, now_ns)
+    def accept(self, frame: Frame, now_ns: int) -> bool:
+        """Whether to process this frame, read at `now_ns` of CLOCK_MONOTONIC."""
+        reason = self._skip_reason(frame, now_ns)
         self._read += 1
         if reason is not None:
             self.frames_skipped[reason] += 1
             return False
         return True
 
-    def _reason_against(self, frame: Frame, now_ns: int) -> str | None:
-        asked = self._selection
-        if self._read % asked.every:
+    def _skip_reason(self, frame: Frame, now_ns: int) -> str | None:
+        selection = self._selection
+        if self._read % selection.every:
             return EVERY
-        if asked.max_age_s is not None and now_ns - frame.captured_ns > asked.max_age_s * 1e9:
+        if selection.max_age_s is not None and now_ns - frame.captured_ns > selection.max_age_s * 1e9:
             return TOO_OLD
-        if asked.rate_hz is not None:
-            period_ns = round(1e9 / asked.rate_hz)
-            # Frames jitter: one that comes a quarter of a period early is the one that was due.
+        if selection.rate_hz is not None:
+            period_ns = round(1e9 / selection.rate_hz)
+            # Frames jitter: one that arrives up to a quarter of a period early is the one that was due.
             if frame.captured_ns < self._due_ns - period_ns // 4:
                 return RATE
-            # From the due time on, so that the rate holds on average; after a gap, from this frame on.
+            # Counted from the due time, so that the rate holds on average; after a gap, from this frame.
             next_ns = self._due_ns + period_ns
             self._due_ns = next_ns if next_ns > frame.captured_ns else frame.captured_ns + period_ns
         return None

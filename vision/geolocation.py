@@ -1,4 +1,4 @@
-"""From a pixel to a direction to a place on the ground, in the world's NED frame."""
+"""From a pixel to a direction to a position on the ground, in the world's NED frame."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 
 from vision.camera_model import CameraModel, CameraMount
 
-# How deep an object is taken to be along the line of sight, against its width across. On rendered people,
-# cars and bicycles 0.6 has the smallest median error, and 0.4 fewer ranges that are too far.
+# Assumed depth of an object along the line of sight, as a share of its width. On rendered people, cars and
+# bicycles 0.6 has the smallest median error, and 0.4 fewer ranges that are too far.
 DEPTH_OF_WIDTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelRays:
-    """Where pixels look, given the vehicle's attitude when they were captured.
+    """Directions of pixels in NED, for the vehicle's attitude at the capture.
 
     All float64; offsets are metres from the vehicle.
 
     Attributes:
         directions: (N, 3) unit vectors, NED.
-        cosines: (N,) of the angle to the optical axis: how much of a metre along the line is depth.
+        cosines: (N,) of the angle to the optical axis: depth per metre along the ray.
         camera_ned_m: (3,) offset of the optical centre.
     """
 
@@ -41,7 +41,7 @@ class PixelRays:
         ned_from_body: NDArray[np.float64],
         pixels: NDArray[Any],
     ) -> PixelRays:
-        """Those of (N, 2) pixels; `ned_from_body` is the (3, 3) attitude."""
+        """Rays of (N, 2) pixels; `ned_from_body` is the (3, 3) attitude."""
         rays = camera.rays(pixels)
         directions = rays @ mount.ned_from_optical(ned_from_body).T
         return cls(directions, rays[:, 2], ned_from_body @ mount.position_frd_m)
@@ -50,25 +50,25 @@ class PixelRays:
         return PixelRays(self.directions[part], self.cosines[part], self.camera_ned_m)
 
     def at_depth(self, depth_m: NDArray[Any]) -> NDArray[np.float64]:
-        """(N, 3) NED offsets of the points with these depths (N,) along the optical axis."""
+        """(N, 3) NED offsets of the points at depths (N,) along the optical axis."""
         along_m = np.asarray(depth_m, np.float64) / self.cosines
         offsets: NDArray[np.float64] = self.camera_ned_m + self.directions * along_m[:, None]
         return offsets
 
     def on_ground(self, height_m: float, min_depression_rad: float = 0.02) -> NDArray[np.float64]:
-        """(N, 3) NED offsets of where the lines meet level ground; NaN where they do not.
+        """(N, 3) NED offsets of the intersections with level ground; NaN where there is none.
 
         Args:
             height_m: of the vehicle above that ground.
-            min_depression_rad: lines that point down by less than this give NaN: near the horizon a small
-                error of attitude is a large error of range.
+            min_depression_rad: rays that point down by less than this give NaN: near the horizon a small
+                attitude error is a large range error.
         """
         drop_m = height_m - float(self.camera_ned_m[2])
         down = self.directions[:, 2]
         if drop_m <= 0.0:
             return np.full(self.directions.shape, np.nan)
-        met = np.where(down > np.sin(min_depression_rad), down, np.nan)
-        offsets: NDArray[np.float64] = self.camera_ned_m + self.directions * (drop_m / met)[:, None]
+        sloped = np.where(down > np.sin(min_depression_rad), down, np.nan)
+        offsets: NDArray[np.float64] = self.camera_ned_m + self.directions * (drop_m / sloped)[:, None]
         return offsets
 
 
@@ -80,15 +80,15 @@ def range_from_known_height(
     height_m: float,
     min_spread: float = 0.005,
 ) -> NDArray[np.float64]:
-    """(3,) NED offset from the vehicle of the foot of something upright that is `height_m` tall.
+    """(3,) NED offset from the vehicle to the foot of an upright object that is `height_m` tall.
 
-    Its top and its foot are in one direction and as far away: that distance is the height, divided by the
-    difference of the tangents of their elevations. Seen from above, its top is its far edge: it is taken as
+    Top and foot have the same bearing and range: the range is the height divided by the difference of the
+    tangents of their elevations. Seen from above, the top is the far edge: the object is assumed
     `DEPTH_OF_WIDTH` as deep as it is wide.
 
     Args:
         xyxy: edges of its box, pixels.
-        min_spread: the difference of the tangents below which the answer is NaN: it is too small to measure.
+        min_spread: smallest measurable difference of the tangents; below it the result is NaN.
     """
     left, top, right, bottom = (edge - 0.5 for edge in xyxy)
     x, y = (left + right) / 2, (top + bottom) / 2
@@ -96,7 +96,7 @@ def range_from_known_height(
     lines = PixelRays.of(camera, mount, ned_from_body, pixels)
     directions = lines.directions
     level = np.hypot(directions[:, 0], directions[:, 1])
-    # Nearly straight above something its height is not seen.
+    # Seen from nearly straight above, the height cannot be measured.
     if level.min() < 0.1:
         return np.full(3, np.nan)
     tangents = -directions[:, 2] / level

@@ -1,7 +1,7 @@
-"""Fitting a frame into the network's input: resized with its aspect kept, padded with grey, and the way back.
+"""Fitting a frame into the network's input: resized with its aspect kept, padded with grey, and the inverse.
 
-The conventions (114 as padding, which side gets the odd pixel, where rounding happens) are those under which
-YOLOv8 networks are trained and published; half a pixel off costs accuracy.
+The conventions (padding value 114, side of the odd pixel, rounding) are those of published YOLOv8 networks;
+half a pixel of offset costs accuracy.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STRIDE = 32
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """Where a frame lies in the network's input. All sizes in pixels.
+    """Position of a frame in the network's input. All sizes in pixels.
 
     Attributes:
         frame_width, frame_height: the frame.
@@ -41,11 +41,11 @@ class Letterbox:
         """(frame_height, frame_width, 3) uint8 → (height, width, 3) uint8, the same channel order.
 
         Args:
-            into: what `blank` gave for this letterbox, or an earlier result of it; is overwritten, which
-                saves making and padding a new one. None: a new one.
+            into: a result of `blank` or of an earlier call on this letterbox; it is overwritten, which saves
+                allocating and padding a new one. None: a new one.
 
         Returns:
-            `into`, a new array, or the frame itself where it fits as it is.
+            `into`, a new array, or the frame itself if it already has the input's size.
         """
         if image.shape != (self.frame_height, self.frame_width, 3):
             raise ValueError(
@@ -60,11 +60,11 @@ class Letterbox:
         else:
             size = (self.resized_width, self.resized_height)
             if cv2.resize(image, size, dst=inside, interpolation=cv2.INTER_LINEAR) is not inside:
-                raise RuntimeError("the image library did not resize in place")
+                raise RuntimeError("cv2.resize did not write in place")
         return boxed
 
     def blank(self) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8, padding all over."""
+        """(height, width, 3) uint8, filled with padding."""
         return np.full((self.height, self.width, 3), PADDING, np.uint8)
 
     def to_frame(self, xyxy: NDArray[Any]) -> NDArray[np.float32]:
@@ -81,7 +81,8 @@ class Letterbox:
 
     @property
     def _scale(self) -> NDArray[np.float32]:
-        # Sizes are whole pixels, so the two axes differ by a little, and small boxes would feel it.
+        # Sizes are whole pixels, so the scales of the two axes differ slightly, which matters for small
+        # boxes.
         across, down = self.resized_width / self.frame_width, self.resized_height / self.frame_height
         return np.array([across, down] * 2, np.float32)
 
@@ -93,7 +94,7 @@ class Letterbox:
 def fit(
     frame_width: int, frame_height: int, image_size: int = 640, *, square: bool = False, stride: int = STRIDE
 ) -> Letterbox:
-    """The letterbox for frames of one size.
+    """Compute the letterbox for frames of one size.
 
     Args:
         image_size: the input's longer side, a multiple of the stride.
@@ -101,11 +102,11 @@ def fit(
         stride: the network's largest, pixels.
     """
     if frame_width < 1 or frame_height < 1:
-        raise ValueError(f"a frame needs pixels, got {frame_width}x{frame_height}")
+        raise ValueError(f"a frame must have a positive size, got {frame_width}x{frame_height}")
     if image_size < stride or image_size % stride:
         raise ValueError(f"image_size must be a multiple of {stride} (such as 640), got {image_size}")
     scale = min(image_size / frame_height, image_size / frame_width)
-    # A frame a thousand times wider than high still keeps one row.
+    # A frame a thousand times wider than high still keeps one row of pixels.
     resized_width = max(1, round(frame_width * scale))
     resized_height = max(1, round(frame_height * scale))
     spare_width, spare_height = image_size - resized_width, image_size - resized_height

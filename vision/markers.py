@@ -1,10 +1,10 @@
-"""ArUco and AprilTag markers: found in a picture, and where they are before the camera.
+"""ArUco and AprilTag markers: detection in an image, and pose relative to the camera.
 
-Markers after Garrido-Jurado et al. 2014 and Olson 2011, found by OpenCV. A square marker's pose follows from
-its four corners in closed form (IPPE: Collins and Bartoli, Infinitesimal Plane-based Pose Estimation, 2014).
-That gives two, and seen from far away or nearly face on both fit about equally well. Where the marker is
-hardly differs between them, how it is turned does; both are kept, so that whoever knows more (that a pad lies
-level) can choose.
+Markers after Garrido-Jurado et al. 2014 and Olson 2011, detected by OpenCV. A square marker's pose follows
+from its four corners in closed form (IPPE: Collins and Bartoli, Infinitesimal Plane-based Pose Estimation,
+2014), which gives two solutions. Seen from far away or nearly face on, both fit about equally well: they
+hardly differ in position, but in orientation. Both are kept, so that a caller with more knowledge (that a pad
+is level) can choose.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from vision.camera_model import CameraModel
 
-# A square that is no marker, or corners torn apart by blur, fit no pose: RMS over its corners, as a share of
-# the marker's own side in the picture, and never less than this many pixels.
+# A false detection, or corners displaced by blur, fits no pose: largest RMS over the corners, as a share of
+# the marker's side in the image, and never less than this many pixels.
 WORST_FIT, WORST_FIT_PX = 0.05, 2.0
-# Two poses turned less than this apart are one; the steps that a fit takes at most.
-SAME_RAD, _SETTLING_STEPS = 0.005, 8
-# OpenCV spells some of them twice; the usual spelling is offered.
+# Two poses rotated less than this apart are the same; the most iterations of a fit.
+SAME_RAD, _MAX_STEPS = 0.005, 8
+# OpenCV has two spellings of some names; the usual one is offered.
 DICTIONARIES = tuple(
     sorted(
         name.removeprefix("DICT_")
@@ -39,12 +39,12 @@ DICTIONARIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class MarkerKind:
-    """Which markers are looked for, and how large they are.
+    """Dictionary and sizes of the markers to detect.
 
     Attributes:
         dictionary: one of DICTIONARIES: "4X4_50", "APRILTAG_36h11".
         size_m: side of the black square, metres.
-        sizes_m: the same for single ids that are larger or smaller.
+        sizes_m: size per id, for ids with another size.
 
     Raises:
         ValueError: no such dictionary, an id that is not in it, or a size that is not positive.
@@ -59,11 +59,11 @@ class MarkerKind:
         for identifier in self.sizes_m:
             if not 0 <= identifier < count:
                 raise ValueError(
-                    f"marker {identifier} is not in dictionary {self.dictionary}, which has 0 to {count - 1}"
+                    f"marker id {identifier} is not in dictionary {self.dictionary} (0 to {count - 1})"
                 )
         for size_m in (self.size_m, *self.sizes_m.values()):
             if not (math.isfinite(size_m) and size_m > 0.0):
-                raise ValueError(f"a marker's side must be a number of metres above 0, got {size_m}")
+                raise ValueError(f"a marker's side must be finite and above 0 m, got {size_m}")
 
     def size_of(self, identifier: int) -> float:
         """Side of that marker's black square, metres."""
@@ -72,10 +72,10 @@ class MarkerKind:
 
 @dataclass(frozen=True, slots=True)
 class PadMarker:
-    """A marker on the pad of another: several sizes on one pad are seen from every height.
+    """One marker of a pad with several: with several sizes, one is visible from every height.
 
     Attributes:
-        identifier: of this marker. pad: of the one whose centre is the pad's.
+        identifier: of this marker. pad: id of the marker whose centre is the pad's.
         right_m, up_m: this marker's centre from the pad's, along the print's right and upper edge; both are
             printed the same way up.
     """
@@ -88,12 +88,12 @@ class PadMarker:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerPose:
-    """Where a marker is before the camera.
+    """Pose of a marker relative to the camera.
 
     Attributes:
         position_camera_m: (3,) its centre in the optical frame: right, down, forward.
         rotation: (3, 3) `optical_from_marker`; x to the marker's right, y to its upper edge, z out of it.
-        reprojection_px: RMS distance of its four corners from where this pose puts them, pixels.
+        reprojection_px: RMS reprojection error of its four corners, pixels.
     """
 
     position_camera_m: NDArray[np.float64]
@@ -103,14 +103,14 @@ class MarkerPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marker:
-    """One marker in one picture. Small, and can be pickled.
+    """One marker in one image. Small and picklable.
 
     Attributes:
         identifier: in its dictionary.
-        size_m: side of the black square by which it was measured, metres.
+        size_m: assumed side of the black square, metres.
         corners_px: (4, 2) float64 pixels: its upper left corner, then clockwise as printed.
-        position_camera_m, rotation, reprojection_px: of the pose that fits better; see MarkerPose.
-        other: the second pose that the same corners allow; None where it cannot be.
+        position_camera_m, rotation, reprojection_px: of the better fitting pose; see MarkerPose.
+        other: the second pose that fits the same corners; None if there is none.
     """
 
     identifier: int
@@ -123,25 +123,25 @@ class Marker:
 
     @property
     def ambiguity(self) -> float:
-        """How well the second pose fits beside the first: 0 not at all, 1 just as well."""
+        """Error of the first pose over that of the second: 0 unambiguous, 1 both fit equally well."""
         if self.other is None or self.other.reprojection_px <= 0.0:
             return 0.0
         return self.reprojection_px / self.other.reprojection_px
 
     @property
     def side_px(self) -> float:
-        """Mean length of its sides in the picture, pixels."""
+        """Mean length of its sides in the image, pixels."""
         sides = self.corners_px - np.roll(self.corners_px, 1, axis=0)
         return float(np.linalg.norm(sides, axis=1).mean())
 
 
 def markers_in(dictionary: str) -> int:
-    """How many markers a dictionary has. Raises ValueError, naming those that there are."""
+    """Number of markers in a dictionary. Raises ValueError, listing the known dictionaries."""
     return len(_dictionary(dictionary).bytesList)
 
 
 class MarkerDetector:
-    """Finds the markers of one dictionary in pictures."""
+    """Detects the markers of one dictionary in images."""
 
     def __init__(self, kind: MarkerKind) -> None:
         self.kind = kind
@@ -150,18 +150,18 @@ class MarkerDetector:
         self._detector = cv2.aruco.ArucoDetector(_dictionary(kind.dictionary), parameters)
 
     def detect(self, image_bgr: NDArray[np.uint8], camera: CameraModel) -> tuple[Marker, ...]:
-        """What is in the picture, by id.
+        """Detect markers, sorted by id.
 
         Args:
             image_bgr: (height, width, 3) uint8 BGR, or (height, width) uint8 grey.
-            camera: the model for pictures of this size.
+            camera: the model for images of this size.
 
         Raises:
-            ValueError: the picture's size is not the camera model's.
+            ValueError: the image's size differs from the camera model's.
         """
         if image_bgr.shape[:2] != (camera.height, camera.width):
             raise ValueError(
-                f"the camera model is of {camera.width}x{camera.height} pixels, the picture of "
+                f"the camera model is for {camera.width}x{camera.height} pixels, the image has "
                 f"{image_bgr.shape[1]}x{image_bgr.shape[0]}"
             )
         grey = image_bgr if image_bgr.ndim == 2 else cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
@@ -178,7 +178,7 @@ class MarkerDetector:
 def marker_from_corners(
     identifier: int, corners_px: NDArray[Any], size_m: float, camera: CameraModel
 ) -> Marker | None:
-    """The marker whose corners are seen there; None where no pose before the camera explains them.
+    """The marker with these corners; None where no pose in front of the camera fits.
 
     Args:
         corners_px: (4, 2) pixels: its upper left corner, then clockwise as printed.
@@ -202,9 +202,9 @@ def marker_from_corners(
 
 
 def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraModel) -> list[MarkerPose]:
-    """The poses that the corners allow, the better one first: two, one or none.
+    """The poses that fit the corners, the better one first: two, one or none.
 
-    One behind the camera, or showing the marker's back, is left out.
+    Poses behind the camera, or showing the marker's back, are dropped.
 
     Args:
         corners_px: (4, 2) pixels, as `marker_from_corners`.
@@ -216,11 +216,11 @@ def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraM
     model = square(size_m)
     poses: list[MarkerPose] = []
     for rotation in _rotations(model, plane):
-        rotation, position = _settled(model, plane, rotation, _position(model @ rotation.T, plane))
+        rotation, position = _refined(model, plane, rotation, _position(model @ rotation.T, plane))
         if not (np.isfinite(position).all() and position[2] > 0.0 and rotation[:, 2] @ position < 0.0):
             continue
-        off = camera.project(model @ rotation.T + position) - corners_px
-        error_px = float(np.sqrt((off**2).sum(axis=1).mean()))
+        error = camera.project(model @ rotation.T + position) - corners_px
+        error_px = float(np.sqrt((error**2).sum(axis=1).mean()))
         if math.isfinite(error_px):
             poses.append(MarkerPose(position, rotation, error_px))
     poses.sort(key=lambda pose: pose.reprojection_px)
@@ -228,13 +228,13 @@ def marker_poses(corners_px: NDArray[np.float64], size_m: float, camera: CameraM
 
 
 def _rotations(model: NDArray[np.float64], plane: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """IPPE: the two rotations that agree with the homography at the marker's centre; none where it has none.
+    """IPPE: the two rotations that agree with the homography at the marker's centre; empty if degenerate.
 
-    Not OpenCV's: its rotation vectors fail at half a turn, which is how a camera sees a marker face on
+    OpenCV's solver is not used: its rotation vectors fail at half a turn, which is a marker seen face on
     (found with OpenCV 5.0).
 
     Args:
-        model: (4, 3) corners in the marker's plane. plane: (4, 2) where they are seen, at unit depth.
+        model: (4, 3) corners in the marker's plane. plane: (4, 2) their projections at unit depth.
     """
     if len(np.unique(plane, axis=0)) < 4:
         return ()
@@ -255,14 +255,14 @@ def _rotations(model: NDArray[np.float64], plane: NDArray[np.float64]) -> tuple[
     rotations = []
     for sign in (1.0, -1.0):
         first, second = np.vstack([upper, sign * lower]).T
-        turned = np.column_stack([first, second, np.cross(first, second)])
-        left, _, right = np.linalg.svd(ahead @ turned)
+        rotated = np.column_stack([first, second, np.cross(first, second)])
+        left, _, right = np.linalg.svd(ahead @ rotated)
         rotations.append(np.asarray(left @ right, np.float64))
     return tuple(rotations)
 
 
 def _homography(model: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) that takes the four corners to where they are seen; its last element is 1. NaN if none does."""
+    """(3, 3) from the marker's plane to the four projections; its last element is 1. NaN if degenerate."""
     rows = []
     for (x, y), (u, v) in zip(model, plane, strict=True):
         rows.append([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y])
@@ -276,7 +276,7 @@ def _homography(model: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArr
 
 
 def _turn_to(point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) the shortest rotation of the optical axis to the ray through (x, y, 1), after Rodrigues."""
+    """(3, 3) shortest rotation of the optical axis to the ray through (x, y, 1), after Rodrigues."""
     ray = np.array([point[0], point[1], 1.0])
     ray /= np.linalg.norm(ray)
     x, y, cosine = ray
@@ -285,37 +285,38 @@ def _turn_to(point: NDArray[np.float64]) -> NDArray[np.float64]:
     return turn
 
 
-def _position(turned: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) where the marker's centre is, by least squares over the turned corners (4, 3)."""
+def _position(rotated: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) the marker's centre, by least squares over the rotated corners (4, 3)."""
     count = len(plane)
     system, wanted = np.zeros((2 * count, 3)), np.zeros(2 * count)
     system[0::2, 0] = system[1::2, 1] = 1.0
     system[0::2, 2], system[1::2, 2] = -plane[:, 0], -plane[:, 1]
-    wanted[0::2] = plane[:, 0] * turned[:, 2] - turned[:, 0]
-    wanted[1::2] = plane[:, 1] * turned[:, 2] - turned[:, 1]
+    wanted[0::2] = plane[:, 0] * rotated[:, 2] - rotated[:, 0]
+    wanted[1::2] = plane[:, 1] * rotated[:, 2] - rotated[:, 1]
     return np.asarray(np.linalg.lstsq(system, wanted, rcond=None)[0], np.float64)
 
 
-def _settled(
+def _refined(
     model: NDArray[np.float64],
     plane: NDArray[np.float64],
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The pose near this one that fits all corners best: Levenberg's damped least squares.
+    """Refine a pose to fit all corners: Levenberg's damped least squares.
 
-    The homography's slope at one point makes degrees of tilt of half a pixel's error, seen face on.
+    The homography's slope at one point turns half a pixel of error into degrees of tilt, seen face on.
     """
-    damping, fit = 1e-3, _misfit(model, plane, rotation, position)
+    damping, fit = 1e-3, _residuals(model, plane, rotation, position)
     jacobian = np.zeros((2 * len(model), 6))
     across, along = jacobian[0::2], jacobian[1::2]
-    for _ in range(_SETTLING_STEPS):
-        turned = model @ rotation.T
-        ahead = turned + position
+    for _ in range(_MAX_STEPS):
+        rotated = model @ rotation.T
+        ahead = rotated + position
         if not np.isfinite(fit).all() or ahead[:, 2].min() <= 0.0:
             break
-        # How each corner moves in the picture: with the place, and with a small turn about the camera's axes.
-        (x, y, z), nearness = turned.T, 1.0 / ahead[:, 2]
+        # Derivative of each projected corner by the position, and by a small rotation about the camera's
+        # axes.
+        (x, y, z), nearness = rotated.T, 1.0 / ahead[:, 2]
         u, v = ahead[:, 0] * nearness, ahead[:, 1] * nearness
         across[:, 0] = along[:, 1] = nearness
         across[:, 2], along[:, 2] = -u * nearness, -v * nearness
@@ -327,43 +328,43 @@ def _settled(
             step = np.linalg.solve(normal, -(jacobian.T @ fit))
         except np.linalg.LinAlgError:
             break
-        tried_rotation = cv2.Rodrigues(step[3:])[0] @ rotation
-        tried_position = position + step[:3]
-        tried = _misfit(model, plane, tried_rotation, tried_position)
-        gained = fit @ fit - tried @ tried
+        new_rotation = cv2.Rodrigues(step[3:])[0] @ rotation
+        new_position = position + step[:3]
+        new_fit = _residuals(model, plane, new_rotation, new_position)
+        gained = fit @ fit - new_fit @ new_fit
         if not gained > 0.0:
             damping *= 10.0
             continue
-        rotation, position, fit, damping = tried_rotation, tried_position, tried, damping / 10.0
+        rotation, position, fit, damping = new_rotation, new_position, new_fit, damping / 10.0
         if gained < 1e-10:  # a hundredth of a pixel
             break
     return rotation, position
 
 
-def _misfit(
+def _residuals(
     model: NDArray[np.float64],
     plane: NDArray[np.float64],
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(8,) by how much each corner is seen elsewhere, at unit depth."""
+    """(8,) reprojection errors of the corners, at unit depth."""
     ahead = model @ rotation.T + position
-    off: NDArray[np.float64] = (ahead[:, :2] / ahead[:, 2:] - plane).ravel()
-    return off
+    error: NDArray[np.float64] = (ahead[:, :2] / ahead[:, 2:] - plane).ravel()
+    return error
 
 
 def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Whether two rotations are one: they settled into the same fit."""
+    """Whether two rotations are equal: both fits converged to one solution."""
     return bool(np.trace(one.T @ other) > 1.0 + 2.0 * math.cos(SAME_RAD))
 
 
 def square(size_m: float) -> NDArray[np.float64]:
-    """(4, 3) corners of a marker of that side in its own frame, metres: upper left, then clockwise."""
+    """(4, 3) corners of a marker of side `size_m` in its frame, metres: upper left, then clockwise."""
     half = size_m / 2
     return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
     if name not in DICTIONARIES:
-        raise ValueError(f"unknown marker dictionary {name!r}; known are {', '.join(DICTIONARIES)}")
+        raise ValueError(f"unknown marker dictionary {name!r}; known: {', '.join(DICTIONARIES)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))

@@ -1,11 +1,11 @@
-"""Where models are kept on this machine: one folder, in which a model is found by its bare name."""
+"""The models folder, in which a model is found by its bare name."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-# What counts as a model in the folder, in the order in which a bare name is looked for.
+# Suffixes of model files, in the order in which a bare name is looked up.
 MODEL_SUFFIXES = (".safetensors", ".pt")
 
 
@@ -18,7 +18,7 @@ def models_folder() -> Path:
 
 
 def kept_models(folder: Path | None = None) -> list[Path]:
-    """The model files in the folder, by name; none if there is no folder."""
+    """The model files in the folder, sorted by name; empty if there is no folder."""
     folder = models_folder() if folder is None else folder
     if not folder.is_dir():
         return []
@@ -26,9 +26,9 @@ def kept_models(folder: Path | None = None) -> list[Path]:
 
 
 def find_model(name: str | Path) -> Path:
-    """The file that `name` means: a path that exists, else `NAME` or `NAME.pt` in the models folder.
+    """Resolve `name`: an existing path, else `NAME` or `NAME.pt` in the models folder.
 
-    What is in neither place comes back as it is, for the reader to name in its error.
+    A name found nowhere is returned as it is, so that the reader names it in its error.
     """
     path = Path(name).expanduser()
     if path.exists() or path.name != str(name):
@@ -38,6 +38,6 @@ def find_model(name: str | Path) -> Path:
         try:
             if candidate.is_file():
                 return candidate
-        except OSError:  # a folder that we may not look into holds nothing for us
+        except OSError:  # an unreadable folder holds no model for us
             return path
     return path

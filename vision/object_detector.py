@@ -1,4 +1,4 @@
-"""What a detector is, and the table of kinds: a decorator adds one, built in or of a plug-in."""
+"""The detector interface, and the registry of kinds: a decorator adds one, built in or from a plug-in."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ YOLO = "yolo"
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """What a detector is made of. A kind ignores what it has no use for.
+    """Settings of a detector. A kind ignores what does not apply to it.
 
     Attributes:
-        model: for `yolo` as `vision.detector.Detector` takes it; a plug-in may give it any meaning.
+        model: for `yolo` as in `vision.detector.Detector`; a plug-in may give it any meaning.
         classes: names or ids to report; None for all.
-        confidence: boxes less sure than this are dropped, 0..1.
-        iou: of two boxes of one class overlapping more than this the less confident is dropped, 0..1.
+        confidence: boxes below this are dropped, 0..1.
+        iou: NMS IoU threshold, 0..1.
         image_size: longer side of a network's input, pixels.
-        precision: what a network computes in, or `auto`.
-        threads: processor threads; None: the detector's own choice.
-        runtime: what computes a network.
+        precision: of the network, or `auto`.
+        threads: processor threads; None: the detector's default.
+        runtime: of the network, or `auto`.
     """
 
     model: str = "default"
@@ -51,7 +51,7 @@ class DetectorSettings:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How long the parts of one detection took, milliseconds."""
+    """Durations of the stages of one detection, milliseconds."""
 
     preprocess_ms: float
     inference_ms: float
@@ -63,16 +63,16 @@ class Timing:
 
 
 class ObjectDetector(ABC):
-    """Finds objects in single frames. Create and use it in one thread.
+    """Detects objects in single frames. Create and use it in one thread.
 
-    A detector needs `class_names` and `detect`; the rest is what status and log say of it.
+    A detector needs `class_names` and `detect`; the other attributes are for status and log.
 
     Attributes:
-        class_names: id → name, all that it can report; it stays as it is once the detector is made.
-        last_timing: of the latest `detect`; None where it measures nothing: all its time counts as inference.
-        model_name: what it computes with, for messages; empty: the name of its kind.
-        runtime: what computes it; None where there is no choice.
-        precision: what it computes in, `float32` for example; None where that says nothing.
+        class_names: id → name, all that it can report; constant after construction.
+        last_timing: of the latest `detect`; None if not measured: all its time then counts as inference.
+        model_name: for messages; empty: the name of its kind.
+        runtime: of its network; None where there is no choice.
+        precision: `float32` for example; None where it does not apply.
         reason: why this runtime and precision, in words.
     """
 
@@ -85,34 +85,35 @@ class ObjectDetector(ABC):
 
     @abstractmethod
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
-        """What is in one frame.
+        """Detect objects in one frame.
 
         Args:
             image_bgr: (height, width, 3) uint8, BGR. Its size may change from frame to frame. It is the
-                frame itself: not to be written to, nor kept.
+                frame's own
+                memory: do not write to it or keep it.
 
         Returns:
-            The boxes in the frame's pixels (left, top, right, bottom; origin at the upper left corner), with
-            this detector's `class_names`; `Detections.empty(self.class_names)` for none.
+            Boxes in the frame's pixels (left, top, right, bottom; origin at the upper left corner), with this
+            detector's `class_names`; `Detections.empty(self.class_names)` for none.
         """
 
 
 OpenDetector = Callable[[DetectorSettings], ObjectDetector]
-"""Makes a detector ready. Raises ValueError, in one line, where it cannot."""
+"""Creates a detector. Raises ValueError, in one line, if it cannot."""
 
 DETECTORS: Registry[OpenDetector] = Registry(
     "kind of detector", r"[a-z][a-z0-9-]*", "lower-case letters, digits and `-`"
 )
-"""Kind → what makes such a detector."""
+"""Kind → factory."""
 
 _Opener = TypeVar("_Opener", bound=OpenDetector)
 
 
 def detector(kind: str, help_text: str) -> Callable[[_Opener], _Opener]:
-    """Let `detector.kind = "…"` choose the decorated class or function.
+    """Decorator: register a class or function for `detector.kind = "…"`.
 
-    It is called with the `DetectorSettings` and returns an `ObjectDetector`. What a plug-in's detector finds
-    outside of `classes` or below `confidence` is dropped by the caller.
+    It is called with the `DetectorSettings` and returns an `ObjectDetector`. Detections of a plug-in outside
+    of `classes` or below `confidence` are dropped by the caller.
 
         @detector("bright", "everything that is white")
         class Bright(ObjectDetector):
@@ -123,10 +124,10 @@ def detector(kind: str, help_text: str) -> Callable[[_Opener], _Opener]:
 
     Args:
         kind: lower-case letters, digits and hyphens.
-        help_text: what it finds and how, one line without a full stop.
+        help_text: what it detects and how, one line without a full stop.
 
     Raises:
-        ValueError: the kind has another form, or another detector has it.
+        ValueError: the kind does not match the pattern, or is already registered.
     """
 
     def register(opener: _Opener) -> _Opener:
@@ -137,24 +138,24 @@ def detector(kind: str, help_text: str) -> Callable[[_Opener], _Opener]:
 
 
 def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
-    """Make a detector ready.
+    """Create a detector.
 
     Raises:
-        ValueError: no such kind (the message lists the known ones), an unknown class, or what the kind itself
-            refuses: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors.
+        ValueError: no such kind (the message lists the known ones), an unknown class, or an error of the kind
+            itself: `CheckpointError`, `RuntimeMissingError` and `RuntimeUnusableError` are ValueErrors.
     """
     if (opener := DETECTORS.get(kind)) is None:
         raise ValueError(
-            f"detector.kind: there is no {kind!r}; known: {DETECTORS.known()}. The kind of a plug-in "
-            "is known once its module is loaded (plugins.modules, --plugins-modules)"
+            f"detector.kind: unknown kind {kind!r}; known: {DETECTORS.known()}. Kinds of a plug-in "
+            "are known once its module is loaded (plugins.modules, --plugins-modules)"
         )
-    made = opener(settings)
-    return made if kind == YOLO else _Selecting(made, kind, settings)
+    opened = opener(settings)
+    return opened if kind == YOLO else _FilteredDetector(opened, kind, settings)
 
 
 @detector(YOLO, "a YOLO network, by detector.model")
 def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
-    with gc_paused():  # only here: it imports half a second
+    with gc_paused():  # only here: the import takes half a second
         from vision.detector import Detector
 
     return Detector(
@@ -169,8 +170,8 @@ def _open_yolo(settings: DetectorSettings) -> ObjectDetector:
     )
 
 
-class _Selecting(ObjectDetector):
-    """Drops what `classes` and `confidence` exclude: a plug-in need not do so, and cannot forget it."""
+class _FilteredDetector(ObjectDetector):
+    """Applies `classes` and `confidence` to a plug-in's detector."""
 
     def __init__(self, inner: ObjectDetector, kind: str, settings: DetectorSettings) -> None:
         self.class_names = tuple(inner.class_names)
@@ -199,7 +200,7 @@ class _Selecting(ObjectDetector):
 def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) -> tuple[int, ...]:
     """Class names or ids (also ids as text) → sorted ids.
 
-    Raises `ValueError` for an unknown one; the message names the nearest names.
+    Raises `ValueError` for an unknown one; the message names the closest matches.
     """
     if isinstance(classes, str) or not classes:
         raise ValueError(f"classes must be a list of names or ids, or None for all; got {classes!r}")

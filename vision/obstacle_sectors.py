@@ -1,8 +1,8 @@
-"""How far the nearest obstacle is, in each of 72 directions about the vehicle, from one depth image.
+"""Distance of the nearest obstacle in each of 72 directions about the vehicle, from one depth image.
 
 The layout is that of MAVLink's OBSTACLE_DISTANCE (common, 330): sectors of 5°, here level and from north, so
-that a vehicle that turns or banks after the capture does not turn its obstacles. Only what lies in a band of
-heights about the vehicle counts; the ground is below it.
+that rotation of the vehicle after the capture does not rotate the obstacles. Only points in a band of heights
+about the vehicle count; the ground is below it.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from vision.camera_model import CameraModel, CameraMount
 
 SECTORS = 72
 SECTOR_RAD = math.tau / SECTORS
-# Of the vehicle's own height: what is in this band can be flown into (metres above and below).
+# The height band relative to the vehicle, metres above and below.
 ABOVE_M, BELOW_M = 0.7, 0.8
-# The band ends so far above the ground; a degree of attitude raises it by 0.2 m, 10 m away.
+# The band ends this far above the ground; a degree of attitude error raises it by 0.2 m, 10 m away.
 GROUND_GAP_M = 0.35
-# The near end of what is seen in a sector, against single wrong pixels that are too near.
+# Percentile used as the nearest distance, against single wrong pixels that are too near.
 NEAR_PERCENTILE = 5.0
 LEAST_POINTS = 5
-# With depth in fewer of its pixels, nothing can be said of a sector: a dark lens is not a free sky.
+# With a smaller share of known depth a sector is unknown: a dark lens is not free space.
 LEAST_KNOWN_SHARE = 0.1
-# Rows and columns that are looked at, at most.
+# Most rows and columns that are sampled.
 GRID_ROWS, GRID_COLUMNS = 120, 160
 
 
 @dataclass(frozen=True, slots=True)
 class ObstacleSectors:
-    """What one depth image says of the surroundings.
+    """Obstacle distances from one depth image.
 
     Attributes:
         captured_ns: CLOCK_MONOTONIC stamp of the image.
         distance_m: 72 horizontal distances from the vehicle, metres. Sector i is centred i · 5° clockwise
-            from north. Infinite: seen, and nothing is there. NaN: not seen, or without depth.
+            from north. Infinite: observed and free. NaN: not observed, or without depth.
     """
 
     captured_ns: int
@@ -61,13 +61,13 @@ def obstacle_sectors(
 
     Args:
         depth_m: (H, W) float32, metres along the optical axis; NaN, infinite or not above zero where unknown.
-        camera: of that size.
+        camera: model of the depth image's size.
         ned_from_body: (3, 3) float64, the attitude at the capture, body FRD to NED.
-        height_m: of the vehicle above the ground, which then lies below the band; None: not known, and the
-            vehicle must be higher than 0.8 m.
+        height_m: of the vehicle above the ground, which limits the band; None: unknown, and the vehicle must
+            be higher than 0.8 m.
 
     Raises:
-        ValueError: the image is not of the camera's size.
+        ValueError: the image's size differs from the camera's.
     """
     if depth_m.shape != (camera.height, camera.width):
         raise ValueError(
@@ -78,21 +78,21 @@ def obstacle_sectors(
     depth = depth_m[rows, columns].ravel().astype(np.float32, copy=False)
     rays = _rays(camera, rows.step, columns.step)
     turn = mount.ned_from_optical(ned_from_body).astype(np.float32)
-    eye = (ned_from_body @ mount.position_frd_m).astype(np.float32)
+    lens = (ned_from_body @ mount.position_frd_m).astype(np.float32)
 
     north, east, down = turn @ rays
-    looked = _sector(north, east)
+    sampled_sector = _sector(north, east)
     known = np.isfinite(depth) & (depth > 0.0)
-    counted = np.bincount(looked, minlength=SECTORS)
-    with_depth = np.bincount(looked[known], minlength=SECTORS)
+    counted = np.bincount(sampled_sector, minlength=SECTORS)
+    with_depth = np.bincount(sampled_sector[known], minlength=SECTORS)
     seen = (counted >= LEAST_POINTS) & (with_depth >= LEAST_KNOWN_SHARE * counted)
 
     below_m = BELOW_M if height_m is None else min(BELOW_M, height_m - GROUND_GAP_M)
-    with np.errstate(invalid="ignore"):  # an unknown depth is no number, and in no band
-        below = down * depth + eye[2]
+    with np.errstate(invalid="ignore"):  # an unknown depth is NaN, and in no band
+        below = down * depth + lens[2]
     in_band = known & (below > -ABOVE_M) & (below < below_m)
     away = depth[in_band]
-    north, east = north[in_band] * away + eye[0], east[in_band] * away + eye[1]
+    north, east = north[in_band] * away + lens[0], east[in_band] * away + lens[1]
     distance = np.full(SECTORS, np.nan)
     distance[seen] = np.inf
     _nearest_of_each(_sector(north, east), np.hypot(north, east), distance)
@@ -102,23 +102,23 @@ def obstacle_sectors(
 def _nearest_of_each(
     sector: NDArray[np.int64], range_m: NDArray[np.float32], distance: NDArray[np.float64]
 ) -> None:
-    """Write each sector's low percentile where it has points enough."""
-    # By sector and in it by range, in one sort of integers: the bits of a float above zero ascend as it does.
+    """Write each sector's low percentile where it has enough points."""
+    # One integer sort by sector, then by range: the bits of a positive float ascend with its value.
     ordered = np.sort((sector << 32) | range_m.view(np.int32))
     counts = np.bincount(sector, minlength=SECTORS)
     firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
     enough = counts >= LEAST_POINTS
-    places = firsts + (counts * (NEAR_PERCENTILE / 100.0)).astype(np.int64)
-    distance[enough] = ordered[places[enough]].astype(np.int32).view(np.float32)
+    indices = firsts + (counts * (NEAR_PERCENTILE / 100.0)).astype(np.int64)
+    distance[enough] = ordered[indices[enough]].astype(np.int32).view(np.float32)
 
 
 def _sector(north: NDArray[np.float32], east: NDArray[np.float32]) -> NDArray[np.int64]:
     if not north.size:
         return np.zeros(0, np.int64)
-    # Good to a hundredth of a degree, and many times as fast as arctan2.
-    turned = cv2.phase(north, east).ravel() * np.float32(1.0 / SECTOR_RAD)
-    sector: NDArray[np.int64] = np.rint(turned).astype(np.int64)
-    # A quarter of the time that a remainder takes. What is no number became negative, and is in no band.
+    # Accurate to a hundredth of a degree, and many times faster than arctan2.
+    scaled = cv2.phase(north, east).ravel() * np.float32(1.0 / SECTOR_RAD)
+    sector: NDArray[np.int64] = np.rint(scaled).astype(np.int64)
+    # A quarter of the time of a remainder. NaN became negative, and is in no band.
     sector[(sector < 0) | (sector >= SECTORS)] = 0
     return sector
 
@@ -127,7 +127,7 @@ _cached: dict[tuple[CameraModel, int, int], NDArray[np.float32]] = {}
 
 
 def _rays(camera: CameraModel, row_step: int, column_step: int) -> NDArray[np.float32]:
-    """(3, N) float32 rays of the looked-at pixels with z = 1; the last camera's are kept."""
+    """(3, N) float32 rays of the sampled pixels with z = 1; the last camera's are cached."""
     key = (camera, row_step, column_step)
     if key not in _cached:
         across, down = np.meshgrid(

@@ -1,4 +1,4 @@
-"""The perception worker's one loop: a frame, what is in it, which object that is, how far, and on its way."""
+"""The perception worker's loop: read a frame, detect, track, measure ranges, deliver the result."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from vision.tracking import CameraView, Tracker, TrackEvent
 
 logger = logging.getLogger(__name__)
 
-_SAY_AGAIN_NS = 10_000_000_000
+_WARN_INTERVAL_NS = 10_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class PerceptionResult:
-    """What was seen in one frame. Small, and can be pickled.
+    """What was detected in one frame. Small and picklable.
 
     Attributes:
-        sequence: the frame's. A gap: frames that were not looked at.
+        sequence: the frame's. A gap: frames that were not processed.
         captured_ns: CLOCK_MONOTONIC nanoseconds of the frame's capture.
-        inferred_ns: of the moment when the detections were known.
+        inferred_ns: when the detections were ready.
         width, height: the frame's size, pixels.
-        detections: in the frame's pixels, with tracks if there is a tracker, and with their nearest points
-            where the frame has depth.
-        timing_ms: stage → milliseconds. `capture`: from the capture stamp until its bytes were there;
-            `decode`; `wait`: until the frame was picked up; then `preprocess`, `inference`, `postprocess`,
-            `track`, `range`; `total`: from picking it up to here.
-        dropped: frames lost so far, between the source and here; those left out on purpose do not count.
-        frames_skipped: reason → frames so far that were not looked at. `replaced`: a newer one came first;
-            `unreadable`; `too_old`; and on purpose `every` and `rate`.
-        track_events: what happened to tracks, the oldest first; all since the result before.
-        markers: those in the frame; None where none are looked for.
-        obstacles: how far the nearest is in each direction; None without depth or attitude.
+        detections: in the frame's pixels, with tracks if there is a tracker, and with their nearest points if
+            the frame has depth.
+        timing_ms: stage → milliseconds. `capture`: from the capture stamp until the bytes arrived; `decode`;
+            `wait`: until the frame was read; then `preprocess`, `inference`, `postprocess`, `track`, `range`;
+            `total`: from reading the frame to here.
+        dropped: frames lost so far between the source and here; frames skipped on purpose do not count.
+        frames_skipped: reason → frames so far that were not processed. `replaced` by a newer one,
+            `unreadable`, `too_old`; and on purpose `every` and `rate`.
+        track_events: oldest first; all since the previous result.
+        markers: those in the frame; None if marker detection is off.
+        obstacles: distance of the nearest one in each direction; None without depth or attitude.
     """
 
     sequence: int
@@ -61,7 +61,7 @@ class PerceptionResult:
 
 
 class Timing(Protocol):
-    """How long the parts of one detection took, milliseconds."""
+    """Durations of the stages of one detection, milliseconds."""
 
     @property
     def preprocess_ms(self) -> float: ...
@@ -72,7 +72,7 @@ class Timing(Protocol):
 
 
 class FrameDetector(Protocol):
-    """What the pipeline needs of a detector; every `vision.object_detector.ObjectDetector` is one."""
+    """The part of `vision.object_detector.ObjectDetector` that the pipeline needs."""
 
     @property
     def class_names(self) -> tuple[str, ...]: ...
@@ -82,13 +82,13 @@ class FrameDetector(Protocol):
 
 
 class FrameRecorder(Protocol):
-    """What keeps the frames; `vision.recording.Recording` does."""
+    """Records frames; for example `vision.recording.Recording`."""
 
     def write(self, frame: Frame, detections: Detections, /) -> None: ...
 
 
 class Pipeline:
-    """Source → detector → tracker → range → result, one frame a step.
+    """Source → detector → tracker → range → result, one frame per step.
 
     Attributes:
         frames: frames read so far.
@@ -111,16 +111,16 @@ class Pipeline:
         """
         Args:
             source: open; the caller closes it.
-            detector: None: nothing is looked for, and every result is empty.
-            selection: which frames are looked at. The others are only recorded.
-            recorder: is given every frame with the newest detections, after the result has left.
-            tracker: is given the detections of every frame that is looked at.
-            view_at: tells where the camera looked when it took a frame, None where that is not known. Asked
-                after the detection, when what the vehicle told of that moment has come.
-            find_markers: is given every frame that is looked at, beside the detector.
-            obstacles_in: finds them in a frame with depth.
-            nearest_in: gives the nearest points (N, 3) of the objects in boxes (N, 4) of a frame with depth,
-                see `vision.depth.nearest_points`; None: no ranges are measured.
+            detector: None: no detection, every result is empty.
+            selection: which frames are processed. The others are only recorded.
+            recorder: receives every frame with the newest detections, after the result is delivered.
+            tracker: receives the detections of every processed frame.
+            view_at: returns the camera orientation at a frame's capture, None if unknown. Called after the
+                detection, when the vehicle's attitude of that moment has arrived.
+            find_markers: called for every processed frame.
+            obstacles_in: called for every processed frame with depth.
+            nearest_in: returns the nearest points (N, 3) of the objects in boxes (N, 4) of a frame with
+                depth, see `vision.depth.nearest_points`; None: no ranges are measured.
             clock_ns: the clock of the frames' stamps, CLOCK_MONOTONIC nanoseconds.
         """
         self._source = source
@@ -137,30 +137,30 @@ class Pipeline:
         self._next_sequence = 0
         self._missing = 0
         self._replaced = 0
-        self._say_again_ns = 0
+        self._next_warning_ns = 0
         self.frames = 0
 
     @property
     def frames_skipped(self) -> dict[str, int]:
-        """Reason → frames so far that were not looked at; see `PerceptionResult`."""
+        """Reason → frames so far that were not processed; see `PerceptionResult`."""
         unreadable = self._source.statistics.unreadable
-        # The source counts the unreadable ahead of the gap that they leave; a count never goes back.
+        # The source counts an unreadable frame before the gap it leaves; the count must not decrease.
         self._replaced = max(self._replaced, self._missing - unreadable)
         return {"replaced": self._replaced, "unreadable": unreadable, **self._selector.frames_skipped}
 
     @property
     def dropped(self) -> int:
-        """Frames lost so far between the source and here; those left out on purpose do not count."""
+        """Frames lost so far between the source and here; frames skipped on purpose do not count."""
         return self._missing + self._selector.frames_skipped[TOO_OLD]
 
     def step(self, timeout_s: float, deliver: Callable[[PerceptionResult], None]) -> bool:
-        """Read one frame, look at it if it is its turn, hand the result to `deliver`, then record the frame.
+        """Read one frame, process it if selected, pass the result to `deliver`, then record the frame.
 
         Returns:
-            False if no frame came within `timeout_s`.
+            False if no frame arrived within `timeout_s`.
 
         Raises:
-            EndOfStream, SourceError: as the source does.
+            EndOfStream, SourceError: from the source.
         """
         frame = self._source.read(timeout_s)
         if frame is None:
@@ -170,8 +170,8 @@ class Pipeline:
         self._next_sequence = frame.sequence + 1
         self.frames += 1
         too_old = self._selector.frames_skipped[TOO_OLD]
-        if self._selector.look_at(frame, picked_ns):
-            result = self._look(frame, picked_ns)
+        if self._selector.accept(frame, picked_ns):
+            result = self._process(frame, picked_ns)
             self._newest = result.detections
             deliver(result)
         if self._selector.frames_skipped[TOO_OLD] > too_old:
@@ -181,13 +181,13 @@ class Pipeline:
         return True
 
     def _log_too_old(self, age_s: float, now_ns: int) -> None:
-        if now_ns >= self._say_again_ns:
-            self._say_again_ns = now_ns + _SAY_AGAIN_NS
+        if now_ns >= self._next_warning_ns:
+            self._next_warning_ns = now_ns + _WARN_INTERVAL_NS
             logger.warning(
-                "%s: a frame is %.2f s old when it comes, too old to be looked at", self._source.uri, age_s
+                "%s: frame age is %.2f s on arrival, above max_age_s; skipped", self._source.uri, age_s
             )
 
-    def _look(self, frame: Frame, picked_ns: int) -> PerceptionResult:
+    def _process(self, frame: Frame, picked_ns: int) -> PerceptionResult:
         started_ns = time.perf_counter_ns()
         timing_ms = {"decode": frame.decode_ms}
         if frame.ready_ns:

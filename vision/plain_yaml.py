@@ -1,7 +1,7 @@
-"""YAML as data and nothing more: the core schema of YAML 1.2, without tags, anchors or duplicate keys.
+"""YAML as plain data: the core schema of YAML 1.2, without tags, anchors or duplicate keys.
 
-`no`, `on` and `1:30` stay the texts that they are (YAML 1.1 makes other things of them, and they are class
-names too), and what a small file can make large is refused before it is built.
+`no`, `on` and `1:30` stay strings (YAML 1.1 converts them, and they are class names too). Input that would
+expand to something large is rejected before it is built.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _DumperBase: Any = yaml.SafeDumper
 
 
 class PlainYamlError(ValueError):
-    """A text that is not plain YAML; one line with what is wrong and in which line of the text."""
+    """Text that is not plain YAML; the message is one line with the problem and its line number."""
 
 
 class _PlainLoader(_Base):  # type: ignore[misc]
@@ -29,7 +29,7 @@ class _PlainLoader(_Base):  # type: ignore[misc]
 
 
 class PlainDumper(_DumperBase):  # type: ignore[misc]
-    """The safe dumper for this reader: a text that it would take for a number (`1e5`) gets quotes."""
+    """The matching safe dumper: quotes strings that this reader would parse as numbers (`1e5`)."""
 
 
 def _resolve(tag: str, pattern: str, first: str) -> None:
@@ -40,7 +40,7 @@ def _resolve(tag: str, pattern: str, first: str) -> None:
 _resolve("null", r"^(?:~|null|Null|NULL|)$", "~nN")
 _PlainLoader.yaml_implicit_resolvers.setdefault("", []).extend(_PlainLoader.yaml_implicit_resolvers["~"])
 _resolve("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF")
-# No octal, and no number so long that reading it takes time.
+# No octal, and no number long enough to be slow to parse.
 _resolve("int", r"^[-+]?(?:0|[1-9][0-9]{0,17})$", "-+0123456789")
 _EXPONENT = r"(?:[eE][-+]?[0-9]{1,3})"
 _resolve(
@@ -52,30 +52,30 @@ _resolve(
 
 
 def _mapping(loader: Any, node: yaml.MappingNode) -> dict[Any, Any]:
-    made: dict[Any, Any] = {}
+    result: dict[Any, Any] = {}
     for key_node, value_node in node.value:
         line = key_node.start_mark.line + 1
         if not isinstance(key_node, yaml.ScalarNode):
             raise PlainYamlError(f"line {line}: a key must be a plain value")
         key = loader.construct_object(key_node, deep=True)
-        if key in made:
-            raise PlainYamlError(f"line {line}: the key {key!r:.100} stands there twice")
-        made[key] = loader.construct_object(value_node, deep=True)
-    return made
+        if key in result:
+            raise PlainYamlError(f"line {line}: duplicate key {key!r:.100}")
+        result[key] = loader.construct_object(value_node, deep=True)
+    return result
 
 
 _PlainLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
 
 
 def load_plain_yaml(text: str) -> Any:
-    """The value that `text` describes: dicts, lists, texts, numbers, booleans, None.
+    """Parse `text` to dicts, lists, strings, numbers, booleans, None.
 
     Raises:
-        PlainYamlError: not YAML, or more than data (tags, anchors), or beyond the bounds (2 MiB, 100 000
-            values, 32 levels).
+        PlainYamlError: not YAML, or uses tags or anchors, or exceeds the limits (2 MiB, 100 000 values,
+            32 levels).
     """
     if len(text) > _LONGEST_TEXT:
-        raise PlainYamlError(f"has {len(text)} characters, at most {_LONGEST_TEXT} make sense")
+        raise PlainYamlError(f"has {len(text)} characters, the limit is {_LONGEST_TEXT}")
     try:
         _check_events(text)
         return yaml.load(text, Loader=_PlainLoader)
@@ -88,18 +88,18 @@ def load_plain_yaml(text: str) -> Any:
 
 
 def _check_events(text: str) -> None:
-    """Refuse what would grow, before anything is built of it."""
+    """Reject tags, anchors and oversized input before anything is built."""
     depth = 0
     for index, event in enumerate(yaml.parse(text, Loader=_PlainLoader)):
         if index > _MOST_EVENTS:
-            raise PlainYamlError(f"has more than {_MOST_EVENTS} values; that is no description")
+            raise PlainYamlError(f"has more than {_MOST_EVENTS} values, the limit of a description")
         assert event.start_mark is not None
         line = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise PlainYamlError(f"line {line}: anchors and aliases (& and *) are not read")
+            raise PlainYamlError(f"line {line}: anchors and aliases (& and *) are not supported")
         tag = getattr(event, "tag", None)
         if tag is not None and tag != "!":
-            raise PlainYamlError(f"line {line}: the tag {tag!r:.100} is not read; nothing was run")
+            raise PlainYamlError(f"line {line}: the tag {tag!r:.100} is not supported and was not run")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > _DEEPEST:

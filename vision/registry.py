@@ -1,4 +1,4 @@
-"""Name → factory: one table of what can be chosen by name, for what is built in and for plug-ins alike."""
+"""Name → factory: the table of what can be chosen by name, built-in or from plug-ins."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class Registry(Generic[_Factory]):
     """Factories by name, in the order of registration.
 
     Args:
-        noun: what a name stands for, for messages: "source scheme".
+        noun: what a name identifies, for messages: "source scheme".
         pattern: regular expression that a whole name must match.
-        form: the same in words.
+        form: the pattern in words.
     """
 
     def __init__(self, noun: str, pattern: str, form: str) -> None:
@@ -22,34 +22,35 @@ class Registry(Generic[_Factory]):
         self._entries: dict[str, tuple[str, _Factory]] = {}
 
     def add(self, name: str, help_text: str, factory: _Factory) -> None:
-        """Register a factory. The same one again, of a module that is read twice, replaces itself.
+        """Register a factory. Registering the same factory again (a module imported twice) replaces it.
 
         Args:
-            help_text: what it is, one line without a full stop.
+            help_text: description, one line without a full stop.
 
         Raises:
-            ValueError: the name has another form, or another factory has it; the message names both modules.
+            ValueError: the name does not match the pattern, or is registered by another factory; the message
+                names both modules.
         """
         if self._pattern.fullmatch(name) is None:
-            raise ValueError(f"{_name_of(factory)}: a {self._noun} is {self._form}, got {name!r}")
+            raise ValueError(f"{_name_of(factory)}: a {self._noun} must be {self._form}, got {name!r}")
         other = self.get(name)
         if other is not None and _name_of(other) != _name_of(factory):
             raise ValueError(
-                f"{_name_of(factory)}: there is a {self._noun} {name!r} already, {_name_of(other)}; "
+                f"{_name_of(factory)}: {self._noun} {name!r} is already registered by {_name_of(other)}; "
                 "choose another name"
             )
         self._entries[name] = (help_text, factory)
 
     def get(self, name: str) -> _Factory | None:
-        """The factory of a name; None where there is none."""
+        """The factory registered under `name`, or None."""
         return self._entries[name][1] if name in self._entries else None
 
     def remove(self, name: str) -> None:
-        """Forget a name. Raises KeyError where there is none."""
+        """Remove a name. Raises KeyError if it is not registered."""
         del self._entries[name]
 
     def known(self) -> str:
-        """Every name with its help, for a message."""
+        """Every name with its help text, for messages."""
         return ", ".join(f"{name} ({help_text})" for name, (help_text, _) in self._entries.items())
 
 

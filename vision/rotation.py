@@ -1,6 +1,6 @@
 """Rotation matrices between the frames: camera (optical), body (FRD), world (NED).
 
-A rotation matrix `a_from_b` turns a vector's coordinates in b into its coordinates in a.
+A rotation matrix `a_from_b` maps a vector's coordinates in b to its coordinates in a.
 Angles and quaternions are as in `vision.attitude`.
 """
 
@@ -18,7 +18,7 @@ BODY_FROM_OPTICAL: NDArray[np.float64] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0
 
 
 def matrix_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
-    """(3, 3) `parent_from_child` of a child frame turned by yaw, then pitch, then roll."""
+    """(3, 3) `parent_from_child` of a child frame rotated by yaw, then pitch, then roll."""
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)

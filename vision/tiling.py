@@ -1,10 +1,9 @@
-"""Small objects in large frames: the frame looked at in overlapping tiles, and once as a whole.
+"""Small objects in large frames: detection in overlapping tiles, and once in the whole frame.
 
-A network sees 640 pixels; a 1920-pixel frame is shrunk threefold for it, and an object of ten pixels with
-it. Tiles are seen as they are. Every tile costs as much as a frame (`docs/models.md` has the figures), so
-this is for those who look from high up and can wait. The idea of slicing is SAHI's (Akyon et al., 2022,
-arXiv:2202.06934); boxes that a tile's edge cuts are told apart here, so that a whole box never falls to a
-half one.
+A network's input is 640 pixels wide; a 1920-pixel frame is shrunk threefold for it, and a ten-pixel object
+with it. Tiles are not shrunk. Every tile costs as much as a frame (`docs/models.md` has the figures): use it
+at high altitude where latency matters less. Slicing follows SAHI (Akyon et al., 2022, arXiv:2202.06934);
+boxes cut by a tile's edge are marked here, so that a whole box is never suppressed by a partial one.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ from numpy.typing import NDArray
 from vision.detections import Detections
 from vision.pipeline import FrameDetector, Timing
 
-# Nearer than this to an inner edge of its tile, a box is taken for cut, pixels.
+# A box nearer than this to an inner edge of its tile counts as cut, pixels.
 _CUT_PX = 4.0
-# Two boxes of different passes are one object from this overlap on: of both, or of the smaller one.
+# Two boxes of different passes are one object from this overlap on: over the union, or over the smaller one.
 _SAME_UNION = 0.5
 _SAME_SMALLER = 0.8
-# A cut box is a piece of another when it lies in it by so much.
+# A cut box is a piece of another when this share of it lies inside.
 _PIECE = 0.6
 _MOST_BOXES = 300
 
@@ -50,7 +49,7 @@ class TiledTiming:
 def tiles_of(width: int, height: int, tile_size: int, overlap: float) -> list[Tile]:
     """Tiles that cover a frame, row by row, evenly spread, overlapping by at least `overlap` of a tile.
 
-    A frame that is no larger than a tile is one tile.
+    A frame not larger than a tile is one tile.
     """
     return [
         Tile(left, top, min(left + tile_size, width), min(top + tile_size, height))
@@ -68,12 +67,12 @@ def _starts(length: int, tile_size: int, overlap: float) -> list[int]:
 
 
 class TiledDetector:
-    """A detector that looks at tiles. Takes the place of the one it wraps; not to be shared between threads.
+    """A detector that runs another one on tiles. Not thread-safe.
 
     Attributes:
-        detector: the one that looks at each tile.
+        detector: the detector run on each tile.
         last_timing: of the latest `detect`, all passes together; None before the first.
-        last_passes: how often the wrapped detector was asked for the latest frame.
+        last_passes: number of passes for the latest frame.
     """
 
     def __init__(
@@ -86,12 +85,12 @@ class TiledDetector:
     ) -> None:
         """
         Args:
-            tile_size: side of a tile, pixels of the frame; best the size that the network sees.
-            overlap: of neighbouring tiles, share of a tile; objects smaller than this are seen whole.
-            whole_frame: also look at the frame as a whole, for what is larger than a tile.
+            tile_size: side of a tile, pixels of the frame; best the network's input size.
+            overlap: of neighbouring tiles, share of a tile; smaller objects are never cut.
+            whole_frame: also process the whole frame, for objects larger than a tile.
 
         Raises:
-            ValueError: a number out of its range.
+            ValueError: a number out of range.
         """
         if tile_size < 64:
             raise ValueError(f"tile_size must be at least 64 pixels, got {tile_size}")
@@ -109,7 +108,7 @@ class TiledDetector:
         return self.detector.class_names
 
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
-        """What is in one frame, (height, width, 3) uint8 BGR; boxes in its pixels, the most confident
+        """Detect objects in one frame, (height, width, 3) uint8 BGR; boxes in its pixels, most confident
         first.
         """
         height, width = image_bgr.shape[:2]
@@ -123,19 +122,19 @@ class TiledDetector:
         cuts: list[NDArray[np.bool_]] = []
         # Tiles first: they have one size, and a detector prepares for a size.
         for tile in tiles:
-            found = self._look(image_bgr[tile.top : tile.bottom, tile.left : tile.right], spent)
+            found = self._detect_part(image_bgr[tile.top : tile.bottom, tile.left : tile.right], spent)
             cuts.append(_cut(found.xyxy, tile, width, height))
             shifted = found.xyxy + np.array([tile.left, tile.top] * 2, np.float32)
             passes.append(Detections(shifted, found.confidence, found.class_id, found.class_names))
         if self._whole_frame:
-            passes.append(self._look(image_bgr, spent))
+            passes.append(self._detect_part(image_bgr, spent))
             cuts.append(np.zeros(len(passes[-1]), np.bool_))
         merged = merge_passes(passes, cuts)
         self.last_timing = TiledTiming(*map(float, spent))
         self.last_passes = len(passes)
         return merged
 
-    def _look(self, part: NDArray[np.uint8], spent: NDArray[np.float64]) -> Detections:
+    def _detect_part(self, part: NDArray[np.uint8], spent: NDArray[np.float64]) -> Detections:
         found = self.detector.detect(np.ascontiguousarray(part))
         timing = self.detector.last_timing
         if timing is not None:
@@ -146,16 +145,16 @@ class TiledDetector:
 def merge_passes(
     passes: Sequence[Detections], cuts: Sequence[NDArray[np.bool_]], most: int = _MOST_BOXES
 ) -> Detections:
-    """One set of detections from several looks at one frame.
+    """Merge the detections of several passes over one frame.
 
-    Boxes that are whole come before those that an edge cuts, and the more confident before the less; one
-    that says what an earlier one of its class from another pass says already is dropped. Cut boxes that are
-    pieces of one object on both sides of an edge become the box around both.
+    Whole boxes come before cut ones, and more confident before less; a box that overlaps an earlier one of
+    its class from another pass is dropped. Cut boxes that are pieces of one object on both sides of an edge
+    are merged into their bounding box.
 
     Args:
-        passes: each in the frame's pixels, already without overlaps of its own.
+        passes: each in the frame's pixels, after NMS.
         cuts: for each pass (N,) whether an inner edge cuts the box.
-        most: how many to keep at most.
+        most: largest number of boxes to keep.
     """
     names = passes[0].class_names
     xyxy = np.concatenate([each.xyxy for each in passes]).astype(np.float64)
@@ -171,7 +170,7 @@ def merge_passes(
         rivals = (class_id[rest] == class_id[first]) & (origin[rest] != origin[first])
         union, smaller, share = _overlaps(xyxy[first], xyxy[rest])
         same = (union > _SAME_UNION) | np.where(cut[rest], share > _PIECE, smaller > _SAME_SMALLER)
-        if cut[first]:  # Then all the rest are cut too, and what they become together may take in more.
+        if cut[first]:  # Then all the rest are cut too, and the merged box may cover more of them.
             pieces = rivals & (smaller > 0) & _continue_each_other(xyxy[first], xyxy[rest])
             around = xyxy[[first, *rest[pieces]]]
             xyxy[first] = (*around[:, :2].min(axis=0), *around[:, 2:].max(axis=0))
@@ -200,7 +199,7 @@ def _cut(xyxy: NDArray[np.float32], tile: Tile, width: int, height: int) -> NDAr
 def _overlaps(
     box: NDArray[np.float64], others: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Of one box with each of (N, 4): over the union, over the smaller, over the other."""
+    """Overlap of one box with each of (N, 4): over the union, over the smaller, over the other."""
     sides = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
     common = sides.clip(0).prod(axis=1)
     area, areas = (box[2:] - box[:2]).prod(), (others[:, 2:] - others[:, :2]).prod(axis=1)
@@ -213,7 +212,7 @@ def _overlaps(
 
 
 def _continue_each_other(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether two pieces fit together: along one axis they span the same."""
+    """(N,) whether two pieces fit together: along one axis they have the same extent."""
     common = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0)
     span = np.maximum(box[2:], others[:, 2:]) - np.minimum(box[:2], others[:, :2])
     return np.asarray((common / np.maximum(span, 1e-9) > 0.7).any(axis=1))

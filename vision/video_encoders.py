@@ -1,8 +1,8 @@
-"""What encodes a film, VP8 in WebM: PyAV where it is installed, else the FFmpeg that OpenCV carries.
+"""VP8 encoders for WebM: PyAV where it is installed, else the FFmpeg of OpenCV.
 
-PyAV can tell the encoder to be done in time, and leaves the slots of a film that nobody filled empty. OpenCV
-hands an encoder no options (its issue 24570): it takes five times as long for a picture and twice the bytes,
-and each empty slot has to be encoded as a repeat of the picture before it.
+PyAV can set a realtime deadline, and leaves empty slots empty. OpenCV passes no options to an encoder (its
+issue 24570): it takes five times as long per image and twice the bytes, and each empty slot has to be encoded
+as a repeat of the previous image.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ from vision.sources.opencv import quiet_opencv
 logger = logging.getLogger(__name__)
 
 _FOURCC = cv2.VideoWriter.fourcc(*"VP80")
-_HARMLESS = b"is not supported with codec id"  # said of every WebM, which has no such tags at all
+_HARMLESS = b"is not supported with codec id"  # logged for every WebM, which has no such tags
 _standard_error_lock = threading.Lock()
 
 # WebM counts milliseconds.
 _CLOCK_HZ = 1000
 _KEY_FRAME_S = 5.0
-# Constant quality (0..63, less is better), and no picture is left out.
+# Constant quality (0..63, less is better), and no frame is dropped.
 _OPTIONS = {"deadline": "realtime", "cpu-used": "8", "crf": "20", "drop-threshold": "0"}
-# The most that it may cost: 4 Mbit/s at 640x480 and 10 Hz. Below the least, libvpx counts in nothing.
+# Upper bound: 4 Mbit/s at 640x480 and 10 Hz. Below the minimum libvpx rounds the rate to 0.
 _MOST_BITS_PER_PIXEL = 1.3
 _LEAST_BITS_PER_S = 200_000
 
 
 class Encoder(Protocol):
-    """Takes the pictures of a film, (height, width, 3) uint8 BGR, each for a slot after the one before."""
+    """Encodes the images of a video, (height, width, 3) uint8 BGR, in ascending slots."""
 
     def put(self, image: NDArray[np.uint8], slot: int) -> None:
-        """Add a picture, which may be drawn on again afterwards. Raises OSError."""
+        """Add an image, which may be modified afterwards. Raises OSError."""
 
     def close(self) -> int:
-        """Complete the file; the slots up to the last picture that it holds. Raises OSError."""
+        """Complete the file; returns the slots up to its last image. Raises OSError."""
 
 
 def has_pyav() -> bool:
-    """Whether PyAV encodes the films here: several times faster."""
+    """Whether videos are encoded by PyAV, which is several times faster."""
     return _pyav() is not None
 
 
 def open_encoder(path: Path, width: int, height: int, rate_hz: float) -> Encoder:
-    """The best that there is. Raises OSError if it cannot begin."""
+    """Open the best available encoder. Raises OSError if it cannot start."""
     av = _pyav()
     if av is None:
         return OpenCvEncoder(path, width, height, rate_hz)
@@ -66,7 +66,7 @@ def open_encoder(path: Path, width: int, height: int, rate_hz: float) -> Encoder
 
 
 def _url(path: Path) -> str:
-    """Else FFmpeg takes what stands before a colon in a name for a protocol."""
+    """A `file:` URL: otherwise FFmpeg takes a prefix before a colon for a protocol."""
     return f"file:{path}"
 
 
@@ -82,12 +82,12 @@ def _pyav() -> Any:
         if "libvpx" in av.codecs_available:
             return av
         problem = "it was built without libvpx"
-    logger.warning("PyAV is installed and of no use (%s): films are encoded by OpenCV, slowly", problem)
+    logger.warning("PyAV is installed but unusable (%s): videos are encoded by OpenCV, slowly", problem)
     return None
 
 
 class AvEncoder:
-    """libvpx at its pace for live pictures, by PyAV, on one thread."""
+    """libvpx with a realtime deadline, by PyAV, on one thread."""
 
     def __init__(self, av: Any, path: Path, width: int, height: int, rate_hz: float) -> None:
         self._av = av
@@ -115,10 +115,10 @@ class AvEncoder:
 
     def put(self, image: NDArray[np.uint8], slot: int) -> None:
         with self._plain_errors():
-            picture = self._av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
-            picture.pts, picture.time_base = round(slot * _CLOCK_HZ / self._rate_hz), Fraction(1, _CLOCK_HZ)
+            frame = self._av.VideoFrame.from_ndarray(image, format="bgr24").reformat(format="yuv420p")
+            frame.pts, frame.time_base = round(slot * _CLOCK_HZ / self._rate_hz), Fraction(1, _CLOCK_HZ)
             self._empty = False
-            self._container.mux(self._stream.encode(picture))
+            self._container.mux(self._stream.encode(frame))
 
     def close(self) -> int:
         with self._plain_errors():
@@ -130,22 +130,22 @@ class AvEncoder:
             return 0 if self._empty else self._slots_in_file()
 
     def _slots_in_file(self) -> int:
-        with self._av.open(self._url) as film:
-            if film.duration:
-                film.seek(film.duration)  # the last pictures tell it: an hour of film is not read again
-            stamps = [packet.pts * packet.time_base for packet in film.demux() if packet.pts is not None]
+        with self._av.open(self._url) as video:
+            if video.duration:
+                video.seek(video.duration)  # the last packets are enough: an hour of video is not read again
+            stamps = [packet.pts * packet.time_base for packet in video.demux() if packet.pts is not None]
         return round(float(max(stamps)) * self._rate_hz) + 1 if stamps else 0
 
     @contextmanager
     def _plain_errors(self) -> Iterator[None]:
         try:
             yield
-        except self._av.FFmpegError as error:  # of which not all are OSErrors
+        except self._av.FFmpegError as error:  # not all of them are OSErrors
             raise OSError(error.errno, error.strerror) from error
 
 
 class OpenCvEncoder:
-    """VP8 at FFmpeg's own settings."""
+    """VP8 with FFmpeg's default settings."""
 
     def __init__(self, path: Path, width: int, height: int, rate_hz: float) -> None:
         self._url = _url(path)
@@ -169,7 +169,7 @@ class OpenCvEncoder:
 
     def close(self) -> int:
         self._writer.release()
-        # OpenCV's write reports no failure, so the file itself has to be asked.
+        # OpenCV's write reports no failure, so the file itself is checked.
         capture = cv2.VideoCapture(self._url, cv2.CAP_FFMPEG)
         readable = capture.isOpened() and capture.grab()
         held = round(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if readable else 0
@@ -179,17 +179,17 @@ class OpenCvEncoder:
 
 @contextmanager
 def _without_harmless_lines() -> Iterator[None]:
-    """Keep one harmless line of OpenCV's C code off standard error; pass on whatever else is said."""
-    with _standard_error_lock, tempfile.TemporaryFile() as said:
+    """Keep one harmless line of OpenCV's C code off standard error; pass on everything else."""
+    with _standard_error_lock, tempfile.TemporaryFile() as captured:
         sys.stderr.flush()
         kept = os.dup(2)
-        os.dup2(said.fileno(), 2)
+        os.dup2(captured.fileno(), 2)
         try:
             yield
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-            said.seek(0)
-            for line in said.read().splitlines(keepends=True):
+            captured.seek(0)
+            for line in captured.read().splitlines(keepends=True):
                 if _HARMLESS not in line:
                     os.write(2, line)

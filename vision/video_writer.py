@@ -1,4 +1,4 @@
-"""A video file that browsers play: WebM with VP8. H.264 would be smaller; its free encoder is GPL code."""
+"""Video files that browsers play: WebM with VP8. H.264 would be smaller; its free encoder is GPL code."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ class VideoWriterError(Exception):
 class VideoWriter:
     """Writes frames at a constant rate so that playing time equals real time.
 
-    Each image belongs to the slot of the film nearest to its capture stamp. A slot nobody filled shows the
-    image before it; of two images for one slot the first stays. `close` completes the file; use it as a
-    context manager.
+    Each image goes to the slot of the video nearest to its capture stamp. An empty slot repeats the previous
+    image; of two images for one slot the first is kept. `close` completes the file; use it as a context
+    manager.
 
     Args:
-        path: ends in `.webm`; its folder is made if it is missing, a file already there is replaced.
+        path: ends in `.webm`; its folder is created if missing, an existing file is replaced.
         width, height: pixels of every image.
-        rate_hz: frames a second of the film.
+        rate_hz: frames per second of the video.
 
     Attributes:
-        frames: slots of the film so far.
-        repeated: of those, the ones that show the image before them.
-        dropped: images for which there was no slot.
+        frames: slots of the video so far.
+        repeated: slots that repeat the previous image.
+        dropped: images without a free slot.
 
     Raises:
         VideoWriterError: the file cannot be written.
@@ -50,7 +50,7 @@ class VideoWriter:
         if self.path.suffix.lower() != ".webm":
             raise VideoWriterError(f"{self.path}: the name of a video must end in .webm")
         if not (1 <= width <= 16383 and 1 <= height <= 16383):
-            raise VideoWriterError(f"{self.path}: VP8 takes 1..16383 pixels a side, got {width}x{height}")
+            raise VideoWriterError(f"{self.path}: VP8 needs 1..16383 pixels per side, got {width}x{height}")
         if not 0.1 <= rate_hz <= 240.0:
             raise VideoWriterError(f"{self.path}: rate_hz must be 0.1..240, got {rate_hz}")
         try:
@@ -59,19 +59,19 @@ class VideoWriter:
                 pass
             self._encoder = open_encoder(self.path, width, height, rate_hz)
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._write_error(error) from error
 
     def write(self, image: NDArray[np.uint8], captured_ns: int) -> int:
         """Add one image, (height, width, 3) uint8 BGR, captured at `captured_ns` (monotonic nanoseconds).
 
-        Returns how many slots the film grew by: 0 if the image came too soon after the one before (or is
-        older), more than 1 if it came late.
+        Returns the number of slots added: 0 if the image is too early or out of order, more than 1 if it is
+        late.
 
         Raises:
-            VideoWriterError: the file cannot be written any more.
+            VideoWriterError: the file can no longer be written.
         """
         if self._closed:
-            raise ValueError(f"{self.path}: written to after close")
+            raise ValueError(f"{self.path}: write after close")
         if image.shape != (self.height, self.width, 3) or image.dtype != np.uint8:
             raise ValueError(
                 f"{self.path}: images must be ({self.height}, {self.width}, 3) uint8, "
@@ -86,11 +86,11 @@ class VideoWriter:
         try:
             self._encoder.put(image, slot)
         except OSError as error:
-            raise self._unwritable(error) from error
-        grown = slot + 1 - self.frames
-        self.repeated += grown - 1
-        self.frames += grown
-        return grown
+            raise self._write_error(error) from error
+        added = slot + 1 - self.frames
+        self.repeated += added - 1
+        self.frames += added
+        return added
 
     @property
     def duration_s(self) -> float:
@@ -98,10 +98,10 @@ class VideoWriter:
         return self.frames / self.rate_hz
 
     def close(self) -> None:
-        """Complete the file and look whether it holds what was written. A second call does nothing.
+        """Complete the file and check that it holds all frames. A second call does nothing.
 
         Raises:
-            VideoWriterError: it does not: most likely the disk is full.
+            VideoWriterError: frames are missing; most likely the disk is full.
         """
         if self._closed:
             return
@@ -109,13 +109,13 @@ class VideoWriter:
         try:
             held = self._encoder.close()
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._write_error(error) from error
         if held < self.frames - 2:
             raise VideoWriterError(
                 f"{self.path}: the file holds {held} of {self.frames} frames; is the disk full?"
             )
 
-    def _unwritable(self, error: OSError) -> VideoWriterError:
+    def _write_error(self, error: OSError) -> VideoWriterError:
         return VideoWriterError(f"{self.path}: cannot be written: {error.strerror}")
 
     def __enter__(self) -> Self:

@@ -19,11 +19,11 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]:
 @pytest.fixture
 def early_foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]:
     """As the first releases had them: all layers in one file."""
-    places = {
-        name: "ultralytics.nn.modules" if place.startswith("ultralytics.nn.modules") else place
-        for name, place in FOREIGN.items()
+    modules = {
+        name: "ultralytics.nn.modules" if module.startswith("ultralytics.nn.modules") else module
+        for name, module in FOREIGN.items()
     }
-    return foreign_classes(monkeypatch, places)
+    return foreign_classes(monkeypatch, modules)
 
 
 @pytest.fixture

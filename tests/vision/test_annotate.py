@@ -32,7 +32,7 @@ def seen(
     )
 
 
-def picture(width: int = 640, height: int = 480, value: int = 90) -> np.ndarray:
+def make_image(width: int = 640, height: int = 480, value: int = 90) -> np.ndarray:
     return np.full((height, width, 3), value, np.uint8)
 
 
@@ -42,8 +42,8 @@ def changed(before: np.ndarray, after: np.ndarray) -> tuple[int, int, int, int]:
     return int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())
 
 
-def test_the_given_picture_stays_as_it_was() -> None:
-    image = picture()
+def test_input_image_is_not_modified() -> None:
+    image = make_image()
     before = image.copy()
     drawn = annotate(image, seen([[100, 100, 300, 200]]), lines=["hello"], highlight=0)
     np.testing.assert_array_equal(image, before)
@@ -52,13 +52,13 @@ def test_the_given_picture_stays_as_it_was() -> None:
     assert (drawn != image).any()
 
 
-def test_nothing_seen_and_nothing_said_draws_nothing() -> None:
-    image = picture()
+def test_no_detections_and_lines_draw_nothing() -> None:
+    image = make_image()
     np.testing.assert_array_equal(annotate(image, Detections.empty(NAMES)), image)
 
 
-def test_a_box_is_in_its_class_s_colour_where_it_was_seen() -> None:
-    drawn = annotate(picture(), seen([[100, 150, 300, 250]]))
+def test_box_is_drawn_in_its_class_colour() -> None:
+    drawn = annotate(make_image(), seen([[100, 150, 300, 250]]))
     for x, y in ((100, 200), (300, 200), (200, 250)):
         assert tuple(int(value) for value in drawn[y, x]) == class_colour(2)
     assert tuple(drawn[200, 200]) == (90, 90, 90)
@@ -66,13 +66,13 @@ def test_a_box_is_in_its_class_s_colour_where_it_was_seen() -> None:
 
 def test_the_range_makes_the_label_longer() -> None:
     box = [[100.0, 150.0, 120.0, 170.0]]
-    without = changed(picture(), annotate(picture(), seen(box)))
-    with_range = changed(picture(), annotate(picture(), seen(box, depths_m=[12.3])))
+    without = changed(make_image(), annotate(make_image(), seen(box)))
+    with_range = changed(make_image(), annotate(make_image(), seen(box, depths_m=[12.3])))
     assert with_range[2] > without[2]
 
 
-def test_lines_make_a_panel_that_lets_the_picture_through() -> None:
-    image = picture(value=200)
+def test_lines_are_drawn_on_a_translucent_panel() -> None:
+    image = make_image(value=200)
     drawn = annotate(image, Detections.empty(NAMES), lines=["OFFBOARD", "1.5 m/s"])
     left, top, right, bottom = changed(image, drawn)
     assert right < 320
@@ -83,23 +83,23 @@ def test_lines_make_a_panel_that_lets_the_picture_through() -> None:
     assert (drawn[top:bottom, left:right] > 220).any()  # letters
 
 
-def test_a_line_too_long_is_set_smaller_and_not_cut() -> None:
-    image = picture(320, 240)
+def test_long_line_is_scaled_not_cut() -> None:
+    image = make_image(320, 240)
     drawn = annotate(image, Detections.empty(NAMES), lines=["a very long line " * 6])
     left, _, right, _ = changed(image, drawn)
     assert left > 0
     assert right < 319
 
 
-def test_letters_and_lines_grow_with_the_picture() -> None:
-    small, large = picture(320, 240), picture(1920, 1440)
+def test_drawing_scales_with_the_image() -> None:
+    small, large = make_image(320, 240), make_image(1920, 1440)
     _, top, _, bottom = changed(small, annotate(small, Detections.empty(NAMES), lines=["x"]))
     _, large_top, _, large_bottom = changed(large, annotate(large, Detections.empty(NAMES), lines=["x"]))
     assert large_bottom - large_top > 3 * (bottom - top)
 
 
-def test_the_one_that_matters_looks_different() -> None:
-    image = picture()
+def test_highlighted_detection_looks_different() -> None:
+    image = make_image()
     boxes = seen([[100, 150, 200, 250], [300, 150, 400, 250]])
     plain, marked = annotate(image, boxes), annotate(image, boxes, highlight=1)
     assert (plain[200, 350] != marked[200, 350]).any()
@@ -107,7 +107,7 @@ def test_the_one_that_matters_looks_different() -> None:
 
 
 def test_labels_of_neighbours_do_not_hide_each_other() -> None:
-    image = picture()
+    image = make_image()
     boxes = [[200.0, 200.0, 240.0, 260.0], [215.0, 200.0, 255.0, 260.0]]
     alone = [annotate(image, seen([box])) for box in boxes]
     colour = np.array(class_colour(2))
@@ -116,8 +116,8 @@ def test_labels_of_neighbours_do_not_hide_each_other() -> None:
     assert together > 0.9 * sum(areas)
 
 
-def test_a_track_is_named_on_its_plate_and_doubted_until_it_counts_as_true() -> None:
-    image = picture()
+def test_label_marks_unconfirmed_tracks() -> None:
+    image = make_image()
     plain = seen([[200, 200, 240, 260]])
 
     def plate(track_id: int, confirmed: bool) -> int:
@@ -137,9 +137,9 @@ def test_a_track_is_named_on_its_plate_and_doubted_until_it_counts_as_true() -> 
 
 
 @pytest.mark.parametrize("highlight", [-1, 1])
-def test_a_highlight_that_is_not_there_is_refused(highlight: int) -> None:
+def test_invalid_highlight_is_rejected(highlight: int) -> None:
     with pytest.raises(IndexError, match="highlight must be"):
-        annotate(picture(), seen([[1, 1, 5, 5]]), highlight=highlight)
+        annotate(make_image(), seen([[1, 1, 5, 5]]), highlight=highlight)
 
 
 def test_neighbouring_classes_have_colours_far_apart() -> None:
@@ -156,8 +156,8 @@ def test_neighbouring_classes_have_colours_far_apart() -> None:
     st.lists(st.text(max_size=30), max_size=4),
     st.sampled_from([None, 0, 2]),
 )
-def test_any_box_on_any_picture_with_any_text_is_drawn(
+def test_any_box_and_text_can_be_drawn(
     width: int, height: int, boxes: np.ndarray, lines: list[str], highlight: int | None
 ) -> None:
-    drawn = annotate(picture(width, height), seen(boxes.tolist()), lines=lines, highlight=highlight)
+    drawn = annotate(make_image(width, height), seen(boxes.tolist()), lines=lines, highlight=highlight)
     assert drawn.shape == (height, width, 3)

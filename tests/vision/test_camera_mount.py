@@ -20,7 +20,7 @@ headings = st.floats(-math.pi, math.pi)
 
 
 @given(roll=leans, pitch=leans, yaw=headings, down=st.floats(0.1, 1.4), aside=st.floats(-1.0, 1.0))
-def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(
+def test_stabilized_camera_direction_ignores_body_tilt(
     roll: float, pitch: float, yaw: float, down: float, aside: float
 ) -> None:
     mount = CameraMount(pitch_rad=-down, yaw_rad=aside, levelled=True)
@@ -34,14 +34,14 @@ def test_a_levelled_camera_looks_where_it_is_set_however_the_body_leans(
 
 
 @given(yaw=headings, roll=leans, pitch=st.floats(-1.2, 0.0))
-def test_on_a_level_body_both_are_one(yaw: float, roll: float, pitch: float) -> None:
+def test_both_mounts_are_equal_on_a_level_body(yaw: float, roll: float, pitch: float) -> None:
     body = matrix_from_euler(0.0, 0.0, yaw)
     fixed, held = (CameraMount(0.1, 0.0, 0.05, roll, pitch, 0.2, levelled) for levelled in (False, True))
     assert np.allclose(fixed.ned_from_optical(body), held.ned_from_optical(body))
 
 
 @given(roll=leans, pitch=leans, yaw=headings, levelled=st.booleans())
-def test_the_ground_point_and_the_point_at_its_depth_are_one(
+def test_ground_point_equals_point_at_its_depth(
     roll: float, pitch: float, yaw: float, levelled: bool
 ) -> None:
     mount = CameraMount(0.2, -0.1, 0.05, pitch_rad=-0.9, levelled=levelled)

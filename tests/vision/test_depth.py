@@ -27,14 +27,14 @@ def depth_at(depth_m: np.ndarray, *box: float) -> float:
     return float(nearest_points(depth_m, np.array([box]), SMALL, LEVEL)[0, 2])
 
 
-def test_the_range_is_that_of_the_object_and_not_of_what_is_behind_it() -> None:
+def test_range_is_the_objects_not_the_backgrounds() -> None:
     depth_m = depth_of(30.0)
     depth_m[10:30, 20:40] = 7.0
     # A box a third larger than the object on every side.
     assert depth_at(depth_m, 13, 3, 47, 37) == pytest.approx(7.0)
 
 
-def test_a_thin_object_is_nearer_than_what_is_seen_through_it() -> None:
+def test_thin_object_is_nearer_than_its_background() -> None:
     depth_m = depth_of(30.0)
     depth_m[:, 28:32] = 5.0
     assert depth_at(depth_m, 22, 0, 38, 48) == pytest.approx(5.0)
@@ -48,7 +48,7 @@ def test_unknown_pixels_do_not_count() -> None:
     assert depth_at(depth_m, 0, 0, 64, 48) == pytest.approx(9.0)
 
 
-def test_single_wrong_near_pixels_do_not_decide() -> None:
+def test_single_near_outliers_are_ignored() -> None:
     depth_m = depth_of(12.0)
     depth_m[20:24, 30:34] = 0.3
     assert depth_at(depth_m, 10, 5, 54, 43) == pytest.approx(12.0)
@@ -133,8 +133,8 @@ def cuboid_scene(
     low, high = np.array([-length / 2, -width / 2, -tall]), np.array([length / 2, width / 2, 0.0])
     with np.errstate(divide="ignore", invalid="ignore"):
         ground_m = np.where(directions[:, 2] > 1e-6, height_m / directions[:, 2], np.nan)
-        ways = directions @ to_cuboid.T
-        first, second = (low - origin) / ways, (high - origin) / ways
+        slopes = directions @ to_cuboid.T
+        first, second = (low - origin) / slopes, (high - origin) / slopes
     enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
     seen = (leaves >= enters) & (enters > 0.0)
     depth_m = np.where(seen, enters, ground_m).reshape(CAMERA.height, CAMERA.width).astype(np.float32)
@@ -166,7 +166,7 @@ def inside(scene: Scene, margin: float = 4.0) -> bool:
     pitch_deg=st.floats(-45.0, -10.0),
     roll_deg=st.floats(-10.0, 10.0),
 )
-def test_nearest_corner_of_a_cuboid_askew_is_found(
+def test_nearest_corner_of_a_rotated_cuboid_is_found(
     yaw_rad: float, north_m: float, east_m: float, pitch_deg: float, roll_deg: float
 ) -> None:
     scene = cuboid_scene(
@@ -195,7 +195,7 @@ def test_ground_below_a_box_that_is_too_large_is_not_the_object() -> None:
     assert ground_range_m(scene, scene.depth_m, larger) == pytest.approx(scene.true_m, abs=0.15)
 
 
-def test_in_a_box_cut_off_below_the_lens_height_tells_the_ground() -> None:
+def test_lens_height_gives_the_ground_of_a_cut_off_box() -> None:
     scene = cuboid_scene(north_m=8.0)
     left, top, right, _ = scene.box
     down_to_the_edge = np.array([[left, top, right, float(CAMERA.height)]])
@@ -220,7 +220,7 @@ def test_noise_of_a_stereo_camera_does_not_make_it_nearer(yaw_rad: float) -> Non
     assert max(map(abs, errors_m)) < 0.6
 
 
-def test_a_small_object_before_it_is_not_the_object() -> None:
+def test_small_object_in_front_is_ignored() -> None:
     scene = cuboid_scene(north_m=10.0)
     left, top, *_ = map(int, scene.box)
     depth_m = scene.depth_m.copy()

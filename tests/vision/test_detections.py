@@ -35,7 +35,7 @@ def tracked() -> Detections:
 @pytest.mark.parametrize(
     "index", [slice(1, 3), np.array([False, True, True]), np.array([1, 2])], ids=["slice", "mask", "indices"]
 )
-def test_a_part_keeps_everything_of_its_detections(index: Any) -> None:
+def test_slice_keeps_all_fields(index: Any) -> None:
     part = tracked()[index]
     assert part.names == ["car", "car"]
     assert part.track_id is not None
@@ -49,19 +49,19 @@ def test_a_part_keeps_everything_of_its_detections(index: Any) -> None:
     assert untracked.track_confirmed is None
 
 
-def test_records_tell_of_tracks_what_is_known() -> None:
+def test_records_contain_the_track_fields() -> None:
     tracks = [(r["track_id"], r["track_score"], r["track_state"]) for r in tracked()]
     assert tracks == [(4, 0.8, "confirmed"), (None, None, "none"), (9, 0.3, "tentative")]
     assert {(r["track_id"], r["track_score"], r["track_state"]) for r in three()} == {(None, None, None)}
 
 
-def test_tracks_come_whole_or_not_at_all() -> None:
-    with pytest.raises(ValueError, match=r"all of track_id, .* or none; track_score is missing"):
+def test_track_arrays_are_all_given_or_none() -> None:
+    with pytest.raises(ValueError, match=r"track_score is missing"):
         three(track_id=np.array([1, 2, 3]))
 
 
-def test_tracks_are_as_many_as_boxes() -> None:
-    with pytest.raises(ValueError, match=r"Detections.track_confirmed must be \(3,\) like xyxy, got \(2,\)"):
+def test_track_arrays_have_one_entry_per_box() -> None:
+    with pytest.raises(ValueError, match=r"track_confirmed"):
         three(
             track_id=np.array([1, 2, 3]),
             track_score=np.zeros(3, np.float32),
@@ -75,7 +75,7 @@ def test_tracks_are_as_many_as_boxes() -> None:
     ids=["without tracks", "with tracks", "none left of some", "every other", "none"],
 )
 @pytest.mark.parametrize("copied", [lambda it: pickle.loads(pickle.dumps(it, 5)), copy.deepcopy])
-def test_they_are_the_same_after_a_journey(detections: Detections, copied: Any) -> None:
+def test_detections_survive_pickling(detections: Detections, copied: Any) -> None:
     again = copied(detections)
     for field in dataclasses.fields(Detections):
         before, after = getattr(detections, field.name), getattr(again, field.name)

@@ -44,7 +44,7 @@ def fail_to_import() -> None:
         raise ImportError
 
 
-def test_what_is_there_is_passed_over_and_what_comes_later_is_collected() -> None:
+def test_only_later_garbage_is_collected() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False, timeout=60
     )

@@ -22,7 +22,7 @@ from vision.letterbox import PADDING, fit
         pytest.param((10_000, 3), False, (640, 32), (0, 15), id="a sliver keeps a row"),
     ],
 )
-def test_a_frame_lies_where_networks_expect_it(
+def test_letterbox_position_follows_the_convention(
     frame: tuple[int, int], square: bool, size: tuple[int, int], corner: tuple[int, int]
 ) -> None:
     box = fit(*frame, 640, square=square)
@@ -36,9 +36,7 @@ def test_a_frame_lies_where_networks_expect_it(
     cells=st.integers(1, 40),
     square=st.booleans(),
 )
-def test_the_frame_always_lies_inside_an_input_of_whole_cells(
-    width: int, height: int, cells: int, square: bool
-) -> None:
+def test_frame_is_inside_an_input_of_whole_cells(width: int, height: int, cells: int, square: bool) -> None:
     box = fit(width, height, 32 * cells, square=square)
     assert box.width % 32 == 0
     assert box.height % 32 == 0
@@ -59,7 +57,7 @@ def test_the_frame_always_lies_inside_an_input_of_whole_cells(
     height=st.integers(2, 2000),
     fractions=st.tuples(*[st.floats(0, 1, width=32)] * 4),
 )
-def test_a_box_comes_back_to_where_it_was(width: int, height: int, fractions: tuple[float, ...]) -> None:
+def test_box_survives_the_round_trip(width: int, height: int, fractions: tuple[float, ...]) -> None:
     box = fit(width, height, 640)
     left, right = sorted((fractions[0] * width, fractions[1] * width))
     top, bottom = sorted((fractions[2] * height, fractions[3] * height))
@@ -78,7 +76,7 @@ def test_no_boxes_stay_no_boxes() -> None:
     assert fit(320, 240, 640).to_frame(np.zeros((0, 4))).shape == (0, 4)
 
 
-def test_the_padding_is_grey_and_the_picture_keeps_its_colours() -> None:
+def test_padding_is_grey_and_colours_are_kept() -> None:
     image = np.zeros((16, 64, 3), np.uint8)
     image[:] = (10, 20, 30)  # blue, green, red
     box = fit(64, 16, 64, square=True)
@@ -90,7 +88,7 @@ def test_the_padding_is_grey_and_the_picture_keeps_its_colours() -> None:
 
 
 @pytest.mark.parametrize("size", [(64, 16), (33, 50), (50, 33), (128, 96), (64, 64)])
-def test_a_buffer_that_is_used_again_gives_what_a_new_one_gives(size: tuple[int, int]) -> None:
+def test_reused_buffer_gives_the_same_result(size: tuple[int, int]) -> None:
     box = fit(*size, 64)
     buffer = box.blank()
     random = np.random.default_rng(0)
@@ -106,7 +104,7 @@ def test_a_frame_that_fits_is_not_copied() -> None:
     assert fit(96, 64, 96).apply(image) is image
 
 
-def test_the_frame_itself_is_left_as_it_was() -> None:
+def test_frame_is_not_modified() -> None:
     image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
     before = image.copy()
     fit(64, 32, 64, square=True).apply(image)

@@ -34,7 +34,7 @@ GROUND = Ground(("concrete",), 0, 256, 0.05)
 FACING = np.diag([1.0, -1.0, -1.0])
 
 
-def picture(
+def make_image(
     height_m: float, north_m: float, yaw: float, camera: CameraModel = PLAIN, **printed: Any
 ) -> NDArray[np.uint8]:
     """A plate on the ground from above, its centre `north_m` ahead of straight down."""
@@ -57,7 +57,7 @@ def picture(
     forward=st.floats(0.6, 15.0),
     size=st.floats(0.05, 1.0),
 )
-def test_exact_corners_give_the_exact_place_through_any_lens(
+def test_exact_corners_give_the_exact_pose_for_any_lens(
     camera: CameraModel,
     tilt: float,
     lean: float,
@@ -85,9 +85,7 @@ def test_exact_corners_give_the_exact_place_through_any_lens(
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31), forward=st.floats(1.0, 6.0), noise_px=st.floats(0.0, 0.4))
-def test_noise_on_the_corners_shows_as_reprojection_and_moves_the_place_by_little(
-    seed: int, forward: float, noise_px: float
-) -> None:
+def test_corner_noise_moves_the_position_little(seed: int, forward: float, noise_px: float) -> None:
     rng = np.random.default_rng(seed)
     position = np.array([0.1, -0.1, forward])
     corners = PLAIN.project(square(0.5) @ FACING.T + position) + rng.normal(0.0, noise_px, (4, 2))
@@ -98,7 +96,7 @@ def test_noise_on_the_corners_shows_as_reprojection_and_moves_the_place_by_littl
     assert np.linalg.norm(marker.position_camera_m - position) < forward * (0.002 + 6 * noise_px / side_px)
 
 
-def test_from_afar_both_poses_fit_and_both_are_kept() -> None:
+def test_both_poses_are_kept_from_far_away() -> None:
     rotation = matrix_from_euler(0.25, 0.0, 0.4) @ FACING
     corners = PLAIN.project(square(0.3) @ rotation.T + np.array([0.0, 0.0, 8.0]))
     marker = marker_from_corners(0, corners + np.array([[0.1, 0], [0, -0.1], [0.1, 0.1], [0, 0]]), 0.3, PLAIN)
@@ -114,10 +112,10 @@ def test_from_afar_both_poses_fit_and_both_are_kept() -> None:
 
 @settings(max_examples=8, deadline=None)
 @given(yaw=st.floats(-math.pi, math.pi), height=st.floats(1.0, 6.0), part=st.floats(-1.0, 1.0))
-def test_a_drawn_plate_is_found_and_placed(yaw: float, height: float, part: float) -> None:
+def test_rendered_marker_is_detected_and_located(yaw: float, height: float, part: float) -> None:
     # As far to the north as the whole plate, its corners too, is still seen.
     north = part * min(0.6, height * PLAIN.cy / PLAIN.fy - 0.4)
-    found = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(picture(height, north, yaw), PLAIN)
+    found = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(make_image(height, north, yaw), PLAIN)
     assert [marker.identifier for marker in found] == [7]
     right, down, forward = found[0].position_camera_m
     # Looking straight down with north to the top: north is up in the picture.
@@ -127,15 +125,15 @@ def test_a_drawn_plate_is_found_and_placed(yaw: float, height: float, part: floa
     assert found[0].reprojection_px < 0.8
 
 
-def test_a_drawn_plate_tells_which_way_its_upper_edge_points() -> None:
-    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(picture(1.5, 0.0, 0.6), PLAIN)[0]
+def test_rendered_marker_gives_its_heading() -> None:
+    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(make_image(1.5, 0.0, 0.6), PLAIN)[0]
     upper = marker.rotation[:, 1]
     assert math.atan2(upper[0], -upper[1]) == pytest.approx(0.6, abs=0.03)
 
 
-def test_every_dictionary_that_is_named_finds_its_markers() -> None:
+def test_every_dictionary_detects_its_markers() -> None:
     for dictionary in ("4X4_50", "5X5_250", "6X6_1000", "ARUCO_ORIGINAL", "APRILTAG_16h5", "APRILTAG_36h11"):
-        image = picture(2.0, 0.0, 0.3, dictionary=dictionary, identifier=5, size=0.8)
+        image = make_image(2.0, 0.0, 0.3, dictionary=dictionary, identifier=5, size=0.8)
         found = MarkerDetector(MarkerKind(dictionary, 0.8)).detect(image, PLAIN)
         assert 5 in [marker.identifier for marker in found], dictionary
     assert "APRILTAG_36h11" in DICTIONARIES
@@ -143,19 +141,19 @@ def test_every_dictionary_that_is_named_finds_its_markers() -> None:
 
 def test_single_ids_may_have_a_size_of_their_own() -> None:
     kind = MarkerKind("4X4_50", 1.0, {7: 0.25})
-    marker = MarkerDetector(kind).detect(picture(2.0, 0.0, 0.0, size=0.25), PLAIN)[0]
+    marker = MarkerDetector(kind).detect(make_image(2.0, 0.0, 0.0, size=0.25), PLAIN)[0]
     assert marker.size_m == 0.25
     assert marker.position_camera_m[2] == pytest.approx(2.0, rel=0.05)
 
 
 def test_a_lens_with_distortion_does_not_move_the_marker() -> None:
-    image = picture(2.0, 0.5, 0.2, camera=BENT)  # the renderer draws it bent
+    image = make_image(2.0, 0.5, 0.2, camera=BENT)  # the renderer draws it bent
     marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(image, BENT)[0]
     assert -marker.position_camera_m[1] == pytest.approx(0.5, abs=0.05)
     assert marker.position_camera_m[2] == pytest.approx(2.0, rel=0.05)
 
 
-def test_a_picture_without_markers_shows_none() -> None:
+def test_image_without_markers_gives_none() -> None:
     detector = MarkerDetector(MarkerKind("4X4_50", 0.5))
     assert detector.detect(np.zeros((480, 640, 3), np.uint8), PLAIN) == ()
     noise = np.random.default_rng(1).integers(0, 255, (480, 640, 3), dtype=np.uint8)
@@ -172,23 +170,23 @@ def test_a_picture_without_markers_shows_none() -> None:
         np.array([[100, 100], [100, 200], [200, 200], [200, 100]]),
     ],
 )
-def test_corners_that_are_no_marker_have_no_pose(corners: NDArray[Any]) -> None:
+def test_invalid_corners_have_no_pose(corners: NDArray[Any]) -> None:
     assert marker_from_corners(0, corners, 0.5, PLAIN) is None
 
 
-def test_what_cannot_be_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="unknown marker dictionary '4x4'; known are"):
+def test_invalid_settings_are_rejected_by_name() -> None:
+    with pytest.raises(ValueError, match="4x4"):
         MarkerKind("4x4", 0.5)
-    with pytest.raises(ValueError, match="marker 50 is not in dictionary 4X4_50, which has 0 to 49"):
+    with pytest.raises(ValueError, match=r"50 .*4X4_50 .*0 to 49"):
         MarkerKind("4X4_50", 0.5, {50: 0.1})
-    with pytest.raises(ValueError, match="above 0, got -1"):
+    with pytest.raises(ValueError, match="got -1"):
         MarkerKind("4X4_50", 0.5, {1: -1})
-    with pytest.raises(ValueError, match="camera model is of 640x480 pixels, the picture of 320x240"):
+    with pytest.raises(ValueError, match=r"640x480 .*320x240"):
         MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(np.zeros((240, 320, 3), np.uint8), PLAIN)
 
 
-def test_a_marker_crosses_a_pipe() -> None:
-    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(picture(2.0, 0.0, 0.0), PLAIN)[0]
+def test_marker_survives_pickling() -> None:
+    marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(make_image(2.0, 0.0, 0.0), PLAIN)[0]
     data = pickle.dumps(marker)
     assert len(data) < 2000
     assert np.array_equal(pickle.loads(data).corners_px, marker.corners_px)

@@ -71,7 +71,7 @@ def _kinds() -> Iterator[None]:
         (DetectorSettings(confidence=0.5, classes=("c",)), []),
     ],
 )
-def test_classes_and_confidence_hold_for_a_plugin(settings: DetectorSettings, names: list[str]) -> None:
+def test_classes_and_confidence_apply_to_a_plugin(settings: DetectorSettings, names: list[str]) -> None:
     assert open_detector("corners", settings).detect(FRAME).names == names
 
 
@@ -86,7 +86,7 @@ def test_unknown_kind_lists_the_known_ones() -> None:
 
 
 @pytest.mark.parametrize("kind", [YOLO, "Corners", ""])
-def test_kind_that_is_taken_or_malformed_is_refused(kind: str) -> None:
+def test_duplicate_or_malformed_kind_is_rejected(kind: str) -> None:
     before = DETECTORS.known()
     with pytest.raises(ValueError, match=r"test_object_detector\.Corners"):
         detector(kind, "of a test")(Corners)
@@ -103,7 +103,7 @@ def test_detector_without_timing_is_timed_as_a_whole() -> None:
     assert (made.model_name, made.runtime, made.precision) == ("corners", None, None)
 
 
-def test_detector_may_say_what_it_is() -> None:
+def test_detector_may_set_its_description() -> None:
     made = open_detector("timed", DetectorSettings())
     made.detect(FRAME)
     assert (made.model_name, made.runtime, made.precision, made.reason) == (
@@ -120,7 +120,7 @@ def test_other_class_names_than_declared_are_an_error() -> None:
         open_detector("wrong", DetectorSettings()).detect(FRAME)
 
 
-def test_yolo_is_a_kind_like_any_other() -> None:
+def test_yolo_is_a_registered_kind() -> None:
     made = open_detector(YOLO, DetectorSettings(confidence=0.5, image_size=64, precision="float32"))
     assert isinstance(made, Detector)
     assert (made.model_name, made.runtime, made.precision) == ("default", "torch", "float32")

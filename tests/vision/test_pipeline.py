@@ -100,7 +100,7 @@ def test_every_frame_of_a_folder_gives_a_result_with_its_own_stamps(tmp_path: Pa
     assert {(result.width, result.height, result.dropped) for result in results} == {(WIDTH, HEIGHT, 0)}
 
 
-def test_the_time_of_every_stage_is_told() -> None:
+def test_every_stage_is_timed() -> None:
     (result,) = run(Pipeline(Frames(frame_of(0)), BrightSpot()))
     assert result.timing_ms["preprocess"] == 1.0
     assert result.timing_ms["inference"] == 2.0
@@ -115,7 +115,7 @@ def test_depth_gives_every_detection_its_range() -> None:
     assert np.isnan(none.detections.depth_m).all()
 
 
-def test_only_every_nth_frame_is_looked_at() -> None:
+def test_only_every_nth_frame_is_processed() -> None:
     pipeline = Pipeline(
         Frames(*(frame_of(number) for number in range(7))), BrightSpot(), selection=Selection(every=3)
     )
@@ -132,17 +132,17 @@ def test_frames_that_the_source_lost_are_counted() -> None:
     assert [result.frames_skipped["replaced"] for result in results] == [1, 1, 4]
 
 
-def test_a_frame_that_is_too_old_is_counted_as_lost_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_old_frame_is_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     second_ago_ns = time.monotonic_ns() - 1_000_000_000
     frames = Frames(*(replace(frame_of(number), captured_ns=second_ago_ns) for number in range(2)))
     pipeline = Pipeline(frames, BrightSpot(), selection=Selection(max_age_s=0.5))
     assert run(pipeline) == []
     assert pipeline.dropped == pipeline.frames_skipped["too_old"] == 2
     (line,) = caplog.messages
-    assert line.startswith("frames: a frame is ")
+    assert "max_age_s" in line
 
 
-def test_arrival_decoding_and_waiting_are_told_apart() -> None:
+def test_arrival_decoding_and_waiting_are_timed_separately() -> None:
     now_ns = time.monotonic_ns()
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     frame = Frame(image, now_ns - 50_000_000, 0, ready_ns=now_ns - 30_000_000, decode_ms=5.0)
@@ -152,7 +152,7 @@ def test_arrival_decoding_and_waiting_are_told_apart() -> None:
     assert result.timing_ms["wait"] >= 30.0
 
 
-def test_a_time_without_a_frame_is_told_and_is_no_end() -> None:
+def test_timeout_without_a_frame_is_not_the_end() -> None:
     results: list[PerceptionResult] = []
     pipeline = Pipeline(Frames(None, frame_of(0)), BrightSpot())
     assert pipeline.step(0.1, results.append) is False
@@ -203,7 +203,7 @@ class Flickering:
         )
 
 
-def test_a_tracker_names_what_is_seen_and_keeps_the_weak_that_belong_to_it() -> None:
+def test_tracker_sets_ids_and_keeps_weak_detections_of_tracks() -> None:
     frames = [frame_of(number, spot_x=10 + 3 * number) for number in range(8)]
     frames = [replace(frame, captured_ns=frame.sequence * 100_000_000 + 1) for frame in frames]
     results = run(Pipeline(Frames(*frames), Flickering(), tracker=Tracker()))
@@ -227,7 +227,7 @@ def test_ranges_are_measured_for_tracked_detections_too() -> None:
     assert result.detections.depth_m == pytest.approx([6.5])
 
 
-def test_where_the_camera_looked_is_asked_for_every_frame_after_it_was_looked_at() -> None:
+def test_view_is_requested_after_each_detection() -> None:
     asked: list[tuple[int, bool]] = []
     detector = Flickering()
 
@@ -238,7 +238,7 @@ def test_where_the_camera_looked_is_asked_for_every_frame_after_it_was_looked_at
     assert asked == [(0, True), (1, True)]
 
 
-def test_without_a_tracker_nobody_has_an_identity() -> None:
+def test_without_a_tracker_there_are_no_track_ids() -> None:
     (result,) = run(Pipeline(Frames(frame_of(0)), Flickering()))
     assert result.detections.track_id is None
     assert result.track_events == ()

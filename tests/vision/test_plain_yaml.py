@@ -30,7 +30,7 @@ def test_what_was_written_is_read_back(value: object) -> None:
     assert load_plain_yaml(yaml.dump(value, Dumper=PlainDumper)) == value
 
 
-def test_class_names_stay_texts() -> None:
+def test_class_names_stay_strings() -> None:
     text = "names: [no, yes, on, off, y, 1:30, 2026-11-21, 0x1F, 010, person]"
     assert load_plain_yaml(text)["names"] == [
         *("no", "yes", "on", "off", "y", "1:30", "2026-11-21", "0x1F", "010", "person")
@@ -38,11 +38,11 @@ def test_class_names_stay_texts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "expected"),
     [
         pytest.param("a: 1\nb: !!python/object/apply:os.system [id]", "line 2: the tag", id="a program"),
         pytest.param("a: &x [1]\nb: *x", "line 1: anchors", id="an alias"),
-        pytest.param("a: 1\na: 2", "line 2: the key 'a' stands there twice", id="a key twice"),
+        pytest.param("a: 1\na: 2", "line 2: duplicate key 'a'", id="a key twice"),
         pytest.param("? [1, 2]\n: 3", "a key must be a plain value", id="a list as key"),
         pytest.param("a: [1, 2", "line [12]: ", id="an open bracket"),
         pytest.param("a: \x00", "characters", id="a control character"),
@@ -52,8 +52,8 @@ def test_class_names_stay_texts() -> None:
         pytest.param(" " * (3 << 20), "characters", id="long"),
     ],
 )
-def test_anything_else_is_refused_in_one_line(text: str, says: str) -> None:
-    with pytest.raises(PlainYamlError, match=says) as error:
+def test_anything_else_is_rejected_in_one_line(text: str, expected: str) -> None:
+    with pytest.raises(PlainYamlError, match=expected) as error:
         load_plain_yaml(text)
     assert "\n" not in str(error.value)
 

@@ -40,7 +40,7 @@ def played(path: Path) -> list[np.ndarray]:
         return [frame.image for frame in source]
 
 
-def test_the_film_shows_every_frame_with_what_was_seen_in_it(tmp_path: Path) -> None:
+def test_video_contains_every_frame_with_detections(tmp_path: Path) -> None:
     path = tmp_path / "flight.webm"
     recording = Recording(path, 20.0)
     for sequence in range(8):
@@ -54,8 +54,8 @@ def test_the_film_shows_every_frame_with_what_was_seen_in_it(tmp_path: Path) -> 
     assert recording.skipped == 0
 
 
-def test_lines_and_the_highlighted_class_change_the_picture(tmp_path: Path) -> None:
-    films = []
+def test_lines_and_highlight_change_the_image(tmp_path: Path) -> None:
+    videos = []
     for name, lines, highlight in (
         ("a", (), None),
         ("b", ("seek car",), None),
@@ -67,8 +67,8 @@ def test_lines_and_the_highlighted_class_change_the_picture(tmp_path: Path) -> N
         recording.lines, recording.highlight = lines, highlight
         give(recording, frame_of(0))
         recording.close()
-        films.append(played(path)[0].astype(int))
-    plain, panel, marked, other = films
+        videos.append(played(path)[0].astype(int))
+    plain, panel, marked, other = videos
     assert np.abs(panel - plain).max() > 40
     assert np.abs(marked - plain).max() > 20
     assert np.array_equal(other, plain)
@@ -80,7 +80,7 @@ def test_a_recording_without_frames_leaves_no_file(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def test_frames_beyond_the_films_rate_are_not_drawn(tmp_path: Path) -> None:
+def test_frames_beyond_the_video_rate_are_not_drawn(tmp_path: Path) -> None:
     path = tmp_path / "flight.webm"
     recording = Recording(path, 10.0)
     for sequence in range(41):
@@ -90,7 +90,7 @@ def test_frames_beyond_the_films_rate_are_not_drawn(tmp_path: Path) -> None:
     assert recording.skipped == 0
 
 
-def test_a_frame_of_another_size_goes_on_in_the_size_of_the_first(tmp_path: Path) -> None:
+def test_frame_of_another_size_is_resized(tmp_path: Path) -> None:
     path = tmp_path / "flight.webm"
     recording = Recording(path, 20.0)
     give(recording, frame_of(0))
@@ -99,22 +99,20 @@ def test_a_frame_of_another_size_goes_on_in_the_size_of_the_first(tmp_path: Path
     assert [image.shape for image in played(path)] == [(HEIGHT, WIDTH, 3)] * 2
 
 
-def test_an_encoder_that_is_too_slow_costs_frames_and_no_time(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_slow_encoder_drops_frames_without_blocking(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recording = Recording(tmp_path / "flight.webm", 200.0)
     large = np.random.default_rng(1).integers(0, 255, (1080, 1920, 3), np.uint8)
     for sequence in range(100):
         recording.write(Frame(large, sequence * 5_000_000, sequence), SPOT)
-    # Pictures of the film, not frames that were offered for one: each of its places is offered two.
+    # Pictures of the video, not frames that were offered for one: each of its places is offered two.
     for sequence in range(100, 300):
         recording.write(Frame(large, sequence * 2_500_000 + 250_000_000, sequence), SPOT)
     recording.close()
     assert 0 < recording.skipped <= 200
-    assert any("the encoder was slow" in record.getMessage() for record in caplog.records)
+    assert any("rate_hz" in record.getMessage() for record in caplog.records)
 
 
-def test_the_end_does_not_wait_for_a_slow_encoder_and_the_film_is_whole(
+def test_close_does_not_wait_for_a_slow_encoder(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vision.recording._FINISHING_S", -1.0)
@@ -139,10 +137,10 @@ def test_the_end_does_not_wait_for_a_slow_encoder_and_the_film_is_whole(
     closing.join(30)
     assert len(played(path)) == 1
     assert recording.skipped == 3
-    assert any("3 pictures are missing" in record.getMessage() for record in caplog.records)
+    assert any("3 frames" in record.getMessage() for record in caplog.records)
 
 
-def test_a_fault_of_ours_ends_the_film_and_not_in_silence(
+def test_internal_error_ends_the_recording_with_a_log(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def faulty(image: np.ndarray, detections: Detections, **_: object) -> np.ndarray:
@@ -155,22 +153,20 @@ def test_a_fault_of_ours_ends_the_film_and_not_in_silence(
     give(recording, frame_of(1), SPOT[:0])
     give(recording, frame_of(2), SPOT[:0])
     recording.close()
-    (said,) = [record for record in caplog.records if record.levelno == logging.ERROR]
-    assert "the recording has failed: list index out of range" in said.getMessage()
-    assert said.exc_info is not None
+    (record_logged,) = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert "list index out of range" in record_logged.getMessage()
+    assert record_logged.exc_info is not None
     assert played(path)  # what was in it until then
 
 
 @pytest.mark.parametrize("name", ["flight.mp4", "blocked/flight.webm"])
-def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path: Path, name: str) -> None:
+def test_unwritable_video_fails_at_once(tmp_path: Path, name: str) -> None:
     (tmp_path / "blocked").write_bytes(b"")
     with pytest.raises(VideoWriterError, match=name.rpartition("/")[2]):
         Recording(tmp_path / name, 20.0)
 
 
-def test_a_recording_that_fails_says_so_once_and_takes_no_more(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_failed_recording_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "flight.webm"
     recording = Recording(path, 20.0)
     path.unlink()
@@ -180,9 +176,7 @@ def test_a_recording_that_fails_says_so_once_and_takes_no_more(
             give(recording, frame_of(sequence))
         recording.close()
         recording.close()
-    assert (
-        len([record for record in caplog.records if "the recording has failed" in record.getMessage()]) == 1
-    )
+    assert len([record for record in caplog.records if "recording failed" in record.getMessage()]) == 1
 
 
 def test_an_encoder_that_pauses_for_a_second_leaves_no_gap(

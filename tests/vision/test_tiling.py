@@ -43,7 +43,7 @@ class Patches:
         )
 
 
-def picture(width: int, height: int, *boxes: tuple[int, int, int, int]) -> NDArray[np.uint8]:
+def make_image(width: int, height: int, *boxes: tuple[int, int, int, int]) -> NDArray[np.uint8]:
     image = np.zeros((height, width, 3), np.uint8)
     for left, top, right, bottom in boxes:
         image[top:bottom, left:right] = 255
@@ -56,9 +56,7 @@ def same_boxes(found: Detections, boxes: list[tuple[int, int, int, int]]) -> boo
 
 @settings(max_examples=200, deadline=None)
 @given(st.integers(1, 4000), st.integers(1, 3000), st.integers(64, 1000), st.floats(0, 0.8))
-def test_tiles_cover_the_frame_and_overlap_as_asked(
-    width: int, height: int, size: int, overlap: float
-) -> None:
+def test_tiles_cover_the_frame_with_the_overlap(width: int, height: int, size: int, overlap: float) -> None:
     tiles = tiles_of(width, height, size, overlap)
     axes: tuple[tuple[Edge, Edge, int], ...] = (
         (lambda tile: tile.left, lambda tile: tile.right, width),
@@ -76,24 +74,24 @@ def test_tiles_cover_the_frame_and_overlap_as_asked(
 def test_full_hd_takes_eight_tiles_and_a_whole_frame() -> None:
     detector = Patches()
     tiled = TiledDetector(detector)
-    tiled.detect(picture(1920, 1080))
+    tiled.detect(make_image(1920, 1080))
     assert detector.asked == [(640, 640)] * 8 + [(1920, 1080)]
     assert tiled.last_passes == 9
     assert tiled.last_timing is not None
     assert (tiled.last_timing.preprocess_ms, tiled.last_timing.inference_ms) == (9.0, 90.0)
 
 
-def test_a_frame_no_larger_than_a_tile_is_looked_at_once() -> None:
+def test_frame_not_larger_than_a_tile_is_one_pass() -> None:
     detector = Patches()
     tiled: FrameDetector = TiledDetector(detector)
-    assert len(tiled.detect(picture(640, 480, (10, 10, 40, 40)))) == 1
+    assert len(tiled.detect(make_image(640, 480, (10, 10, 40, 40)))) == 1
     assert detector.asked == [(640, 480)]
     assert tiled.class_names == NAMES
 
 
-def test_what_the_whole_frame_is_too_coarse_for_is_found_in_a_tile() -> None:
+def test_small_object_is_found_in_a_tile() -> None:
     small = (1500, 700, 1512, 712)
-    image = picture(1920, 1080, small)
+    image = make_image(1920, 1080, small)
     coarse = Patches(smallest=0.015)
     assert len(coarse.detect(image)) == 0
     assert same_boxes(TiledDetector(coarse).detect(image), [small])
@@ -101,17 +99,17 @@ def test_what_the_whole_frame_is_too_coarse_for_is_found_in_a_tile() -> None:
 
 def test_an_object_in_the_overlap_is_found_once() -> None:
     boxes = [(440, 300, 520, 380), (560, 500, 630, 560), (100, 460, 180, 520)]
-    assert same_boxes(TiledDetector(Patches()).detect(picture(1920, 1080, *boxes)), boxes)
+    assert same_boxes(TiledDetector(Patches()).detect(make_image(1920, 1080, *boxes)), boxes)
 
 
-def test_an_object_larger_than_a_tile_is_the_whole_frames() -> None:
+def test_object_larger_than_a_tile_is_found_once() -> None:
     box = (100, 100, 1800, 1000)
-    assert same_boxes(TiledDetector(Patches()).detect(picture(1920, 1080, box)), [box])
+    assert same_boxes(TiledDetector(Patches()).detect(make_image(1920, 1080, box)), [box])
 
 
-def test_without_the_whole_frame_pieces_are_put_together() -> None:
+def test_pieces_are_merged_without_the_whole_frame() -> None:
     box = (200, 300, 900, 400)
-    found = TiledDetector(Patches(), whole_frame=False).detect(picture(1280, 640, box))
+    found = TiledDetector(Patches(), whole_frame=False).detect(make_image(1280, 640, box))
     assert same_boxes(found, [box])
 
 
@@ -126,7 +124,7 @@ def test_objects_within_each_other_in_one_pass_stay_two() -> None:
     assert len(merge_passes([one_pass, nothing], [np.zeros(2, np.bool_), np.zeros(0, np.bool_)])) == 2
 
 
-def test_a_whole_box_does_not_fall_to_a_surer_half() -> None:
+def test_whole_box_beats_a_more_confident_piece() -> None:
     half = Detections(
         np.array([[0, 0, 50, 100]], np.float32), np.array([0.99], np.float32), np.array([0]), NAMES
     )
@@ -140,8 +138,8 @@ def test_a_whole_box_does_not_fall_to_a_surer_half() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "says"), [({"tile_size": 10}, "tile_size"), ({"overlap": 0.9}, "overlap")]
+    ("values", "expected"), [({"tile_size": 10}, "tile_size"), ({"overlap": 0.9}, "overlap")]
 )
-def test_senseless_tiles_are_refused(values: dict[str, float], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_tile_settings_are_rejected(values: dict[str, float], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
         TiledDetector(Patches(), **values)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Films: real time kept, errors told, and a browser that plays them."""
+"""Films: real time kept, errors reported, and a browser that plays them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from vision.video_writer import VideoWriter, VideoWriterError
 SECOND = 1_000_000_000
 
 
-def picture(value: int, width: int = 64, height: int = 48) -> np.ndarray:
+def make_image(value: int, width: int = 64, height: int = 48) -> np.ndarray:
     return np.full((height, width, 3), value, np.uint8)
 
 
 def frames_of(path: Path, rate_hz: float) -> list[float]:
-    """The mean grey that is seen in each slot of the film."""
+    """The mean grey that is seen in each slot of the video."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     greys: list[float] = []
     while True:
@@ -48,7 +48,7 @@ def frames_of(path: Path, rate_hz: float) -> list[float]:
 
 @pytest.fixture(params=["PyAV", "OpenCV"], autouse=True)
 def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Every film by either."""
+    """Every video by either."""
     if request.param == "PyAV":
         pytest.importorskip("av", reason="PyAV is an optional extra")
     else:
@@ -58,13 +58,11 @@ def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     video_encoders._pyav.cache_clear()
 
 
-def test_a_film_at_its_own_rate_holds_every_image_once(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "new" / "film.webm"
+def test_video_at_its_rate_has_every_image_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "new" / "video.webm"
     with VideoWriter(path, 64, 48, 20.0) as writer:
         for index in range(20):
-            assert writer.write(picture(index * 12), 5 * SECOND + index * SECOND // 20) == 1
+            assert writer.write(make_image(index * 12), 5 * SECOND + index * SECOND // 20) == 1
         assert writer.duration_s == 1.0
     assert (writer.frames, writer.repeated, writer.dropped) == (20, 0, 0)
     greys = frames_of(path, 20.0)
@@ -73,35 +71,33 @@ def test_a_film_at_its_own_rate_holds_every_image_once(
 
 
 def test_a_pause_is_filled_with_the_image_before_it(tmp_path: Path) -> None:
-    path = tmp_path / "film.webm"
+    path = tmp_path / "video.webm"
     with VideoWriter(path, 64, 48, 10.0) as writer:
-        assert writer.write(picture(40), 0) == 1
-        assert writer.write(picture(200), SECOND) == 10
+        assert writer.write(make_image(40), 0) == 1
+        assert writer.write(make_image(200), SECOND) == 10
     assert (writer.frames, writer.repeated) == (11, 9)
     greys = frames_of(path, 10.0)
     np.testing.assert_allclose(greys, [40] * 10 + [200], atol=4)
 
 
-def test_what_nobody_filled_costs_nothing_where_the_encoder_can_leave_it_out(
-    tmp_path: Path, encoder: str
-) -> None:
-    path = tmp_path / "film.webm"
+def test_empty_slots_are_not_encoded_by_pyav(tmp_path: Path, encoder: str) -> None:
+    path = tmp_path / "video.webm"
     with VideoWriter(path, 64, 48, 10.0) as writer:
-        writer.write(picture(40), 0)
-        writer.write(picture(200), 60 * SECOND)
+        writer.write(make_image(40), 0)
+        writer.write(make_image(200), 60 * SECOND)
     assert (writer.frames, writer.repeated, writer.duration_s) == (601, 599, 60.1)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    pictures = 0
+    images = 0
     while capture.grab():
-        pictures += 1
-    assert pictures == {"PyAV": 2, "OpenCV": 601}[encoder]
+        images += 1
+    assert images == {"PyAV": 2, "OpenCV": 601}[encoder]
 
 
 def test_images_that_come_too_fast_are_dropped_and_counted(tmp_path: Path) -> None:
-    path = tmp_path / "film.webm"
+    path = tmp_path / "video.webm"
     with VideoWriter(path, 64, 48, 10.0) as writer:
         for index in range(100):
-            writer.write(picture(100), index * SECOND // 100)
+            writer.write(make_image(100), index * SECOND // 100)
     assert writer.frames + writer.dropped == 100
     assert writer.frames in (10, 11)
     assert len(frames_of(path, 10.0)) == writer.frames
@@ -113,35 +109,35 @@ def test_playing_time_is_real_time_whatever_the_stamps(
     tmp_path: Path, rate_hz: float, steps: list[int]
 ) -> None:
     stamps = np.cumsum(steps)
-    with VideoWriter(tmp_path / "film.webm", 16, 16, rate_hz) as writer:
+    with VideoWriter(tmp_path / "video.webm", 16, 16, rate_hz) as writer:
         for stamp in stamps:
-            writer.write(picture(10, 16, 16), int(stamp))
+            writer.write(make_image(10, 16, 16), int(stamp))
         newest_s = max(float(stamps.max() - stamps[0]) / SECOND, 0.0)
         assert abs(writer.duration_s - newest_s) <= 1.51 / rate_hz
     assert writer.frames - writer.repeated + writer.dropped == len(stamps)
 
 
-def test_the_image_may_be_drawn_on_after_it_was_given(tmp_path: Path) -> None:
-    path = tmp_path / "film.webm"
-    image = picture(40)
+def test_image_may_be_modified_after_write(tmp_path: Path) -> None:
+    path = tmp_path / "video.webm"
+    image = make_image(40)
     with VideoWriter(path, 64, 48, 10.0) as writer:
         writer.write(image, 0)
         image[:] = 250
-        writer.write(picture(40), SECOND // 2)
+        writer.write(make_image(40), SECOND // 2)
     np.testing.assert_allclose(frames_of(path, 10.0), [40] * 6, atol=4)
 
 
 @pytest.mark.parametrize(
     ("name", "size", "rate_hz", "words"),
     [
-        ("film.mp4", (64, 48), 10.0, "must end in .webm"),
-        ("film.webm", (0, 48), 10.0, "VP8 takes 1..16383 pixels"),
-        ("film.webm", (64, 48), 0.0, "rate_hz must be 0.1..240"),
-        ("file/film.webm", (64, 48), 10.0, "cannot be written: "),
+        ("video.mp4", (64, 48), 10.0, "must end in .webm"),
+        ("video.webm", (0, 48), 10.0, "1..16383 pixels"),
+        ("video.webm", (64, 48), 0.0, "rate_hz must be 0.1..240"),
+        ("file/video.webm", (64, 48), 10.0, "cannot be written: "),
         ("taken.webm", (64, 48), 10.0, "cannot be written: Is a directory"),
     ],
 )
-def test_what_cannot_be_written_is_one_clear_line(
+def test_write_failure_is_a_one_line_error(
     tmp_path: Path, name: str, size: tuple[int, int], rate_hz: float, words: str
 ) -> None:
     (tmp_path / "file").write_text("in the way")
@@ -151,27 +147,27 @@ def test_what_cannot_be_written_is_one_clear_line(
     assert str(tmp_path / name) in str(caught.value)
 
 
-def test_a_full_disk_is_told(tmp_path: Path, encoder: str) -> None:
+def test_full_disk_is_reported(tmp_path: Path, encoder: str) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full to stand for a full disk")
-    path = tmp_path / "film.webm"
+    path = tmp_path / "video.webm"
     path.symlink_to("/dev/full")
     writer = VideoWriter(path, 64, 48, 10.0)
     for index in range(20):
-        writer.write(picture(index * 12), index * SECOND // 10)
-    told = {
+        writer.write(make_image(index * 12), index * SECOND // 10)
+    reported = {
         "PyAV": "cannot be written: No space left on device",
-        "OpenCV": "holds 0 of 20 frames; is the disk full?",
+        "OpenCV": "0 of 20 frames",
     }
-    with pytest.raises(VideoWriterError, match=re.escape(told[encoder])):
+    with pytest.raises(VideoWriterError, match=re.escape(reported[encoder])):
         writer.close()
 
 
-def test_a_disk_that_fills_while_filming_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "film.webm"
+def test_disk_filling_during_recording_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "video.webm"
     noise = np.random.default_rng(0).integers(0, 255, (30, 240, 320, 3), dtype=np.uint8)
 
-    def film() -> None:
+    def video() -> None:
         with VideoWriter(path, 320, 240, 30.0) as writer:
             for index, image in enumerate(noise):
                 writer.write(image, index * SECOND // 30)
@@ -180,71 +176,71 @@ def test_a_disk_that_fills_while_filming_is_told(tmp_path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
     try:
         with pytest.raises(VideoWriterError, match=re.escape(str(path))):
-            film()
+            video()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.stat().st_size <= 200_000
 
 
-def test_a_name_with_a_colon_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_name_may_contain_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with VideoWriter("flight-12:30.webm", 64, 48, 10.0) as writer:
-        writer.write(picture(40), 0)
+        writer.write(make_image(40), 0)
     assert len(frames_of(Path("file:flight-12:30.webm"), 10.0)) == 1
 
 
-def test_a_pyav_that_cannot_be_loaded_is_told_and_opencv_films(
+def test_broken_pyav_is_logged_and_opencv_is_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "av.py").write_text("raise ImportError('libav: wrong version')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "av", raising=False)
-    path = tmp_path / "film.webm"
+    path = tmp_path / "video.webm"
     for _ in range(2):
         with VideoWriter(path, 64, 48, 10.0) as writer:
-            writer.write(picture(40), 0)
+            writer.write(make_image(40), 0)
     assert len(frames_of(path, 10.0)) == 1
-    (told,) = [record.getMessage() for record in caplog.records]
-    assert told.startswith("PyAV is installed and of no use (libav: wrong version)")
+    (reported,) = [record.getMessage() for record in caplog.records]
+    assert reported.startswith("PyAV is installed but unusable (libav: wrong version)")
 
 
 def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "film.webm", 64, 48, 10.0) as writer:
+    with VideoWriter(tmp_path / "video.webm", 64, 48, 10.0) as writer:
         with pytest.raises(ValueError, match=re.escape("must be (48, 64, 3) uint8, got (48, 60, 3)")):
-            writer.write(picture(1, 60), 0)
-        writer.write(picture(1), 0)
+            writer.write(make_image(1, 60), 0)
+        writer.write(make_image(1), 0)
     with pytest.raises(ValueError, match="after close"):
-        writer.write(picture(1), SECOND)
+        writer.write(make_image(1), SECOND)
 
 
 def test_an_odd_size_can_be_written(tmp_path: Path) -> None:
-    path = tmp_path / "film.webm"
+    path = tmp_path / "video.webm"
     with VideoWriter(path, 63, 47, 10.0) as writer:
         for index in range(5):
-            writer.write(picture(90, 63, 47), index * SECOND // 10)
+            writer.write(make_image(90, 63, 47), index * SECOND // 10)
     assert len(frames_of(path, 10.0)) == 5
 
 
-PAGE = """<!doctype html><video id="film" muted src="film.webm"></video><script>
-const film = document.getElementById("film");
+PAGE = """<!doctype html><video id="video" muted src="video.webm"></video><script>
+const video = document.getElementById("video");
 function tell(what) {
-  fetch("/told", {method: "POST", body: JSON.stringify({what, width: film.videoWidth,
-    height: film.videoHeight, duration: film.duration, time: film.currentTime,
-    error: film.error && film.error.message})});
+  fetch("/reported", {method: "POST", body: JSON.stringify({what, width: video.videoWidth,
+    height: video.videoHeight, duration: video.duration, time: video.currentTime,
+    error: video.error && video.error.message})});
 }
-film.onerror = () => tell("error");
-film.onended = () => tell("ended");
-film.play().catch(error => tell(String(error)));
+video.onerror = () => tell("error");
+video.onended = () => tell("ended");
+video.play().catch(error => tell(String(error)));
 </script>"""
 
 
 class Cinema(SimpleHTTPRequestHandler):
-    """Serves the page and the film, and takes what the page tells."""
+    """Serves the page and the video, and takes what the page tells."""
 
-    told: ClassVar[queue.SimpleQueue[dict[str, Any]]] = queue.SimpleQueue()
+    reported: ClassVar[queue.SimpleQueue[dict[str, Any]]] = queue.SimpleQueue()
 
     def do_POST(self) -> None:
-        self.told.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.reported.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
         self.send_response(204)
         self.end_headers()
 
@@ -253,13 +249,13 @@ class Cinema(SimpleHTTPRequestHandler):
 
 
 @pytest.mark.realtime
-def test_a_browser_plays_the_film_to_its_end(tmp_path: Path) -> None:
+def test_browser_plays_the_video_to_its_end(tmp_path: Path) -> None:
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
-        pytest.skip("no Chromium is installed to play the film in")
-    with VideoWriter(tmp_path / "film.webm", 320, 240, 20.0) as writer:
+        pytest.skip("no Chromium is installed to play the video in")
+    with VideoWriter(tmp_path / "video.webm", 320, 240, 20.0) as writer:
         for index in range(30):
-            image = picture(60, 320, 240)
+            image = make_image(60, 320, 240)
             cv2.circle(image, (20 + index * 9, 120), 15, (40, 60, 230), cv2.FILLED)
             writer.write(image, index * SECOND // 20)
     (tmp_path / "page.html").write_text(PAGE)
@@ -277,11 +273,11 @@ def test_a_browser_plays_the_film_to_its_end(tmp_path: Path) -> None:
             stderr=subprocess.DEVNULL,
         ) as process:
             try:
-                told = Cinema.told.get(timeout=50)
+                reported = Cinema.reported.get(timeout=50)
             finally:
                 process.terminate()
         server.shutdown()
-    assert (told["what"], told["error"]) == ("ended", None)
-    assert (told["width"], told["height"]) == (320, 240)
-    assert told["duration"] == pytest.approx(1.5, abs=0.1)
-    assert told["time"] == pytest.approx(1.5, abs=0.1)
+    assert (reported["what"], reported["error"]) == ("ended", None)
+    assert (reported["width"], reported["height"]) == (320, 240)
+    assert reported["duration"] == pytest.approx(1.5, abs=0.1)
+    assert reported["time"] == pytest.approx(1.5, abs=0.1)
