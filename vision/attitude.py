@@ -71,6 +71,6 @@ def unit_quaternion(quaternion: Quaternion) -> Quaternion:
     """The same rotation with length 1. Raises ValueError for a zero quaternion."""
     norm = math.sqrt(sum(value * value for value in quaternion))
     if norm == 0.0:
-        raise ValueError("a zero quaternion is no rotation")
+        raise ValueError("a zero quaternion is not a rotation")
     w, x, y, z = (value / norm for value in quaternion)
     return (w, x, y, z)

@@ -78,9 +78,9 @@ def test_detect_finds_the_square_of_the_plugins(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (("square://10x10", "--detector-kind", "red", *PLUGINS), "square://10x10: expected square://WIDTH"),
-        (("circle://10x10", "--detector-kind", "red", *PLUGINS), "no circle://; known: .* square"),
-        (("square://320x240", "--detector-kind", "blue", *PLUGINS), "no 'blue'; known: yolo .* red "),
-        (("square://320x240", "--detector-kind", "red"), "no 'red'; known: yolo "),
+        (("circle://10x10", "--detector-kind", "red", *PLUGINS), "circle://; known: .* square"),
+        (("square://320x240", "--detector-kind", "blue", *PLUGINS), "'blue'; known: yolo .* red "),
+        (("square://320x240", "--detector-kind", "red"), "'red'; known: yolo "),
         (
             ("square://320x240", "--detector-kind", "red", "--classes", "car", *PLUGINS),
             "no class 'car'.*blob",

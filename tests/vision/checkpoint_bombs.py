@@ -1,6 +1,6 @@
-"""Files that are small and claim to be large, or that would keep a reader busy for ever.
+"""Small files that claim to be large, or that would keep a reader busy forever.
 
-Each is a function that writes it at a path (and may choose another ending), with a pattern of its refusal.
+Each is a function that writes the file to a path (it may change the suffix), with a pattern of its error.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def described(path: Path, **changes: Any) -> Path:
 
 
 def many_members(path: Path) -> Path:
-    """A table of contents with nothing behind it, forty-six bytes a member."""
+    """A table of contents without members, forty-six bytes per entry."""
     member = struct.pack("<4s4B4HL2L5H2L", b"PK\x01\x02", *[0] * 18)
     contents = b"PK\x03\x04" + member * 200_000
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 0xFFFF, 0xFFFF, len(contents) - 4, 4, 0)

@@ -1,7 +1,7 @@
-"""Reads one checkpoint in a process of its own, and tells what that took.
+"""Reads checkpoints in a separate process and reports the outcome, memory and time.
 
-Run as `python checkpoint_memory.py WARM_UP FILE…`: for each file one line of JSON with the outcome, the
-growth of the process's peak memory, and the seconds. Whatever tries to run something ends the process.
+Run as `python checkpoint_memory.py WARM_UP FILE…`: prints one line of JSON per file with the outcome, the
+growth of the process's peak memory, and the seconds. An attempt to run code ends the process.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ def forbid(event: str, arguments: tuple[object, ...]) -> None:
 def main(warm_up: str, *paths: str) -> None:
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
 
-    # Torch's own first-time needs are not the file's.
+    # Memory of torch's first use is not counted.
     load_checkpoint(warm_up)
     sys.addaudithook(forbid)
     for path in paths:
-        # What an earlier file left in the heap must not hide what this one takes.
+        # The heap of an earlier file must not hide this one's memory.
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)
-        # Writing 5 resets the peak to what is held now (proc(5)).
+        # Writing 5 resets the peak to the current value (proc(5)).
         Path("/proc/self/clear_refs").write_text("5")
         before, started = peak_bytes(), time.monotonic()
         try:

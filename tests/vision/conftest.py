@@ -1,4 +1,4 @@
-"""Classes that bear the names of Ultralytics' layers, so that a pickle can name them; and no proxy."""
+"""Classes with the names of Ultralytics' layers, so that a pickle can refer to them; and no proxy."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from tests.vision.foreign_checkpoints import FOREIGN, foreign_classes
 
 @pytest.fixture
 def foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]:
-    """Classes of the foreign library's names, importable only while a test runs."""
+    """Classes with the foreign library's names, importable only during a test."""
     return foreign_classes(monkeypatch, FOREIGN)
 
 
 @pytest.fixture
 def early_foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]:
-    """As the first releases had them: all layers in one file."""
+    """As in the first releases: all layers in one module."""
     modules = {
         name: "ultralytics.nn.modules" if module.startswith("ultralytics.nn.modules") else module
         for name, module in FOREIGN.items()
@@ -28,7 +28,7 @@ def early_foreign(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[nn.Module]]
 
 @pytest.fixture
 def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Loopback is asked directly, whatever the machine's environment says."""
+    """Loopback is accessed directly, whatever proxy the environment sets."""
     for name in getproxies():
         monkeypatch.delenv(f"{name}_proxy", raising=False)
         monkeypatch.delenv(f"{name.upper()}_PROXY", raising=False)

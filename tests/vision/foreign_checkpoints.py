@@ -30,12 +30,12 @@ FOREIGN = {
     **dict.fromkeys(("DetectionModel", "SegmentationModel"), "ultralytics.nn.tasks"),
     "DictConfig": "omegaconf.dictconfig",
 }
-# What is called otherwise there.
+# Attributes with other names there.
 FOREIGN_NAMES = {"AreaAttention": "AAttn", "LargeKernelDWConv": "RepVGGDW"}
 
 
 def trained_model(description: ModelDescription | None = None, seed: int = 0) -> YoloModel:
-    """A small network whose normalisations have seen something."""
+    """A small network whose normalisations have statistics."""
     torch.manual_seed(seed)
     model = build(description or yolov8_description(SMALL, NAMES))
     for _ in range(2):
@@ -58,7 +58,7 @@ def foreign_classes(monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) ->
 
 
 def as_foreign(model: YoloModel, classes: dict[str, type[nn.Module]], **attributes: Any) -> Any:
-    """Our network's modules, relabelled as the foreign library's: a module with attributes of any kind."""
+    """Our network's modules with the foreign library's class names and attributes."""
 
     def relabelled(module: nn.Module) -> nn.Module:
         module = copy.copy(module)
@@ -112,7 +112,7 @@ class Calls:
 
 
 class Global:
-    """Pickles as a mere mention of `module.name`, whether or not that exists."""
+    """Pickles as a reference to `module.name`, whether or not that exists."""
 
     def __init__(self, module: str, name: str) -> None:
         self.module, self.name = module, name

@@ -1,4 +1,4 @@
-"""What the tests of network streams share: pictures that can be told apart, as JPEG and in RTP."""
+"""Shared by tests of network streams: distinguishable images, as JPEG and in RTP."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def is_blue(value: int) -> Callable[[Frame], bool]:
 
 
 def rtp_packets(image: np.ndarray[Any, Any], sequence: int, timestamp: int) -> list[bytes]:
-    """One picture as RTP packets of JPEG (RFC 2435), its quantisation tables in the first."""
+    """One image as RTP packets of JPEG (RFC 2435), its quantisation tables in the first."""
     data = cv2.imencode(
         ".jpg", image, [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     )[1]
@@ -72,7 +72,7 @@ def rtp_packets(image: np.ndarray[Any, Any], sequence: int, timestamp: int) -> l
 
 @contextmanager
 def sending(send: Callable[[bytes], object], blue: int = 200) -> Iterator[None]:
-    """Sends a picture of that blue thirty times a second."""
+    """Sends an image of this blue value thirty times a second."""
     stop = threading.Event()
     image = np.full((96, 128, 3), (blue, 90, 20), np.uint8)
 

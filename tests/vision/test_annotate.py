@@ -1,4 +1,4 @@
-"""Drawing: what must be on the picture, and what must not change."""
+"""Drawing: what must appear in the image, and what must not change."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def make_image(width: int = 640, height: int = 480, value: int = 90) -> np.ndarr
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of everything that changed."""
+    """Left, top, right, bottom of the changed area."""
     rows, columns = np.nonzero((before != after).any(axis=2))
     return int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())
 

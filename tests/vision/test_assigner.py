@@ -57,7 +57,7 @@ def test_only_cells_inside_an_object_are_given_to_it() -> None:
 
 def test_an_object_takes_its_best_aligned_cells_alone() -> None:
     found = assign([[16, 16, 40, 40]], [1], top_k=1)
-    # The cell in its very middle predicts it exactly.
+    # The cell at its centre predicts it exactly.
     assert found.foreground[0].nonzero().flatten().tolist() == [3 * 8 + 3]
     assert found.class_scores[0, 3 * 8 + 3].tolist() == pytest.approx([0, 1, 0])
 
@@ -76,7 +76,7 @@ def test_a_higher_class_score_wins_between_equal_boxes() -> None:
     assert found.foreground[0].nonzero().flatten().tolist() == [2 * 8 + 2]
 
 
-def test_a_contested_cell_goes_to_the_object_its_box_overlaps_most() -> None:
+def test_contested_cell_goes_to_the_largest_overlap() -> None:
     found = assign([[8, 8, 56, 56], [16, 16, 40, 40]], [0, 1])
     middle = 3 * 8 + 3
     assert found.boxes[0, middle].tolist() == [16, 16, 40, 40]
@@ -89,7 +89,7 @@ def test_object_between_cell_centres_is_assigned() -> None:
 
 
 def test_faint_overlaps_still_make_targets() -> None:
-    """With β = 6 the alignment of a small object in big first boxes is 1e-14; it must not round to zero."""
+    """With β = 6 the alignment of a small object in big initial boxes is 1e-14; it must not round to zero."""
     found = assign([[18, 18, 22, 22]], [0], boxes=boxes_around_centres(60.0))
     assert float(found.class_scores.max()) == pytest.approx(16 / 120**2, rel=1e-3)
 

@@ -1,4 +1,4 @@
-"""A camera that is fixed to the body, and one that a gimbal holds level."""
+"""A camera fixed to the body, and one stabilized by a gimbal."""
 
 from __future__ import annotations
 

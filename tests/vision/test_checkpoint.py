@@ -1,4 +1,4 @@
-"""Checkpoints that are well: ours, and those of every release and generation of Ultralytics."""
+"""Valid checkpoints: ours, and those of every release and family of Ultralytics."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_metadata_must_be_plain_values(tmp_path: Path) -> None:
         pytest.param({"metadata": 3}, "has no metadata", id="metadata of another kind"),
     ],
 )
-def test_our_format_with_a_part_wrong_is_refused(
+def test_our_format_with_a_part_wrong_is_rejected(
     tmp_path: Path, change: dict[str, Any], expected: str
 ) -> None:
     save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
@@ -214,7 +214,7 @@ def test_names_may_be_a_list(tmp_path: Path, foreign: dict[str, type[nn.Module]]
         pytest.param({"yaml": {"nc": 2}}, "needs 1..128 rows", id="no rows"),
     ],
 )
-def test_a_foreign_model_with_a_part_missing_is_refused(
+def test_a_foreign_model_with_a_part_missing_is_rejected(
     tmp_path: Path, foreign: dict[str, type[nn.Module]], attributes: dict[str, Any], expected: str
 ) -> None:
     path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), foreign, **attributes))
@@ -231,13 +231,13 @@ def test_a_layer_that_is_not_known_is_named_with_its_row(
         load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
 
 
-def test_a_model_of_another_task_is_refused(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
+def test_a_model_of_another_task_is_rejected(tmp_path: Path, foreign: dict[str, type[nn.Module]]) -> None:
     path = save_foreign(tmp_path / "f.pt", foreign["SegmentationModel"]())
     with pytest.raises(CheckpointError, match="SegmentationModel"):
         load_checkpoint(path)
 
 
-def test_a_class_that_is_not_on_the_list_is_refused_by_name(
+def test_a_class_that_is_not_on_the_list_is_rejected_by_name(
     tmp_path: Path, foreign: dict[str, type[nn.Module]]
 ) -> None:
     path = save_foreign(tmp_path / "f.pt", foreign["C3Ghost"]())
@@ -245,7 +245,7 @@ def test_a_class_that_is_not_on_the_list_is_refused_by_name(
         load_checkpoint(path)
 
 
-def test_modules_that_contain_each_other_are_refused(
+def test_modules_that_contain_each_other_are_rejected(
     tmp_path: Path, foreign: dict[str, type[nn.Module]]
 ) -> None:
     whole = as_foreign(trained_model(), foreign)
@@ -254,7 +254,7 @@ def test_modules_that_contain_each_other_are_refused(
         load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
 
 
-# Every generation, as releases old and new wrote it
+# Every family, as old and new releases wrote it
 
 
 def shrunk(model_family: str, scale: str) -> ModelDescription:
@@ -263,7 +263,7 @@ def shrunk(model_family: str, scale: str) -> ModelDescription:
 
 
 def terse(whole: Any) -> None:
-    """The table as it is published: what scale and layers imply is left unsaid."""
+    """The table as published, with the values implied by scale and layers left out."""
     for row in whole.yaml["backbone"] + whole.yaml["head"]:
         if row[2] == "C3k2" and len(row[3]) < 4:
             row[3][1:2] = [False]
@@ -364,7 +364,7 @@ def test_the_head_is_the_one_that_was_trained(
     assert_same_maps(model, loaded.model)
 
 
-def test_another_stride_than_the_layers_give_is_refused(
+def test_another_stride_than_the_layers_give_is_rejected(
     tmp_path: Path, foreign: dict[str, type[nn.Module]]
 ) -> None:
     whole = as_foreign(trained_model(), foreign)

@@ -1,6 +1,6 @@
-"""The reader against files that nobody meant well: refused by name, at once, without running or growing.
+"""The reader against hostile files: rejected with a reason, without running code or excessive memory.
 
-Every file is read in a process of its own kind (`checkpoint_memory.py`) that ends should anything try to run.
+Every file is read in a separate process (`checkpoint_memory.py`) that ends if anything tries to run.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ REAL = (
     / "models"
     / "yolov8n_coco.pt"
 )
-# What reading may take beside three times the file: `docs/models.md`.
+# Memory limit of reading, besides three times the file: `docs/models.md`.
 FIXED_BYTES = 32 << 20
 
 
 def read_apart(*paths: Path) -> list[dict[str, Any]]:
-    """What a process of its own says of each file; it may take a minute for all."""
+    """Report of a separate process for each file; it may take a minute for all."""
     done = subprocess.run(
         [sys.executable, str(READER), str(DEFAULT_WEIGHTS), *map(str, paths)],
         capture_output=True,
@@ -65,7 +65,7 @@ def members_of(path: Path) -> dict[str, bytes]:
 
 
 def mutated(data: bytes, dice: random.Random) -> bytes:
-    """A few bytes flipped, cut out, doubled, or put in."""
+    """A few bytes flipped, cut out, duplicated or inserted."""
     changed = bytearray(data)
     for _ in range(dice.randint(1, 4)):
         at = dice.randrange(len(changed))
@@ -91,7 +91,7 @@ def assert_harmless(path: Path, report: dict[str, Any]) -> None:
     assert report["bytes"] <= limit, (path.name, report)
 
 
-def test_mutations_are_read_or_refused_by_name(tmp_path: Path) -> None:
+def test_mutations_are_read_or_rejected_by_name(tmp_path: Path) -> None:
     ours = small_pt(tmp_path)
     paths = [
         *mutated_pickles(ours, tmp_path, 24),
@@ -113,7 +113,7 @@ def test_memory_stays_below_three_times_the_file_size(tmp_path: Path) -> None:
 
 
 def mutated_pickles(source: Path, folder: Path, count: int) -> list[Path]:
-    """The archive is whole, what it says is not."""
+    """The archive is intact, its contents are not."""
     original = members_of(source)
     name = next(name for name in original if name.endswith("data.pkl"))
     return [
@@ -123,7 +123,7 @@ def mutated_pickles(source: Path, folder: Path, count: int) -> list[Path]:
 
 
 def mutated_bytes(data: bytes, folder: Path, count: int) -> list[Path]:
-    """Cut off somewhere, or changed anywhere."""
+    """Truncated somewhere, or changed anywhere."""
     paths = []
     for seed in range(count):
         dice = random.Random(seed)
@@ -133,11 +133,11 @@ def mutated_bytes(data: bytes, folder: Path, count: int) -> list[Path]:
 
 
 def mutated_pairs(source: Path, folder: Path, count: int) -> list[Path]:
-    """The header of one file or the text of the other changed."""
+    """Changed in the header of one file or the text of the other."""
     save_checkpoint(folder / "o.safetensors", load_checkpoint(source).model, metadata={"a": [1]})
     weights = (folder / "o.safetensors").read_bytes()
     table = yaml.safe_load((folder / "o.yaml").read_bytes())
-    del table["weights"]  # Without the checksum, so that a damaged header is read at all.
+    del table["weights"]  # Without the checksum, so that a damaged header is read.
     report = yaml.safe_dump(table).encode()
     length = int.from_bytes(weights[:8], "little") + 8
     paths = []
@@ -180,7 +180,7 @@ def test_any_pickle_program_gives_a_model_or_an_error(tmp_path: Path, program: l
     assert str(caught.value).isprintable()
 
 
-def test_every_bomb_is_refused_by_name_without_growing(tmp_path: Path) -> None:
+def test_every_bomb_is_rejected_by_name_without_growing(tmp_path: Path) -> None:
     paths = []
     for index, (make, _) in enumerate(BOMBS.values()):
         (folder := tmp_path / f"{index}").mkdir()

@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged or hostile: refused by name, never run, at no cost."""
+"""Damaged or hostile checkpoints: rejected by name, never run, without excessive memory."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_hidden_call_in_a_checkpoint_is_not_run(tmp_path: Path, foreign: dict[st
     with pytest.raises(UnsafeCheckpointError, match=r"posix\.system"):
         load_checkpoint(path)
     assert not marker.exists()
-    torch.load(path, weights_only=False)  # The file was truly armed.
+    torch.load(path, weights_only=False)  # The file does contain a call.
     assert marker.exists()
 
 
@@ -144,7 +144,7 @@ def storage(kind: str = "FloatStorage", key: str = "0", count: int = 4) -> Any:
         pytest.param((storage(kind="Generator"), 0, (1,), (1,)), "torch.Generator", id="another kind"),
     ],
 )
-def test_a_tensor_outside_its_storage_is_refused(
+def test_a_tensor_outside_its_storage_is_rejected(
     tmp_path: Path, arguments: tuple[Any, ...], expected: str
 ) -> None:
     function, call = tensor_call(*arguments)
@@ -179,7 +179,7 @@ def test_a_network_larger_than_its_file_costs_no_memory(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("depth", [5, 14, 60, 50_000])
 def test_nested_references_are_rejected_at_once(tmp_path: Path, depth: int) -> None:
-    """Each tuple holds the one before twice: a few bytes whose copy or text would never be finished."""
+    """Each tuple contains the one before twice: a few bytes whose copy or text would never end."""
     program = dumped({"format": FORMAT})[:-1] + b"(" + dumped("description")[2:-1]
     program += b"]q\x09" + b"h\x09h\x09\x86q\x09" * depth + b"u."
     with pytest.raises(CheckpointError):
@@ -217,7 +217,9 @@ def test_unprintable_class_name_is_rejected(tmp_path: Path, name: str) -> None:
         ),
     ],
 )
-def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path: Path, content: bytes, expected: str) -> None:
+def test_a_file_of_another_kind_is_rejected_in_one_line(
+    tmp_path: Path, content: bytes, expected: str
+) -> None:
     path = tmp_path / "x.pt"
     path.write_bytes(content)
     with pytest.raises(CheckpointError, match=expected) as caught:
@@ -226,28 +228,28 @@ def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path: Path, content: 
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_missing_file_is_rejected_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no such file.*\.pt"):
         load_checkpoint(tmp_path / "none.pt")
     with pytest.raises(CheckpointError, match="is a folder"):
         load_checkpoint(tmp_path)
 
 
-def test_an_archive_without_a_model_is_refused(tmp_path: Path) -> None:
+def test_an_archive_without_a_model_is_rejected(tmp_path: Path) -> None:
     for value in ({"weights": 1}, [1, 2], {"model": None}, {"model": torch.zeros(2)}, {"ema": {"a": 1}}, 5):
         torch.save(value, tmp_path / "x.pt")
         with pytest.raises(CheckpointError, match="model"):
             load_checkpoint(tmp_path / "x.pt")
 
 
-def test_a_compressed_archive_is_refused(tmp_path: Path) -> None:
+def test_a_compressed_archive_is_rejected(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("model/data.pkl", bytes(50_000_000))
     with pytest.raises(CheckpointError, match="is compressed"):
         load_checkpoint(tmp_path / "bomb.pt")
 
 
-def test_two_members_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
+def test_two_members_that_share_their_bytes_are_rejected(tmp_path: Path) -> None:
     """Overlapping members make a small file large."""
     path = tmp_path / "overlap.pt"
     with zipfile.ZipFile(path, "w") as file:
@@ -260,13 +262,13 @@ def test_two_members_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
         load_checkpoint(path)
 
 
-def test_a_program_for_torchscript_is_refused_as_such(tmp_path: Path) -> None:
+def test_a_program_for_torchscript_is_rejected_as_such(tmp_path: Path) -> None:
     path = archive(tmp_path / "s.pt", dumped({}), {"code/__torch__.py": b""})
     with pytest.raises(CheckpointError, match="TorchScript"):
         load_checkpoint(path)
 
 
-def test_numbers_of_the_other_byte_order_are_refused(tmp_path: Path) -> None:
+def test_numbers_of_the_other_byte_order_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="big-endian"):
         load_checkpoint(archive(tmp_path / "b.pt", dumped({}), {"byteorder": b"big"}))
 
@@ -289,7 +291,7 @@ def foreign_pickle(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, dic
     return members.pop("data.pkl"), members
 
 
-def test_a_truncated_file_is_refused_at_every_length(tmp_path: Path, own_bytes: bytes) -> None:
+def test_a_truncated_file_is_rejected_at_every_length(tmp_path: Path, own_bytes: bytes) -> None:
     path = tmp_path / "cut.pt"
     lengths = {
         *range(0, 200, 7),
@@ -304,7 +306,7 @@ def test_a_truncated_file_is_refused_at_every_length(tmp_path: Path, own_bytes: 
         assert str(path) in str(caught.value)
 
 
-def test_a_truncated_pickle_is_refused_at_every_length(
+def test_a_truncated_pickle_is_rejected_at_every_length(
     tmp_path: Path, foreign_pickle: tuple[bytes, dict[str, bytes]]
 ) -> None:
     pickled, members = foreign_pickle
@@ -331,12 +333,12 @@ def loads_or_names_the_reason(path: Path) -> None:
 
 @UNHURRIED
 @given(edits=EDITS)
-def test_a_file_with_changed_bytes_loads_or_is_refused(
+def test_a_file_with_changed_bytes_loads_or_is_rejected(
     tmp_path: Path, own_bytes: bytes, edits: list[tuple[float, int]]
 ) -> None:
     changed = bytearray(own_bytes)
     for where, value in edits:
-        # Headers and directory lie at the two ends; the numbers between are many and uninteresting.
+        # Headers and directory are at both ends; the numbers between are less interesting.
         half = 30_000
         position = int(where * 2 * half)
         changed[position if position < half else len(changed) - 2 * half + position] = value
@@ -346,7 +348,7 @@ def test_a_file_with_changed_bytes_loads_or_is_refused(
 
 @UNHURRIED
 @given(edits=EDITS)
-def test_a_pickle_with_changed_bytes_loads_or_is_refused(
+def test_a_pickle_with_changed_bytes_loads_or_is_rejected(
     tmp_path: Path, foreign_pickle: tuple[bytes, dict[str, bytes]], edits: list[tuple[float, int]]
 ) -> None:
     pickled, members = foreign_pickle

@@ -83,7 +83,7 @@ corner = st.floats(-100, 200)
 
 
 @given(st.tuples(corner, corner, corner, corner), st.floats(0.125, 100, width=32))
-def test_in_front_of_a_wall_every_box_has_the_walls_depth_or_none(
+def test_every_box_on_a_wall_has_its_depth_or_none(
     box: tuple[float, float, float, float], wall_m: float
 ) -> None:
     found_m = depth_at(depth_of(wall_m), *box)
@@ -98,7 +98,7 @@ class Scene:
     """A cuboid on level ground before a camera whose lens is above the origin.
 
     Attributes:
-        depth_m: (240, 320) exact. box: edges around what is seen of the cuboid.
+        depth_m: (240, 320) exact. box: edges around the visible part of the cuboid.
         down: gravity in the optical frame. ned_from_optical: (3, 3).
         true_m: horizontal, from the lens to the cuboid.
     """

@@ -1,4 +1,4 @@
-"""The one value between the detector and everybody else."""
+"""The detections value: slices, records, tracks and pickling."""
 
 from __future__ import annotations
 

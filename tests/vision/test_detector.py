@@ -1,4 +1,4 @@
-"""Frames in, detections out; and real photographs against an independent implementation's results."""
+"""The detector on frames; and on real photographs, compared with an independent implementation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COCO_MODEL = TEST_DATA / "models" / "yolov8n_coco.pt"
 
 
 def eager_model(class_id: int = 2) -> YoloModel:
-    """A network that sees a box of 2 × 2 cells of class `class_id` in every cell of its coarsest level."""
+    """A network that predicts a box of 2 × 2 cells of class `class_id` in every coarse cell."""
     torch.manual_seed(0)
     model = build(yolov8_description((0.1, 0.01, 64), NAMES)).eval()
     for level, branches in enumerate(zip(model.detect.cv2, model.detect.cv3, strict=True)):
@@ -54,13 +54,13 @@ def frame() -> np.ndarray[Any, Any]:
 
 
 def detector_of(path: Path, **arguments: Any) -> Detector:
-    """In float32: which precision is the faster here is none of these tests' business, and takes its time."""
+    """In float32: measuring the faster precision is not part of these tests and takes time."""
     return Detector(path, precision="float32", **arguments)
 
 
 def test_boxes_are_in_the_pixels_of_the_frame(model_path: Path, frame: np.ndarray[Any, Any]) -> None:
     found = detector_of(model_path, image_size=64).detect(frame)
-    # The input is half the frame's size; each cell of 32 sees 2 × 2 cells around its middle.
+    # The input is half the frame's size; each cell of 32 predicts 2 × 2 cells around its centre.
     assert len(found) == 2
     assert set(found.names) == {"car"}
     np.testing.assert_allclose(sorted(found.xyxy.tolist()), [[0, 0, 96, 64], [32, 0, 128, 64]], atol=0.05)
@@ -162,7 +162,7 @@ def test_bfloat16_detects_the_same(model_path: Path, frame: np.ndarray[Any, Any]
         pytest.param({"threads": 0}, "threads must be at least 1", id="threads"),
     ],
 )
-def test_a_setting_out_of_its_range_is_refused_by_name(
+def test_a_setting_out_of_its_range_is_rejected_by_name(
     model_path: Path, arguments: dict[str, Any], expected: str
 ) -> None:
     with pytest.raises(ValueError, match=expected):

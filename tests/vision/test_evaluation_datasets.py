@@ -1,4 +1,4 @@
-"""Data sets as they come, YOLO's and COCO's, and each mistake in them named with its file and line."""
+"""YOLO and COCO data sets, and errors in them with file and line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def text(path: Path, content: str) -> Path:
 
 @pytest.fixture
 def yolo(tmp_path: Path) -> Path:
-    """Two labelled images and one that shows nothing."""
+    """Two labelled images and one negative."""
     for name in ("a", "b", "c"):
         make_image(tmp_path / "images" / "val" / f"{name}.jpg")
     text(tmp_path / "labels" / "val" / "a.txt", "0 0.5 0.5 0.2 0.4\n\n1 0.25 0.25 0.5 0.5\n")
@@ -47,7 +47,7 @@ def test_images_and_labels_in_separate_folders(yolo: Path) -> None:
     assert [sample.image.name for sample in dataset.samples] == ["a.jpg", "b.jpg", "c.jpg"]
     assert pixels(dataset, 0) == [[80, 30, 120, 70], [0, 0, 100, 50]]
     assert dataset.samples[0].class_ids.tolist() == [0, 1]
-    assert pixels(dataset, 1) == [[20, 10, 60, 50]]  # A polygon's box.
+    assert pixels(dataset, 1) == [[20, 10, 60, 50]]  # The box of a polygon.
     assert len(dataset.samples[2].boxes) == 0
 
 

@@ -1,4 +1,4 @@
-"""The worst mistakes: which count as such, which are kept, and that they can be looked at."""
+"""The worst errors: which detections count as errors, which are kept, and the sheet."""
 
 from __future__ import annotations
 

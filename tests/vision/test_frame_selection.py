@@ -1,4 +1,4 @@
-"""Which frames are looked at, and why the others are not."""
+"""Which frames are processed, and why the others are skipped."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 
 from vision.gc_pause import gc_paused
 
-# What is there is passed over for good: that is to be tried in a process that ends.
+# Existing objects are never collected afterwards, so this is tested in a separate process.
 PROGRAM = """
 import gc
 import weakref
@@ -52,7 +52,7 @@ def test_only_later_garbage_is_collected() -> None:
 
 
 def test_an_import_that_fails_leaves_the_collector_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gc, "freeze", lambda: None)  # not what the other tests made
+    monkeypatch.setattr(gc, "freeze", lambda: None)  # keep the objects of other tests collectable
     with pytest.raises(ImportError):
         fail_to_import()
     assert gc.isenabled()

@@ -27,7 +27,7 @@ Layer = TypeVar("Layer", bound=nn.Module)
 
 
 def with_lively_statistics(module: Layer, seed: int = 0) -> Layer:
-    """Batch normalisations as after training, so that folding them is not folding an identity."""
+    """Batch normalisations with statistics, so that folding them is not folding an identity."""
     generator = torch.Generator().manual_seed(seed)
     for norm in module.modules():
         if isinstance(norm, nn.BatchNorm2d):
@@ -110,7 +110,7 @@ def test_the_head_starts_with_rare_objects() -> None:
     for level, stride in zip(head.cv3, (8, 16, 32), strict=True):
         *_, last = level.children()
         probability = last.get_parameter("bias").sigmoid()
-        # 5 objects spread over the cells of a 640-pixel picture and over the classes.
+        # 5 objects distributed over the cells of a 640-pixel image and over the classes.
         assert torch.all((probability - 5 / 7 / (640 / stride) ** 2).abs() < 1e-4)
     *_, last = head.cv2[0].children()
     assert all(math.isclose(value, 1.0) for value in last.get_parameter("bias").tolist())
@@ -134,7 +134,7 @@ def test_area_attention_stays_within_its_area() -> None:
     changed[:, :, 20, 1] += 5.0  # In the third area, rows 16 to 23.
     difference = (layer(changed) - layer(x)).abs().amax(dim=(0, 1, 3))
     assert bool((difference[16:24] > 1e-6).all())
-    # Beyond it only the 7×7 convolution of the values reaches, and not past its area's end by more than 3.
+    # Outside it only the 7×7 convolution of the values reaches, by at most 3 cells.
     assert bool((difference[:16] < 1e-6).all())
     assert bool((difference[24:] < 1e-6).all())
 

@@ -1,4 +1,4 @@
-"""The losses, against values worked out by hand and against what they must do."""
+"""The losses, compared with values computed by hand and with their properties."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_cells_are_counted_level_by_level_and_row_by_row() -> None:
 def head_maps(
     classes: int, sure_of: tuple[int, float, float, float, float] | None = None
 ) -> tuple[list[torch.Tensor], tuple[int, ...]]:
-    """Maps of a 64 × 64 input; with `sure_of`, the head says exactly that class and box."""
+    """Outputs for a 64 × 64 input; with `sure_of`, the head predicts exactly that class and box."""
     strides, maps = (8, 16, 32), []
     for stride in strides:
         cells = 64 // stride

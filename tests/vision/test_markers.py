@@ -1,4 +1,4 @@
-"""Markers: found by their pictures, and placed where they are."""
+"""Markers: detection in images, and pose."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ PLAIN = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
 BENT = CameraModel(640, 480, 455.0, 460.0, 321.0, 236.0, (-0.12, 0.03, 0.001, -0.0005))
 DOWN = matrix_from_euler(0.0, -math.pi / 2, 0.0)
 GROUND = Ground(("concrete",), 0, 256, 0.05)
-# A marker looked at straight on: its x to the right, its y up, its z towards the camera.
+# A marker seen straight on: its x to the right, its y up, its z towards the camera.
 FACING = np.diag([1.0, -1.0, -1.0])
 
 
 def make_image(
     height_m: float, north_m: float, yaw: float, camera: CameraModel = PLAIN, **printed: Any
 ) -> NDArray[np.uint8]:
-    """A plate on the ground from above, its centre `north_m` ahead of straight down."""
+    """A marker on the ground seen from above, its centre `north_m` north of straight down."""
     print_ = Print(
         printed.get("dictionary", "4X4_50"), printed.get("identifier", 7), printed.get("size", 0.5)
     )
@@ -76,7 +76,7 @@ def test_exact_corners_give_the_exact_pose_for_any_lens(
     marker = marker_from_corners(3, corners, size, camera)
     assert marker is not None
     assert np.linalg.norm(marker.position_camera_m - position) < 0.01 * forward
-    # The true turning is one of the two that fit.
+    # The true rotation is one of the two that fit.
     poses = marker_poses(corners, size, camera)
     angles = [math.acos(min(1.0, (np.trace(pose.rotation.T @ rotation) - 1) / 2)) for pose in poses]
     assert min(angles) < 0.05
@@ -113,12 +113,12 @@ def test_both_poses_are_kept_from_far_away() -> None:
 @settings(max_examples=8, deadline=None)
 @given(yaw=st.floats(-math.pi, math.pi), height=st.floats(1.0, 6.0), part=st.floats(-1.0, 1.0))
 def test_rendered_marker_is_detected_and_located(yaw: float, height: float, part: float) -> None:
-    # As far to the north as the whole plate, its corners too, is still seen.
+    # As far to the north as the whole marker, corners included, is in view.
     north = part * min(0.6, height * PLAIN.cy / PLAIN.fy - 0.4)
     found = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(make_image(height, north, yaw), PLAIN)
     assert [marker.identifier for marker in found] == [7]
     right, down, forward = found[0].position_camera_m
-    # Looking straight down with north to the top: north is up in the picture.
+    # Looking straight down with north to the top: north is up in the image.
     assert right == pytest.approx(0.0, abs=0.02 + 0.01 * height)
     assert -down == pytest.approx(north, abs=0.02 + 0.01 * height)
     assert forward == pytest.approx(height, rel=0.04)

@@ -1,4 +1,4 @@
-"""Average precision on cases whose answer is known."""
+"""Average precision on cases with a known result."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_an_ignored_region_makes_nothing_right_or_wrong() -> None:
 
 
 def test_score_matches_pycocotools() -> None:
-    """Random scenes with crowds, second boxes and false alarms, against pycocotools."""
+    """Random scenes with crowds, duplicate boxes and false positives, compared with pycocotools."""
     coco = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
     cocoeval = pytest.importorskip("pycocotools.cocoeval")
     rng = np.random.default_rng(3)

@@ -1,6 +1,6 @@
-"""Every generation and scale: parameters, names, numbers, the checkpoints of releases old and new.
+"""Every family and scale: parameters, names, outputs, the checkpoints of old and new releases.
 
-The counts and the sums of maps are facts of the published networks, measured on the reference implementation
+The counts and output sums are facts of the published networks, measured on the reference implementation
 by `tools/ultralytics_parity.py` and `tools/golden_maps.py`; no test needs it.
 """
 
@@ -35,9 +35,9 @@ PARAMETERS = {
     "YOLO12": {"n": 2_602_288, "s": 9_284_096, "m": 20_199_168, "l": 26_450_784, "x": 59_210_784},
     "YOLO26": {"n": 2_572_280, "s": 10_009_784, "m": 21_896_248, "l": 26_299_704, "x": 58_993_368},
 }
-# Published, at 640 pixels; YOLO12's leave out the products of attention, which are counted here.
+# Published, at 640 pixels; YOLO12's omit the products of attention, which are counted here.
 GFLOPS = {"YOLOv5u": 7.7, "YOLOv8": 8.7, "YOLOv10": 6.7, "YOLO11": 6.5, "YOLO12": 7.5, "YOLO26": 5.4}
-# Mean, root mean square and weighted sum of the maps that `filled(small(…))` gives of `picture()`.
+# Mean, root mean square and weighted sum of the outputs of `filled(small(…))` for `make_image()`.
 GOLDEN = {
     ("YOLOv5u", "n"): (-0.0132937, 0.248442, 0.00280242),
     ("YOLOv8", "n"): (0.0403146, 0.225783, -0.0172437),
@@ -54,13 +54,13 @@ EVERY = [(model_family, scale) for model_family, scales in PARAMETERS.items() fo
 
 
 def small(model_family: str, scale: str) -> ModelDescription:
-    """The rows of a published network, with the multipliers of a small one: quick, and its rules are kept."""
+    """The rows of a published network, with the multipliers of a small one, which is fast."""
     description = published_description(model_family, scale, FEW)
     return dataclasses.replace(description, depth_multiple=0.34, width_multiple=0.25, max_channels=1024)
 
 
 def fill(state: dict[str, Tensor], seed: int = 7) -> None:
-    """Weights that depend on nothing but the names: the same numbers for any network of these names."""
+    """Weights that depend only on the names: the same numbers for any network with these names."""
     generator = torch.Generator().manual_seed(seed)
     for name in sorted(state):
         tensor = state[name]
@@ -85,7 +85,7 @@ def make_image() -> Tensor:
 
 
 def facts(maps: list[Tensor]) -> tuple[float, float, float]:
-    """The mean of all maps, their root mean square, and a sum in which every place has its own weight."""
+    """The mean of all outputs, their root mean square, and a sum with distinct weights."""
     flat = torch.cat([level.flatten(2) for level in maps], dim=2).double().flatten()
     weights = torch.linspace(-1, 1, len(flat), dtype=torch.float64)
     return flat.mean().item(), flat.square().mean().sqrt().item(), (flat * weights).mean().item()
@@ -176,14 +176,14 @@ def test_published_description_survives_the_round_trip(model_family: str) -> Non
         ("YOLO11", "b", "YOLO11 .*'b'.*n, s, m, l, x"),
     ],
 )
-def test_an_unpublished_network_is_refused_with_the_known_ones(
+def test_an_unpublished_network_is_rejected_with_the_known_ones(
     model_family: str, scale: str, expected: str
 ) -> None:
     with pytest.raises(ArchitectureError, match=expected):
         published_description(model_family, scale, FEW)
 
 
-# What a network tells of itself
+# Facts of a network
 
 
 @pytest.mark.parametrize("model_family", SCALES)
@@ -246,7 +246,7 @@ def test_custom_networks_differ_from_published_ones() -> None:
 def reference_boxes(
     model: YoloModel, maps: list[Tensor], confidence: float, most: int
 ) -> list[tuple[int, int]]:
-    """(cell, class) of the boxes, by sorting every pair of the best cells; the plain way."""
+    """(cell, class) of the boxes, by sorting every pair of the best cells."""
     scores = model.decode(maps)[0, :, 4:]
     cells = scores.max(dim=1).values.argsort(descending=True, stable=True)[:most]
     pairs = [(scores[cell, kind].item(), int(cell), kind) for cell in cells for kind in range(len(FEW))]
@@ -303,7 +303,7 @@ def test_end_to_end_head_trains_and_predicts_separately() -> None:
     x = make_image()
     with torch.inference_mode():
         answered = model(x)
-        model.detect.training = True  # Normalisation stays as it is, so that only the branches differ.
+        model.detect.training = True  # Normalisation is unchanged, so that only the branches differ.
         learnt = model(x)
         model.detect.cv3, model.detect.one2one_cv3 = model.detect.one2one_cv3, model.detect.cv3
         model.detect.cv2, model.detect.one2one_cv2 = model.detect.one2one_cv2, model.detect.cv2

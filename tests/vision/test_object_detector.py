@@ -1,4 +1,4 @@
-"""Kinds of detectors, and what becomes of what a plug-in's finds."""
+"""Detector kinds, and the handling of a plug-in's detections."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FRAME = np.zeros((48, 64, 3), np.uint8)
 
 
 class Corners(ObjectDetector):
-    """Finds one of each class, ever less sure."""
+    """Detects one object of each class, with decreasing confidence."""
 
     class_names = ("a", "b", "c")
 
@@ -39,14 +39,14 @@ class Corners(ObjectDetector):
 
 
 class Wrong(Corners):
-    """Says other class names than its own."""
+    """Reports other class names than it declares."""
 
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
         return Detections.empty(("a", "b"))
 
 
 class Timed(Corners):
-    """Measures itself, and has a name and a runtime."""
+    """Has its own timing, name and runtime."""
 
     model_name, runtime, precision, reason = "corners-2", "harris", "int8", "there is no other"
     last_timing = Timing(1.0, 2.0, 3.0)
@@ -75,7 +75,7 @@ def test_classes_and_confidence_apply_to_a_plugin(settings: DetectorSettings, na
     assert open_detector("corners", settings).detect(FRAME).names == names
 
 
-def test_unknown_class_of_a_plugin_is_refused() -> None:
+def test_unknown_class_of_a_plugin_is_rejected() -> None:
     with pytest.raises(ValueError, match="no class 'd'"):
         open_detector("corners", DetectorSettings(classes=("d",)))
 

@@ -29,7 +29,7 @@ class Timing:
 
 
 class BrightSpot:
-    """A detector of the brightest square: real enough to tell frames apart."""
+    """A detector of the brightest square, which distinguishes frames."""
 
     class_names = ("spot",)
     last_timing = Timing()
@@ -43,7 +43,7 @@ class BrightSpot:
 
 
 class Frames(Source):
-    """A source of given frames; None stands for a time in which none came."""
+    """A source of given frames; None is a timeout."""
 
     uri = "frames"
     live = True
@@ -89,7 +89,7 @@ def run(pipeline: Pipeline) -> list[PerceptionResult]:
             return results
 
 
-def test_every_frame_of_a_folder_gives_a_result_with_its_own_stamps(tmp_path: Path) -> None:
+def test_every_frame_of_a_folder_gives_a_stamped_result(tmp_path: Path) -> None:
     for number in range(4):
         cv2.imwrite(str(tmp_path / f"{number}.png"), frame_of(0, spot_x=number * 10).image)
     with open_source(str(tmp_path), SourceSettings()) as source:
@@ -181,7 +181,7 @@ def test_every_must_be_a_count() -> None:
 
 
 class Flickering:
-    """The bright spot, seen surely and weakly in turn, and a weak ghost where nothing is."""
+    """The bright spot, alternately with high and low confidence, and a weak false detection."""
 
     class_names = ("spot",)
     last_timing = Timing()
@@ -247,7 +247,7 @@ def test_without_a_tracker_there_are_no_track_ids() -> None:
 
 
 class Kept:
-    """A recorder that keeps what it is given."""
+    """A recorder that keeps its frames."""
 
     def __init__(self) -> None:
         self.kept: list[tuple[int, int]] = []

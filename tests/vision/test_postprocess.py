@@ -1,4 +1,4 @@
-"""From raw maps to a short list of boxes."""
+"""From raw outputs to a short list of boxes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def model() -> YoloModel:
 
 
 def empty_maps() -> list[Tensor]:
-    """Maps of a 64 × 96 input in which nothing is seen."""
+    """Outputs for a 64 × 96 input without any detection."""
     maps = [torch.full((1, 64 + 3, 64 // stride, 96 // stride), -40.0) for stride in (8, 16, 32)]
     for level in maps:
         level[:, :64] = 0
@@ -34,7 +34,7 @@ def empty_maps() -> list[Tensor]:
 
 
 def put(maps: list[Tensor], level: int, x: int, y: int, bins: tuple[int, ...], **logits: float) -> None:
-    """An object seen by one cell: its sides at whole bins, its class logits by name."""
+    """An object predicted by one cell: its sides at whole bins, its class logits by name."""
     cell = maps[level][0, :, y, x]
     cell[:64] = -40.0
     for side, number in enumerate(bins):
@@ -132,10 +132,10 @@ def test_one_to_one_head_predicts_every_class_without_nms() -> None:
 def test_computing_some_classes_equals_filtering_afterwards(
     seed: int, classes: int, wanted: set[int], confidence: float
 ) -> None:
-    """Whole numbers, so that logits are exact and ties between classes are many."""
+    """Integers, so that logits are exact and ties between classes are frequent."""
     random = np.random.default_rng(seed)
     ids = sorted(index for index in wanted if index < classes) or [0]
-    # Few different rows: some classes have the very same weights.
+    # Few distinct rows: some classes have identical weights.
     weight = random.integers(-2, 3, (3, 4))[random.integers(0, 3, classes)].astype(np.float32)
     bias = random.integers(-1, 2, classes).astype(np.float32)
     features = random.integers(-2, 3, (4, 5, 6)).astype(np.float32)

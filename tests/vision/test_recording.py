@@ -27,7 +27,7 @@ def frame_of(sequence: int, *, rate_hz: float = 20.0, width: int = WIDTH, height
 
 
 def give(recording: Recording, frame: Frame, detections: Detections = SPOT) -> None:
-    """Give a frame as a camera does that is slower than the encoder."""
+    """Write a frame like a camera that is slower than the encoder."""
     deadline_s = time.monotonic() + 30
     while recording._queue.full():
         assert time.monotonic() < deadline_s
@@ -104,7 +104,7 @@ def test_slow_encoder_drops_frames_without_blocking(tmp_path: Path, caplog: pyte
     large = np.random.default_rng(1).integers(0, 255, (1080, 1920, 3), np.uint8)
     for sequence in range(100):
         recording.write(Frame(large, sequence * 5_000_000, sequence), SPOT)
-    # Pictures of the video, not frames that were offered for one: each of its places is offered two.
+    # Frames of the video, not frames offered: two are offered for each slot.
     for sequence in range(100, 300):
         recording.write(Frame(large, sequence * 2_500_000 + 250_000_000, sequence), SPOT)
     recording.close()
@@ -131,7 +131,7 @@ def test_close_does_not_wait_for_a_slow_encoder(
         assert drawing.wait(30)
     closing = threading.Thread(target=recording.close)
     closing.start()
-    while recording._queue.qsize() < 4:  # three pictures, and the word that it is the end
+    while recording._queue.qsize() < 4:  # three frames and the end marker
         time.sleep(0.001)
     may_go_on.set()
     closing.join(30)
@@ -156,7 +156,7 @@ def test_internal_error_ends_the_recording_with_a_log(
     (record_logged,) = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert "list index out of range" in record_logged.getMessage()
     assert record_logged.exc_info is not None
-    assert played(path)  # what was in it until then
+    assert played(path)  # the frames before the error
 
 
 @pytest.mark.parametrize("name", ["flight.mp4", "blocked/flight.webm"])
@@ -170,7 +170,7 @@ def test_failed_recording_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptu
     path = tmp_path / "flight.webm"
     recording = Recording(path, 20.0)
     path.unlink()
-    path.mkdir()  # nothing can be written there any more
+    path.mkdir()  # the file can no longer be written
     with caplog.at_level(logging.ERROR):
         for sequence in range(10):
             give(recording, frame_of(sequence))

@@ -1,4 +1,4 @@
-"""Frames across processes: whole, newest, and the writer's deaths survived."""
+"""Frames across processes: complete, newest first, and the death of writers."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_a_frame_read_is_a_copy_that_later_writes_do_not_touch(name: str) -> Non
         assert same(got, frame(0))
 
 
-def test_a_second_process_writing_at_full_speed_never_shows_a_torn_frame(
+def test_fast_writer_in_another_process_shows_no_torn_frame(
     name: str, start_writer: Callable[..., subprocess.Popen[str]]
 ) -> None:
     process = start_writer(0, 1500)
@@ -245,7 +245,7 @@ def test_a_reader_follows_a_writer_of_another_size(name: str) -> None:
             assert (reader.width, reader.height, reader.depth) == (40, 30, False)
 
 
-def test_two_writers_of_one_name_are_refused(name: str) -> None:
+def test_two_writers_of_one_name_are_rejected(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, True) as writer:
         with pytest.raises(FileExistsError, match="another process"):
             SharedFrameWriter(name, 16, 12, True)
@@ -287,7 +287,7 @@ def test_file_that_is_not_a_segment_is_rejected(name: str, content: bytes) -> No
         SharedFrameReader(name)
 
 
-def test_a_truncated_segment_is_refused(name: str) -> None:
+def test_a_truncated_segment_is_rejected(name: str) -> None:
     with SharedFrameWriter(name, 64, 48, True):
         whole = segment_path(name).read_bytes()
     segment_path(name).write_bytes(whole[:9000])
@@ -333,13 +333,13 @@ def test_writer_without_calibration_gives_none(name: str) -> None:
         assert reader.calibration is None
 
 
-def test_calibration_of_another_size_is_refused(name: str) -> None:
+def test_calibration_of_another_size_is_rejected(name: str) -> None:
     calibration = CameraCalibration(CameraModel.from_horizontal_fov(640, 480, 1.2))
     with pytest.raises(ValueError, match="640x480"):
         SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration)
 
 
-def test_a_segment_of_version_one_is_refused(name: str) -> None:
+def test_a_segment_of_version_one_is_rejected(name: str) -> None:
     with SharedFrameWriter(name, 16, 12, depth=False):
         with segment_path(name).open("r+b") as file:
             file.seek(8)
@@ -348,7 +348,7 @@ def test_a_segment_of_version_one_is_refused(name: str) -> None:
             SharedFrameReader(name)
 
 
-def test_a_damaged_calibration_is_refused(name: str) -> None:
+def test_a_damaged_calibration_is_rejected(name: str) -> None:
     calibration = CameraCalibration(CameraModel.from_horizontal_fov(16, 12, 1.2))
     with SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration):
         with segment_path(name).open("r+b") as file:

@@ -1,4 +1,4 @@
-"""Files, folders and images: every frame in order, and what is said about those that cannot be opened."""
+"""Files, folders and images: every frame in order, and errors on opening."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_image(path: Path, value: int, width: int = 32, height: int = 24) -> No
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """20 frames at 50 Hz, each of its own grey; MJPEG in AVI, whose frames stand alone."""
+    """20 frames at 50 Hz, each with its own grey; MJPEG in AVI, whose frames are independent."""
     path = tmp_path_factory.mktemp("video") / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 50.0, (64, 48))
     for index in range(20):
@@ -79,7 +79,7 @@ def test_a_video_in_real_time_keeps_its_own_pace_and_ends(video: Path) -> None:
         assert source.live
         frames = list(source)
         statistics = source.statistics
-    # Twenty frames at 50 Hz: the last is due 0.38 s after the first, on however slow a machine.
+    # Twenty frames at 50 Hz: the last is due 0.38 s after the first, on any machine.
     assert time.monotonic() - began_s >= 0.37
     assert frames[-1].sequence == 19
     assert statistics.delivered + statistics.dropped == 20
@@ -235,7 +235,7 @@ def test_open_failure_is_a_one_line_error(
     with pytest.raises(SourceError, match=words) as caught:
         open_source(uri)
     assert "\n" not in str(caught.value)
-    assert capfd.readouterr().err == ""  # neither OpenCV nor FFmpeg adds its own
+    assert capfd.readouterr().err == ""  # no output of OpenCV or FFmpeg
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A V4L2 camera, with a stand-in for `cv2.VideoCapture`, the lowest layer: no camera is needed."""
+"""A V4L2 camera, with a fake `cv2.VideoCapture`, the lowest layer: no camera is needed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vision.sources.camera import camera_device, fourcc_text
 
 
 class FakeCamera:
-    """A driver that gives 640x480 YUYV at 30 Hz whatever is asked, but takes MJPG."""
+    """A driver that delivers 640x480 YUYV at 30 Hz for any request, but accepts MJPG."""
 
     opened: list[FakeCamera] = []  # noqa: RUF012 - a record across instances, emptied by the fixture
     frames_before_unplugged = 1 << 30

@@ -1,4 +1,4 @@
-"""Motion JPEG over HTTP from a real loopback server, and what is said where there is none."""
+"""Motion JPEG over HTTP from a real loopback server, and errors without one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("no_proxy")
 
 
 class CameraHandler(BaseHTTPRequestHandler):
-    """A web camera; what it shows, and whether it may, is its server's."""
+    """A web camera; the server sets its image and whether it may send."""
 
     protocol_version = "HTTP/1.0"
     server: CameraServer
@@ -42,7 +42,7 @@ class CameraHandler(BaseHTTPRequestHandler):
         with contextlib.suppress(OSError):
             while not server.stopping.is_set():
                 encoded = jpeg(server.blue)
-                # The length is wrong on purpose, as many a camera's is.
+                # The length is wrong on purpose, as with many cameras.
                 self.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: 1\r\n\r\n")
                 half = len(encoded) // 2
                 self.wfile.write(encoded[:half])
@@ -50,7 +50,7 @@ class CameraHandler(BaseHTTPRequestHandler):
                 server.stopping.wait(0.02)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Tests are quiet."""
+        """No log output in tests."""
 
 
 class CameraServer(ThreadingHTTPServer):

@@ -1,4 +1,4 @@
-"""A live source: the newest wins, a lost one is opened again, and everything is told once."""
+"""A live source: the newest frame wins, a lost capture is reopened, events are logged once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUICK = SourceSettings(open_timeout_s=20.0, read_timeout_s=0.2, retry_min_s=0.01
 
 
 class ScriptedFeed(Capture):
-    """Gives what its script says: a number (that grey), an exception, None (silence)."""
+    """Delivers its script: a number (that grey), an exception, None (no data)."""
 
     def __init__(self, script: list[int | Exception | None], gate: threading.Event | None = None) -> None:
         self.script = script

@@ -1,4 +1,4 @@
-"""Cutting Motion JPEG into images, whatever the pieces it comes in."""
+"""Splitting Motion JPEG into images, for pieces of any size."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ kinds = st.builds(
     progressive=st.booleans(),
     restart=st.sampled_from([0, 1, 3]),
 )
-# Text between images, as multipart headers are; no marker of a beginning in it.
+# Text between images, like multipart headers, without a start marker.
 between = st.binary(max_size=40).filter(lambda data: b"\xff" not in data)
 
 
@@ -75,7 +75,7 @@ def test_a_thumbnail_inside_a_segment_is_not_taken_for_an_image(
 @given(st.binary(max_size=400), st.lists(st.integers(0, 1 << 20), max_size=8))
 def test_image_after_any_bytes_is_found(noise: bytes, cuts: list[int]) -> None:
     image = jpeg(1)
-    # Twice, since the noise may end in the beginning of a segment that swallows the first.
+    # Twice, since the noise may end with the start of a segment that includes the first.
     stream = noise + (b"\0" * 65536 + image) * 2
     splitter = MjpegSplitter()
     found = [whole for piece in in_pieces(stream, cuts) for whole in splitter.push(piece)]

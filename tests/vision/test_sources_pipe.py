@@ -83,7 +83,7 @@ def test_raw_frames_are_complete_for_any_stream_split(
     assert bool(parser.leftover()) == (extra % size > 0)
 
 
-def test_every_frame_of_a_fifo_comes_in_order_and_its_writer_ends_it(tmp_path: Path) -> None:
+def test_fifo_every_frame_in_order_until_the_writer_closes(tmp_path: Path) -> None:
     path = fifo(tmp_path)
     writer = write_in_thread(path, lambda out: [os.write(out, raw_frame(i)) for i in range(40)] and None)
     with open_source(str(path), EVERY) as source:
@@ -156,7 +156,7 @@ def test_a_slow_writer_of_a_fifo_is_not_cut_off(tmp_path: Path, caplog: pytest.L
     def write(out: int) -> None:
         os.write(out, raw_frame(1))
         go_on.wait(30)
-        os.write(out, raw_frame(2))  # would be EPIPE, had the reader closed
+        os.write(out, raw_frame(2))  # would fail with EPIPE if the reader had closed
 
     writer = write_in_thread(path, write)
     quick = SourceSettings(width=8, height=6, pixel_format="bgr24", read_timeout_s=0.2)
@@ -171,7 +171,7 @@ def test_a_slow_writer_of_a_fifo_is_not_cut_off(tmp_path: Path, caplog: pytest.L
     writer.join()
 
 
-def test_a_read_of_every_frame_gives_none_while_the_writer_is_late(tmp_path: Path) -> None:
+def test_read_returns_none_while_the_writer_is_late(tmp_path: Path) -> None:
     path = fifo(tmp_path)
     go_on = threading.Event()
 
@@ -268,7 +268,7 @@ def test_stdin_every_frame_reports_a_partial_last_frame() -> None:
     assert "10 of 144 bytes" in message
 
 
-def test_standard_input_from_a_pipe_is_live_and_ends_with_its_writer() -> None:
+def test_piped_standard_input_is_live_until_the_writer_ends() -> None:
     stream = b"".join(raw_frame(i) for i in range(30))
     result, _ = read_standard_input(RAW_WORDS, input=stream)
     frames = result["frames"]

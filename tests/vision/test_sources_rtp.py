@@ -23,7 +23,7 @@ def test_rtp_jpeg_recovers_from_a_sender_restart(caplog: pytest.LogCaptureFixtur
         out.connect(("127.0.0.1", port))
 
         def send(packet: bytes) -> None:
-            with contextlib.suppress(ConnectionRefusedError):  # nobody listens yet
+            with contextlib.suppress(ConnectionRefusedError):  # there is no listener yet
                 out.send(packet)
 
         with sending(send):
@@ -77,7 +77,7 @@ def test_session_description_matches_the_address(uri: str, lines: list[str]) -> 
     assert set(lines) <= set(text)
 
 
-def test_a_payload_type_out_of_range_is_refused() -> None:
+def test_a_payload_type_out_of_range_is_rejected() -> None:
     with pytest.raises(SourceError, match=r"payload .*'200'"):
         UdpStream("udp://:5600?format=rtp-h264&payload=200", SourceSettings())
 

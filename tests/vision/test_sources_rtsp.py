@@ -22,7 +22,7 @@ def test_passwords_are_never_shown() -> None:
 
 
 class RtspServer:
-    """A camera that speaks RTSP (RFC 2326) with its RTP inside the same connection."""
+    """A camera with RTSP (RFC 2326) and its RTP inside the same connection."""
 
     def __init__(self, status: str = "200 OK") -> None:
         self._status = status

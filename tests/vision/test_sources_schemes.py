@@ -1,4 +1,4 @@
-"""Schemes of sources, those of plug-ins too."""
+"""Schemes of sources, including those of plug-ins."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from vision.sources.registry import SOURCES, source
 
 
 class OneGrey(Capture):
-    """One grey picture."""
+    """One grey image."""
 
     def read(self, timeout_s: float) -> RawFrame | None:
         return RawFrame(np.full((48, 64, 3), 128, np.uint8))
 
     def close(self) -> None:
-        """Nothing is kept open."""
+        """Nothing stays open."""
 
 
 @pytest.fixture
 def grey() -> Iterator[str]:
-    """The scheme of a source that gives grey pictures."""
+    """The scheme of a source of grey images."""
 
     @source("grey", "grey pictures")
     def open_grey(uri: str, settings: SourceSettings) -> Source:

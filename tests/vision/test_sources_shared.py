@@ -1,4 +1,4 @@
-"""Frames out of shared memory, with depth, and a writer that dies and returns."""
+"""Frames from shared memory, with depth, and a writer that dies and returns."""
 
 from __future__ import annotations
 

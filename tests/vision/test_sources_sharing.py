@@ -1,4 +1,4 @@
-"""One camera, several readers: what is read is offered in shared memory as well."""
+"""One camera, several readers: frames are also published in shared memory."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_name_in_use_is_a_one_line_error(name: str, tmp_path: Path) -> None:
 def test_sharing_includes_frames_a_slow_reader_misses(name: str, tmp_path: Path) -> None:
     folder = write_images(tmp_path, (32, 24), (32, 24))
     with shared(folder, name, realtime=True, loop=True, rate_hz=200.0), SharedFrameReader(name) as reader:
-        # Nobody reads the source itself.
+        # The source itself is not read.
         seen: set[int] = set()
         deadline_s = time.monotonic() + 30.0
         while len(seen) < 5:

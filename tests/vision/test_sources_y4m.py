@@ -109,7 +109,7 @@ def test_bad_header_is_rejected_with_a_reason(line: bytes, words: str) -> None:
         parse_y4m_header(line)
 
 
-def test_without_a_colour_space_it_is_420_and_without_a_rate_none() -> None:
+def test_default_colour_space_is_420_and_rate_is_none() -> None:
     header = parse_y4m_header(b"YUV4MPEG2 W6 H5")
     assert header.subsampling == (2, 2)
     assert header.rate_hz is None
@@ -122,7 +122,7 @@ def test_a_broken_frame_line_ends_the_stream_with_what_was_there() -> None:
         parser.push(b"YUV4MPEG2 W2 H2 Cmono\nFRAME\n\0\0\0\0FRAMEX\n")
 
 
-def test_a_line_without_end_is_refused() -> None:
+def test_a_line_without_end_is_rejected() -> None:
     with pytest.raises(StreamError, match="another format"):
         Y4mParser().push(b"YUV4MPEG2 " + b"W" * 5000)
 

@@ -1,4 +1,4 @@
-"""Frames looked at in tiles: nothing small is lost, nothing found twice, and small frames are as before."""
+"""Tiled detection: no small object is lost, none is found twice, and small frames are one pass."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Edge = Callable[[Tile], int]
 
 @dataclass
 class Patches:
-    """Finds the bright rectangles of a picture that are at least `smallest` of its width."""
+    """Detects the bright rectangles of an image that are at least `smallest` of its width."""
 
     class_names: tuple[str, ...] = NAMES
     smallest: float = 0.0

@@ -1,4 +1,4 @@
-"""Training from drawn scenes: it learns, it repeats itself, it goes on where it stopped."""
+"""Training on rendered scenes: it learns, is reproducible, and resumes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLOURS = ((40, 40, 220), (60, 200, 60))
 
 
 def rectangles(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
-    """Two rectangles of two classes on noise, in their own halves so that none hides another."""
+    """Two rectangles of two classes on noise, in separate halves so that neither hides the other."""
     image = rng.integers(90, 130, (height, width, 3), dtype=np.uint8)
     boxes, ids = [], []
     for half in range(2):
@@ -41,7 +41,7 @@ def rectangles(rng: np.random.Generator, width: int, height: int) -> LabelledIma
 
 
 def one_of_eight(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
-    """One of eight fixed pictures."""
+    """One of eight fixed images."""
     return rectangles(np.random.default_rng(int(rng.integers(8))), width, height)
 
 
@@ -107,7 +107,7 @@ def test_resumed_training_gives_uninterrupted_weights(
     assert torch.equal(weights(load_average(kept, SMALL)), weights(resumed))
 
 
-def test_resuming_another_network_is_refused(tmp_path: Path) -> None:
+def test_resuming_another_network_is_rejected(tmp_path: Path) -> None:
     kept = tmp_path / "state.pt"
     train(replace(SMALL, time_limit_s=0.0), rectangles, silent, checkpoint=kept)
     with pytest.raises(ValueError, match=r"network"):
@@ -191,7 +191,7 @@ def test_stage_decay_is_at_most_its_length(decay_steps: int) -> None:
         pytest.param({"average_decay": 1.0}, "average_decay must be in", id="an average that never moves"),
     ],
 )
-def test_impossible_settings_are_refused(change: dict[str, Any], message: str) -> None:
+def test_impossible_settings_are_rejected(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(SMALL, **change)
 

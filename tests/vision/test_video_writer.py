@@ -1,4 +1,4 @@
-"""Films: real time kept, errors reported, and a browser that plays them."""
+"""Video files: real time is kept, errors are reported, and a browser plays them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def make_image(value: int, width: int = 64, height: int = 48) -> np.ndarray:
 
 
 def frames_of(path: Path, rate_hz: float) -> list[float]:
-    """The mean grey that is seen in each slot of the video."""
+    """The mean grey of each slot of the video."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     greys: list[float] = []
     while True:
@@ -48,7 +48,7 @@ def frames_of(path: Path, rate_hz: float) -> list[float]:
 
 @pytest.fixture(params=["PyAV", "OpenCV"], autouse=True)
 def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Every video by either."""
+    """Every test with both encoders."""
     if request.param == "PyAV":
         pytest.importorskip("av", reason="PyAV is an optional extra")
     else:
@@ -67,7 +67,7 @@ def test_video_at_its_rate_has_every_image_once(tmp_path: Path, capfd: pytest.Ca
     assert (writer.frames, writer.repeated, writer.dropped) == (20, 0, 0)
     greys = frames_of(path, 20.0)
     np.testing.assert_allclose(greys, [index * 12 for index in range(20)], atol=4)
-    assert capfd.readouterr().err == ""  # the harmless line about tags is kept off
+    assert capfd.readouterr().err == ""  # the harmless line about tags is suppressed
 
 
 def test_a_pause_is_filled_with_the_image_before_it(tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_broken_pyav_is_logged_and_opencv_is_used(
     assert reported.startswith("PyAV is installed but unusable (libav: wrong version)")
 
 
-def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_rejected(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "video.webm", 64, 48, 10.0) as writer:
         with pytest.raises(ValueError, match=re.escape("must be (48, 64, 3) uint8, got (48, 60, 3)")):
             writer.write(make_image(1, 60), 0)
@@ -235,7 +235,7 @@ video.play().catch(error => tell(String(error)));
 
 
 class Cinema(SimpleHTTPRequestHandler):
-    """Serves the page and the video, and takes what the page tells."""
+    """Serves the page and the video, and receives the page's report."""
 
     reported: ClassVar[queue.SimpleQueue[dict[str, Any]]] = queue.SimpleQueue()
 

@@ -1,4 +1,4 @@
-"""The network as its description tells it."""
+"""The network built from its description."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_folded_network_gives_the_same_outputs() -> None:
     torch.manual_seed(2)
     model = build(yolov8_description(SMALL, ("car", "dog")))
     for _ in range(3):
-        model(torch.rand(4, 3, 64, 64))  # Gives the normalisations statistics of their own.
+        model(torch.rand(4, 3, 64, 64))  # Gives the normalisations statistics.
     model.eval()
     x = torch.rand(1, 3, 64, 96)
     with torch.inference_mode():
@@ -200,7 +200,7 @@ def test_invalid_table_is_rejected_by_name(changes: dict[str, Any]) -> None:
         build(ModelDescription.from_plain(small_table(**changes)))
 
 
-def test_an_unknown_scale_is_refused_with_the_known_ones() -> None:
+def test_an_unknown_scale_is_rejected_with_the_known_ones() -> None:
     with pytest.raises(ArchitectureError, match=r"'q'.*n, s, m, l, x"):
         yolov8_description("q", ("a",))
 

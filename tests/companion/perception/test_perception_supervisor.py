@@ -171,7 +171,7 @@ async def test_the_end_of_the_source_is_the_end_and_not_a_loss(photos: Path) -> 
     [
         ({"source.uri": "/nowhere/street.mp4"}, "/nowhere/street.mp4: no such file"),
         ({"detector.enabled": "true", "detector.model": "/nowhere/m.pt"}, "/nowhere/m.pt: no such file"),
-        ({"detector.enabled": "true", "detector.kind": "rad"}, "there is no 'rad'; known: yolo ("),
+        ({"detector.enabled": "true", "detector.kind": "rad"}, "'rad'; known: yolo ("),
         ({"plugins.modules": "no_such_module"}, "no module 'no_such_module'"),
         ({"recording.video": "/dev/null/v.webm"}, "/dev/null/v.webm: cannot be written: "),
     ],

@@ -1,4 +1,4 @@
-"""A small lively network, as a checkpoint, and pictures for it."""
+"""A small network with random weights, as a checkpoint, and images for it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAMES = ("person", "bicycle", "car", "dog", "boat", "chair")
 
 
 def lively_model(seed: int = 0) -> YoloModel:
-    """Random weights whose signal neither dies nor explodes, and class logits around zero."""
+    """Random weights that keep the signal's size through all layers, and class logits around zero."""
     torch.manual_seed(seed)
     model = build(yolov8_description((0.1, 0.05, 64), NAMES)).eval()
     for module in model.modules():
@@ -50,7 +50,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is read from, or left in, the cache of who runs the tests; the tests share one."""
+    """Isolates the tests from the user's cache; the tests share one."""
     base = tmp_path_factory.getbasetemp()
     monkeypatch.setenv("XDG_CACHE_HOME", str(base / "cache"))
 

@@ -1,4 +1,4 @@
-"""Exported networks: the same maps, loadable alone, refused when they are not what they should be."""
+"""Exported networks: same outputs as torch, loadable alone, rejected if invalid."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def needs(*packages: str) -> None:
 
 @pytest.fixture(scope="module")
 def exported(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Each kind is made once."""
+    """Each kind is exported once."""
     folder = tmp_path_factory.mktemp("exported")
     made: dict[ExportKind, Path] = {}
 
@@ -64,7 +64,7 @@ def test_exported_network_matches_torch_at_every_size(
     needs(runtime)
     found = runtime_of_file(runtime, exported(kind), threads=1)
     reference = TorchRuntime(lively_model(), precision="float32")
-    # A checkpoint's weights are kept in half precision.
+    # A checkpoint's weights are stored in half precision.
     for size in ((96, 96), (64, 160), (96, 96), (32, 32)):
         image = make_image(*size)
         for a, b in zip(found.infer(image), reference.infer(image), strict=True):

@@ -1,4 +1,4 @@
-"""What an exported file tells of itself."""
+"""Metadata of exported files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_facts_survive_the_round_trip(**values: object) -> None:
 
 
 @given(text=st.text() | st.recursive(st.none() | st.integers() | st.text(), st.lists).map(json.dumps))
-def test_anything_else_is_refused_by_name(text: str) -> None:
+def test_anything_else_is_rejected_by_name(text: str) -> None:
     with pytest.raises(RuntimeUnusableError, match=r"net\.engine"):
         ExportedFacts.from_json(text, PATH)
 
@@ -74,7 +74,7 @@ def test_a_plan_keeps_its_facts_before_it() -> None:
 
 
 @given(cut=st.integers(0, len(with_facts(FACTS, b"")) - 1))
-def test_a_plan_that_is_cut_short_is_refused(cut: int) -> None:
+def test_a_plan_that_is_cut_short_is_rejected(cut: int) -> None:
     with pytest.raises(RuntimeUnusableError):
         split_facts(with_facts(FACTS, b"")[:cut], PATH)
 

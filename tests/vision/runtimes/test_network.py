@@ -1,4 +1,4 @@
-"""A model made into what is run gives what the model gives."""
+"""The inference network gives the results of the model it is converted from."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vision.yolo.level_outputs import LevelOutput
 
 
 def whole_maps(image: np.ndarray) -> list[Tensor]:
-    """What the untouched model says of a BGR picture."""
+    """Outputs of the unmodified model for a BGR image."""
     rgb = torch.from_numpy(image[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
     with torch.inference_mode():
         maps: list[Tensor] = lively_model()(rgb)

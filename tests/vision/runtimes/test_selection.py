@@ -1,4 +1,4 @@
-"""Which runtime runs a model, and how the fastest is found."""
+"""Selection of a model's runtime by name, and of the fastest by measurement."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vision.runtimes.source import read_source
 
 
 def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """As if these runtimes alone were installed."""
+    """Pretend that only these runtimes are installed."""
     real = importlib.util.find_spec
     absent = set(base.RUNTIMES) - set(names)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
@@ -49,9 +49,7 @@ def test_broken_runtime_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
-def test_a_checkpoint_runs_on_a_named_runtime_and_is_converted_once(
-    checkpoint: Path, runtime: RuntimeName
-) -> None:
+def test_checkpoint_is_converted_once_for_a_named_runtime(checkpoint: Path, runtime: RuntimeName) -> None:
     pytest.importorskip(runtime, reason=f"{runtime} is an optional extra")
     pytest.importorskip("onnx", reason="onnx comes with the optional extras")
     image = make_image(64, 96)
@@ -74,7 +72,7 @@ def test_runtime_rejects_unsupported_files(checkpoint: Path, tmp_path: Path) -> 
         start_runtime(read_source(path), "openvino")
 
 
-def test_precisions_that_a_runtime_does_not_have_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+def test_precisions_that_a_runtime_does_not_have_are_rejected(checkpoint: Path, tmp_path: Path) -> None:
     path = export(checkpoint, "torchscript", tmp_path / "net.torchscript", 64)
     with pytest.raises(RuntimeUnusableError, match="computes in float32"):
         Detector(path, precision="bfloat16")
@@ -91,7 +89,7 @@ def test_auto_is_torch_if_only_torch_is_installed(checkpoint: Path, monkeypatch:
 
 
 class Trial:
-    """Stands for the measuring processes: answers by a table, and counts how often it is asked."""
+    """Replaces the measuring processes: returns values from a table and counts the calls."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, answer: dict[RuntimeName, float | str]) -> None:
         self.answer, self.asked = answer, 0
@@ -134,7 +132,7 @@ def test_auto_selects_the_fastest_with_a_reason(
     assert all(f"{key} {value:.1f} ms" in reason for key, value in answer.items() if value != str(value))
     assert f"runtime auto: {best}" in caplog.text
     again = autotune.fastest_runtime(source, list(answer), **CHOICE)
-    # One that failed may run next time: that is asked again.
+    # A failed runtime may work next time, so it is measured again.
     failed = any(isinstance(value, str) for value in answer.values())
     assert again == (best, reason if failed else reason.replace("measured now", "measured before"))
     assert asked.asked == (2 if failed else 1)

@@ -1,4 +1,4 @@
-"""TensorRT as far as it goes without a GPU: what is missing or wrong is said by name."""
+"""TensorRT without a GPU: missing or invalid parts are named in the error."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_plan_metadata_is_readable_without_tensorrt(engine: Path) -> None:
     assert source.runners() == ("tensorrt",)
 
 
-def test_a_precision_that_a_plan_does_not_have_is_refused(engine: Path) -> None:
+def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None:
     with pytest.raises(RuntimeUnusableError, match="float16, not in bfloat16"):
         TensorRtRuntime(engine, precision="bfloat16")
 

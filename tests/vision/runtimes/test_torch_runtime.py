@@ -96,7 +96,7 @@ def test_auto_measures_both_where_it_must() -> None:
     assert runtime.precision_reason.startswith("measured")
 
 
-def test_a_precision_it_does_not_have_is_refused() -> None:
+def test_a_precision_it_does_not_have_is_rejected() -> None:
     with pytest.raises(RuntimeUnusableError, match="float32 or bfloat16"):
         TorchRuntime(lively_model(), precision="float16")
 

@@ -1,4 +1,4 @@
-"""The assignment against every permutation; the pairing against every pairing there is."""
+"""The assignment compared with every permutation; the matching compared with every pairing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from vision.tracking.association import assign, enlarge, match, overlaps
 
-# Whole numbers too: ties are where a shortest path goes astray.
+# Integers too: ties are the difficult case of shortest paths.
 costs = arrays.arrays(
     np.float64,
     st.tuples(st.integers(0, 5), st.integers(0, 5)),
@@ -62,7 +62,7 @@ def test_non_finite_cost_is_rejected(bad: float) -> None:
 
 
 def best_gain(gain: np.ndarray) -> float:
-    """Over every way to pair rows with columns or leave them alone."""
+    """The best gain over every pairing of rows with columns, unpaired ones included."""
     if not gain.size:
         return 0.0
     alone = best_gain(gain[1:])

@@ -1,4 +1,4 @@
-"""What the tracker promises: who is who, who counts as true, and what it tells."""
+"""The tracker: identities, confirmation, events."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMES = ("person", "car")
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70))
 FRAME_S = 0.05
 
-Seen = tuple[float, float, float]  # x, y of the middle, confidence
+Seen = tuple[float, float, float]  # x, y of the centre, confidence
 
 
 def detections(*seen: Seen, class_id: int = 0, size: float = 40.0) -> Detections:
@@ -39,7 +39,7 @@ def detections(*seen: Seen, class_id: int = 0, size: float = 40.0) -> Detections
 
 
 class TrackingSequence:
-    """A tracker that is given one frame after another."""
+    """A tracker that receives one frame after another."""
 
     def __init__(self, **settings: float) -> None:
         self.tracker = Tracker(TrackerSettings(**settings))  # type: ignore[arg-type]
@@ -365,13 +365,13 @@ def test_invariants_hold_for_any_input(
         assert all(np.isfinite(track.xyxy).all() for track in sequence.tracker.tracks)
 
 
-# --- what else an object was called
+# --- other classes on an object
 
 CAR, PERSON = 1, 0
 
 
 def detected_as(*names: tuple[int, float], x: float = 100.0) -> Detections:
-    """One object that a frame gives these classes, each with its confidence."""
+    """One object that a frame reports with these classes, each with its confidence."""
     box = [[x - 20, 80.0, x + 20, 120.0]] * len(names)
     return Detections(
         np.array(box, np.float32).reshape(-1, 4),
@@ -430,7 +430,7 @@ def test_a_confirmed_track_is_in_doubt_while_its_class_changes() -> None:
     assert sequence.reported.count(("new", 1)) == 1, "events tell of it once"
 
 
-def test_an_object_beside_another_does_not_put_its_class_in_doubt() -> None:
+def test_neighbouring_object_does_not_affect_the_class() -> None:
     sequence = TrackingSequence()
     for _ in range(6):
         sequence.now_s += FRAME_S

@@ -1,4 +1,4 @@
-"""Boxes under a turning camera, against points projected one by one; and attitudes between their samples."""
+"""Boxes under camera rotation, compared with points projected one by one; and interpolated attitudes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_rotation_and_back_restores_the_state(
 def test_roll_rotates_velocity_and_keeps_sides() -> None:
     states = initiate(at(CAMERA.cx, CAMERA.cy))
     states.mean[0, 4:6] = (10.0, 0.0)
-    # About the optical axis, a quarter turn: what went right goes down.
+    # About the optical axis, a quarter turn: motion to the right becomes motion down.
     moved, _ = rotate_boxes(states, CAMERA, matrix_from_euler(0.0, 0.0, math.pi / 2))
     np.testing.assert_allclose(moved.mean[0], [CAMERA.cx, CAMERA.cy, 20, 40, 0, 10, 0, 0], atol=1e-6)
 
@@ -72,7 +72,7 @@ def test_roll_rotates_velocity_and_keeps_sides() -> None:
 def test_boxes_grow_towards_the_image_edge() -> None:
     yaw = matrix_from_euler(0.0, math.radians(30), 0.0)  # about the optical frame's y axis
     moved, _ = rotate_boxes(initiate(at(CAMERA.cx, CAMERA.cy, 2, 2)), CAMERA, yaw)
-    # Off the axis by 30° a small thing is stretched by 1/cos² away from the middle and by 1/cos across.
+    # Off the axis by 30° a small object is stretched by 1/cos² away from the centre and by 1/cos across.
     np.testing.assert_allclose(
         moved.mean[0, 2:4], [2 / math.cos(yaw_rad := math.radians(30)) ** 2, 2 / math.cos(yaw_rad)], rtol=1e-3
     )
@@ -136,8 +136,8 @@ def test_extrapolation_does_not_amplify_noise() -> None:
         ((), 50),
         ((100, 120, 200), 99),  # before all
         ((100, 120, 200), 200 + int(MAX_AHEAD_S * 1000) + 1),  # long after all
-        ((100,), 110),  # one says nothing of how it turns
-        ((100, 1000), 500),  # who knows what was between
+        ((100,), 110),  # a single sample has no rate
+        ((100, 1000), 500),  # the gap is too long
     ],
 )
 def test_unknown_attitude_is_none(stamps_ms: tuple[int, ...], asked_ms: int) -> None:

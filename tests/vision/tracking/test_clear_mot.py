@@ -1,4 +1,4 @@
-"""The measures, on sequences small enough to count by hand."""
+"""The metrics, on sequences small enough to count by hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Frame = tuple[dict[int, float], dict[int, float]]
 
 
 def score(*frames: Frame) -> MotScore:
-    """Of frames that say at which x each identity's box of 10 by 10 pixels stands."""
+    """Score of frames given as the x of each identity's box of 10 by 10 pixels."""
     return clear_mot((labelled(truth), labelled(tracked)) for truth, tracked in frames)
 
 
@@ -65,7 +65,7 @@ def test_existing_pair_is_kept_over_a_better_one() -> None:
 
 
 def test_as_many_as_possible_are_paired() -> None:
-    # 7 fits both, 8 fits the first alone.
+    # 7 matches both, 8 matches only the first.
     result = score(({1: 0, 2: 4}, {7: 1, 8: -3}))
     assert (result.misses, result.false_positives) == (0, 0)
 

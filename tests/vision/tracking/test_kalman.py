@@ -1,4 +1,4 @@
-"""The filter of boxes: right by time whatever the frames, and never surer than it may be."""
+"""The box filter: independent of the frame rate, with consistent uncertainty."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tracking is worth on rendered sequences with known truth; the bench runs longer ones."""
+"""Tracking quality on rendered sequences with ground truth; the bench runs longer ones."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_tracker_has_far_fewer_switches_than_matching(scores: Scores, motion: st
 
 
 @pytest.mark.parametrize("motion", ["gusts", "turning"])
-def test_the_vehicles_attitude_keeps_identities_of_a_moving_camera(scores: Scores, motion: str) -> None:
+def test_attitude_keeps_identities_of_a_moving_camera(scores: Scores, motion: str) -> None:
     by_method = scores[motion]
     assert by_method["attitude"].switches < 0.5 * by_method["tracker"].switches
     assert by_method["attitude"].mota > by_method["tracker"].mota + 0.1

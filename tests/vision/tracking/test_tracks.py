@@ -1,4 +1,4 @@
-"""The values of tracking."""
+"""Data types of tracking."""
 
 from __future__ import annotations
 
