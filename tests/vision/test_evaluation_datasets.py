@@ -104,7 +104,7 @@ def test_a_wrong_label_is_named_with_file_and_line(yolo: Path, line: str, expect
 
 
 def test_folder_without_data_set_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="no such file or folder"):
+    with pytest.raises(DatasetError, match="no such file"):
         open_dataset(tmp_path / "none")
     with pytest.raises(DatasetError, match="has no images"):
         open_dataset(tmp_path)
@@ -145,13 +145,13 @@ def annotated(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        (annotated(category_id=1), "annotation 0: its category_id 1"),
-        (annotated(bbox=[0, 0, -1, 1]), "annotation 0: its bbox must"),
+        (annotated(category_id=1), "annotation 0: .*category_id 1"),
+        (annotated(bbox=[0, 0, -1, 1]), "annotation 0: .*bbox"),
         (annotated(image_id=8), "image 8"),
-        ({"annotations": {}}, "`annotations` must be a list"),
+        ({"annotations": {}}, "`annotations`"),
         ({"categories": []}, "has no categories"),
         ({"categories": [{"id": 1}]}, "category 0: expected"),
-        ({"images": [{"id": 7, "file_name": "gone.jpg"}]}, "image 0: gone.jpg is in none of .*--images"),
+        ({"images": [{"id": 7, "file_name": "gone.jpg"}]}, "image 0: gone.jpg .*--images"),
     ],
 )  # fmt: skip
 def test_a_wrong_entry_of_a_coco_file_is_named(

@@ -97,12 +97,12 @@ def test_no_images_give_no_score() -> None:
 
 
 def test_unknown_class_id_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"class ids must be 0\.\.1, got 0\.\.7"):
+    with pytest.raises(ValueError, match=r"0\.\.1, got 0\.\.7"):
         score_detections([result([(SQUARE, 0.5, 7)], [(SQUARE, 0)])], NAMES)
 
 
 def test_precision_without_true_objects_is_not_defined() -> None:
-    with pytest.raises(ValueError, match="at least one true object"):
+    with pytest.raises(ValueError, match="got 0"):
         average_precision(np.zeros(0, np.float32), np.zeros(0, bool), 0)
 
 

@@ -176,7 +176,7 @@ def test_a_result_is_small_and_survives_pickling() -> None:
 
 
 def test_every_must_be_a_count() -> None:
-    with pytest.raises(ValueError, match="every must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"every .*got 0"):
         Selection(every=0)
 
 

@@ -42,8 +42,8 @@ def test_class_names_stay_strings() -> None:
     [
         pytest.param("a: 1\nb: !!python/object/apply:os.system [id]", "line 2: the tag", id="a program"),
         pytest.param("a: &x [1]\nb: *x", "line 1: anchors", id="an alias"),
-        pytest.param("a: 1\na: 2", "line 2: duplicate key 'a'", id="a key twice"),
-        pytest.param("? [1, 2]\n: 3", "a key must be a plain value", id="a list as key"),
+        pytest.param("a: 1\na: 2", "duplicate key 'a'", id="a key twice"),
+        pytest.param("? [1, 2]\n: 3", "plain value", id="a list as key"),
         pytest.param("a: [1, 2", "line [12]: ", id="an open bracket"),
         pytest.param("a: \x00", "characters", id="a control character"),
         pytest.param("--- 1\n--- 2\n", "document", id="two documents"),

@@ -153,8 +153,8 @@ def test_http_of_another_type_goes_to_ffmpeg_and_names_it() -> None:
 @pytest.mark.parametrize(
     ("address", "words"),
     [
-        ("http://127.0.0.1:{port}/video", "connection refused; is the server running"),
-        ("rtsp://user:secret@127.0.0.1:{port}/live", "connection refused; is the camera on"),
+        ("http://127.0.0.1:{port}/video", "connection refused"),
+        ("rtsp://user:secret@127.0.0.1:{port}/live", "connection refused"),
     ],
 )
 def test_refused_connection_is_one_line_without_password(

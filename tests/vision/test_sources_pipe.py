@@ -145,7 +145,7 @@ def test_fifo_recovers_with_a_new_writer(tmp_path: Path, caplog: pytest.LogCaptu
 
 def test_fifo_without_writer_times_out(tmp_path: Path) -> None:
     path = fifo(tmp_path)
-    with pytest.raises(SourceError, match=r"camera\.fifo: no frame within 0\.3 s.*start its writer"):
+    with pytest.raises(SourceError, match=r"camera\.fifo: .* 0\.3 s"):
         open_source(str(path), SourceSettings(open_timeout_s=0.3))
 
 
@@ -216,7 +216,7 @@ def test_mjpeg_is_recognised_by_its_first_bytes(tmp_path: Path) -> None:
 def test_unknown_bytes_require_format_and_size(tmp_path: Path) -> None:
     path = fifo(tmp_path)
     writer = write_in_thread(path, lambda out: os.write(out, b"\1\2\3\4" * 100) and None)
-    with pytest.raises(SourceError, match=r"starts with 01 02 03.*give pixel_format bgr24"):
+    with pytest.raises(SourceError, match=r"01 02 03.*pixel_format bgr24"):
         open_source(str(path), SourceSettings(every_frame=True))
     writer.join()
 

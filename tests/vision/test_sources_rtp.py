@@ -42,7 +42,7 @@ def test_rtp_jpeg_recovers_from_a_sender_restart(caplog: pytest.LogCaptureFixtur
 def test_silent_udp_port_names_the_expected_stream(capfd: pytest.CaptureFixture[str]) -> None:
     port = free_port()
     settings = SourceSettings(open_timeout_s=0.5)
-    with pytest.raises(SourceError, match=f"no MPEG-TS .*{port}; is the sender sending"):
+    with pytest.raises(SourceError, match=f"no MPEG-TS .*{port}"):
         open_source(f"udp://127.0.0.1:{port}", settings)
     with pytest.raises(SourceError, match=f"no RTP H264 .*{port}"):
         open_source(f"udp://127.0.0.1:{port}?format=rtp-h264", settings)

@@ -101,7 +101,7 @@ def test_plane_layout_matches_opencv() -> None:
         pytest.param(b"YUV4MPEG2 W-4 H480", "width", id="negative"),
         pytest.param(b"YUV4MPEG2 W99999 H480", "width", id="huge"),
         pytest.param(b"YUV4MPEG2 W4 H4 C420p10", "ffmpeg -pix_fmt yuv420p", id="ten bits"),
-        pytest.param(b"RIFFxxxx", "not a YUV4MPEG2 header", id="another format"),
+        pytest.param(b"RIFFxxxx", "YUV4MPEG2 header", id="another format"),
     ],
 )
 def test_bad_header_is_rejected_with_a_reason(line: bytes, words: str) -> None:

@@ -186,9 +186,9 @@ def test_stage_decay_is_at_most_its_length(decay_steps: int) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        pytest.param({"stages": ()}, "at least one stage", id="no stage"),
+        pytest.param({"stages": ()}, "one stage", id="no stage"),
         pytest.param({"learning_rate": 0.0}, "learning rate", id="no rate"),
-        pytest.param({"average_decay": 1.0}, "average_decay must be in", id="an average that never moves"),
+        pytest.param({"average_decay": 1.0}, "average_decay", id="an average that never moves"),
     ],
 )
 def test_impossible_settings_are_rejected(change: dict[str, Any], message: str) -> None:
@@ -219,8 +219,8 @@ def label_short(rng: np.random.Generator, width: int, height: int) -> LabelledIm
     ("source", "message"),
     [
         pytest.param(wrong_size, "the source returned", id="size"),
-        pytest.param(unknown_class, r"class ids must be 0\.\.1", id="class"),
-        pytest.param(label_short, "2 boxes but 1 class ids", id="labels"),
+        pytest.param(unknown_class, r"class ids .*0\.\.1", id="class"),
+        pytest.param(label_short, "2 boxes .* 1", id="labels"),
     ],
 )
 def test_invalid_scene_is_rejected(source: SceneSource, message: str) -> None:

@@ -130,11 +130,11 @@ def test_image_may_be_modified_after_write(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "size", "rate_hz", "words"),
     [
-        ("video.mp4", (64, 48), 10.0, "must end in .webm"),
+        ("video.mp4", (64, 48), 10.0, ".webm"),
         ("video.webm", (0, 48), 10.0, "1..16383 pixels"),
-        ("video.webm", (64, 48), 0.0, "rate_hz must be 0.1..240"),
+        ("video.webm", (64, 48), 0.0, "0.1..240"),
         ("file/video.webm", (64, 48), 10.0, "cannot be written: "),
-        ("taken.webm", (64, 48), 10.0, "cannot be written: Is a directory"),
+        ("taken.webm", (64, 48), 10.0, "Is a directory"),
     ],
 )
 def test_write_failure_is_a_one_line_error(
@@ -201,12 +201,12 @@ def test_broken_pyav_is_logged_and_opencv_is_used(
             writer.write(make_image(40), 0)
     assert len(frames_of(path, 10.0)) == 1
     (reported,) = [record.getMessage() for record in caplog.records]
-    assert reported.startswith("PyAV is installed but unusable (libav: wrong version)")
+    assert reported.startswith("PyAV")
 
 
 def test_an_image_of_another_size_is_rejected(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "video.webm", 64, 48, 10.0) as writer:
-        with pytest.raises(ValueError, match=re.escape("must be (48, 64, 3) uint8, got (48, 60, 3)")):
+        with pytest.raises(ValueError, match=re.escape("got (48, 60, 3)")):
             writer.write(make_image(1, 60), 0)
         writer.write(make_image(1), 0)
     with pytest.raises(ValueError, match="after close"):

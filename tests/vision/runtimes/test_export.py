@@ -142,7 +142,7 @@ def test_file_with_wrong_outputs_is_not_kept(
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"to": "coreml"}, "onnx, openvino, tensorrt, torchscript"),
+        ({"to": "coreml"}, "tensorrt, torchscript"),
         ({"to": "torchscript", "image_size": 100}, "multiple of 32"),
         ({"to": "torchscript", "output": Path("net.onnx")}, ".torchscript"),
     ],

@@ -25,7 +25,7 @@ def engine(tmp_path: Path) -> Path:
 
 @absent
 def test_running_without_tensorrt_names_the_extra(engine: Path) -> None:
-    with pytest.raises(RuntimeMissingError, match=r"pip install 'mavlink-companion\[tensorrt\]'"):
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
         TensorRtRuntime(engine)
 
 
@@ -42,10 +42,10 @@ def test_plan_metadata_is_readable_without_tensorrt(engine: Path) -> None:
 
 
 def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None:
-    with pytest.raises(RuntimeUnusableError, match="float16, not in bfloat16"):
+    with pytest.raises(RuntimeUnusableError, match=r"float16.* bfloat16"):
         TensorRtRuntime(engine, precision="bfloat16")
 
 
 def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no such file"):
+    with pytest.raises(RuntimeUnusableError, match=r"none\.engine"):
         read_source(tmp_path / "none.engine")

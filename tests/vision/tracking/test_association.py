@@ -57,7 +57,7 @@ def test_large_assignment_is_optimal_under_swaps() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_non_finite_cost_is_rejected(bad: float) -> None:
-    with pytest.raises(ValueError, match="every cost must be finite"):
+    with pytest.raises(ValueError, match="finite"):
         assign(np.array([[1.0, bad], [0.0, 1.0]]))
 
 

@@ -28,14 +28,14 @@ def test_median_without_confidences_is_zero() -> None:
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ({"low_confidence": 0.5, "high_confidence": 0.4}, "low not above high, got 0.5 and 0.4"),
+        ({"low_confidence": 0.5, "high_confidence": 0.4}, "got 0.5 and 0.4"),
         ({"high_confidence": 1.5}, "must be 0 to 1"),
-        ({"confirm_score": -0.1}, "confirm_score must be 0 to 1, got -0.1"),
-        ({"keep_confidence": 2.0}, "keep_confidence must be 0 to 1, got 2"),
-        ({"min_iou": float("nan")}, "min_iou must be 0 to 1, got nan"),
-        ({"min_hits": 0}, "min_hits must be at least 1, got 0"),
+        ({"confirm_score": -0.1}, "confirm_score .*got -0.1"),
+        ({"keep_confidence": 2.0}, "keep_confidence .*got 2"),
+        ({"min_iou": float("nan")}, "min_iou .*got nan"),
+        ({"min_hits": 0}, "min_hits .*got 0"),
         ({"coast_timeout_s": 0.0}, "coast_timeout_s"),
-        ({"coast_timeout_s": 3.0, "max_age_s": 2.0}, "not above max_age_s, got 3 and 2"),
+        ({"coast_timeout_s": 3.0, "max_age_s": 2.0}, "max_age_s, got 3 and 2"),
     ],
 )
 def test_contradictory_settings_are_rejected(bad: dict[str, float], message: str) -> None:
