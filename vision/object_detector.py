@@ -89,8 +89,7 @@ class ObjectDetector(ABC):
 
         Args:
             image_bgr: (height, width, 3) uint8, BGR. Its size may change from frame to frame. It is the
-                frame's own
-                memory: do not write to it or keep it.
+                frame's own memory: do not write to it or keep it.
 
         Returns:
             Boxes in the frame's pixels (left, top, right, bottom; origin at the upper left corner), with this

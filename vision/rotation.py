@@ -1,7 +1,7 @@
 """Rotation matrices between the frames: camera (optical), body (FRD), world (NED).
 
-A rotation matrix `a_from_b` maps a vector's coordinates in b to its coordinates in a.
-Angles and quaternions are as in `vision.attitude`.
+A rotation matrix `a_from_b` maps a vector's coordinates in b to its coordinates in a. Angles and quaternions
+are as in `vision.attitude`.
 """
 
 from __future__ import annotations

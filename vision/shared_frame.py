@@ -1,11 +1,10 @@
 """Frames between two processes of one host through shared memory: a ring of slots, the newest frame wins.
 
 A segment is a file in /dev/shm, mapped by both sides. The writer creates it under another name and then
-renames it, so a reader sees either none or a complete one. The writer holds a lock (`flock`) on it for its
-lifetime: the kernel releases the lock when the writer dies, and the next writer of the name then replaces the
-    segment. Readers
-detect that by the file's identity and map the new one. (`multiprocessing.shared_memory` is not used: its
-resource tracker on Python 3.11 removes a segment when any reader exits.)
+renames it, so a reader sees either none or a complete one. The writer holds a lock (`fcntl.flock`) on it: the
+kernel releases the lock when the writer dies, and the next writer of the name then replaces the segment.
+Readers detect that by the file's identity and map the new one. (`multiprocessing.shared_memory` is not used:
+its resource tracker on Python 3.11 removes a segment when any reader exits.)
 
 Layout, in 64-bit words of the host's byte order; the slots begin at the second page:
 

@@ -1,4 +1,4 @@
-"""Safetensors files: what was written is read back, and a damaged file is one error."""
+"""Safetensors files: round trip, and damaged files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def entry(dtype: Any = "F32", shape: Any = (2,), offsets: Any = (0, 8)) -> dict[
     return {"dtype": dtype, "shape": shape, "data_offsets": offsets}
 
 
-def test_what_was_written_is_read_back(tmp_path: Path) -> None:
+def test_round_trip(tmp_path: Path) -> None:
     dtypes = (torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool)
     tensors = {f"a.{dtype}": (torch.randn(2, 3) * 9).to(dtype) for dtype in dtypes}
     tensors |= {"scalar": torch.tensor(3.5), "none": torch.zeros(0, 4), "turned": torch.randn(4, 5).T}

@@ -223,14 +223,14 @@ def test_an_odd_size_can_be_written(tmp_path: Path) -> None:
 
 PAGE = """<!doctype html><video id="video" muted src="video.webm"></video><script>
 const video = document.getElementById("video");
-function tell(what) {
+function report(what) {
   fetch("/reported", {method: "POST", body: JSON.stringify({what, width: video.videoWidth,
     height: video.videoHeight, duration: video.duration, time: video.currentTime,
     error: video.error && video.error.message})});
 }
-video.onerror = () => tell("error");
-video.onended = () => tell("ended");
-video.play().catch(error => tell(String(error)));
+video.onerror = () => report("error");
+video.onended = () => report("ended");
+video.play().catch(error => report(String(error)));
 </script>"""
 
 

@@ -1,8 +1,7 @@
 """The worst errors of a detector, collected during evaluation and shown on one sheet.
 
 Missed: ground truth objects without a detection of their class, largest first. Imagined: detections without
-    an
-object, most confident first.
+an object, most confident first.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reading and writing safetensors files with the format's own library; every error is a `CheckpointError`."""
+"""Reads and writes safetensors files with their library; every error is a `CheckpointError`."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _MAX_HEADER_BYTES = 4 << 20
 
 @dataclass(frozen=True, slots=True)
 class SafetensorsContent:
-    """Tensors on the CPU by name, and the free texts of the header."""
+    """Tensors on the CPU by name, and the string metadata of the header."""
 
     tensors: dict[str, Tensor]
     metadata: dict[str, str]
 
 
 def read_safetensors(path: Path) -> SafetensorsContent:
-    """Read every tensor of `path`; takes as much memory as the file.
+    """Read every tensor of `path`; needs as much memory as the file.
 
     Raises:
-        CheckpointError: the file is missing, truncated, or not of the format.
+        CheckpointError: the file is missing, truncated, or invalid.
     """
     try:
         with path.open("rb") as file:
@@ -56,10 +56,10 @@ def read_safetensors(path: Path) -> SafetensorsContent:
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write `tensors` and `metadata` to `path`, and wait until they are on the disk.
+    """Write `tensors` and `metadata` to `path`, and sync to disk.
 
     Raises:
-        TypeError: a tensor of a type that the format does not have.
+        TypeError: a tensor of a type that the format does not support.
     """
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     for name, tensor in contiguous.items():

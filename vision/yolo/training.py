@@ -83,8 +83,8 @@ class TrainingSettings:
         warmup_steps: the rate rises linearly over these.
         decay: shape of the rate's fall within a stage.
         final_rate: its end value, as a share of `learning_rate`.
-        normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03
-            lags behind the weights in a short training.
+        normalisation_momentum: share of a batch in the running statistics; YOLOv8's own 0.03 lags behind the
+            weights in a short training.
         gradient_limit: largest norm of the gradient (clipping).
         average_decay: of the running average of the weights, which is the result.
         seed: of the initial weights and of every scene.

@@ -324,7 +324,7 @@ def test_ids_start_at_first_track_id() -> None:
         Tracker(first_track_id=0)
 
 
-frames_of_film = st.lists(
+frame_sequences = st.lists(
     st.tuples(
         st.floats(0.0, 1.5),
         st.lists(st.tuples(st.floats(0, 640), st.floats(0, 480), st.floats(0, 1)), max_size=6),
@@ -335,7 +335,7 @@ frames_of_film = st.lists(
 
 
 @settings(max_examples=60)
-@given(frames_of_film)
+@given(frame_sequences)
 def test_invariants_hold_for_any_input(
     frames: list[tuple[float, list[Seen], float | None]],
 ) -> None:
@@ -427,7 +427,7 @@ def test_a_confirmed_track_is_in_doubt_while_its_class_changes() -> None:
     frame = show(sequence, detected_as((CAR, 0.6), (PERSON, 0.9)), 6)
     assert confirmed(frame, CAR) == [False]
     assert confirmed(show(sequence, detected_as((CAR, 0.8)), 8), CAR) == [True]
-    assert sequence.reported.count(("new", 1)) == 1, "events tell of it once"
+    assert sequence.reported.count(("new", 1)) == 1, "reported once"
 
 
 def test_neighbouring_object_does_not_affect_the_class() -> None:
