@@ -57,8 +57,8 @@ def findings(text: str) -> Iterator[tuple[int, str, str]]:
         for match in _WORDS.finditer(_CAPITALS.sub("_", line)):
             yield number, match[0], INSTEAD[match[0].lower()]
         for phrase, instead in PHRASES.items():
-            if match := re.search(phrase, line, re.IGNORECASE):
-                yield number, match[0], instead
+            if found := re.search(phrase, line, re.IGNORECASE):
+                yield number, found[0], instead
 
 
 def main(arguments: Sequence[str]) -> int:

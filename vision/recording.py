@@ -114,7 +114,7 @@ class Recording:
                 "%s: %d frames are missing, the encoder was too slow; lower rate_hz%s",
                 self._path,
                 self.skipped,
-                "" if find_spec("av") else ", or pip install 'mavlink-companion[film]' for a faster encoder",
+                "" if find_spec("av") else ", or pip install 'mavlink-companion[video]' for a faster encoder",
             )
 
     def _run(self) -> None:
